@@ -105,6 +105,8 @@ class SynthConfig(Config):
     """Boxes that travel round the flat all the time."""
     people: NonNegativeInt = 0
     """People who each cross the view once, within two metres of the camera."""
+    people_stand_s: NonNegativeFloat = 0.0
+    """How long each of them stands still in the middle of the view before walking on."""
     texture_contrast: Ratio = 1.0
     """Contrast of all textures and of the light; with 0 everything is evenly white, and only depth varies."""
     texture_px_per_m: PositiveInt = 256
@@ -305,7 +307,7 @@ class LidarSynthConfig(Config):
 _LATER = {
     SynthConfig: {
         *("moving_boxes", "wheels", "scene", "hall_length_m", "hall_width_m", "hall_clearance_m"),
-        *("people", "texture_contrast", "disturbances", "day"),
+        *("people", "people_stand_s", "texture_contrast", "disturbances", "day"),
     },
     SensorConfig: {
         *("readout_s", "depth_delay_s", "radial_k1", "radial_k2", "depth_scale", "disparity_warp_px"),

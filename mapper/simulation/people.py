@@ -1,4 +1,4 @@
-"""People who cross the view of the camera near by, each walking straight on at a constant speed."""
+"""People who cross the view of the camera near by, each walking straight on; some stop there for a while."""
 
 from dataclasses import dataclass
 
@@ -31,15 +31,20 @@ class Walkers:
 
     Attributes:
         positions: (P, 2) where each is at the start, world x and y, metres.
-        velocities_mps: (P, 2).
+        velocities_mps: (P, 2) while they walk.
+        stops_s: (P,) when each stops.
+        stand_s: How long each stands.
     """
 
     positions: Array
     velocities_mps: Array
+    stops_s: Array
+    stand_s: float
 
     def at(self, time_s: float) -> Array:
         """Return (P, 2) where they are so many seconds after the start."""
-        where: Array = self.positions + self.velocities_mps * time_s
+        walked_s = time_s - np.clip(time_s - self.stops_s, 0.0, self.stand_s)
+        where: Array = self.positions + self.velocities_mps * walked_s[:, None]
         return where
 
 
@@ -51,6 +56,7 @@ def make_walkers(config: SynthConfig, motion: Motion) -> Walkers:
     """
     rng, count = rng_of(config.seed, Stream.PEOPLE), config.people
     times_s = motion.duration_s * (np.arange(count) + rng.uniform(0.3, 0.7, count)) / max(count, 1)
+    stops_s = times_s - 0.5 * config.people_stand_s
     clock_s = np.arange(0.0, motion.duration_s, 0.1)
     camera_xy = motion.poses(clock_s)[:, :2, 3]
     positions, velocities = np.empty((count, 2)), np.empty((count, 2))
@@ -61,13 +67,14 @@ def make_walkers(config: SynthConfig, motion: Motion) -> Walkers:
             across = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]) @ ahead
             crossing = T_world_camera[:2, 3] + rng.uniform(_NEAREST_M, _FARTHEST_M) * ahead
             velocities[i] = rng.uniform(_SLOWEST_MPS, _FASTEST_MPS) * across
-            positions[i] = crossing - velocities[i] * times_s[i]
-            walked = positions[i] + velocities[i] * clock_s[:, None]
+            positions[i] = crossing - velocities[i] * stops_s[i]
+            walked_s = clock_s - np.clip(clock_s - stops_s[i], 0.0, config.people_stand_s)
+            walked = positions[i] + velocities[i] * walked_s[:, None]
             if np.linalg.norm(walked - camera_xy, axis=1).min(initial=np.inf) > _APART_M:
                 break
         else:
             raise SourceError(f"people {count}: person {i + 1} has no free way past the camera; want fewer")
-    return Walkers(positions, velocities)
+    return Walkers(positions, velocities, stops_s, config.people_stand_s)
 
 
 def build_people(config: SynthConfig, scene: Scene, builder: Builder) -> None:

@@ -42,6 +42,7 @@ def motion_of(
     moved: Points,
     observers: tuple[int, int],
     T_moved: Transform = T_WALKED,
+    variance: float = 1.0,
 ) -> CameraMotion:
     """Return the motion from points that stand still and others that moved, each seen so often."""
     points = np.concatenate([still, moved])
@@ -54,7 +55,7 @@ def motion_of(
     )
     counts = np.repeat(observers, [len(still), len(moved)])
     return camera_motion(
-        np.eye(4), points, observation, np.arange(len(points)), counts, observation.sensor_weights
+        np.eye(4), points, observation, np.arange(len(points)), counts, observation.sensor_weights, variance
     )
 
 
@@ -72,6 +73,27 @@ def test_a_person_does_not_lead(observation, count, observers):
     assert motion.agree[100:].mean() < 0.1
 
 
+@pytest.mark.parametrize(("variance", "errs"), [(0.15, False), (0.25, False), (0.35, False), (1.0, True)])
+@pytest.mark.parametrize(("count", "walked_m"), [(30, 0.05), (45, 0.07)])
+def test_a_turn_and_a_step_before_a_wall_do_not_follow_who_starts_to_walk(
+    observation, variance, errs, count, walked_m
+):
+    """Before a wall a turn looks like a step, so that both together fit the wall roughly and the person."""
+    rng = np.random.default_rng(1)
+    wall = rng.uniform((-1.6, -1.2, 3.0), (1.6, 1.2, 3.0), (500, 3))
+    motion = motion_of(
+        observation,
+        rng,
+        still=wall,
+        moved=person(count, rng),
+        observers=(3, 3),
+        T_moved=exp(np.zeros(3), np.array([walked_m, 0.0, 0.0])),
+        variance=variance,
+    )
+    assert (miss_m(motion) > 0.05) == errs
+    assert (motion.agree[500:].mean() > 0.5) == errs
+
+
 def test_mismatches_are_no_other_motion(observation):
     rng = np.random.default_rng(2)
     motion = motion_of(observation, rng, still=room(200, rng), moved=room(1, rng), observers=(2, 0))
@@ -85,7 +107,7 @@ def test_mismatches_are_no_other_motion(observation):
         weights=np.ones((230, 3)),
         sensor_weights=np.ones((230, 3)),
     )
-    motion = camera_motion(np.eye(4), points, mixed, np.arange(230), np.full(230, 2), mixed.weights)
+    motion = camera_motion(np.eye(4), points, mixed, np.arange(230), np.full(230, 2), mixed.weights, 1.0)
     assert miss_m(motion) < 0.01
     assert not motion.moving.any()
     assert not motion.doubts

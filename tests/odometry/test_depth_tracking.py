@@ -196,6 +196,8 @@ def test_a_hand_before_the_lens_is_no_ground_to_stand_on(source, frames):
         (40, 0.02, 0, "map"),
         (40, 0.0, 0, "map+depth"),
         (40, 0.0, 200, "map"),
+        (200, 0.02, 0, "map"),
+        (200, 0.0, 0, "map+depth"),
     ],
 )
 def test_depth_takes_part_where_landmarks_tell_too_little(

@@ -4,7 +4,7 @@ import numpy as np
 
 from mapper.core.geometry import transform
 from mapper.graph.noise import with_model_error
-from mapper.odometry.local_map.log_residuals import LogResiduals
+from mapper.odometry.local_map.log_residuals import USUAL_VARIANCE, LogResiduals
 from mapper.registration.variance_factor import ResidualStatistics
 
 INFORMATION = np.diag([1e7] * 3 + [1e6] * 3)
@@ -39,3 +39,16 @@ def test_residuals_that_depend_on_each_other_show_all_of_it():
 def test_single_keyframes_do_not_decide():
     usual = [ResidualStatistics(0.25, 0.9)] * 9
     assert np.allclose(honest(*usual), honest(*usual, ResidualStatistics(50.0, 9.0)))
+
+
+def test_the_variance_of_features_is_the_usual_one_within_limits():
+    def variance(*values):
+        residuals = LogResiduals()
+        for value in values:
+            residuals.add(ResidualStatistics(value, 1.0))
+        return residuals.variance
+
+    assert variance(*[0.5] * 4) == USUAL_VARIANCE
+    assert variance(*[0.3] * 8, 50.0) == 0.3
+    assert variance(*[0.01] * 9) == 0.15
+    assert variance(*[4.0] * 9) == 1.0

@@ -2,6 +2,8 @@
 
 import pickle
 from dataclasses import replace
+from itertools import pairwise
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -52,6 +54,30 @@ def test_what_came_into_view_has_moved(odometry, earlier_depth, frames):
     assert inside.sum() > 20
     assert moved[inside].mean() > 0.8
     assert moved[~inside].mean() < 0.02
+
+
+def test_most_features_on_a_visitor_have_moved_where_most_surfaces_stand(odometry, earlier_depth, frames):
+    pose = odometry._last
+    visited = odometry.observe(with_visitor(frames[NOW]))
+    moved = earlier_depth.moved(visited, pose.T_camera_world, pose.reference)
+    shirt = np.tile(visited.points_camera[moved], (100, 1))[: 9 * len(visited)]
+    points_camera = np.concatenate([visited.points_camera, shirt])
+    crowded = replace(visited, points_camera=points_camera)
+    assert earlier_depth.moved(crowded, pose.T_camera_world, pose.reference)[len(visited) :].all()
+
+
+def test_who_came_and_stands_is_remembered(odometry):
+    observation = odometry._last.observation
+    landmark_map = Mock()
+    landmark_map.observation.return_value = observation
+    stamps_ns = [round(200_000_000 * k) for k in range(100)]
+    landmark_map.keyframes = [Mock(stamp_ns=stamp_ns, origin=0, doubt_m=0.0) for stamp_ns in stamps_ns]
+    now = replace(observation, stamp_ns=stamps_ns[-1])
+    compared = EarlierDepth(landmark_map, None)._earlier(now, len(stamps_ns) - 1, most=10)
+    ages_s = [1e-9 * (now.stamp_ns - stamps_ns[k]) for k in compared]
+    assert ages_s[0] == pytest.approx(0.4)
+    assert ages_s[-1] > 10.0
+    assert all(later > 1.49 * sooner for sooner, later in pairwise(ages_s))
 
 
 def test_a_visitor_gives_no_landmarks_and_no_support(odometry, frames):

@@ -125,6 +125,17 @@ def test_people_cross_the_view_and_keep_off_the_camera():
     assert max(shares) > 0.1
 
 
+def test_people_stand_in_the_middle_of_the_view_before_they_walk_on():
+    hall = changed(PLAIN, scene="hall", hall_length_m=9.0, hall_width_m=8.0, hall_clearance_m=2.6, people=2)
+    standing = CameraSimulator(changed(hall, people_stand_s=1.5)).movers.walkers
+    np.testing.assert_array_equal(standing.positions.shape, (2, 2))
+    for person, stop_s in enumerate(standing.stops_s):
+        where = [standing.at(float(stop_s + after_s))[person] for after_s in (-0.5, 0.0, 0.7, 1.5, 2.0)]
+        np.testing.assert_allclose(where[1:4], [where[1]] * 3)
+        step = 0.5 * standing.velocities_mps[person]
+        np.testing.assert_allclose([where[1] - where[0], where[4] - where[3]], [step, step])
+
+
 def test_a_rolling_shutter_shows_each_row_at_its_own_time(source):
     rolling = seen_by(source, readout_s=0.1)
     still = seen_by(source)
@@ -205,14 +216,18 @@ def test_truth_is_that_of_the_middle_row_and_does_not_change(source):
 def test_later_settings_are_written_only_where_they_are_set(tmp_path):
     tiny = changed(PLAIN, duration_s=0.1)
     rough = changed(
-        tiny, people=1, sensor=SensorConfig(readout_s=0.01), disturbances=DisturbanceConfig(hand_share=0.5)
+        tiny,
+        people=1,
+        people_stand_s=0.5,
+        sensor=SensorConfig(readout_s=0.01),
+        disturbances=DisturbanceConfig(hand_share=0.5),
     )
     written = {}
     for name, config in {"plain": tiny, "rough": rough}.items():
         write_tum_log(tmp_path / name, config)
         written[name] = json.loads((tmp_path / name / "scene.json").read_text())["config"]
 
-    later = {"scene", "people", "disturbances", "texture_contrast", "hall_length_m"}
+    later = {"scene", "people", "people_stand_s", "disturbances", "texture_contrast", "hall_length_m"}
     assert not later & set(written["plain"])
     assert not {"readout_s", "radial_k1", "depth_scale"} & set(written["plain"]["sensor"])
     assert written["rough"]["people"] == 1

@@ -50,6 +50,7 @@ def camera_motion(
     features: NDArray[np.integer],
     observers: NDArray[np.integer],
     weights: Array,
+    variance: float,
 ) -> CameraMotion:
     """Return the pose that established landmarks agree with, unless a wider part of the scene contradicts.
 
@@ -63,9 +64,12 @@ def camera_motion(
         features: (M,) the feature of each point.
         observers: (M,) number of keyframes that observe each point, 0 for those that are no landmarks.
         weights: (N, 3) inverse variances of the frame's features by which pairs agree.
+        variance: Usual square of residuals, relative to what the weights say. Features are found better than
+            that, so that a compromise between still walls and someone near by, whose features all pass the
+            test, has residuals that are too large.
     """
     T_found, agree = refined_by_established(
-        T_camera_world, points_world, observation, features, observers, weights
+        T_camera_world, points_world, observation, features, observers, weights, variance
     )
     only_motion = CameraMotion(T_found, agree, np.zeros(len(features), np.bool_))
     least = max(_LEAST_OTHERS, _LEAST_OTHER_RATIO * len(features))
@@ -94,27 +98,31 @@ def refined_by_established(
     features: NDArray[np.integer],
     observers: NDArray[np.integer],
     weights: Array,
+    variance: float = 1.0,
 ) -> tuple[Transform, NDArray[np.bool_]]:
     """Return the refined T_camera_world and which pairs agree with it, as established landmarks see it.
 
     What moves soon contradicts the keyframes that saw it, so landmarks that most keyframes observe stand
     still. The pose is theirs first, and is then refined by all pairs that agree with it: however many
-    features a passer-by adds to the view, they have no vote. Arguments as for ``camera_motion``.
+    features a passer-by adds to the view, they have no vote. Arguments as for ``camera_motion``; by default
+    the weights are taken as they are.
     """
     is_established = _established(observers)
     if is_established is not None:
-        T_found, agree = refined(
+        T_found, _ = refined(
             T_camera_world,
             points_world[is_established],
             observation,
             features[is_established],
-            weights,
+            weights / variance,
         )
-        if agree.sum() >= _MIN_KEPT_RATIO * len(agree):
-            agree = agreeing(T_found, points_world, observation, features, weights)
-            T_found, _ = refined(T_found, points_world[agree], observation, features[agree], weights)
+        agree = agreeing(T_found, points_world, observation, features, weights)
+        if agree[is_established].sum() >= _MIN_KEPT_RATIO * is_established.sum():
+            T_found, _ = refined(
+                T_found, points_world[agree], observation, features[agree], weights / variance
+            )
             return T_found, agreeing(T_found, points_world, observation, features, weights)
-    T_found, _ = refined(T_camera_world, points_world, observation, features, weights)
+    T_found, _ = refined(T_camera_world, points_world, observation, features, weights / variance)
     return T_found, agreeing(T_found, points_world, observation, features, weights)
 
 

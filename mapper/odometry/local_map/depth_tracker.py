@@ -149,7 +149,7 @@ class DepthTracker:
         """
         if found.inliers < _FEW_INLIERS_RATIO * self._config.min_inliers:
             return False
-        if found.inliers >= self._config.weak_inliers or not found.few_move:
+        if not found.few_move:
             return True
         covariance = covariance_of(frame_information(self._map, found))
         return largest_sigma(covariance[3:, 3:]) <= _LOOSE_M

@@ -19,12 +19,13 @@ from mapper.odometry.local_map.image_observation import ImageObservation
 from mapper.odometry.local_map.landmarks import LandmarkMap
 from mapper.sensing.config import KINECT_NOISE, DepthNoiseConfig
 
-_APART_S, _MOST = 0.4, 6
-"""Time between the keyframes that are compared: someone who walks moves on by his own width in it."""
+_APART_S, _OLDER, _MOST = 0.4, 1.5, 10
+"""Age of the first keyframe that is compared: someone who walks moves on by his own width in it. Each further
+one is so many times as old, up to 15 s: someone who came and stands has moved."""
 _MARGIN_M, _MARGIN_SIGMAS, _MARGIN_RATIO = 0.1, 4.0, 0.02
 """What has moved stands so far in front of a surface: more than the errors of poses, noise and scale."""
 _MOST_MOVED_RATIO = 0.6
-"""When more has moved it was the camera, and the pose is wrong."""
+"""When more of the surfaces has moved it was the camera, and the pose is wrong."""
 _SAME_M, _SAME_SIGMAS, _SAME_RATIO = 0.02, 3.0, 0.01
 """Surfaces that are no farther apart are the same."""
 _SMOOTH = 1.1
@@ -45,7 +46,7 @@ class Displacement:
     Attributes:
         ratio: Share of the points on the same surfaces or beside them.
         distance_m: Their mean distance along the earlier rays; 0 if there are none.
-        since_s: Age of the earlier image.
+        since_s: Age of the earlier image; 0 if too little of the frame is in one.
         far_ratio: Share of the farther half of the compared points.
     """
 
@@ -56,7 +57,7 @@ class Displacement:
 
 
 class EarlierDepth:
-    """Comparison of frames with the depth images of keyframes at least 0.4 s older."""
+    """Comparison of frames with the depth images of keyframes that are 0.4 to 15 s older."""
 
     def __init__(self, landmark_map: LandmarkMap, noise: DepthNoiseConfig | None) -> None:
         self._map = landmark_map
@@ -79,19 +80,21 @@ class EarlierDepth:
             points_camera: (N, 3) metres, camera frame; None are the frame's features.
         """
         points = observation.points_camera if points_camera is None else points_camera
-        earlier = self._earlier(observation, reference, most=_MOST)
-        if observation.depth_cells is None or not earlier:
+        cells, earlier = observation.depth_cells, self._earlier(observation, reference, most=_MOST)
+        if cells is None or not earlier:
             return np.zeros(len(points), np.bool_)
-        moved: NDArray[np.bool_] = _in_free_space(
-            points,
-            T_camera_world,
+        before = (
             np.array([_cells_of(self._map, k).inverse_depth for k in earlier]),
             np.array([self._map.keyframes[k].T_camera_world for k in earlier]),
-            observation.depth_cells.camera.parameters,
-            observation.depth_cells.cell_px,
+            cells.camera.parameters,
+            cells.cell_px,
             self._noise,
         )
-        if moved.sum() > _MOST_MOVED_RATIO * (~np.isnan(points[:, 2])).sum():
+        moved: NDArray[np.bool_] = _in_free_space(points, T_camera_world, *before)
+        if moved.sum() <= _MOST_MOVED_RATIO * (~np.isnan(points[:, 2])).sum():
+            return moved
+        # Most features may be on one person with a patterned shirt, so the surfaces decide.
+        if _in_free_space(cells.points(), T_camera_world, *before).mean() > _MOST_MOVED_RATIO:
             moved[:] = False
         return moved
 
@@ -123,18 +126,18 @@ class EarlierDepth:
             _UNSYNCHRONISED_S * keyframe.twist_camera,
         )
         is_beside = beside_m > 0.0
-        if not is_beside.any() or len(compared) < _MIN_COMPARED_RATIO * len(points):
+        if not len(compared) or len(compared) < _MIN_COMPARED_RATIO * len(points):
             return Displacement()
         depths_m = points[compared, 2]
         return Displacement(
             float(is_beside.mean()),
-            float(beside_m[is_beside].mean()),
+            float(beside_m.sum() / max(int(is_beside.sum()), 1)),
             (observation.stamp_ns - keyframe.stamp_ns) / NS_PER_S,
             float(is_beside[depths_m >= np.median(depths_m)].mean()),
         )
 
     def _earlier(self, observation: ImageObservation, reference: int, *, most: int) -> list[int]:
-        """Return keyframes of the same sub-map and camera, each 0.4 s older than the one before."""
+        """Return keyframes of the same sub-map and camera, 0.4 s old and older, fewer of the oldest."""
         keyframes, cells = self._map.keyframes, observation.depth_cells
         if cells is None:
             return []
@@ -151,7 +154,7 @@ class EarlierDepth:
             earlier.append(k)
             if len(earlier) == most:
                 break
-            latest_ns = there.stamp_ns - apart_ns
+            latest_ns = observation.stamp_ns - round(_OLDER * (observation.stamp_ns - there.stamp_ns))
         return earlier
 
 

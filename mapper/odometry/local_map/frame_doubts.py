@@ -92,30 +92,34 @@ class FrameDoubts:
             return NO_DOUBT
         usual_m, usual_agreement = self._usual("sigma_m"), self._usual("agreement")
         agreement = tracked_pose.agreement
-        if sigma_m > max(_LOOSE_M, _LOOSE_RATIO * usual_m):
+        is_loose = sigma_m > max(_LOOSE_M, _LOOSE_RATIO * usual_m)
+        if is_loose:
             phrases.append(
                 f"{tracked_pose.inliers} features agree, which tell the translation to {sigma_m:.3f} m"
                 + (f", {usual_m:.3f} m is usual" if usual_m else "")
             )
-        if agreement < _LOW_AGREEMENT * usual_agreement:
+        is_contradicted = agreement < _LOW_AGREEMENT * usual_agreement
+        if is_contradicted:
             phrases.append(f"{agreement:.0%} of the matches agree, {usual_agreement:.0%} is usual")
         is_supported = (
             agreement >= _SUPPORT_AGREEMENT * usual_agreement
             and sigma_m <= _SUPPORT_RATIO * usual_m
             and tracked_pose.few_move
         )
-        if not is_supported:
-            phrases += self._jumps(jump, elapsed_s)
+        jumps = [] if is_supported else self._jumps(jump, elapsed_s)
+        phrases += jumps
         if elsewhere := self._surfaces.speak_against(tracked_pose, displaced):
             phrases.append(elsewhere)
             sigma_m = max(sigma_m, displaced.distance_m)
         is_apart = jump[0] > _LOOSE_RAD or jump[1] > _LOOSE_M
         if excess_error > _MIN_EXCESS and is_apart and self._exceeds_usual(jump, elapsed_s, _APART):
+            is_contradicted = True
             phrases.append(
                 f"the image fits the predicted motion better by {excess_error:.0f} standard errors"
             )
         if phrases:
-            return Doubt(tuple(phrases), off_rad, max(off_m, sigma_m))
+            is_wild = is_loose and is_contradicted and bool(jumps)
+            return Doubt(tuple(phrases), off_rad, max(off_m, sigma_m), is_wild=is_wild)
         self._learn(sigma_m=sigma_m, agreement=agreement)
         self._learn_motion(speed, jump, elapsed_s)
         return NO_DOUBT

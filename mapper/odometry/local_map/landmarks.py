@@ -12,6 +12,7 @@ from mapper.odometry.local_map.bundle_adjustment import adjust, common_parameter
 from mapper.odometry.local_map.image_observation import ImageObservation
 from mapper.odometry.local_map.keyframe import DepthLink, Keyframe, RecentObservations, packed, unpacked
 from mapper.odometry.local_map.landmark_kernels import count_observers, observations_of
+from mapper.odometry.local_map.log_residuals import USUAL_VARIANCE
 from mapper.odometry.local_map.paged_table import PagedTable
 from mapper.odometry.local_map.ray_uncertainty import updated_ray_sigma_m
 from mapper.odometry.local_map.readout_time import ReadoutTime
@@ -60,6 +61,7 @@ class LandmarkMap:
             readouts=((), np.int32),
         )
         self.scale_factor = scale_factor
+        self.residual_variance = USUAL_VARIANCE  # as ``LogResiduals.variance``
         self._observed_with_s = readout.seconds
         self._readout_steps_s: list[float] = []  # observations tell how many of them they follow
         self._first_landmark: list[int] = []  # of each keyframe

@@ -16,6 +16,10 @@ _NONE, _WHOLE = 1.0, 1.5
 calibration have 0.75 to 1.0, real and uncalibrated ones 1.5 to 2.3."""
 _LEAST = 0.125
 """Share of the model error that is always added."""
+USUAL_VARIANCE = 0.25
+"""Variance of features as long as too few keyframes tell it: real and synthetic logs have 0.1 to 0.35."""
+_LEAST_VARIANCE = 0.15
+"""Landmarks err as well, while a keyframe's residuals are those to its own."""
 
 
 class LogResiduals:
@@ -28,15 +32,24 @@ class LogResiduals:
     def __init__(self) -> None:
         self._factors: list[float] = []  # of the keyframes, in increasing order, as are the next
         self._effects: list[float] = []
+        self._variances: list[float] = []
         self._factor = self._scale = 1.0  # of covariances, and of the model error
 
     def add(self, keyframe: ResidualStatistics) -> None:
         """Add a keyframe's."""
         insort(self._factors, float(keyframe.variance_factor))
         insort(self._effects, float(keyframe.design_effect))
+        insort(self._variances, float(keyframe.variance))
         if len(self._factors) >= _FEWEST:
             self._factor = median(self._factors)
             self._scale = float(np.clip((median(self._effects) - _NONE) / (_WHOLE - _NONE), _LEAST, 1.0))
+
+    @property
+    def variance(self) -> float:
+        """Usual square of a feature's residual, relative to what its weight says."""
+        if len(self._variances) < _FEWEST:
+            return USUAL_VARIANCE
+        return float(np.clip(median(self._variances), _LEAST_VARIANCE, 1.0))
 
     def honest(self, information: Array, T_i_j: Transform) -> Array:
         """Return the (6, 6) information of a relative pose by what the residuals show.

@@ -61,10 +61,15 @@ class MotionPoseTracker:
         return self._better(best, by_keyframe)
 
     def _better(self, a: TrackedPose | None, b: TrackedPose | None) -> TrackedPose | None:
-        """Return the pose of more inliers, which is doubtful if those of the other one contradict it."""
+        """Return the pose of more inliers, which is doubtful if those of the other one contradict it.
+
+        While something moves in view, the other one needs twice as many as ``a``, which is nearer to what is
+        predicted.
+        """
         if a is None or b is None:
             return a or b
-        best, other = (a, b) if a.inliers >= b.inliers else (b, a)
+        least = 1.0 if a.few_move else _RIVAL_RATIO
+        best, other = (a, b) if a.inliers >= least * b.inliers else (b, a)
         features = np.flatnonzero(other.landmark_of_feature >= 0)
         positions_world = self._map.landmarks["position"][other.landmark_of_feature[features]]
         agree = agreeing(
@@ -117,6 +122,7 @@ class MotionPoseTracker:
                 landmark[hits],
                 observation.weights_among(moved),
             ),
+            self._map.residual_variance,
         )
         agree = motion.agree
         if agree.sum() < self._config.min_matches // 2:

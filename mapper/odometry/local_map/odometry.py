@@ -44,6 +44,7 @@ from mapper.odometry.local_map.pose_tracker import PoseTracker, TrackedPose, unm
 from mapper.odometry.local_map.readout_time import ReadoutTime
 from mapper.odometry.local_map.relocalizer import Relocalizer
 from mapper.odometry.local_map.rolling_shutter import RollingShutter
+from mapper.odometry.local_map.tracking_recovery import TrackingRecovery
 from mapper.odometry.local_map.triangulation import add_triangulated, weights_with_landmarks
 from mapper.odometry.local_map.velocity_filter import VelocityFilter
 from mapper.places.vocabulary import load_vocabulary
@@ -93,6 +94,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         self._velocity = VelocityFilter()
         self._depth = DepthTracker(config, self._map)
         self._earlier_depth = EarlierDepth(self._map, config.depth_noise)
+        self._recovery = TrackingRecovery(config, self._map, self._relocalizer, self._earlier_depth)
         self._decision = KeyframeDecision(config, self._map)
         self._doubts = FrameDoubts()
         self._residuals = LogResiduals()
@@ -113,7 +115,9 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         """Track the next frame, in time order."""
         self._map.step()
         last = self._last
-        follows = last is not None and not self._lost_frames and _gap_ns(last, observation) <= STEADY_NS
+        follows = (
+            last is not None and not self._lost_frames and observation.stamp_ns - last.stamp_ns <= STEADY_NS
+        )
         if not follows:
             self._shutter.restart()  # the motion before a gap is not that in this image
         observation = self._shutter.predicted(observation)
@@ -125,10 +129,14 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
             tracked_pose = self._shutter.refined(tracked_pose, last, *self._landmarks_of(tracked_pose))
             self._calibration.pass_frame(self._before_last, last, tracked_pose)
         observation = tracked_pose.observation
-        information = frame_information(self._map, tracked_pose)
         displaced = self._earlier_depth.displacement(
             observation, tracked_pose.T_camera_world, tracked_pose.reference, self._shutter.twist_camera
         )
+        recognised = self._recovery.instead_of(tracked_pose, displaced, self._shutter.twist_camera)
+        if recognised is not None:
+            (tracked_pose, displaced), expected = recognised, None
+            self._velocity.restart()
+        information = frame_information(self._map, tracked_pose)
         covariance = covariance_of(information)
         doubt = self._doubts.assess(
             tracked_pose,
@@ -138,13 +146,15 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
             displaced,
             excess_error(tracked_pose, last, expected),
         )
+        if doubt.is_wild and tracked_pose.inliers < self._config.weak_inliers:
+            return self._lost(observation)
         # The motion before a gap does not predict the motion after it.
         before_last = None if self._lost_frames else last
-        if before_last is not None:
+        if before_last is not None and recognised is None:
             self._velocity.add(tracked_pose, covariance, last, is_doubtful=bool(doubt.phrases))
         self._lost_frames = self._unknown_frames = 0
         reference, inliers = tracked_pose.reference, tracked_pose.inliers
-        is_keyframe = self._decision.is_due(tracked_pose)
+        is_keyframe = self._decision.is_due(tracked_pose) and recognised is None
         if doubt.repeats or (doubt.phrases and tracked_pose.inliers >= self._config.weak_inliers):
             is_keyframe = False  # tracking goes on without it
         self._agreeing = tracked_pose.landmark_of_feature >= 0
@@ -287,7 +297,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         relocalised = self._relocalizer.best_among(
             candidates, observation, method="relocalised", is_possible=self._is_possible, exhaustive=True
         )
-        if relocalised is None and _gap_ns(last, observation) > STEADY_NS:
+        if relocalised is None and observation.stamp_ns - last.stamp_ns > STEADY_NS:
             return None  # depth alone needs a guess, and by now the camera may be in another room
         found = self._depth.supported(observation, relocalised or last, None, relocalised)
         return found if found is not None and self._is_possible(found) else None
@@ -296,7 +306,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         """Return whether a pose is soon after the last one, and in its sub-map."""
         keyframes = self._map.keyframes
         one_map = keyframes[tracked_pose.reference].origin == keyframes[last.reference].origin
-        return _gap_ns(last, tracked_pose.observation) <= STEADY_NS and one_map
+        return tracked_pose.stamp_ns - last.stamp_ns <= STEADY_NS and one_map
 
     def _is_possible(self, tracked_pose: TrackedPose) -> bool:
         """Return whether a pose after a gap is possible by the motion since, where something else tells it.
@@ -358,6 +368,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         self._calibration.pass_keyframe()
         if (statistics := keyframe_residuals(self._map, index)) is not None:
             self._residuals.add(statistics)
+            self._map.residual_variance = self._residuals.variance
         self._decision.restart()
         keyframe = self._map.keyframes[index]
         keyframe.doubt_rad, keyframe.doubt_m = doubt.sigma_rad, doubt.sigma_m
@@ -407,8 +418,3 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         last = self._last
         T_world_body = np.eye(4) if last is None else last.body_pose
         return lost_frame(observation.stamp_ns, T_world_body, features=len(observation), residual_unit="px")
-
-
-def _gap_ns(last: TrackedPose, observation: ImageObservation) -> int:
-    """Return the time since a tracked frame."""
-    return observation.stamp_ns - last.observation.stamp_ns

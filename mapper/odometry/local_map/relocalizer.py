@@ -110,12 +110,16 @@ class Relocalizer:
             position_world: (3,) metres: last known position of the camera.
         """
         limit = self._config.relocalisation_keyframes
-        words = self._vocabulary.vector(observation.words)
-        similar = [k for k, _ in self._index.query(words, min_similarity=0.0, limit=limit)]
+        similar = self.similar(observation, limit=limit)
         T_camera_world = np.array([keyframe.T_camera_world for keyframe in self._map.keyframes])
         position_camera = T_camera_world[:, :3, :3] @ position_world + T_camera_world[:, :3, 3]
         nearest = np.argsort(np.linalg.norm(position_camera, axis=1), kind="stable")[:limit]
         return list(dict.fromkeys([*similar, *map(int, nearest)]))
+
+    def similar(self, observation: ImageObservation, *, limit: int) -> list[int]:
+        """Return the keyframes that look most like a frame, best first."""
+        words = self._vocabulary.vector(observation.words)
+        return [k for k, _ in self._index.query(words, min_similarity=0.0, limit=limit)]
 
     def _match_keyframe(
         self, k: int, observation: ImageObservation, *, method: str, exhaustive: bool

@@ -1,0 +1,112 @@
+"""Recovery of tracking that followed the motion of something else, by keyframes without doubt."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from mapper.core.geometry import Array
+from mapper.core.timebase import NS_PER_S
+from mapper.odometry.config import KeyframeOdometryConfig
+from mapper.odometry.local_map.earlier_depth import Displacement, EarlierDepth
+from mapper.odometry.local_map.landmarks import MIN_SHARED_LANDMARKS, LandmarkMap
+from mapper.odometry.local_map.pose_tracker import TrackedPose
+from mapper.odometry.local_map.relocalizer import Relocalizer
+
+_MOST = 0.5
+"""Share of displaced surfaces from which another pose is sought."""
+_LESS = 0.5
+"""Another pose displaces at most this share of what the tracked one does."""
+_SINCE_NS = 5 * NS_PER_S
+"""After a doubtful keyframe the keyframes before it are searched for so long."""
+
+
+class TrackingRecovery:
+    """Search for another pose where surfaces lie elsewhere, or where a doubtful keyframe began another map.
+
+    What follows from a wrong pose agrees with itself, so that tracking alone does not come back.
+    """
+
+    def __init__(
+        self,
+        config: KeyframeOdometryConfig,
+        landmark_map: LandmarkMap,
+        relocalizer: Relocalizer,
+        earlier_depth: EarlierDepth,
+    ) -> None:
+        self._config = config
+        self._map = landmark_map
+        self._relocalizer = relocalizer
+        self._earlier_depth = earlier_depth
+
+    def instead_of(
+        self, tracked_pose: TrackedPose, displaced: Displacement, twist_camera: Array
+    ) -> tuple[TrackedPose, Displacement] | None:
+        """Return another pose of a frame, which is doubtful, and what it displaces; None if there is none.
+
+        Args:
+            tracked_pose: The pose that was tracked.
+            displaced: Surfaces that lie elsewhere by it.
+            twist_camera: (6,) velocity of the camera in its own axes, rad/s and m/s.
+        """
+        is_displaced = max(displaced.ratio, displaced.far_ratio) > _MOST
+        before = self._first_doubtful(tracked_pose)
+        if not is_displaced and (before is None or self._is_linked(tracked_pose, before)):
+            return None
+        observation, keyframes = tracked_pose.observation, self._map.keyframes
+        origin = keyframes[tracked_pose.reference].origin
+
+        def displacement(pose: TrackedPose) -> Displacement:
+            compared_with = tracked_pose if is_displaced else pose
+            return self._earlier_depth.displacement(
+                observation, pose.T_camera_world, compared_with.reference, twist_camera
+            )
+
+        def is_possible(pose: TrackedPose) -> bool:
+            there = displacement(pose)
+            if there.since_s == 0.0:
+                return False  # nothing is compared
+            if is_displaced:
+                return (
+                    there.ratio <= _LESS * displaced.ratio and there.far_ratio <= _LESS * displaced.far_ratio
+                )
+            enough = 2 * pose.inliers >= self._config.weak_inliers
+            return enough and max(there.ratio, there.far_ratio) <= _MOST
+
+        known = [
+            k
+            for k in self._relocalizer.similar(observation, limit=len(keyframes))
+            if keyframes[k].origin == origin
+            and keyframes[k].doubt_m == 0.0
+            and (before is None or k < before)
+        ]
+        found = self._relocalizer.best_among(
+            known[: self._config.relocalisation_keyframes],
+            observation,
+            method="relocalised",
+            is_possible=is_possible,
+        )
+        if found is None:
+            return None
+        apart_m = float(np.linalg.norm(found.body_pose[:3, 3] - tracked_pose.body_pose[:3, 3]))
+        doubt = f"recognised {apart_m:.2f} m from where the frames before it led"
+        displaced = self._earlier_depth.displacement(
+            observation, found.T_camera_world, found.reference, twist_camera
+        )
+        return replace(found, doubts=(*found.doubts, doubt)), displaced
+
+    def _first_doubtful(self, tracked_pose: TrackedPose) -> int | None:
+        """Return the first doubtful keyframe of the sub-map in the last seconds; None if there is none."""
+        keyframes, since_ns = self._map.keyframes, tracked_pose.stamp_ns - _SINCE_NS
+        origin, first = keyframes[tracked_pose.reference].origin, None
+        for k in range(len(keyframes) - 1, origin, -1):
+            if keyframes[k].stamp_ns < since_ns:
+                break
+            if keyframes[k].doubt_m > 0.0 and keyframes[k].origin == origin:
+                first = k
+        return first
+
+    def _is_linked(self, tracked_pose: TrackedPose, before: int) -> bool:
+        """Return whether a pose rests on landmarks that a keyframe before another one observes."""
+        ids = tracked_pose.landmark_of_feature
+        counts = self._map.shared_counts(ids[ids >= 0])
+        return bool(counts[:before].max(initial=0) >= MIN_SHARED_LANDMARKS)

@@ -1,0 +1,108 @@
+"""Frames that followed something else are recognised among keyframes without doubt; wild poses are lost."""
+
+from dataclasses import replace
+from unittest.mock import Mock
+
+import numpy as np
+import pytest
+
+from mapper.core.geometry import exp, inverse, log
+from mapper.odometry.config import LocalMapConfig
+from mapper.odometry.factory import build_frame_odometry
+from mapper.odometry.local_map.doubt import Doubt
+from mapper.odometry.local_map.earlier_depth import Displacement
+from mapper.odometry.local_map.pose_tracker import unmatched
+
+NOW = 42
+STILL = np.zeros(6)
+T_ASIDE = exp(np.array([0.0, 0.05, 0.0]), np.array([0.0, 0.0, 0.3]))
+
+
+@pytest.fixture
+def odometry(frames):
+    odometry = build_frame_odometry(LocalMapConfig())
+    for frame in frames[:NOW]:
+        odometry.track(odometry.observe(frame))
+    return odometry
+
+
+def miss_m(pose, right):
+    return float(np.linalg.norm(log(pose.T_camera_world @ inverse(right.T_camera_world))[1]))
+
+
+def astray(pose):
+    """Return the pose of a frame that followed something else, all of whose landmarks are new."""
+    return replace(
+        pose,
+        T_camera_world=T_ASIDE @ pose.T_camera_world,
+        landmark_of_feature=unmatched(pose.observation),
+    )
+
+
+def test_a_pose_that_displaces_most_surfaces_is_recognised_where_it_is(odometry):
+    right = odometry._last
+    wrong = astray(right)
+    displaced = odometry._earlier_depth.displacement(
+        right.observation, wrong.T_camera_world, right.reference, STILL
+    )
+    assert max(displaced.ratio, displaced.far_ratio) > 0.5
+    found, then = odometry._recovery.instead_of(wrong, displaced, STILL)
+    assert miss_m(found, right) < 0.02
+    assert max(then.ratio, then.far_ratio) < 0.25
+    assert "recognised 0.3" in found.doubts[-1]
+
+
+def test_what_follows_from_a_doubtful_keyframe_is_recognised_until_it_is_linked(odometry):
+    right, nothing = odometry._last, Displacement()
+    assert odometry._recovery.instead_of(astray(right), nothing, STILL) is None
+    odometry._map.keyframes[-1].doubt_m = 0.3
+    found, _ = odometry._recovery.instead_of(astray(right), nothing, STILL)
+    assert miss_m(found, right) < 0.02
+    assert odometry._recovery.instead_of(found, nothing, STILL) is None  # rests on landmarks of before
+
+
+def test_a_recognised_frame_is_doubtful_no_keyframe_and_where_it_is(odometry, frames, monkeypatch):
+    observation = odometry.observe(frames[NOW])
+    track = odometry._tracker.track
+    wrong = Mock(side_effect=lambda *arguments: astray(track(*arguments)))
+    monkeypatch.setattr(odometry._tracker, "track", wrong)
+    monkeypatch.setattr(odometry._depth, "supported", lambda *arguments: arguments[-1])
+    result = odometry.track(observation)
+    monkeypatch.undo()
+    assert not result.is_keyframe
+    assert any("recognised" in doubt for doubt in result.doubts)
+    after = odometry.track(odometry.observe(frames[NOW + 1]))
+    assert not after.doubts
+    assert np.linalg.norm(log(inverse(result.T_world_body) @ after.T_world_body)[1]) < 0.03
+
+
+@pytest.mark.parametrize(("inliers", "outcome"), [(40, "lost"), (400, "doubtful")])
+def test_a_wild_pose_of_few_features_is_lost(odometry, frames, monkeypatch, inliers, outcome):
+    track = odometry._tracker.track
+
+    def with_inliers(*arguments):
+        pose = track(*arguments)
+        ids = pose.landmark_of_feature.copy()
+        ids[np.flatnonzero(ids >= 0)[inliers:]] = -1
+        return replace(pose, landmark_of_feature=ids)
+
+    monkeypatch.setattr(odometry._tracker, "track", with_inliers)
+    monkeypatch.setattr(odometry._depth, "supported", lambda *arguments: arguments[-1])
+    monkeypatch.setattr(odometry._doubts, "assess", lambda *_: Doubt(("jump",), 0.1, 0.5, is_wild=True))
+    before = odometry._last
+    result = odometry.track(odometry.observe(frames[NOW]))
+    assert (result.node is None) == (outcome == "lost")
+    assert bool(result.doubts) == (outcome == "doubtful")
+    assert (odometry._last is before) == (outcome == "lost")
+
+
+@pytest.mark.parametrize(("moves", "first"), [(True, True), (False, False)])
+def test_among_what_moves_the_predicted_pose_needs_no_more_features(odometry, moves, first):
+    pose = odometry._last
+    ids = pose.landmark_of_feature.copy()
+    ids[np.flatnonzero(ids >= 0)[::3]] = -1
+    moving = np.arange(len(ids) // 5, dtype=np.int32) if moves else np.empty(0, np.int32)
+    predicted = replace(pose, landmark_of_feature=ids, moving=moving, method="map")
+    other = replace(pose, T_camera_world=T_ASIDE @ pose.T_camera_world, method="fallback")
+    best = odometry._tracker._better(predicted, other)
+    assert best.method == ("map" if first else "fallback")
