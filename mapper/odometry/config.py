@@ -22,7 +22,7 @@ class MatchConfig(Config):
     """Matching of two images' features (Somlyai, PhD thesis, alg. 8)."""
 
     filter: Literal["homography", "none"] = "homography"
-    """"homography": RANSAC with four pairs, as published; "none": ISVD gets every mutual match."""
+    """"homography": RANSAC with four pairs, as published; "none": ISVD uses every mutual match."""
     max_ratio: Annotated[float, Field(gt=0.0, le=1.0)] = 0.9
     """Lowe's ratio between the best and the second-best descriptor distance."""
     homography_tolerance_px: PositiveFloat = 4.0
@@ -41,11 +41,11 @@ class IsvdOdometryConfig(Config):
 
     kind: Literal["isvd"] = "isvd"
     detector: DetectorConfig = UniformOrbConfig()
-    """Features by which frames are matched; SURF, as published, takes longer."""
+    """Features with which frames are matched; SURF, as published, takes longer."""
     match: MatchConfig = MatchConfig()
     """How features of two frames are paired."""
     fallback: MatchConfig = MatchConfig(filter="none", max_ratio=0.95)
-    """Matching once ``match`` has led to no motion."""
+    """Matching that is tried if ``match`` leads to no motion."""
     registration: IsvdConfig = IsvdConfig()
     """ISVD on the matched points."""
     earlier: Literal["keyframes", "frames"] = "keyframes"
@@ -54,13 +54,13 @@ class IsvdOdometryConfig(Config):
     previous_frames: PositiveInt = 4
     """MP: number of earlier frames that each frame is registered against."""
     residual: Literal["pixels", "points"] = "pixels"
-    """What the motion minimises: the "pixels" and depths by their noise, beginning with ISVD's motion, or the
-    distances of the "points" alone, as published."""
+    """Residual of the motion: "pixels" and depths weighted by their noise, starting from ISVD's motion, or
+    the distances of the "points" alone, as published."""
     depth_noise: DepthNoiseConfig | None = None
     """Depth noise of the sensor, as measured by ``mapper sensor depth``; None is a Kinect v1's."""
     average: Literal["information", "weighted", "mean"] = "information"
-    """Average of the MP candidate poses: by their covariances, or of the translations, weighted by eq. 4.1 or
-    plain."""
+    """Average of the MP candidate poses: weighted by their covariances, or of the translations, weighted by
+    eq. 4.1 or unweighted."""
     rotation: Literal["nearest", "mean"] = "nearest"
     """With an average of the translations: the nearest frame's rotation, or the weighted mean on SO(3); the
     thesis does not state it."""
@@ -88,13 +88,14 @@ class KeyframeOdometryConfig(Config):
 
     kind: str
     detector: Annotated[OrbConfig | UniformOrbConfig, Field(discriminator="kind")] = UniformOrbConfig()
-    """Evenly distributed features keep track in views where plain ORB finds all in one far corner."""
+    """Evenly distributed features keep tracking in views where plain ORB finds all features in one distant
+    corner."""
     max_depth_m: PositiveFloat | None = None
-    """Depth beyond it is not used. None uses all: a depth z counts as a disparity bf / z, whose error is the
-    same near and far, so that far points count by their noise."""
+    """Depth beyond it is not used. None uses all: a depth z is used as a disparity bf / z, whose error is the
+    same near and far, so that far points are weighted by their noise."""
     virtual_baseline_px_m: PositiveFloat = 40.0
-    """bf: depth z counts as the disparity bf / z (Mur-Artal & Tardós 2017); a Kinect's is 40 to 43. Set it to
-    the focal length times the baseline of another sensor."""
+    """bf: depth z is used as the disparity bf / z (Mur-Artal & Tardós 2017); 40 to 43 for a Kinect. For
+    another sensor, set it to the focal length times the baseline."""
     disparity_sigma_px: PositiveFloat = 1.0
     """Standard deviation of the virtual disparity relative to that of a pixel."""
     depth_noise: DepthNoiseConfig | None = None
@@ -108,27 +109,28 @@ class KeyframeOdometryConfig(Config):
     """Search radius around the projected landmarks of the local map in the finest octave; raise it for images
     of higher resolution."""
     local_keyframes: NonNegativeInt = 15
-    """Number of covisible keyframes whose landmarks are searched; 0 keeps only the first matches."""
+    """Number of covisible keyframes whose landmarks are searched; 0 uses only the first matches."""
     min_matches: Annotated[int, Field(ge=8)] = 12
     """Fewer matches to the last frame, or to a keyframe, give no pose."""
     min_inliers: PositiveInt = 15
-    """With fewer landmarks that agree with the pose the frame is lost; where many landmarks are in view, more
-    have to agree, as some do by chance."""
+    """With fewer landmarks that agree with the pose, the frame is lost; with many landmarks in view more have
+    to agree, as some do by chance."""
     weak_inliers: PositiveInt = 150
-    """With fewer, a pose competes with those from other keyframes and without a prediction."""
+    """With fewer inliers, poses from other keyframes and without a prediction are tried as well."""
     max_lost_frames: NonNegativeInt = 15
-    """A new sub-map begins after so many frames with enough features but no known landmarks; 0: never."""
+    """A new sub-map begins after this many frames with enough features but no known landmarks; 0: never."""
     keyframe_ratio: Annotated[float, Field(gt=0.0, le=1.0)] = 0.75
-    """Keyframe when the inliers fall below this share of the most since the last keyframe; raise it for
+    """Keyframe if the inliers fall below this share of their maximum since the last keyframe; raise it for
     more keyframes."""
     mapped_ratio: Ratio = 0.5
-    """Keyframe when the inliers are a smaller share of the features with depth: much of the view is new."""
+    """Keyframe if the inliers are less than this share of the features with depth: much of the view is
+    new."""
     max_keyframe_gap: PositiveInt = 20
-    """Keyframe at the latest so many frames after the last one."""
+    """Largest number of frames between keyframes."""
     bundle_keyframes: PositiveInt = 10
     """Keyframes in the window of the local bundle adjustment; fewer are faster and less accurate."""
     vocabulary: Path | None = None
-    """File of the visual words; None is the one that comes with the toolkit, trained on synthetic logs."""
+    """File of the visual words; None is the included one, which was trained on synthetic logs."""
     ransac_iterations: PositiveInt = 500
     """M: largest number of samples of four pairs for P3P (Zhao et al. 2020, §1.2, take 100)."""
     ransac_tolerance_px: PositiveFloat = 4.0
@@ -138,9 +140,9 @@ class KeyframeOdometryConfig(Config):
     align_depth: bool = False
     """Where an image has few landmarks, its depth image is aligned to those of the keyframes."""
     triangulate: bool = False
-    """Features without depth become landmarks where two keyframes show them from apart."""
+    """Features without depth become landmarks if two keyframes show them from different positions."""
     min_agreement_ratio: Ratio = 0.3
-    """A pose that a smaller share of the matches agrees with is refused: repeated structure gave 0.28."""
+    """A pose with a smaller share of agreeing matches is rejected: repeated structure gave 0.28."""
     relocalisation_keyframes: PositiveInt = 5
     """A lost frame is compared with this many of the most similar keyframes and of the nearest."""
 
@@ -153,10 +155,10 @@ class LocalMapConfig(KeyframeOdometryConfig):
     """Where an image has few landmarks, its depth image is aligned to those of the keyframes; false where
     depth is unreliable."""
     triangulate: bool = True
-    """Features without depth, as beyond the sensor's range, become landmarks where two keyframes show them
-    from apart; false uses features with depth alone."""
+    """Features without depth, such as beyond the sensor's range, become landmarks if two keyframes show them
+    from different positions; false uses only features with depth."""
     search_px: PositiveFloat = 15.0
-    """Search radius around the predicted pixel in the finest octave, doubled once when too little matches;
+    """Search radius around the predicted pixel in the finest octave, doubled once if too little matches;
     raise it for fast motion."""
 
 
@@ -171,11 +173,12 @@ class WheelsOdometryConfig(WheelNoiseConfig):
 
     kind: Literal["wheels"] = "wheels"
     keyframe_distance_m: PositiveFloat = 0.3
-    """A frame this far from the last keyframe becomes a keyframe. Less finds more loops and takes longer."""
+    """A frame this far from the last keyframe becomes a keyframe. Lower values find more loops and take
+    longer."""
     keyframe_angle_rad: PositiveFloat = 0.2
     """A frame turned this much from the last keyframe becomes a keyframe."""
     detector: Annotated[OrbConfig | UniformOrbConfig, Field(discriminator="kind")] = UniformOrbConfig()
-    """Features by which loops recognise images; scans are recognised by their points."""
+    """Features with which loop detection recognises images; scans are recognised by their points."""
 
 
 class GivenOdometryConfig(WheelNoiseConfig):
@@ -190,19 +193,20 @@ class GivenOdometryConfig(WheelNoiseConfig):
     least_m: PositiveFloat = 0.002
     """Error of a factor's translation; the default is motion capture's."""
     path_share: NonNegativeFloat = 0.0
-    """What is added to it, as a share of the metres in between: for poses that drift."""
+    """Additional error, as a share of the distance in between, for poses that drift."""
     least_rad: PositiveFloat = 0.002
     """Error of a factor's rotation."""
     turn_share: NonNegativeFloat = 0.0
-    """What is added to it, as a share of the radians turned."""
+    """Additional error, as a share of the angle turned."""
     rad_per_m: NonNegativeFloat = 0.0
-    """What is added to it per metre in between."""
+    """Additional error per metre in between."""
     keyframe_distance_m: PositiveFloat = 0.3
-    """A frame this far from the last keyframe becomes a keyframe. Less finds more loops and takes longer."""
+    """A frame this far from the last keyframe becomes a keyframe. Lower values find more loops and take
+    longer."""
     keyframe_angle_rad: PositiveFloat = 0.2
     """A frame turned this much from the last keyframe becomes a keyframe."""
     detector: Annotated[OrbConfig | UniformOrbConfig, Field(discriminator="kind")] = UniformOrbConfig()
-    """Features by which loops recognise images; scans are recognised by their points."""
+    """Features with which loop detection recognises images; scans are recognised by their points."""
 
 
 class OwnOdometryConfig(Config):

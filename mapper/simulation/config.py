@@ -17,14 +17,14 @@ class SensorConfig(Config):
     """Standard deviation of the disparity, in pixels at 640 px: σ_z is z² times this over 43.5 m px, as of a
     stereo camera, for which ``axial_noise_ratio`` is 0."""
     lateral_noise_px: NonNegativeFloat = 0.4
-    """Standard deviation of where in the image a depth really was measured."""
+    """Standard deviation of the pixel position at which a depth was measured."""
     disparity_step_px: NonNegativeFloat = 0.125
     """Disparity is reported in these steps; 0 does not quantise."""
     dropout_ratio: Ratio = 1.0
     """Multiplies the chances of losing depth at shadows, edges and grazing angles, and at random."""
     min_depth_m: NonNegativeFloat = 0.4
     fade_depth_m: PositiveFloat = 5.0
-    """From here to ``max_depth_m`` ever fewer pixels return."""
+    """From here to ``max_depth_m`` fewer and fewer pixels have depth."""
     max_depth_m: PositiveFloat = 8.0
     image_noise_levels: NonNegativeFloat = 2.0
     """Standard deviation of the image noise in grey levels."""
@@ -33,12 +33,12 @@ class SensorConfig(Config):
     readout_s: NonNegativeFloat = 0.0
     """Rolling shutter: from the first row of an image to its last; the stamp is that of the middle row."""
     depth_delay_s: float = 0.0
-    """How much later than the colour image its depth is measured."""
+    """Delay of the depth measurement after the colour image."""
     radial_k1: float = 0.0
     radial_k2: float = 0.0
-    """Distortion of the lens (Brown 1971), which the log's calibration does not mention."""
+    """Distortion of the lens (Brown 1971) that is missing from the log's calibration."""
     depth_scale: PositiveFloat = 1.0
-    """Multiplies every depth, as wrong units do."""
+    """Factor on every depth, like that of wrong units."""
     disparity_warp_px: NonNegativeFloat = 0.0
     """Standard deviation over the image of a smooth error of the disparity, the same in all frames (Herrera
     et al. 2012), in pixels at 640 px; depth is wrong by its square times this over 43.5 m px."""
@@ -50,11 +50,12 @@ class SynthWheelsConfig(Config):
     rate_hz: PositiveFloat = 50.0
     """Poses per second."""
     path_sigma: NonNegativeFloat = 0.01
-    """Standard deviation, over logs, of the share by which wheels are larger than they are taken to be."""
+    """Standard deviation, over logs, of the relative error of the wheels' size."""
     turn_sigma: NonNegativeFloat = 0.01
-    """The same of the distance between them, and so of turns."""
+    """Likewise of the distance between the wheels, and so of turns."""
     heading_rad_per_sqrt_m: NonNegativeFloat = 0.005
-    """Standard deviation of the heading after a metre of uneven floor; it grows with the way's root."""
+    """Standard deviation of the heading after a metre of uneven floor; it grows with the square root of the
+    path."""
 
 
 class DisturbanceConfig(Config):
@@ -62,21 +63,22 @@ class DisturbanceConfig(Config):
 
     gap_start_s: NonNegativeFloat = 0.0
     gap_duration_s: NonNegativeFloat = 0.0
-    """For this long all frames are missing."""
+    """Duration for which all frames are missing."""
     freeze_start_s: NonNegativeFloat = 0.0
     freeze_duration_s: NonNegativeFloat = 0.0
-    """For this long the frame before is repeated, image and depth, while the camera moves on."""
+    """Duration for which the previous frame is repeated, image and depth, while the camera moves on."""
     hand_start_s: NonNegativeFloat = 0.0
     hand_duration_s: NonNegativeFloat = 0.0
-    """For this long a hand is held before the lens and moves with the camera."""
+    """Duration for which a hand is held in front of the lens and moves with the camera."""
     hand_share: Annotated[float, Field(gt=0.0, le=1.0)] = 0.75
-    """About how much of the image it covers."""
+    """Approximate share of the image that it covers."""
     hand_distance_m: PositiveFloat = 0.45
     """Below the sensor's ``min_depth_m`` it has no depth."""
     gain_step_s: NonNegativeFloat = 0.0
     """The image's brightness jumps at every multiple of this time; 0 never."""
     gain_factor: Annotated[float, Field(ge=1.0)] = 3.0
-    """Largest factor by which it is brighter or darker, in turns; what gets brighter than white is white."""
+    """Largest factor by which the image is alternately brighter and darker; values above white are
+    clipped."""
 
 
 class SynthConfig(Config):
@@ -93,7 +95,7 @@ class SynthConfig(Config):
     hall_length_m: Annotated[float, Field(ge=4.0)] = 15.0
     hall_width_m: Annotated[float, Field(ge=2.0)] = 13.0
     hall_clearance_m: Annotated[float, Field(ge=0.6)] = 4.5
-    """From the walls of a hall to the way round, which is the nearest that the camera comes to them."""
+    """Distance from the walls of a hall to the path, the camera's smallest distance from them."""
     rooms: Annotated[int, Field(ge=4, multiple_of=2)] = 4
     """Rooms of the flat, in two rows; doors join them to one ring."""
     room_size_m: Annotated[float, Field(ge=3.6)] = 4.4
@@ -102,13 +104,14 @@ class SynthConfig(Config):
     furniture_per_room: NonNegativeInt = 9
     posters_per_room: NonNegativeInt = 8
     moving_boxes: NonNegativeInt = 0
-    """Boxes that travel round the flat all the time."""
+    """Number of boxes that move around the flat all the time."""
     people: NonNegativeInt = 0
     """People who each cross the view once, within two metres of the camera."""
     people_stand_s: NonNegativeFloat = 0.0
     """How long each of them stands still in the middle of the view before walking on."""
     texture_contrast: Ratio = 1.0
-    """Contrast of all textures and of the light; with 0 everything is evenly white, and only depth varies."""
+    """Contrast of all textures and of the light; with 0 everything is uniformly white, and only depth
+    varies."""
     texture_px_per_m: PositiveInt = 256
     """Detail of walls and floors; smaller is faster to make and enough for small images."""
 
@@ -116,23 +119,23 @@ class SynthConfig(Config):
     """"loop": walk through every room; "desk": small motions before a desk; "spin": turn fast on the spot;
     "wall": stand before a wall, looking straight at it."""
     wall_distance_m: PositiveFloat = 1.5
-    """From the camera to that wall."""
+    """Distance from the camera to that wall."""
     laps: PositiveFloat = 1.0
     """Rounds of the loop."""
     overlap_m: NonNegativeFloat = 1.0
-    """How far the loop goes on past its start, so that its ends see the same."""
+    """Length by which the loop continues past its start, so that its ends see the same."""
     duration_s: PositiveFloat | None = None
     """Length of the log; None is as long as the laps take, or 20 s for the other paths."""
     frame_rate_hz: PositiveFloat = 30.0
     speed_mps: PositiveFloat = 0.9
     """Walking speed on the loop; sharp turns are slower."""
     max_yaw_rate_rad_s: PositiveFloat = 1.2
-    """The walker's fastest turn; the shake comes on top."""
+    """The walker's largest turning rate; the shake is added."""
     shake_m: NonNegativeFloat = 0.015
-    """Amplitude of the hand's unsteadiness along each axis."""
+    """Amplitude of the hand's shake along each axis."""
     shake_rad: NonNegativeFloat = 0.02
     wheels: SynthWheelsConfig | None = None
-    """Wheels carry the camera, which then neither shakes nor nods, and are read; None is a walker's hand."""
+    """The camera is on wheels with odometry, and neither shakes nor nods; None is a walker's hand."""
 
     width_px: PositiveInt = 640
     height_px: PositiveInt = 480
@@ -144,7 +147,7 @@ class SynthConfig(Config):
     """Share of frames that are missing from the log."""
     blackout_start_s: NonNegativeFloat = 0.0
     blackout_duration_s: NonNegativeFloat = 0.0
-    """For this long the lens is covered: black images without depth; 0 never."""
+    """Duration for which the lens is covered: black images without depth; 0 never."""
     image_format: Literal["png", "jpg"] = "png"
     """How colour images are stored; "jpg" is a fifth of the size and not exact."""
     disturbances: DisturbanceConfig = DisturbanceConfig()
@@ -270,7 +273,7 @@ class LidarSynthConfig(Config):
 
     laps: PositiveFloat = 1.0
     overlap_m: NonNegativeFloat = 15.0
-    """How far the way goes on past its start, so that its ends see the same."""
+    """Length by which the path continues past its start, so that its ends see the same."""
     duration_s: PositiveFloat | None = None
     """Length of the log; None is as long as the laps take."""
     rate_hz: PositiveFloat = 10.0
@@ -279,9 +282,9 @@ class LidarSynthConfig(Config):
     mount_height_m: PositiveFloat = 1.7
     """Height of the sensor above the ground."""
     tilt_rad: Annotated[float, Field(ge=0.0, le=0.6)] = 0.0
-    """The sensor's up swings this far from the ground's normal, in changing directions."""
+    """Angle by which the sensor's up axis swings from the ground's normal, in changing directions."""
     yaw_swing_rad: Annotated[float, Field(ge=0.0, le=1.6)] = 0.0
-    """The sensor turns this far to either side of the direction of travel."""
+    """Angle by which the sensor turns to either side of the direction of travel."""
     wheels: SynthWheelsConfig | None = None
     """What is read of the vehicle's wheels."""
 

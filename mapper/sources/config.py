@@ -50,9 +50,9 @@ class TopicsConfig(Config):
     camera_info: str | None = None
     """Calibration of the colour camera."""
     points: str | None = None
-    """Point clouds; set, they are mapped even where there are RGB-D images too."""
+    """Point clouds; if set, they are mapped even if there are RGB-D images too."""
     imu: str | None = None
-    """Inertial readings, of which the accelerations tell which way is up."""
+    """Inertial readings, whose accelerations show which way is up."""
     truth: str | None = None
     """True poses (Odometry, PoseStamped, TransformStamped); None is /ground_truth, if there is one."""
     wheels: str | None = None
@@ -63,10 +63,10 @@ class WheelsConfig(Config):
     """How a log's wheels move its body."""
 
     wheelbase_m: PositiveFloat | None = None
-    """Between the axles; a log's encoders.txt needs it, its wheels.txt does not."""
+    """Distance between the axles; required for a log's encoders.txt, not for its wheels.txt."""
     body_in_base: tuple[float, float, float, float, float, float, float] | None = None
-    """x y z (metres) qx qy qz qw of the body in the frame that the wheels move, x forward, y left, z up; None
-    is what tf tells, or else its origin, looking forward."""
+    """x y z (metres) qx qy qz qw of the body in the frame of the wheels, x forward, y left, z up; None is the
+    pose from tf, or else the origin, looking forward."""
 
 
 class BodyConfig(Config):
@@ -106,16 +106,17 @@ class SourceConfig(Config):
     stride: PositiveInt = 1
     """Use every n-th frame. More is faster, and loses track where the sensor moves fast."""
     require_truth: bool = False
-    """Leave out frames without ground truth within ``max_truth_gap_s``: a comparison then counts them all."""
+    """Leave out frames without ground truth within ``max_truth_gap_s``, so that a comparison covers all
+    frames used."""
     max_truth_gap_s: NonNegativeFloat = 0.02
-    """Largest time between a frame and a pose of the truth for the two to be compared. More, where the truth
-    has fewer poses a second than the log has frames."""
+    """Largest time between a frame and a pose of the truth that are compared. Raise it if the truth has fewer
+    poses per second than the log has frames."""
     max_pair_gap_s: NonNegativeFloat = 0.02
-    """Largest time between a colour image and its depth image. More, where the two are not synchronised and
+    """Largest time between a colour image and its depth image. Raise it if the two are not synchronised and
     the camera moves slowly; frames without a partner are left out."""
     depth_offset_s: float = 0.0
     """Added to the stamps of depth images before they are paired with colour images: how much later they show
-    the scene than their stamps say. The warning ``camera`` tells it where it was measured."""
+    the scene than their stamps say. The warning ``camera`` reports it if it was measured."""
     rate_hz: PositiveFloat | None = None
     """Frames per second of numbered files without stamps; None is the format's own (30, Poznań, scans 10)."""
     camera: CameraConfig | None = None
@@ -129,7 +130,8 @@ class SourceConfig(Config):
     pattern: str | None = None
     """Glob of the names of a LiDAR log's clouds, e.g. ``os1_*.bin``; None is all with the usual ending."""
     stamps_file: Path | None = None
-    """A cloud's stamp a line, seconds or nanoseconds; None looks for stamps in names, then for times.txt."""
+    """File with one stamp per line and cloud, seconds or nanoseconds; None looks for stamps in names, then
+    for times.txt."""
     truth_file: Path | None = None
     """Poses of a LiDAR log, in TUM's or KITTI's text; None looks for groundtruth.txt and poses.txt."""
     cloud_scale: PositiveFloat | None = None

@@ -13,29 +13,32 @@ class ScanOdometryConfig(Config):
 
     kind: str
     scale: PositiveFloat | None = None
-    """Factor on all lengths but the ranges. None takes it from the log: 1 outdoors; where walls are near, as
-    much less as makes the voxel 0.06 of the median distance, or 0.15 m. 1 keeps the lengths as they are."""
+    """Factor on all lengths except the ranges. None derives it from the log: 1 outdoors, and where walls are
+    near the factor that makes the voxel 0.06 of the median distance, or 0.15 m. 1 keeps the lengths as they
+    are."""
     min_range_m: PositiveFloat = 1.0
     """Nearer returns are the vehicle's own; ``source.body`` keeps them out of the maps, too."""
     max_range_m: PositiveFloat = 100.0
     """Farther returns are too sparse for registration."""
     voxel_m: PositiveFloat = 0.4
-    """Scans are thinned to one point, the mean of at most eight, per voxel of this size. Larger is faster;
-    smaller keeps thin things in narrow places."""
+    """Scans are thinned to one point per voxel of this size, the mean of at most eight. Larger is faster;
+    smaller keeps thin objects in narrow places."""
     keyframe_distance_m: PositiveFloat = 1.0
-    """A scan this far from the last keyframe becomes a keyframe. Less finds more loops and takes longer."""
+    """A scan this far from the last keyframe becomes a keyframe. Lower values find more loops and take
+    longer."""
     keyframe_angle_rad: PositiveFloat = 0.2
     """A scan turned this much from the last keyframe becomes a keyframe."""
     usual_ratio: Ratio = 0.8
-    """A scan whose overlap with the last keyframe is a smaller share of the usual one, and unusual for this
-    log, is searched again; it is doubtful if more speaks against its pose. 0 believes every pose."""
+    """If a scan's overlap with the last keyframe is less than this share of the usual one, and unusual for
+    this log, other poses are searched; it is doubtful if there is further evidence against its pose. 0
+    accepts every pose."""
     lost_ratio: Ratio = 0.5
-    """A scan whose overlap is still less than this share of the usual one is lost if anything else speaks
-    against its pose, with less than half of it in any case; 0 loses none."""
+    """If the overlap is still less than this share of the usual one, the scan is lost if there is any other
+    evidence against its pose, and below half of this share in any case; 0 loses none."""
     max_lost_scans: NonNegativeInt = 10
-    """After so many lost scans in a row a new sub-map begins; 0 disables it."""
+    """After this many lost scans in a row a new sub-map begins; 0 disables this."""
     rescue: HoughGicpConfig | None = HoughGicpConfig()
-    """Registration without a guess, to the last keyframe, of scans with too little overlap."""
+    """Registration without a guess to the last keyframe, for scans with too little overlap."""
     max_pair_distance_m: PositiveFloat = 0.5
     """Distance from the last keyframe's points within which a point counts as overlap."""
 
