@@ -87,7 +87,7 @@ def _log_rows(log: "LogFacts") -> list[tuple[str, str]]:
     if log.vehicle is not None:
         numbers = ",".join(f"{v:g}" for v in log.vehicle)
         rows.append(
-            ("own vehicle", f"its returns stand still near the sensor: --set source.body.box=[{numbers}]")
+            ("own vehicle", f"returns that stay in place near the sensor: --set source.body.box=[{numbers}]")
         )
     rows += [("note", note) for note in log.notes]
     return rows + [("warning", warning) for warning in log.warnings]

@@ -118,8 +118,8 @@ def _summary(merged: "Merged") -> str:
         Column("placed", "placed"),
         Column("bent", "bent"),
         Column("voxels", "voxels"),
-        Column("shared_voxels", "known before"),
-        Column("agreement", "walls alike", lambda share: MISSING if share is None else f"{share:.0%}"),
+        Column("shared_voxels", "known in both"),
+        Column("agreement", "walls agree", lambda share: MISSING if share is None else f"{share:.0%}"),
     ]
     costs = merged.costs
     seconds = ", ".join(f"{name} {sum(cost.seconds for cost in of):.1f}" for name, of in costs.items())

@@ -53,8 +53,8 @@ def map_quality(
         register: Refine the alignment of the reference by point-to-plane ICP with the run's cloud.
 
     Raises:
-        DataError: The log has no truth to lay the reference by, the two share no known surface, or there are
-            no points to register.
+        DataError: The log has no truth to place the reference by, the two share no known surface, or there
+            are no points to register.
     """
     world = world or ("truth" if reference.in_truth else "map")
     cloud = read_cloud(run.file(files.CLOUD), scale=1.0).points
@@ -66,7 +66,7 @@ def map_quality(
         T_map_reference, how = refined, f"{how}, then registered"
     check = check_occupancy(run.octree, reference, T_map_reference, voxels=voxels)
     metrics = [
-        Metric(f"map held against the {reference.name}, laid {how}", len(check.occupied), "voxels"),
+        Metric(f"map compared with the {reference.name}, placed {how}", len(check.occupied), "voxels"),
         *([Metric("registration moved it by", moved_m, "m")] if register else []),
         *check_metrics(check),
         *_distances(reference, check, cloud, T_map_reference),

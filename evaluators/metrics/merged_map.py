@@ -38,7 +38,7 @@ def merged_map_metrics(
         if run.agreement is not None:
             shared = run.shared_voxels / max(run.voxels, 1)
             metrics.append(Metric(f"{name}: voxels that runs before it know", 100.0 * shared, "%"))
-            metrics.append(Metric(f"{name}: walls alike there", 100.0 * run.agreement, "%"))
+            metrics.append(Metric(f"{name}: walls agree there", 100.0 * run.agreement, "%"))
         if run.moved_m > 0.0:
             metrics.append(Metric(f"{name}: bent by at most", run.moved_m, "m"))
     notes = [f"left out: {path}: {why}" for path, why in manifest.left_out.items()]

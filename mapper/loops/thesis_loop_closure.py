@@ -66,7 +66,7 @@ class ThesisLoopDetector:
         return self._estimator.pose_of(node)
 
     def notes(self) -> Sequence[str]:
-        """Return nothing: no loop is held against the odometry."""
+        """Return nothing: no loop is compared with the odometry."""
         return ()
 
     def places(self) -> Mapping[int, ImageView]:

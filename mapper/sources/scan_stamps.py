@@ -70,7 +70,7 @@ def scan_stamps(
     numbers = numbers_of(files)
     counts = range(len(files)) if numbers is None else numbers.tolist()
     note = (
-        f"neither names nor a times.txt tell stamps; {rate_hz:g} {wording.files} a second assumed "
+        f"no stamps in the names or in a times.txt; {rate_hz:g} {wording.files} a second assumed "
         f"({wording.rate})"
     )
     return np.array([stamp_at(count, rate_hz=rate_hz) for count in counts], dtype=np.int64), [note]

@@ -18,7 +18,7 @@ MERGED = "is a merged map, not a run; mapper eval, view --html, export and plan 
 UNKNOWN = "not a log of a known format"
 
 ANSWERS = {
-    "eval": ("ATE RMSE", "walls alike there", NO_RUN[0], "want poses as TUM or KITTI text", *NO_RUN[2:]),
+    "eval": ("ATE RMSE", "walls agree there", NO_RUN[0], "want poses as TUM or KITTI text", *NO_RUN[2:]),
     "view": ("page.html", "page.html", *NO_RUN),
     "report": ("page.html", MERGED, *NO_RUN),
     "export": ("made.ot", "made.ot", *NO_RUN),

@@ -50,7 +50,7 @@ def test_poses_without_a_calibration_are_the_lidars(tmp_path):
     assert (source.kind, source.sensor, source.name, len(source)) == ("kitti", "lidar", "drive", N)
     assert stamps_of(source) == [i * NS_PER_S // 10 for i in range(N)]
     assert source.notes == [
-        "neither names nor a times.txt tell stamps; 10 scans a second assumed (source.rate_hz)"
+        "no stamps in the names or in a times.txt; 10 scans a second assumed (source.rate_hz)"
     ]
     np.testing.assert_allclose(source.truth.T_world_body, T_WORLD_LIDAR, atol=1e-12)
     assert source.truth.stamps_ns.tolist() == stamps_of(source)

@@ -52,7 +52,7 @@ def first_x(source):
 
 
 def assumed(rate):
-    return f"neither names nor a times.txt tell stamps; {rate} scans a second assumed (source.rate_hz)"
+    return f"no stamps in the names or in a times.txt; {rate} scans a second assumed (source.rate_hz)"
 
 
 @pytest.mark.parametrize("ending", [".bin", ".npy", ".xyz", ".txt", ".csv"])

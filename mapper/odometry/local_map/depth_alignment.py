@@ -1,6 +1,6 @@
 """Alignment of a depth image to those of keyframes, together with the landmarks of the frame, if any.
 
-Each point is held against the plane of the keyframe's cell that it projects to (Chen & Medioni 1992;
+Each point is compared with the plane of the keyframe's cell that it projects to (Chen & Medioni 1992;
 Blais & Levine 1995). Planes and landmarks are weighted by their noise and minimised at once, so that a motion
 that one of them does not observe is decided by the other.
 """

@@ -251,7 +251,7 @@ class PoseSearch:
             phrases.append(f"{shares.overlap:.0%} of the points agree, {usual.usual.overlap:.0%} is usual")
         if contradicts:
             phrases.append(
-                f"{shares.contradicting:.1%} of the points stand where rays passed, "
+                f"{shares.contradicting:.1%} of the points lie where earlier rays passed, "
                 f"{usual.usual.contradicting:.1%} is usual"
             )
         if disagrees:

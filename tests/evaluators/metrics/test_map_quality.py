@@ -1,4 +1,4 @@
-"""Maps held against clouds, other maps and known worlds, and judged by their own sharpness."""
+"""Maps compared with clouds, other maps and known worlds, and judged by their own sharpness."""
 
 import json
 

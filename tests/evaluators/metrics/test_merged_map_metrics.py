@@ -36,13 +36,13 @@ def test_misplaced_runs_are_told_by_the_error_of_all_together(runs, tmp_path):
     found, notes = metrics_of(merged_map_of(as_built(runs), tmp_path / "map").map)
     assert notes == []
     assert found["runs"] == 2
-    assert found["b: walls alike there"] == 100.0
+    assert found["b: walls agree there"] == 100.0
     assert max(found[f"{name}: ATE RMSE, SE(3)-aligned"] for name in NAMES) < 1e-9
     assert 0.1 < found[TOGETHER] < 1.0
 
     found, _ = metrics_of(merged_map_of(by_truth(runs), tmp_path / "right").map)
     assert found[TOGETHER] < 1e-9
-    assert found["b: walls alike there"] < 100.0
+    assert found["b: walls agree there"] < 100.0
 
 
 def test_a_run_whose_folder_is_gone_has_no_truth(runs, tmp_path):

@@ -1,4 +1,4 @@
-"""Relative errors over lengths, held against a plain reading of the benchmark's own definition."""
+"""Relative errors over lengths, compared with a plain reading of the benchmark's own definition."""
 
 from itertools import pairwise
 
