@@ -131,6 +131,7 @@ def test_surfaces_shift_while_the_depth_image_is_not_measured_yet(
     twist_camera = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 1.0 + change_mps])
     found = earlier_depth.displacement(pose.observation, late, pose.reference, twist_camera)
     assert (found.ratio > 0.4) == displaced
+    assert earlier_depth.displacement(pose.observation, late, pose.reference, None).ratio > 0.4
 
 
 def test_what_moves_near_by_does_not_displace_the_farther_surfaces(odometry, earlier_depth, frames):

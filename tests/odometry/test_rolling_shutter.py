@@ -13,7 +13,7 @@ from mapper.odometry.factory import build_frame_odometry
 from mapper.odometry.local_map.bundle_adjustment import adjust, common_parameter
 from mapper.odometry.local_map.pixel_motion import depth_velocity, pixel_velocity, row_phase
 from mapper.odometry.local_map.readout_time import ReadoutTime
-from mapper.odometry.local_map.rolling_shutter import _refine
+from mapper.odometry.local_map.rolling_shutter import RollingShutter, _refine
 
 INTRINSICS = np.array([525.0, 520.0, 319.5, 239.5, 40.0])
 HEIGHT_PX = 480
@@ -141,3 +141,13 @@ def test_the_motion_before_a_gap_is_not_that_of_the_image_after_it(frames, gap_s
     assert speeds[5] > 0.0
     assert (speeds[6] == 0.0) is (gap_s > 1)
     assert speeds[7] > 0.0
+
+
+@pytest.mark.parametrize(("elapsed_s", "is_known"), [(0.2, True), (0.5, False)])
+def test_poses_far_apart_tell_no_velocity(elapsed_s, is_known):
+    shutter = RollingShutter(ReadoutTime(0.0, windows_sharing=10))
+    assert shutter.known_twist is None
+    shutter.follow(exp(np.zeros(3), np.array([0.1, 0.0, 0.0])), elapsed_s)
+    assert (shutter.known_twist is not None) == is_known
+    shutter.restart()
+    assert shutter.known_twist is None

@@ -99,7 +99,11 @@ class EarlierDepth:
         return moved
 
     def displacement(
-        self, observation: ImageObservation, T_camera_world: Transform, reference: int, twist_camera: Array
+        self,
+        observation: ImageObservation,
+        T_camera_world: Transform,
+        reference: int,
+        twist_camera: Array | None,
     ) -> Displacement:
         """Return how much of the depth image lies elsewhere than 0.4 s before.
 
@@ -107,13 +111,14 @@ class EarlierDepth:
             observation: The frame.
             T_camera_world: (4, 4) its pose.
             reference: Keyframe that sees the place; the newest up to it that is old enough is compared.
-            twist_camera: (6,) velocity of the camera in its own axes, rad/s and m/s; 0 if it is unknown.
+            twist_camera: (6,) velocity of the camera in its own axes, rad/s and m/s; None if it is unknown.
         """
         earlier = self._earlier(observation, reference, most=1)
         if observation.depth_cells is None or not earlier:
             return Displacement()
         keyframe, cells = self._map.keyframes[earlier[0]], observation.depth_cells
         points = cells.points()
+        twists = [np.zeros(6)] * 2 if twist_camera is None else [twist_camera, keyframe.twist_camera]
         compared, beside_m = _apart(
             points,
             T_camera_world,
@@ -122,8 +127,7 @@ class EarlierDepth:
             cells.camera.parameters,
             cells.cell_px,
             self._noise,
-            _UNSYNCHRONISED_S * twist_camera,
-            _UNSYNCHRONISED_S * keyframe.twist_camera,
+            *(_UNSYNCHRONISED_S * twist for twist in twists),
         )
         is_beside = beside_m > 0.0
         if not len(compared) or len(compared) < _MIN_COMPARED_RATIO * len(points):

@@ -130,9 +130,9 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
             self._calibration.pass_frame(self._before_last, last, tracked_pose)
         observation = tracked_pose.observation
         displaced = self._earlier_depth.displacement(
-            observation, tracked_pose.T_camera_world, tracked_pose.reference, self._shutter.twist_camera
+            observation, tracked_pose.T_camera_world, tracked_pose.reference, self._shutter.known_twist
         )
-        recognised = self._recovery.instead_of(tracked_pose, displaced, self._shutter.twist_camera)
+        recognised = self._recovery.instead_of(tracked_pose, displaced, self._shutter.known_twist)
         if recognised is not None:
             (tracked_pose, displaced), expected = recognised, None
             self._velocity.restart()

@@ -21,6 +21,8 @@ _FIRST_SPREAD = np.repeat([0.1, 0.05], 3)
 """Change of velocity (rad/s, m/s) from frame to frame before any is known."""
 _LEAST_SPREAD = np.full(6, 0.01)
 _SPREAD_KEPT = 0.95
+_MAX_APART_S = 0.3
+"""Poses farther apart tell no velocity at the time of an image."""
 
 
 class ReadByRows(Protocol):
@@ -51,13 +53,19 @@ class RollingShutter:
         self._readout = readout
         self._variance = _FIRST_SPREAD**2
         self._velocity: Array | None = None
+        self._elapsed_s = np.inf
         self.twist_camera = np.zeros(6)
         """Velocity of the camera in the last image, in its own axes: rotation rad/s, translation m/s."""
 
     def restart(self) -> None:
         """Forget the velocity, after a gap."""
-        self._velocity = None
+        self._velocity, self._elapsed_s = None, np.inf
         self.twist_camera = np.zeros(6)
+
+    @property
+    def known_twist(self) -> Array | None:
+        """``twist_camera``; None where the last images are too far apart to tell it."""
+        return self.twist_camera if self._elapsed_s <= _MAX_APART_S else None
 
     def predicted(self, observation: Observed) -> Observed:
         """Return an observation corrected by the velocity in the image before."""
@@ -65,6 +73,7 @@ class RollingShutter:
 
     def follow(self, T_before_camera: Transform, elapsed_s: float) -> None:
         """Set the velocity in the last image by the camera's motion (4, 4) since the image before it."""
+        self._elapsed_s = elapsed_s
         velocity = np.concatenate(log(T_before_camera)) / elapsed_s
         change = np.zeros(6) if self._velocity is None else velocity - self._velocity
         self._velocity = velocity

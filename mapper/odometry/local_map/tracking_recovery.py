@@ -39,14 +39,14 @@ class TrackingRecovery:
         self._earlier_depth = earlier_depth
 
     def instead_of(
-        self, tracked_pose: TrackedPose, displaced: Displacement, twist_camera: Array
+        self, tracked_pose: TrackedPose, displaced: Displacement, twist_camera: Array | None
     ) -> tuple[TrackedPose, Displacement] | None:
         """Return another pose of a frame, which is doubtful, and what it displaces; None if there is none.
 
         Args:
             tracked_pose: The pose that was tracked.
             displaced: Surfaces that lie elsewhere by it.
-            twist_camera: (6,) velocity of the camera in its own axes, rad/s and m/s.
+            twist_camera: (6,) velocity of the camera in its own axes, rad/s and m/s; None if it is unknown.
         """
         is_displaced = max(displaced.ratio, displaced.far_ratio) > _MOST
         before = self._first_doubtful(tracked_pose)
