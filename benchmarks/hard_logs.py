@@ -127,6 +127,15 @@ HARD_LOGS: Mapping[str, HardLog] = {
         "the same sensor on a walk through the flat",
         "frame_rate_hz=15", more=(*_SMALL, "--uncalibrated"),
     ),
+    "desk_fast": _camera(
+        "that sensor before a desk, at 0.9 m/s to and fro",
+        "frame_rate_hz=30", "duration_s=9", "path=desk", "shake_m=0.25", "shake_rad=0.2",
+        more=(*_SMALL, "--uncalibrated"),
+    ),
+    "white_room_uncalibrated": _camera(
+        "that sensor where nothing has texture: its distorted depth alone shows anything",
+        "frame_rate_hz=15", "duration_s=20", scene="white-room", more=(*_SMALL, "--uncalibrated"),
+    ),
     "lidar_tunnel": _lidar(
         "a smooth tunnel of 100 m; beams reach 30 m, so nothing tells the way along its axis",
         "sensor.rings=16", "sensor.max_range_m=30", "duration_s=30", scene="tunnel",
