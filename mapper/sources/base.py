@@ -13,6 +13,7 @@ from mapper.core.frames import Frame, Scan, Sensor
 from mapper.core.geometry import Array
 from mapper.core.timebase import Stamps
 from mapper.core.trajectory import Trajectory
+from mapper.sensing.depth_distortion import DepthDistortion
 
 
 class ImageFile(Protocol):
@@ -138,6 +139,8 @@ class Log:
         accelerations: Accelerometer readings, if the log has them.
         wheels: T_odom_body by wheel odometry, in a frame of its own that drifts, if the log has it.
         notes: What opening it had to leave out or assume, a sentence each.
+        removed_distortion: Returns the depth distortion that frames are loaded without, or None if none was
+            found. None itself where frames are loaded as they were recorded.
         sessions: The logs that a chained log is made of, oldest first; empty for any other.
     """
 
@@ -151,6 +154,7 @@ class Log:
     accelerations: Accelerations | None = None
     wheels: Trajectory | None = None
     notes: Sequence[str] = ()
+    removed_distortion: Callable[[], DepthDistortion | None] | None = None
     sessions: "Sequence[Session]" = ()
 
     def __len__(self) -> int:
