@@ -27,7 +27,7 @@ import numpy as np
 from hard_logs import HARD_LOGS
 
 from mapper.cli.main import app
-from mapper.config.loading import load_config
+from mapper.config.loading import load_config, load_source_config
 from mapper.core.errors import MapperError
 from mapper.evaluators.metrics.loops import wrong_loops
 from mapper.evaluators.metrics.silent_failures import check_doubts
@@ -176,12 +176,15 @@ def mapped(log: Log, name: str, overrides: Sequence[str] = ()) -> Row:
     )
 
 
-def logs(cache: Path, data: Path | None, only: Sequence[str], seed: int) -> Iterator[tuple[str, Log]]:
+def logs(
+    cache: Path, data: Path | None, only: Sequence[str], seed: int, overrides: Sequence[str] = ()
+) -> Iterator[tuple[str, Log]]:
     """Yield every log with its name; synthetic ones are made where they are not there yet.
 
     Raises:
         SystemExit: A name is unknown.
     """
+    config = load_source_config(None, overrides)
     real = {name: strides for name, strides in REAL_LOGS.items() if data and (data / name).exists()}
     if unknown := set(only) - set(HARD_LOGS) - set(real):
         raise SystemExit(f"no log is called {', '.join(sorted(unknown))}; want of {[*HARD_LOGS, *real]}")
@@ -191,10 +194,10 @@ def logs(cache: Path, data: Path | None, only: Sequence[str], seed: int) -> Iter
             if not folder.exists():
                 arguments = ["synth", str(folder), *hard.arguments, "--seed", str(seed), "--quiet"]
                 app(arguments, standalone_mode=False)
-            yield folder.name, open_source(folder)
+            yield folder.name, open_source(folder, config)
     for name, strides in real.items():
         if data and (not only or name in only):
-            log = open_source(data / name)
+            log = open_source(data / name, config)
             for stride in strides:
                 yield f"{name}:{stride}", every(log, stride)
 
@@ -241,7 +244,9 @@ def main() -> None:
     arguments.cache.mkdir(parents=True, exist_ok=True)
     print(HEADER)
     rows: list[Row] = []
-    for name, log in logs(arguments.cache, arguments.data, arguments.only, arguments.seed):
+    for name, log in logs(
+        arguments.cache, arguments.data, arguments.only, arguments.seed, arguments.overrides
+    ):
         if arguments.neighbours:
             rows += neighbours(log, name, arguments.overrides)
         else:

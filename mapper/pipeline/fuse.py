@@ -26,6 +26,7 @@ from mapper.octree.map_file import write_map
 from mapper.octree.octomap_file import write_bt, write_ot
 from mapper.octree.scan_update_file import ScanUpdateWriter, open_scan_updates
 from mapper.pipeline.checkpoints import Checkpoints
+from mapper.pipeline.distortion_warnings import distortion_warnings
 from mapper.pipeline.fuse_checkpoints import MarkedUpdates, known_updates
 from mapper.pipeline.judge import judge
 from mapper.run import files
@@ -200,6 +201,7 @@ def fuse_into(
     trajectory = results.trajectory
     make_writer = ScanUpdateWriter if checkpoints is None else partial(MarkedUpdates, checkpoints=checkpoints)
     with writer.clock.stage("fuse"):
+        _warn_of_distortion(writer, source, progress)
         settings = _with_depth_noise(writer, source, config, progress)
         if checkpoints is not None:
             before = known_updates(checkpoints, settings.octree)
@@ -240,6 +242,16 @@ def fuse_into(
     log_s = _duration_s(trajectory, [log.begins_ns for log in writer.manifest.input.appended])
     writer.record_timing(log_s=log_s, frames=counts.read)
     observer.on_mapped(Run(writer.folder, config, writer.manifest), results, maps)
+
+
+def _warn_of_distortion(writer: RunWriter, source: Log, progress: Progress) -> None:
+    """Add what is found about the distortion of depth images to a run's warnings, once."""
+    known = writer.manifest.warnings
+    told = {warning.sentence for warning in known}
+    new = [warning for warning in distortion_warnings(source) if warning.sentence not in told]
+    for warning in new:
+        progress.note(warning.sentence)
+    writer.update(warnings=(*known, *new))
 
 
 def _with_depth_noise(writer: RunWriter, source: Log, config: BuildConfig, progress: Progress) -> BuildConfig:

@@ -13,6 +13,7 @@ from mapper.core.frames import Frame, Scan, Sensor
 from mapper.core.geometry import Array
 from mapper.core.timebase import Stamps
 from mapper.core.trajectory import Trajectory
+from mapper.sensing.depth_distortion import DepthDistortion
 
 
 class ImageFile(Protocol):
@@ -139,6 +140,8 @@ class Log:
         wheels: T_odom_body by wheel odometry, in a frame of its own that drifts, if the log has it.
         are_units_assumed: Nothing says how many units of its depth images a metre has.
         notes: What opening it had to leave out or assume, a sentence each.
+        removed_distortion: Returns the depth distortion that frames are loaded without, or None if none was
+            found. None itself where frames are loaded as they were recorded.
         sessions: The logs that a chained log is made of, oldest first; empty for any other.
     """
 
@@ -153,6 +156,7 @@ class Log:
     wheels: Trajectory | None = None
     are_units_assumed: bool = False
     notes: Sequence[str] = ()
+    removed_distortion: Callable[[], DepthDistortion | None] | None = None
     sessions: "Sequence[Session]" = ()
 
     def __len__(self) -> int:

@@ -9,17 +9,20 @@ from mapper.core.errors import SourceError
 from mapper.core.timebase import NS_PER_S, nearest
 from mapper.sources.base import Log
 from mapper.sources.config import SourceConfig
+from mapper.sources.depth_distortion import undistorted
 from mapper.sources.vehicle import without_vehicle
 
 
 def selected(log: Log, config: SourceConfig) -> Log:
     """Return the frames ``first_frame`` … ``last_frame`` by ``stride``, with truth where it is required.
 
-    Returns of the sensor's own vehicle are left out of them.
+    Returns of the sensor's own vehicle are left out of them, and depth distortion if it is to be.
 
     Raises:
         SourceError: Nothing is left, or truth is required of a log that has none.
     """
+    if config.undistort_depth:
+        log = undistorted(log)
     if config.body.clears:
         log = without_vehicle(log, config.body)
     total = len(log)

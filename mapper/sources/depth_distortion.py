@@ -1,0 +1,99 @@
+"""Depth distortion of a log's camera: measured in some of its frames, and removed from all of them."""
+
+import threading
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from mapper.core.errors import FrameError
+from mapper.core.frames import Frame, RgbdFrame, Scan, ray_table
+from mapper.sensing.depth_distortion import DepthDistortion, measure_distortion
+from mapper.sources.base import Log, WrappedEntry
+
+_FRAMES = 60
+
+
+def distortion_of(log: Log) -> DepthDistortion | None:
+    """Measure the depth distortion in frames spread over a log; None if there is none, or no depth images."""
+    frames = _spread(log)
+    first = next(frames, None)
+    if first is None:
+        return None
+    images = (frame.depth_m for frame in (first, *frames) if frame.camera == first.camera)
+    return measure_distortion(images, ray_table(first.camera))
+
+
+def undistorted(log: Log) -> Log:
+    """Return an RGB-D log whose depth images have no distortion; any other log stays as it is.
+
+    The distortion is measured when the first frame is loaded. Where none is found, the frames stay as they
+    are.
+    """
+    if log.sensor != "rgbd":
+        return log
+    measured = _MeasuredOnce(log)
+    return replace(
+        log,
+        entry_at=lambda index: _UndistortedEntry(log.entry_at(index), measured),
+        removed_distortion=measured.distortion,
+    )
+
+
+def _spread(log: Log) -> Iterator[RgbdFrame]:
+    """Yield frames spread over a log, without those that cannot be read."""
+    if log.sensor != "rgbd":
+        return
+    for index in np.unique(np.linspace(0, len(log) - 1, min(_FRAMES, len(log))).round().astype(int)):
+        try:
+            frame = log.entry_at(int(index)).load(colour=False)
+        except FrameError:
+            continue
+        if isinstance(frame, RgbdFrame):
+            yield frame
+
+
+@dataclass(slots=True, eq=False)
+class _MeasuredOnce:
+    """Distortion of a log, measured by the first thread that asks for it."""
+
+    log: Log
+    _lock: threading.Lock = field(default_factory=threading.Lock)
+    _is_known: bool = False
+    _distortion: DepthDistortion | None = None
+
+    def distortion(self) -> DepthDistortion | None:
+        """Return it; None if there is none."""
+        with self._lock:
+            if not self._is_known:
+                self._distortion, self._is_known = distortion_of(self.log), True
+            return self._distortion
+
+
+@dataclass(frozen=True, slots=True)
+class _UndistortedEntry(WrappedEntry):
+    """Frame of another log without its depth's distortion; its files have it."""
+
+    measured: _MeasuredOnce
+
+    def load(self, *, colour: bool = True) -> Frame:
+        """Read the frame.
+
+        Raises:
+            FrameError: As the recorded frame.
+        """
+        frame = self.entry.load(colour=colour)
+        distortion = self.measured.distortion()
+        if distortion is None or not isinstance(frame, RgbdFrame):
+            return frame
+        if frame.depth_m.shape != distortion.error_per_m.shape:  # of another camera
+            return frame
+        return replace(frame, depth_m=distortion.corrected(frame.depth_m))
+
+    def scan(self) -> Scan:
+        """Read the returns alone.
+
+        Raises:
+            FrameError: As ``load``.
+        """
+        return self.load(colour=False).scan()

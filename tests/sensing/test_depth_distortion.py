@@ -1,0 +1,93 @@
+"""Depth distortion measured on the planes of a log."""
+
+import numpy as np
+import pytest
+
+from mapper.core.frames import ray_table
+from mapper.sensing.depth_distortion import measure_distortion
+from mapper.simulation.config import SensorConfig, SynthConfig
+from mapper.simulation.sensor import BASELINE_M, DISPARITY_FOCAL_PX, warp_of
+from mapper.simulation.source import CameraSimulator
+from tests.support.bent_depth import CAMERA, images, off_planes, smooth_error
+
+
+def measured(seen):
+    return measure_distortion(seen, ray_table(CAMERA))
+
+
+@pytest.fixture(scope="module")
+def truth():
+    return smooth_error()
+
+
+@pytest.fixture(scope="module")
+def found(truth):
+    return measured(images(error_per_m=truth))
+
+
+def test_the_error_is_found_but_for_its_part_on_planes(found, truth):
+    wrong = found.error_per_m - truth
+    assert np.corrcoef(found.error_per_m.ravel(), truth.ravel())[0, 1] > 0.97
+    assert wrong.std() < 0.25 * truth.std()
+    assert found.rms_per_m == pytest.approx(truth.std(), rel=0.1)
+    plane = 0.01 * ray_table(CAMERA)[..., 0] - 0.02
+    same = measured(images(error_per_m=truth + plane))
+    np.testing.assert_allclose(same.error_per_m, found.error_per_m, atol=0.2 * truth.std())
+
+
+def test_corrected_depth_is_nearer_to_the_truth(found, truth):
+    exact, bent = (np.array(images(error_per_m=error, sigma_per_m=0.0)) for error in (0.0, truth))
+    corrected = np.array([found.corrected(depth_m) for depth_m in bent])
+    assert corrected.dtype == np.float32
+    assert np.abs(corrected - exact).mean() < 0.3 * np.abs(bent - exact).mean()
+    assert found.rms_m == pytest.approx(found.rms_per_m * found.median_depth_m**2)
+    assert found.median_depth_m == pytest.approx(np.median(bent), rel=0.1)
+
+
+def test_what_is_not_measured_stays_so(found):
+    depth_m = images(frames=1)[0]
+    depth_m[:30] = 0.0
+    depth_m[50] = 1e6
+    corrected = found.corrected(depth_m)
+    assert not corrected[:30].any()
+    assert ((corrected[50] > 0.0) == (found.error_per_m[50] < 1e-6)).all(), "beyond infinity is nowhere"
+    assert (corrected[60:] > 0.0).all()
+
+
+def test_an_exact_camera_has_none():
+    for sigma_per_m in (0.0, 0.002, 0.005):
+        assert measured(images(sigma_per_m=sigma_per_m)) is None
+
+
+def test_a_camera_that_stands_still_before_relief_has_none(truth):
+    assert measured(images(error_per_m=truth, moves=False)) is None
+
+
+def test_an_error_that_changes_is_none(truth):
+    first, second = images(error_per_m=truth, frames=20), images(error_per_m=-truth, frames=20)
+    assert measured(first + second) is None
+    upside_down = images(error_per_m=off_planes(truth[::-1] * [[1.0, -1.0] * 80]), frames=20)
+    assert measured(first + upside_down) is None
+
+
+def test_few_frames_and_few_planes_show_none(truth):
+    assert measured(images(error_per_m=truth, frames=14)) is None
+    rng = np.random.default_rng(0)
+    clutter = [(1.0 / rng.uniform(0.3, 1.5, (120, 160))).astype(np.float32) for _ in range(20)]
+    assert measured(clutter) is None
+    assert measured([]) is None
+
+
+def test_the_warp_of_the_simulator_is_found():
+    sensor = SensorConfig(disparity_warp_px=0.3)
+    config = SynthConfig(seed=4, width_px=160, height_px=120, sensor=sensor)
+    simulator = CameraSimulator(config)
+    log = simulator.log()
+    seen = [log.entry_at(k).load(colour=False).depth_m for k in range(0, len(log), len(log) // 50)]
+    rays = ray_table(simulator.camera).astype(np.float64)
+    found = measure_distortion(seen, rays)
+    flat = np.concatenate([rays, np.ones((120, 160, 1))], axis=2).reshape(-1, 3)
+    truth = warp_of(config).ravel() / (BASELINE_M * DISPARITY_FOCAL_PX)
+    truth = truth - flat @ np.linalg.lstsq(flat, truth, rcond=None)[0]
+    assert np.corrcoef(found.error_per_m.ravel(), truth)[0, 1] > 0.85
+    assert (found.error_per_m.ravel() - truth).std() < 0.6 * truth.std()
