@@ -333,7 +333,7 @@ def test_the_verb_says_what_it_made(runs, tmp_path, capsys):
     app([*arguments, "--tile-m", "1.6"], standalone_mode=False)
 
     lines = capsys.readouterr().out.splitlines()
-    assert lines[0].split() == ["run", "placed", "bent", "voxels", "known", "before", "walls", "alike"]
+    assert lines[0].split() == ["run", "placed", "bent", "voxels", "known", "in", "both", "walls", "agree"]
     assert lines[2].split()[:3] == ["run1", "as", "built"]
     assert lines[-1] == str(tmp_path / "map")
     assert open_map(tmp_path / "map").manifest.status == "complete"
