@@ -60,10 +60,7 @@ def read_log(path: Path, config: SourceConfig) -> Log:
         notes=notes,
     )
     if T_camera_lidar is None and log.truth is not None and _moves_as_a_camera(log.truth):
-        note = (
-            "the true poses move along their z, as a camera's do; without calib.txt they count as the LiDAR's"
-        )
-        return replace(log, notes=[*log.notes, note])
+        return replace(log, notes=[*log.notes, _CAMERAS_NOTE])
     return log
 
 
