@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from mapper.evaluators.depth_camera.accuracy import Patch
 
 _FITTED_FRAMES = 100
+_AS_RECORDED = ("source.undistort_depth=false",)
 
 
 def depth(
@@ -71,7 +72,7 @@ def depth(
 
     distances_m = _distances(logs, plane_at, fit_plane=fit_plane, keep_tilt=keep_tilt)
     where = None if patch is None else _patch(patch)
-    config = load_config(None, merged(selection(first, last, stride, None), set_)).source
+    config = load_config(None, merged([*_AS_RECORDED, *selection(first, last, stride, None)], set_)).source
     sources = [open_source(log, config) for log in logs]
     with nullcontext() if out is None else atomic_folder(out, FOLDER, overwrite=overwrite) as folder:
         study = study_depth(

@@ -18,10 +18,9 @@ def distortion_warnings(source: Log) -> list[RunWarning]:
 
 def _warning(log: Log, *, of: str) -> RunWarning | None:
     removed = log.removed_distortion is not None
-    distortion = distortion_of(log) if log.removed_distortion is None else log.removed_distortion()
+    distortion = log.removed_distortion() if log.removed_distortion else distortion_of(log)
     if distortion is None:
-        unchanged = f"{of}no distortion of depth images was found; they are used as recorded"
-        return RunWarning(kind="camera", sentence=unchanged) if removed else None
+        return None
     size = f"{distortion.rms_m * 100:.1f} cm (rms) at {distortion.median_depth_m:.1f} m"
     if removed:
         return RunWarning(

@@ -66,10 +66,8 @@ class DepthDistortion:
 
     def corrected(self, depth_m: DepthImage) -> DepthImage:
         """Return (H, W) depths without the distortion, metres; 0 stays 0, no measurement."""
-        inverse = np.divide(np.float32(1.0), depth_m, out=np.zeros_like(depth_m), where=depth_m > 0.0)
-        inverse -= self.error_per_m
-        known = (depth_m > 0.0) & (inverse > 0.0)
-        corrected: DepthImage = np.divide(np.float32(1.0), inverse, out=np.zeros_like(depth_m), where=known)
+        scale = 1.0 - depth_m * self.error_per_m
+        corrected: DepthImage = np.divide(depth_m, scale, out=np.zeros_like(depth_m), where=scale > 0.0)
         return corrected
 
 

@@ -36,9 +36,8 @@ def of_distortion(warnings):
 
 def test_a_run_tells_that_depth_is_bent_once(run):
     (warning,) = of_distortion(run.manifest.warnings)
-    assert warning.sentence.startswith("depth images are bent, all in the same way: planes are off by ")
-    assert warning.suggestion == "--set source.undistort_depth=true"
-    assert warning.weight == "note"
+    assert warning.sentence.startswith("depth images were bent, all in the same way; the error of ")
+    assert (warning.weight, warning.suggestion) == ("note", "")
     again = fuse(run.open_log(), run, run.config)
     assert again.manifest.warnings == run.manifest.warnings
 
@@ -51,15 +50,13 @@ def test_an_error_of_a_large_share_of_the_depth_is_a_doubt():
 
 def test_exact_depth_is_not_mentioned():
     assert distortion_warnings(bent_log()) == []
+    assert distortion_warnings(selected(bent_log(), SourceConfig())) == []
 
 
-def test_what_the_setting_did_is_told(bent):
-    on = SourceConfig(undistort_depth=True)
-    (done,) = distortion_warnings(selected(bent, on))
-    assert done.sentence.endswith("is removed")
-    (nothing,) = distortion_warnings(selected(bent_log(), on))
-    assert nothing.sentence == "no distortion of depth images was found; they are used as recorded"
-    assert (done.weight, done.suggestion, nothing.weight) == ("note", "", "note")
+def test_what_is_left_in_the_depth_comes_with_the_setting_that_removes_it(bent):
+    (left,) = distortion_warnings(selected(bent, SourceConfig(undistort_depth=False)))
+    assert left.sentence.startswith("depth images are bent, all in the same way: planes are off by ")
+    assert (left.weight, left.suggestion) == ("note", "--set source.undistort_depth=true")
 
 
 def test_each_log_of_a_chain_is_judged_by_itself(bent):

@@ -58,13 +58,13 @@ def test_the_truth_is_of_frame_numbers_and_mirrored(tmp_path):
     source = open_source(folder, SourceConfig(rate_hz=10.0))
     assert source.truth.stamps_ns.tolist() == [100_000_000, 200_000_000, 300_000_000]
     np.testing.assert_allclose(source.truth.T_world_body, POSES[1:], atol=1e-12)
-    assert next(source.entries()).camera.fy_px == 61.0
+    assert source[0].camera.fy_px == 61.0
 
 
 def test_configured_numbers_keep_the_convention_of_the_log(tmp_path):
     camera = CameraConfig(fx_px=60, fy_px=61, cx_px=31.5, cy_px=23.5)
     source = open_source(icl_nuim(tmp_path), SourceConfig(camera=camera))
-    assert next(source.entries()).camera.fy_px == 61.0
+    assert source[0].camera.fy_px == 61.0
     np.testing.assert_allclose(source.truth.T_world_body, POSES[1:], atol=1e-12)
 
 
@@ -144,7 +144,7 @@ def test_a_negative_fy_is_understood_in_any_format(tiny_tum_log):
     upright = open_source(log)
     (log / "calibration.toml").write_text(Y_UP + "distortion = [0.1, 0.0, 0.02, 0.03, 0.0]\n")
     source = open_source(log)
-    camera = next(source.entries()).camera
+    camera = source[0].camera
     assert (camera.fy_px, camera.distortion) == (61.0, (0.1, 0.0, -0.02, 0.03, 0.0))
     np.testing.assert_allclose(
         source.truth.T_world_body, MIRROR_Y @ upright.truth.T_world_body @ MIRROR_Y, atol=1e-12

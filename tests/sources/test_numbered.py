@@ -175,7 +175,7 @@ def test_the_nominal_camera_is_assumed_only_for_its_own_size(tmp_path):
     full = tmp_path / "full"
     write_picture(full / "color/0.png", full / "depth/0.png", 0, width_px=640, height_px=480)
     source = open_source(full)
-    assert next(iter(source.entries())).camera.fx_px == 525.0
+    assert source[0].camera.fx_px == 525.0
     assert any("PrimeSense's nominal camera" in note for note in source.notes)
 
 

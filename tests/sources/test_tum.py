@@ -177,7 +177,7 @@ def test_images_of_another_size_are_their_own_error(tiny_tum_log):
 def test_the_camera_is_as_large_as_the_first_readable_image(tiny_tum_log):
     log = tiny_tum_log(3)
     sorted((log / "rgb").iterdir())[0].write_bytes(b"")
-    assert next(iter(open_source(log).entries())).camera.width_px == 64
+    assert open_source(log)[1].camera.width_px == 64
     for path in (log / "rgb").iterdir():
         path.write_bytes(b"")
     with pytest.raises(SourceError, match=r"none of 3 colour images can be read; the first: .*: empty file"):
@@ -193,16 +193,16 @@ def test_intrinsics_unknown_says_the_remedy(tiny_tum_log):
 
 def test_the_users_depth_factor_leaves_the_camera_alone(tiny_tum_log):
     log = tiny_tum_log(2)
-    camera = next(open_source(log).entries()).camera
-    entry = next(open_source(log, SourceConfig(camera=CameraConfig(depth_factor=1000))).entries())
-    assert (entry.camera, entry.files.depth_units_per_m) == (camera, 1000)
+    camera = open_source(log)[0].camera
+    source = open_source(log, SourceConfig(camera=CameraConfig(depth_factor=1000)))
+    assert (source[0].camera, source.entry_at(0).files.depth_units_per_m) == (camera, 1000)
 
 
 def test_the_users_camera_wins_over_the_file(tiny_tum_log):
     camera = CameraConfig(fx_px=50, fy_px=51, cx_px=32, cy_px=24, depth_factor=1000)
-    entry = next(iter(open_source(tiny_tum_log(2), SourceConfig(camera=camera)).entries()))
-    assert entry.camera.fx_px == 50
-    assert entry.files.depth_units_per_m == 1000
+    source = open_source(tiny_tum_log(2), SourceConfig(camera=camera))
+    assert source[0].camera.fx_px == 50
+    assert source.entry_at(0).files.depth_units_per_m == 1000
 
 
 def test_a_known_camera_of_another_size_is_refused(tiny_tum_log):

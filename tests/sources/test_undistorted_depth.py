@@ -16,7 +16,7 @@ from mapper.sources.writers import write_log
 from tests.support.bent_depth import bent_log, images, smooth_error
 from tests.support.logs import CountedReads, MemoryEntry, log_in_memory
 
-ON = SourceConfig(undistort_depth=True)
+ON, OFF = SourceConfig(), SourceConfig(undistort_depth=False)
 ERROR_PER_M = smooth_error()
 
 
@@ -36,8 +36,8 @@ def test_frames_are_corrected_by_what_the_log_shows(bent):
 
 
 def test_frames_stay_as_they_are_without_the_setting(bent):
-    assert selected(bent, SourceConfig())[3].depth_m is bent[3].depth_m
-    assert selected(bent, SourceConfig()).removed_distortion is None
+    assert selected(bent, OFF)[3].depth_m is bent[3].depth_m
+    assert selected(bent, OFF).removed_distortion is None
 
 
 def test_it_is_measured_once_whichever_thread_is_first(bent):
@@ -87,6 +87,16 @@ def test_a_log_without_readable_frames_has_none():
 def test_logs_of_any_format_are_corrected(bent, tmp_path, kind):
     path = tmp_path / ("log.mcap" if kind == "mcap" else "log")
     write_log(bent, path, kind=kind)
-    recorded, log = open_source(path), open_source(path, ON)
+    recorded, log = open_source(path, OFF), open_source(path, ON)
     expected_m = distortion_of(recorded).corrected(recorded[3].depth_m)
     np.testing.assert_array_equal(log[3].depth_m, expected_m)
+
+
+@pytest.mark.parametrize(("name", "kind"), [("log", "tum"), ("log.bag", "bag")])
+def test_a_log_written_anew_has_the_depth_that_was_recorded(bent, tmp_path, name, kind):
+    write_log(bent, tmp_path / "log.mcap", kind="mcap")
+    source = open_source(tmp_path / "log.mcap", ON)
+    assert write_log(source, tmp_path / name, kind=kind) == []
+    written = open_source(tmp_path / name, OFF)
+    assert np.abs(source[3].depth_m - bent[3].depth_m).max() > 0.05
+    np.testing.assert_allclose(written[3].depth_m, bent[3].depth_m, atol=2e-4)
