@@ -11,6 +11,7 @@ from statistics import median
 from typing import Any
 
 from mapper.cli.answer import Answer, rows_text
+from mapper.evaluators.metrics.evaluate import CLOCK_OFFSET
 from mapper.evaluators.metrics.metric import Metric
 from mapper.loops.closure import LoopClosure, accepted_loops
 from mapper.run.folder import Run
@@ -143,6 +144,10 @@ def _accuracy_text(metrics: Sequence[Metric]) -> str:
     text = f"{found[_ATE].name} {_value_text(found[_ATE])}"
     if _RPE_M in found and _RPE_RAD in found:
         text += f"; from frame to frame {_value_text(found[_RPE_M])} and {_value_text(found[_RPE_RAD])}"
+    if offset := [metric for metric in metrics if metric.name.startswith(CLOCK_OFFSET)]:
+        late_s, rmse_m = (metric.value for metric in offset)
+        how = "late" if late_s > 0.0 else "early"
+        text += f"; the truth's stamps seem {abs(late_s):.3f} s {how}, without which ATE is {rmse_m:.4f} m"
     return text
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from mapper.core.paths import AnyPath
 from mapper.core.timebase import Stamps
 from mapper.core.trajectory import Trajectory
+from mapper.evaluators.metrics.clock_offset import clock_offset
 from mapper.evaluators.metrics.coverage import frame_coverage, time_coverage
 from mapper.evaluators.metrics.inputs import Estimate, estimate_and_truth
 from mapper.evaluators.metrics.metric import Metric, shown, text_table
@@ -31,6 +32,7 @@ ALIGNED = {
     "se3": "SE(3)-aligned",
     "sim3": "Sim(3)-aligned",
 }
+CLOCK_OFFSET = "clock offset of the truth"
 _CLOCK_NS = 1_000_000
 
 
@@ -178,6 +180,7 @@ def assess(
     metrics = [
         *_against_truth(aligned, alignment),
         *_alignment_metrics(matched, similarity, alignment),
+        *_clock_metrics(estimate, truth, alignment),
         *segment_metrics(lengths),
         *own,
     ]
@@ -207,6 +210,19 @@ def _alignment_metrics(matched: Matched, similarity: Similarity, alignment: Alig
         cosine = np.clip(align(matched, "se3").T_truth_map[2, 2], -1.0, 1.0)
         return [Metric("tilt that SE(3) would add", float(np.arccos(cosine)), "rad")]
     return []
+
+
+def _clock_metrics(estimate: Trajectory, truth: Trajectory, alignment: AlignmentKind) -> list[Metric]:
+    """Return the clock offset that explains most of the position error, if there is one."""
+    if not (have_clock(estimate.stamps_ns) and have_clock(truth.stamps_ns)):
+        return []
+    found = clock_offset(estimate, truth, alignment)
+    if found is None:
+        return []
+    return [
+        Metric(CLOCK_OFFSET, found.offset_s, "s"),
+        Metric(f"{CLOCK_OFFSET}: ATE RMSE without it", found.rmse_m, "m"),
+    ]
 
 
 def have_clock(stamps_ns: Stamps) -> bool:
