@@ -84,7 +84,8 @@ def choose(
     colors = pick.candidates("color", config.color, IMAGES, where=lambda name: name not in depths)
     depth_images = pick.candidates("depth", config.depth, IMAGES, where=depths.__contains__)
     color, depth = _of_one_camera(colors, depth_images, firsts)
-    points = pick.one("points", config.points, CLOUDS, _cloud_rank, where=lambda name: len(series[name]) > 1)
+    clouds = pick.candidates("points", config.points, CLOUDS, where=lambda name: len(series[name]) > 1)
+    points = _best(clouds, _cloud_rank)
     imu = pick.one("imu", config.imu, IMUS, _plain_rank, where=lambda name: _feels_gravity(firsts.get(name)))
     truth = pick.one("truth", config.truth, POSES, _plain_rank, where=lambda name: name == TRUTH)
     wheels = pick.one("wheels", config.wheels, POSES, _plain_rank, where=lambda name: name == WHEELS)
@@ -106,6 +107,8 @@ def choose(
     elif points is not None:
         frames = points
         notes = [_choice_note(f"point clouds {points.topic.name}", config.points, "points")]
+        if others := sorted(one.topic.name for one in clouds if one is not points):
+            notes.append(f"point clouds of other topics are not used: {', '.join(others)}")
     else:
         raise SourceError(f"{path}: nothing to map: {_what_there_is(color, depth, series.values())}")
     if wheels is not None:
@@ -138,11 +141,7 @@ class _Picker:
         where: Callable[[str], bool],
     ) -> Series | None:
         """Return the topic that is wanted, else the one of the lowest rank, else None."""
-        return min(
-            self.candidates(role, wanted, types, where=where),
-            key=lambda one: (*rank(one.topic.name), -len(one), one.topic.name),
-            default=None,
-        )
+        return _best(self.candidates(role, wanted, types, where=where), rank)
 
     def candidates(
         self, role: str, wanted: str | None, types: Collection[str], *, where: Callable[[str], bool]
@@ -187,10 +186,12 @@ def _of_one_camera(
 
     if colors and depths:
         return min(product(colors, depths), key=rank)
-    color = min(
-        colors, key=lambda one: (_color_rank(one.topic.name), -len(one), one.topic.name), default=None
-    )
-    return color, min(depths, key=lambda one: one.topic.name, default=None)
+    return _best(colors, _color_rank), min(depths, key=lambda one: one.topic.name, default=None)
+
+
+def _best(topics: Sequence[Series], rank: Callable[[str], tuple[int, ...]]) -> Series | None:
+    """Return the topic of the lowest rank, of equal ones that of the most messages; None of none."""
+    return min(topics, key=lambda one: (*rank(one.topic.name), -len(one), one.topic.name), default=None)
 
 
 def _shared_namespaces(name: str, other: str) -> int:

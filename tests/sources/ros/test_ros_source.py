@@ -89,6 +89,17 @@ def test_images_go_before_clouds_unless_clouds_are_asked_for(tmp_path):
     assert source.notes == ["point clouds /velodyne_points"]
 
 
+def test_clouds_of_a_second_lidar_are_said_to_be_left_out(tmp_path):
+    messages = [cloud(t, topic) for t in stamps(4) for topic in ("/rear/points", "/front/points")]
+    source = opened(tmp_path / "a.mcap", messages)
+    assert source.notes == [
+        "point clouds /front/points; choose others with source.topics.points=…",
+        "point clouds of other topics are not used: /rear/points",
+    ]
+    chosen = open_source(tmp_path / "a.mcap", SourceConfig(topics=TopicsConfig(points="/rear/points")))
+    assert chosen.notes == ["point clouds /rear/points"]
+
+
 def test_the_likeliest_of_several_topics_is_taken_and_another_can_be_chosen(tmp_path):
     messages = []
     for i, t in enumerate(stamps(3)):
