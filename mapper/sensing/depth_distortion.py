@@ -24,7 +24,7 @@ _MIN_PLANE_SHARE = 0.12
 _MAX_PLANES = 3
 _REFITS = 3
 
-_WAVES = (5, 7)
+_ORDERS = (5, 7)
 """Half periods down and across the image of the finest cosines."""
 _PRIOR_PER_M = 0.004
 _SIGMA_PER_M, _ROBUST_PER_M = 0.011, 0.012
@@ -38,8 +38,8 @@ _MIN_CORRELATION = 0.8
 _MIN_RMS_PER_M = 0.0015
 """Sensors without distortion give up to 0.0008, by surfaces that are not quite plane; others 0.0027 on."""
 
-_Evidence = tuple[Array, Array]
-"""Normal matrix and right side of the least squares that determine the cosines' factors."""
+_NormalEquations = tuple[Array, Array]
+"""(D, D) normal matrix and (D,) right side of the least squares for the D coefficients of the cosines."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -90,27 +90,27 @@ def measure_distortion(images_m: Iterable[DepthImage], rays: NDArray[np.floating
     """
     side = max(rays.shape[1] // _COLUMNS, 1)
     directions = _homogeneous(_samples(rays, side).mean(axis=2))
-    down, across = _waves(rays.shape[:2], side)
+    down, across = _cosine_bases(rays.shape[:2], side)
     cosines = (down[:, None, :, None] * across[None, :, None, :]).reshape(*directions.shape[:2], -1)
     generator = np.random.default_rng(0)
     seen: list[Array] = []
-    evidence: list[_Evidence] = []
+    equations: list[_NormalEquations] = []
     for depth_m in images_m:
         inverse = _cells(depth_m, side)
         known = inverse > 0.0
         if known.mean() < _MIN_KNOWN:
             continue
-        found = _evidence(inverse[known], directions[known], cosines[known], generator)
+        found = _normal_equations(inverse[known], directions[known], cosines[known], generator)
         if found is not None:
             seen.append(inverse)
-            evidence.append(found)
-    if len(evidence) < _MIN_FRAMES:
+            equations.append(found)
+    if len(equations) < _MIN_FRAMES:
         return None
     inverses = np.array(seen)
     if _variation(inverses) < _MIN_VARIATION:
         return None
-    half = len(evidence) // 2
-    parts = [_factors(part) for part in (evidence, evidence[:half], evidence[half:])]
+    half = len(equations) // 2
+    parts = [_coefficients(part) for part in (equations, equations[:half], equations[half:])]
     planes = [_fitted(directions.reshape(-1, 3), (cosines @ part).ravel()) for part in parts]
     errors = [
         (cosines @ part - directions @ plane).ravel() for part, plane in zip(parts, planes, strict=True)
@@ -118,7 +118,7 @@ def measure_distortion(images_m: Iterable[DepthImage], rays: NDArray[np.floating
     rms_per_m = float(np.sqrt((errors[0] ** 2).mean()))
     if rms_per_m < _MIN_RMS_PER_M or not np.corrcoef(errors[1], errors[2])[0, 1] >= _MIN_CORRELATION:
         return None
-    down, across = _waves(rays.shape[:2], 1)
+    down, across = _cosine_bases(rays.shape[:2], 1)
     error_per_m = down @ parts[0].reshape(down.shape[1], -1) @ across.T - _homogeneous(rays) @ planes[0]
     median_depth_m = float(1.0 / np.median(inverses[inverses > 0.0]))
     return DepthDistortion(error_per_m.astype(np.float32), rms_per_m, median_depth_m)
@@ -149,19 +149,19 @@ def _cells(depth_m: DepthImage, side: int) -> Array:
     return np.where(known, inverse.sum(axis=2) / np.maximum(count, 1), 0.0)
 
 
-def _waves(shape: tuple[int, ...], side: int) -> tuple[Array, Array]:
+def _cosine_bases(shape: tuple[int, ...], side: int) -> tuple[Array, Array]:
     """Return (R, D) cosines down and (C, A) cosines across an image at the middles of its cells."""
     down, across = (
-        np.cos(np.pi * np.outer((np.arange(length // side) + 0.5) * side / length, np.arange(waves + 1)))
-        for length, waves in zip(shape, _WAVES, strict=True)
+        np.cos(np.pi * np.outer((np.arange(length // side) + 0.5) * side / length, np.arange(order + 1)))
+        for length, order in zip(shape, _ORDERS, strict=True)
     )
     return down, across
 
 
-def _evidence(
+def _normal_equations(
     inverse: Array, directions: Array, cosines: Array, generator: np.random.Generator
-) -> _Evidence | None:
-    """Return what the planes of (N,) cells of one image tell about the factors; None if there are none."""
+) -> _NormalEquations | None:
+    """Return the normal equations of the planes of (N,) cells of one image; None if there are no planes."""
     normal, side, count = np.zeros((cosines.shape[1],) * 2), np.zeros(cosines.shape[1]), 0
     for cells in _planes(inverse, directions, generator):
         basis, _ = np.linalg.qr(directions[cells])
@@ -198,10 +198,10 @@ def _planes(inverse: Array, directions: Array, generator: np.random.Generator) -
         left = np.setdiff1d(left, cells, assume_unique=True)
 
 
-def _factors(evidence: Sequence[_Evidence]) -> Array:
-    """Return the cosines' factors, 1/m, with a prior of 0."""
-    normal = sum((normal for normal, _ in evidence), np.eye(len(evidence[0][1])) / _PRIOR_PER_M**2)
-    sides = np.sum([side for _, side in evidence], axis=0)
+def _coefficients(equations: Sequence[_NormalEquations]) -> Array:
+    """Return the (D,) coefficients of the cosines, 1/m, with a prior of 0."""
+    normal = sum((normal for normal, _ in equations), np.eye(len(equations[0][1])) / _PRIOR_PER_M**2)
+    sides = np.sum([side for _, side in equations], axis=0)
     return np.asarray(np.linalg.solve(normal, sides), dtype=np.float64)
 
 
