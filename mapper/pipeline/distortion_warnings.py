@@ -21,17 +21,17 @@ def _warning(log: Log, *, of: str) -> RunWarning | None:
     distortion = log.removed_distortion() if log.removed_distortion else distortion_of(log)
     if distortion is None:
         return None
-    size = f"{distortion.rms_m * 100:.1f} cm (rms) at {distortion.median_depth_m:.1f} m"
     if removed:
         return RunWarning(
             kind="camera",
-            sentence=f"{of}depth images were bent, all in the same way; the error of {size} is removed",
+            sentence=f"{of}depth images were bent, all in the same way; the error of {distortion.text} is "
+            "removed",
         )
     share = distortion.rms_m / distortion.median_depth_m
     return RunWarning(
         kind="camera",
-        sentence=f"{of}depth images are bent, all in the same way: planes are off by {size}, {share:.1%} of "
-        f"the median depth (a doubt from {_DOUBTFUL_SHARE:.1%} on)",
+        sentence=f"{of}depth images are bent, all in the same way: planes are off by {distortion.text}, "
+        f"{share:.1%} of the median depth (a doubt from {_DOUBTFUL_SHARE:.1%} on)",
         suggestion="--set source.undistort_depth=true",
         weight="doubt" if share >= _DOUBTFUL_SHARE else "note",
     )

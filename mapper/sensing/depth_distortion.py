@@ -64,6 +64,11 @@ class DepthDistortion:
         """Root mean square of the error of a depth at the median depth."""
         return self.rms_per_m * self.median_depth_m**2
 
+    @property
+    def text(self) -> str:
+        """Its size in words."""
+        return f"{self.rms_m * 100:.1f} cm (rms) at {self.median_depth_m:.1f} m"
+
     def corrected(self, depth_m: DepthImage) -> DepthImage:
         """Return (H, W) depths without the distortion, metres; 0 stays 0, no measurement."""
         scale = 1.0 - depth_m * self.error_per_m

@@ -11,6 +11,7 @@ from mapper.sources import open_source
 from mapper.sources.chained import chained, sessions_of
 from mapper.sources.config import BodyConfig, SourceConfig
 from mapper.sources.depth_distortion import distortion_of
+from mapper.sources.inspection import inspect_log
 from mapper.sources.selection import selected
 from mapper.sources.writers import write_log
 from tests.support.bent_depth import bent_log, images, smooth_error
@@ -70,6 +71,13 @@ def test_logs_of_a_chain_are_corrected_each_by_its_own(bent):
     first, second = (session.log.removed_distortion() for session in sessions_of(both))
     assert first is not None
     assert second is None
+
+
+def test_an_inspection_tells_how_large_it_is(bent, tmp_path):
+    write_log(bent, tmp_path / "log.mcap", kind="mcap")
+    (note,) = [note for note in inspect_log(tmp_path / "log.mcap", ON).log.notes if "bent" in note]
+    assert note.startswith("depth images are bent, all in the same way, by ")
+    assert "bent" not in " ".join(inspect_log(tmp_path / "log.mcap", OFF).log.notes)
 
 
 def test_scans_have_no_depth_images():
