@@ -88,7 +88,7 @@ class Row:
         silent_at_s: When they begin.
         worst_silent_m: Largest error of their translations.
         loops: Accepted loops.
-        false_loops: Those of them that are wrong.
+        false_loops: Number of these that are wrong.
         seconds: Wall time of tracking and solving.
         refused: Why no path was made; empty if one was.
     """

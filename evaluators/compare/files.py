@@ -52,7 +52,7 @@ def compare_into(
     Args:
         out: Folder to create; until it is whole it is called ``OUT.partial``.
         source: The log.
-        config: Which methods, and how they are compared.
+        config: Methods, and how they are compared.
         overwrite: Replace a folder that is there, once the new one is whole.
         progress: As for ``compare``.
 

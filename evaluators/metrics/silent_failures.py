@@ -22,14 +22,14 @@ class DoubtCheck:
     """Comparison of the frames that a run calls doubtful or lost with those that are wrong.
 
     Attributes:
-        windows: Pairs of placed frames a window apart that the truth covers, one from each frame on.
-        wrong: Windows whose relative pose is wrong, flagged or not.
-        silent: Wrong windows of which no frame is doubtful, lost or skipped.
-        silent_at_s: When the first frame of each silent window was taken, seconds after the log's first.
+        windows: Number of pairs of placed frames a window apart that the truth covers, one for each frame.
+        wrong: Number of windows whose relative pose is wrong, flagged or not.
+        silent: Number of wrong windows of which no frame is doubtful, lost or skipped.
+        silent_at_s: Time of the first frame of each silent window, seconds after the log's first.
         worst_m: Largest error of the translation over silent windows; 0 if there are none.
         worst_rad: Largest error of the rotation over them.
-        right: Placed frames that are right.
-        flagged_right: Those of them that are doubtful.
+        right: Number of placed frames that are right.
+        flagged_right: Number of these that are doubtful.
     """
 
     windows: int

@@ -25,7 +25,7 @@ CONFIGS = Path(__file__).with_name("configs")
 
 
 class Place(NamedTuple):
-    """Where a figure stands in a paper."""
+    """Place of a figure in a paper."""
 
     table: str
     row: str
@@ -52,7 +52,7 @@ class Measurement(Hashable, Protocol):
 
     @property
     def places(self) -> Sequence[Place]:
-        """Which figures it gives."""
+        """Places of the figures that it gives."""
         ...
 
     def configs(self) -> Mapping[str, BuildConfig]:

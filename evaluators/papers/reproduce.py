@@ -34,9 +34,9 @@ class Request:
         paper: The paper.
         logs: Folder in which to look for its logs.
         given: Logs of other names, by the paper's names.
-        tables: Which, e.g. "5.1"; empty is all.
+        tables: Names of the tables, e.g. "5.1"; empty is all.
         seeds: Number of draws of all that is random.
-        cut: Which frames are used.
+        cut: Frames that are used.
     """
 
     paper: PaperName

@@ -47,8 +47,8 @@ class Ablation:
         table: Without what we measure; the thesis's figures of its own logs are in it.
         printed: The thesis's figures of logs that may be at hand.
         sequences: And how many of their first frames are used; None is all.
-        settings: By what they are called in the table.
-        places: Where figures belong.
+        settings: Settings by their names in the table.
+        places: Places of the figures.
         measure: How they are worked out.
         alone: It shares too little work with the others to be measured with them.
     """

@@ -88,7 +88,7 @@ def draw_path(
     """Draw a path over the truth, from the side on which that is widest, coloured by its error.
 
     Args:
-        axes: Where.
+        axes: Axes to draw on.
         matched: The path, aligned with the truth.
         errors_m: (N,) distances from the truth.
         most_m: Error of the strongest colour; None is the largest.

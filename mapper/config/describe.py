@@ -93,7 +93,7 @@ def settings(sensor: Sensor = "rgbd") -> Iterator[Setting]:
     """Yield the description of every setting of ``mapper build``, tables before what they hold.
 
     Args:
-        sensor: Whose defaults are meant.
+        sensor: Sensor whose defaults are shown.
     """
     yield from settings_of(load_config(sensor=sensor))
 

@@ -59,7 +59,7 @@ def write_summary(
         path: PNG file to write.
         grid: The slice, world frame.
         trajectory: The estimate, world frame.
-        truth: Where the body really was, already aligned to the world frame, or None.
+        truth: True path of the body, already aligned to the world frame, or None.
         loops_world: (L, 2, 3) ends of the loop closures, metres, world frame.
         title: Headline.
         lines: Figures worth knowing, shown below the headline.
@@ -161,7 +161,7 @@ def write_localised(
     Args:
         path: PNG file to write.
         grid: The map's slice.
-        poses: Of the frames that were placed, in the map's frame; at least one.
+        poses: Poses of the frames that were placed, in the map's frame; at least one.
         begins_ns: Stamps from which the path is drawn anew: what lies before each is not connected to it.
         recognised_world: (K, 3) where the map was recognised, metres.
         title: Headline.
@@ -194,7 +194,7 @@ def write_path(
         path: PNG file to write.
         grid: Background of the path, world frame.
         waypoints_world: (N, 2) or (N, 3) metres, seen from above.
-        radius_m: Of the robot.
+        radius_m: Radius of the robot.
         title: Headline.
         lines: Figures worth knowing, shown below the headline.
     """
@@ -311,7 +311,7 @@ def write_graph_views(path: Path, graph: PoseGraph, solution: Solution, *, title
     Args:
         path: PNG file to write.
         graph: Nodes at their first estimates.
-        solution: Of that graph; factors that weigh less than half are drawn dotted.
+        solution: Solution of that graph; factors that weigh less than half are drawn dotted.
         title: Headline.
     """
     from matplotlib.collections import LineCollection

@@ -28,7 +28,7 @@ class SolvedGraph:
     Attributes:
         path: The file that the graph came from.
         graph: Nodes at their first estimates.
-        solution: Of that graph.
+        solution: Solution of that graph.
         config: What it was solved with.
         seconds: What reading and solving took, by name.
     """

@@ -16,7 +16,7 @@ _HUBER = Kernel("huber", GraphConfig().robust_width)
 
 
 _LARGEST_RATIO = 1e16
-"""Of information that double precision can still add up."""
+"""Largest ratio of information that double precision can still add up."""
 
 
 class IncrementalSolver:

@@ -67,8 +67,9 @@ def edges(red: Response, *, sigma_px: float, threshold: int) -> Response:
 
     Args:
         red: (H, W) red channel.
-        sigma_px: Of the Gaussian; about that of the stripe's own profile.
-        threshold: Of OpenCV's 5 × 5 mask, as a byte holds it: 150 is a stripe of some 20 levels.
+        sigma_px: Standard deviation of the Gaussian; about that of the stripe's own profile.
+        threshold: Least response of OpenCV's 5 × 5 mask, as a byte holds it: 150 is a stripe of some 20
+            levels.
     """
     smooth = cv2.GaussianBlur(red.astype(np.float32), (0, 0), sigma_px)
     return _at_least(cv2.convertScaleAbs(cv2.Laplacian(smooth, cv2.CV_32F, ksize=_LOG_APERTURE)), threshold)

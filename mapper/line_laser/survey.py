@@ -26,7 +26,7 @@ class Drive:
     """Scans with their poses by wheel odometry.
 
     Attributes:
-        scans: Those whose place is known.
+        scans: Scans whose pose is known.
         trajectory: T_world_sensor of each.
         grid: The map.
         notes: What was left out.
@@ -113,7 +113,7 @@ def drive(
     Args:
         scans: In time order.
         T_world_sensor: Sensor poses by wheel odometry.
-        config: Of the map.
+        config: Settings of the map.
         progress: Receives the count of scans.
 
     Raises:

@@ -88,7 +88,7 @@ class MapConstraintDetector(Generic[Place]):
 
         Args:
             config: Settings.
-            known: Of the finished map.
+            known: Places of the finished map.
             verifier: Compares two places.
             similar: Empty; proposes similar places.
             nearby_for: Returns an empty proposer of the places near an estimate.

@@ -65,8 +65,8 @@ class Merged:
 
     Attributes:
         map: The merged map.
-        costs: Of the jobs of its stages: "split", one for each run, "join", one for each tile, and "slice",
-            one for each column of tiles; in no order.
+        costs: Costs of the jobs of each stage, in no order: "split" has a job for each run, "join" one for
+            each tile, "slice" one for each column of tiles.
         shuffle_bytes: Size of the files between the first two stages.
     """
 

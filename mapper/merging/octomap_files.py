@@ -24,7 +24,7 @@ def write_whole_ot(path: Path, workspace: Workspace, tiles: Tiles, *, has_colors
 
     Args:
         path: File to write.
-        workspace: With the tiles' pieces.
+        workspace: Files of the merge, with the tiles' pieces.
         tiles: Increasing.
         has_colors: Whether the map has any.
     """

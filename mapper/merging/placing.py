@@ -31,7 +31,7 @@ class InMap:
     """A run as it lies in a merged map that exists already.
 
     Attributes:
-        folder: Of its files in that map.
+        folder: Folder of its files in that map.
         trajectory_map: As of ``Placed``: its voxels lie within half a voxel of it.
         moved_m: As of ``Placed``, when it was merged.
         fused_again: Whether it was fused again then.

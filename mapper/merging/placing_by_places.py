@@ -45,7 +45,7 @@ class SolvedWorlds:
     """Runs placed by the places that they share; runs are known by their numbers.
 
     Attributes:
-        worlds: Of run 0 and of the runs tied to it.
+        worlds: Poses of run 0 and of the runs tied to it, by number.
         refused: A reason for every run that shares places and is not tied to another by them.
         contradicting: Pairs of runs whose shared places were not used, as stronger ones contradict them.
         used: The shared places by which they lie there, those of a pair together.
@@ -65,7 +65,7 @@ def solve_worlds(shared: Sequence[SharedPlace], gate: GateConfig) -> SolvedWorld
     solved together, each as a rigid body, by least squares over their places. Run 0 is held.
 
     Args:
-        shared: As measured; some may be false.
+        shared: Shared places as measured; some may be false.
         gate: How far two places may disagree, by the distance between them: the drift within a run.
     """
     pairs = defaultdict[tuple[int, int], list[SharedPlace]](list)

@@ -21,7 +21,7 @@ class Cost(NamedTuple):
 
     Attributes:
         seconds: Wall time.
-        peak_memory_mb: Of its process, since that began.
+        peak_memory_mb: Peak memory of its process, since that began.
     """
 
     seconds: float
@@ -34,9 +34,9 @@ class Stages:
 
     Attributes:
         runner: Keeps their results, so that a merge that was stopped goes on where it was.
-        executor: Where they run.
+        executor: Executor of the jobs.
         progress: Receives how many are done.
-        costs: Of the jobs of every stage so far, in no order.
+        costs: Costs of the jobs of every stage so far, in no order.
     """
 
     runner: JobRunner
@@ -51,8 +51,8 @@ class Stages:
 
         Args:
             stage: What the jobs are called together.
-            work: By name, which is what a job is known by when the merge is started again.
-            kind: Of the results.
+            work: Functions by job name; a merge that is started again recognises its jobs by these names.
+            kind: Type of the results.
 
         Raises:
             RunError: A job failed twice; the others were done.

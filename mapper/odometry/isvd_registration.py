@@ -86,7 +86,7 @@ class PairRegistration:
         """Set the method.
 
         Args:
-            config: Of ISVD.
+            config: Settings of ISVD.
             by_pixels: Refine ISVD's motion by the pixels, which is also a second test of it.
         """
         self._config = config

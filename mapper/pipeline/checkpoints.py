@@ -61,7 +61,7 @@ class Checkpoints:
         """Begin, or go on with what is in the folder.
 
         Args:
-            writer: Of the run.
+            writer: Writer of the run.
             identity: What decides the result.
             progress: Receives notes.
             every_s: Seconds between two checkpoints, at least; 0 keeps one of every frame, and waits for it.
@@ -147,8 +147,8 @@ class Checkpoints:
         """Copy a result, or a state on the way to it; return the function that writes it and its journal.
 
         Args:
-            states: Where to write it.
-            number: Of its version.
+            states: File of the state.
+            number: Number of its version.
             result: The result.
             fixed: Parts of it that are not written, by name.
         """

@@ -42,7 +42,7 @@ def without_jumps(
     out.
 
     Args:
-        tracking: With constraints from the map's node.
+        tracking: Tracking result with constraints from the map's node.
         map_node: That node.
         gate: Drift that the odometry may have.
         progress: Receives a note on each cut.

@@ -99,8 +99,8 @@ class Start:
 
     Attributes:
         odometry: Before its first frame.
-        detector: With the places of earlier sessions.
-        graph: Of earlier sessions, without loops.
+        detector: Loop detector with the places of earlier sessions.
+        graph: Graph of earlier sessions, without loops.
         loops: The candidates of earlier sessions.
         searches: The detector's verifier, if its searches can be repeated; None if there are none.
     """

@@ -17,7 +17,7 @@ class MapFolder(Protocol):
 
     @property
     def path(self) -> Path:
-        """Its folder."""
+        """Folder of the run or map."""
         ...
 
     @property

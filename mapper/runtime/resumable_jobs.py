@@ -69,7 +69,7 @@ class JobRunner:
     next time.
 
     Attributes:
-        folder: Where the results are; a Dask cluster's workers must see it as well.
+        folder: Folder of the results; a Dask cluster's workers must see it as well.
         progress: Receives notes of damaged files.
     """
 
@@ -84,8 +84,8 @@ class JobRunner:
         """Yield the result of every job as it finishes, in any order.
 
         Args:
-            jobs: With different keys.
-            executor: Where they run.
+            jobs: Jobs with different keys.
+            executor: Executor that runs them.
             attempts: How often a job is begun before it has failed.
         """
         folder = self.folder.resolve()

@@ -64,7 +64,7 @@ class Place:
     """Images of one kind in a folder.
 
     Attributes:
-        name: Of the folder.
+        name: Name of the folder.
         numbered: Path and microseconds of the images whose names have one number, by that number.
         images: All images, whatever their names.
     """

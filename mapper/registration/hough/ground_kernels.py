@@ -45,7 +45,7 @@ def score_planes(points, triples, min_cosine, low_m, high_m, tolerance_m, below_
         low_m: Least height of the origin above the plane, d.
         high_m: Largest.
         tolerance_m: Largest distance of an inlier.
-        below_weight: Of a point more than twice as far below.
+        below_weight: Weight of a point more than twice as far below.
     """
     best = np.zeros(4)
     best_score = -1.0

@@ -69,7 +69,7 @@ def hill_climb(volume, points, heights, motion, voxel_m, low_m, step_m, step_rad
         volume: As for ``overlap_of``, as are the points, the heights, the motion and the lengths.
         points: See there.
         heights: See there.
-        motion: Where the search begins.
+        motion: Motion at which the search begins.
         voxel_m: See there.
         low_m: See there.
         step_m: First step along x and y.

@@ -17,7 +17,7 @@ class SerializedMessage(NamedTuple):
 
     Attributes:
         stamp_ns: Time of the message.
-        topic: Where it is published.
+        topic: Topic on which it is published.
         type: E.g. "sensor_msgs/msg/Image".
         cdr: The message as CDR, little-endian.
     """
