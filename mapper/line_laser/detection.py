@@ -32,7 +32,7 @@ def hue(image: Image, *, from_deg: float, to_deg: float, saturation: int) -> Res
         image: (H, W, 3) RGB.
         from_deg: First of the hues, 0 to 360°.
         to_deg: Last of them; less than the first if they pass through 0.
-        saturation: Less is grey.
+        saturation: Least saturation; pixels with less are grey.
     """
     hues, saturations, values = cv2.split(cv2.cvtColor(image, cv2.COLOR_RGB2HSV))
     degrees = 2.0 * hues
@@ -47,7 +47,7 @@ def intensity(red: Response, *, threshold: int) -> Response:
 
     Args:
         red: (H, W) red channel: light of the laser is red whatever it falls on (§2.5.2).
-        threshold: k.
+        threshold: Least brightness, k.
     """
     return _at_least(red, threshold)
 
@@ -57,7 +57,7 @@ def weight(image: Image, *, threshold: int) -> Response:
 
     Args:
         image: (H, W, 3) RGB.
-        threshold: Less is not red.
+        threshold: Least redness.
     """
     return _at_least(cv2.transform(image, _TWO_RED), threshold)
 

@@ -111,7 +111,7 @@ def drive(
     """Return the map of scans at their poses by wheel odometry.
 
     Args:
-        scans: In time order.
+        scans: Scans in time order.
         T_world_sensor: Sensor poses by wheel odometry.
         config: Settings of the map.
         progress: Receives the count of scans.

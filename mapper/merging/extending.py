@@ -127,7 +127,7 @@ def known_tiles(
         known: The earlier map.
         placed: The runs of the map that is to be made, those of the earlier one first, from ``kept_in``.
         manifest: Manifest of the new map.
-        tiling: How that is cut.
+        tiling: Tiling of the new map.
     """
     before = known.manifest
     kept = {number for number, item in enumerate(placed) if item.kept is not None}

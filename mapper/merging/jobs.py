@@ -54,8 +54,8 @@ class Workspace:
     Attributes:
         folder: The map that is being made.
         scratch: Folder that is removed at the end.
-        tiling: How the map is cut.
-        config: The map's.
+        tiling: Tiling of the map.
+        config: Settings of the map's octree.
     """
 
     folder: Path

@@ -25,8 +25,8 @@ def write_whole_ot(path: Path, workspace: Workspace, tiles: Tiles, *, has_colors
     Args:
         path: File to write.
         workspace: Files of the merge, with the tiles' pieces.
-        tiles: Increasing.
-        has_colors: Whether the map has any.
+        tiles: Results of the tiles, in Morton order.
+        has_colors: Whether the map has colours.
     """
     ordered = list(tiles)
     upper = _upper(workspace, tiles, [joined.top for joined in tiles.values()])

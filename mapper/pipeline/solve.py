@@ -38,7 +38,7 @@ def solve(graph: PoseGraph, loops: Sequence[LoopClosure], config: GraphConfig) -
 
     Args:
         graph: Graph with a factor for each accepted loop, after all the others and in the loops' order.
-        loops: Every candidate.
+        loops: All loop candidates.
         config: Settings of the solver.
 
     Raises:

@@ -54,7 +54,7 @@ class TrackingState:
     """State of tracking between two frames.
 
     Attributes:
-        odometry: After the last frame.
+        odometry: Odometry after the last frame.
         frames: All frames so far.
     """
 
