@@ -20,7 +20,7 @@ from mapper.odometry.config import IsvdOdometryConfig, MatchConfig
 from mapper.odometry.isvd_odometry import IsvdOdometry
 from mapper.odometry.isvd_registration import IsvdObservation, PairRegistration, RegisterPair, matched_pairs
 from mapper.pipeline.solve import solve
-from mapper.pipeline.track import TrackingResult, refuse_a_fragment
+from mapper.pipeline.tracking_result import TrackingResult, refuse_a_fragment
 from mapper.registration.base import Alignment
 from mapper.sources.base import Log
 

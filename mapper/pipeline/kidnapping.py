@@ -13,7 +13,7 @@ from mapper.loops.closure import discrepancy, exceeds
 from mapper.loops.config import GateConfig
 from mapper.loops.odometry_chain import NodePath, allowed
 from mapper.pipeline.components import disconnected
-from mapper.pipeline.track import TrackingResult
+from mapper.pipeline.tracking_result import TrackingResult
 from mapper.runtime.progress import Progress
 
 _WINDOW, _LEAST = 5, 3

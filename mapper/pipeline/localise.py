@@ -28,14 +28,8 @@ from mapper.pipeline.components import component_of
 from mapper.pipeline.kidnapping import without_jumps
 from mapper.pipeline.known_map import KnownMap, detector_of, loops_between_days
 from mapper.pipeline.solve import solve
-from mapper.pipeline.track import (
-    Start,
-    TrackingResult,
-    depth_cautions,
-    from_tracking,
-    track_log,
-    wheel_measurements,
-)
+from mapper.pipeline.track import Start, depth_cautions, track_log, wheel_measurements
+from mapper.pipeline.tracking_result import TrackingResult, from_tracking
 from mapper.run import files
 from mapper.run.localised import LocalisedManifest, find_stretches
 from mapper.run.pose_covariances import uncertain_poses, write_poses

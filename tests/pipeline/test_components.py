@@ -10,7 +10,7 @@ from mapper.graph.model import BetweenFactor, PoseGraph, PoseSigmas
 from mapper.loops.closure import LoopClosure
 from mapper.pipeline.components import DISCONNECTED, largest_component
 from mapper.pipeline.solve import solve
-from mapper.pipeline.track import TrackingResult
+from mapper.pipeline.tracking_result import TrackingResult
 from mapper.runtime.progress import SILENT
 from tests.support.feature_room import track
 

@@ -9,7 +9,7 @@ from mapper.graph.model import BetweenFactor, PoseGraph, PoseSigmas
 from mapper.loops.closure import LoopClosure
 from mapper.loops.config import GateConfig
 from mapper.pipeline.kidnapping import without_jumps
-from mapper.pipeline.track import TrackingResult
+from mapper.pipeline.tracking_result import TrackingResult
 from mapper.run.frame_outcomes import DISCONNECTED
 from mapper.runtime.progress import SILENT
 from tests.support.feature_room import track
