@@ -234,7 +234,7 @@ def detected_shell() -> str:
         name = Path(os.environ.get("SHELL", "")).name
     if name not in SCRIPTS:
         raise ConfigError(
-            f"shell {name or '(none)'}: no completion for it; tell one: --shell bash, zsh or fish"
+            f"shell {name or '(none)'}: no completion for it; choose one with --shell bash, zsh or fish"
         )
     return name
 

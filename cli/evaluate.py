@@ -185,13 +185,15 @@ def _path_errors(
     from mapper.evaluators.metrics.evaluate import assess
 
     if lengths is not None and truth is None:
-        raise DataError(f"--lengths {lengths}: relative errors need a truth; tell one with --truth")
+        raise DataError(f"--lengths {lengths}: relative errors need a truth; give one with --truth")
     lengths_m = None if lengths is None else _numbers(lengths)
     found = assess(
         trajectory, truth, alignment=align.value, frames_ns=frames_ns, lengths_m=lengths_m, names=names
     )
     if lengths is not None and not any(map(len, found.lengths)):
-        raise DataError(f"--lengths {lengths}: the true path, where there are poses, has no stretch so long")
+        raise DataError(
+            f"--lengths {lengths}: the true path, where there are poses, is shorter than that everywhere"
+        )
     return found
 
 
@@ -230,13 +232,13 @@ def _plot(
 
 def _refuse_for_merged_map(folder: Path, options: Mapping[str, object]) -> None:
     for option in (name for name, value in options.items() if value):
-        raise DataError(f"{folder}: is a merged map; {option} is for a run: evaluate each by itself")
+        raise DataError(f"{folder}: is a merged map; {option} is for a run: evaluate the runs one by one")
 
 
 def _refuse_without_map(world: World | None, *, register: bool, tolerance: int) -> None:
     if world or register or tolerance != _TOLERANCE:
         raise DataError(
-            "--map-world, --register and --tolerance tell how to compare with --map, which is missing"
+            "--map-world, --register and --tolerance are for the comparison with --map, which is missing"
         )
 
 
@@ -298,7 +300,7 @@ def _frames_ns(run: "Run | None", log: Path | None, *, used: bool) -> "Stamps | 
 
     if run is not None:
         if log is not None and not used:
-            raise DataError(f"{log}: --log is for bare trajectories; {run.path} knows the frames of its log")
+            raise DataError(f"{log}: --log is for bare trajectories; {run.path} has the frames of its log")
         return run.frames_ns
     if log is None:
         return None

@@ -126,7 +126,7 @@ def _no_verb(word: str, known: Sequence[str]) -> str:
     if near := get_close_matches(word, known, n=2):
         return f"no verb {word!r}; did you mean {' or '.join(near)}?"
     if Path(word).exists():
-        return f"no verb {word!r}, but a file or folder: mapper inspect {word} tells what is in it"
+        return f"no verb {word!r}, but a file or folder: mapper inspect {word} shows what is in it"
     return f"no verb {word!r}"
 
 

@@ -101,7 +101,7 @@ def _distances(
         return None
     if not plane_at:
         raise ConfigError(
-            "tell the distance of each LOG's plane by --plane-at, or look for any by --fit-plane"
+            "give the distance of each LOG's plane with --plane-at, or search for planes with --fit-plane"
         )
     if len(plane_at) != len(logs):
         raise ConfigError(f"{len(logs)} logs and {len(plane_at)} --plane-at; want one for each log")

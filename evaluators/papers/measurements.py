@@ -94,7 +94,7 @@ def open_with_truth(log: Path, config: BuildConfig) -> tuple[Log, Trajectory]:
     """
     source = open_source(log, config.source)
     if source.truth is None:
-        raise DataError(f"{log}: has no ground truth, so there is no error to tell")
+        raise DataError(f"{log}: has no ground truth, so its error is unknown")
     return source, source.truth
 
 

@@ -52,7 +52,7 @@ class Request:
         if self.paper == "hough":
             if self.given or self.tables or not self.cut.is_whole:
                 raise ConfigError(
-                    "hough has one table, of pairs of clouds: it knows no --log, --tables, --first or --last"
+                    "hough has one table, of pairs of clouds: it has no --log, --tables, --first or --last"
                 )
             return
         known = _PAPERS[self.paper].sequences

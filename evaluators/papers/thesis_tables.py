@@ -165,7 +165,7 @@ def _icp_or_svd(test_logs: Figures) -> Ablation:
             unit="",
             cells=tuple(own),
             notes=(
-                "The thesis's own log is not at hand: its rows tell of another path, so there is no ratio.",
+                "The thesis's own log is not at hand: its rows are of another path, so there is no ratio.",
                 "Axes are the camera's at the start (x right, y down, z forward); roll turns about z, pitch "
                 "about x, yaw about y. “total” is the mean of the three amounts, as the printed totals are.",
             ),

@@ -40,7 +40,7 @@ def write_trajectory_errors(folder: Path, found: Assessment, *, title: str) -> P
     """
     matched = found.matched
     if matched is None:
-        raise DataError(f"{folder}: nothing to draw without a truth; tell one with --truth")
+        raise DataError(f"{folder}: nothing to draw without a truth; give one with --truth")
     picture = made_folder(folder) / TRAJECTORY
     timed = have_clock(matched.stamps_ns)
     elapsed = (matched.stamps_ns - matched.stamps_ns[0]).astype(np.float64)

@@ -97,7 +97,7 @@ def sensor_poses(wheels: Path, calibration: LineLaserCalibration) -> tuple[Traje
         wheels,
         mounted,
         sensor="lidar",
-        wheelbase_by="calibrate with --wheelbase, or tell wheelbase_m under [vehicle] in the calibration",
+        wheelbase_by="calibrate with --wheelbase, or set wheelbase_m under [vehicle] in the calibration",
     )
 
 

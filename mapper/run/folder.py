@@ -257,9 +257,7 @@ def open_run(path: AnyPath) -> Run:
             f"{path}: is a merged map, not a run; mapper eval, view --html, export and plan take it"
         )
     if is_localised_log(path):
-        raise RunError(
-            f"{path}: is a localised log, not a run; the map that it lies in is told in its manifest"
-        )
+        raise RunError(f"{path}: is a localised log, not a run; its manifest names the map that it lies in")
     if not (path / files.MANIFEST).exists():
         raise RunError(f"{path}: {_not_a_run(path)}")
     manifest = read_manifest(path / files.MANIFEST)
