@@ -16,7 +16,7 @@ HELP = {"help_option_names": ["-h", "--help"], "max_content_width": 110}
 """Settings of every context."""
 
 PANELS = ("map", "look", "judge", "edit", "study", "tools")
-"""What verbs are for, in the order of the help."""
+"""Purposes of verbs, in the order of the help."""
 
 _MISUSED = 2
 _UsageError: type[Exception] = typer.BadParameter.__mro__[1]  # Typer gives it no public name

@@ -1,4 +1,4 @@
-"""What a run amounts to: the lines at the end of a build, all rows of ``--verbose``, and the same as JSON."""
+"""Summary of a run: the lines at the end of a build, all rows of ``--verbose``, and the same as JSON."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence

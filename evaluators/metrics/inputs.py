@@ -1,4 +1,4 @@
-"""What is evaluated: a run, a trajectory, or a file of poses, and what it is compared with."""
+"""Inputs of an evaluation: a run, a trajectory or a file of poses, and the truth."""
 
 import os
 from pathlib import Path

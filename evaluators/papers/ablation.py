@@ -41,7 +41,7 @@ class VariantResult:
 
     @property
     def lost(self) -> int:
-        """How many frames were read, but not placed."""
+        """Number of frames that were read, but not placed."""
         return self.frames - (0 if self.estimate is None else len(self.estimate))
 
 

@@ -37,7 +37,7 @@ class Measurement(Hashable, Protocol):
 
     @property
     def name(self) -> str:
-        """What is measured, as a part of a file's name."""
+        """Name of the measurement, as a part of a file's name."""
         ...
 
     @property

@@ -49,7 +49,7 @@ class ThesisJob:
 
     @property
     def name(self) -> str:
-        """What is measured."""
+        """Name of the measurement."""
         return f"thesis-{slug(self.sequence)}-{'-'.join(self.tables)}"
 
     @property

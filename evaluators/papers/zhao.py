@@ -105,7 +105,7 @@ class ZhaoJob:
 
     @property
     def name(self) -> str:
-        """What is measured."""
+        """Name of the measurement."""
         return f"zhao-{slug(self.sequence)}"
 
     @property

@@ -55,7 +55,7 @@ class _InMap:
 
     @property
     def corrections(self) -> int:
-        """How often the poses of new nodes have changed so far; known ones do not move."""
+        """Number of times that the poses of new nodes have changed; known ones do not move."""
         return self._estimator.corrections
 
     def pose_of(self, node: int) -> Transform:

@@ -64,7 +64,7 @@ class JointGraph:
 
     @property
     def ties(self) -> tuple[Tie, ...]:
-        """What ties each pair of runs that share places."""
+        """Ties of the pairs of runs that share places."""
         place_of = {number: place for place, number in enumerate(self.first_nodes)}
         by_pair: dict[tuple[int, int], list[LoopClosure]] = {}
         for loop in self.loops:

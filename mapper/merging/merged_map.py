@@ -109,7 +109,7 @@ class MapManifest(Config):
     ties: tuple[Tie, ...] = ()
     """Loops between runs in the joint graph, by pair of runs."""
     left_out: Mapping[str, str] = {}
-    """Why each of the other runs that were given is not in the map, by its path."""
+    """Reason why each of the other runs that were given is not in the map, by its path."""
     tiles: tuple[Tile, ...] = ()
     voxels: int = 0
     area_km2: float = 0.0

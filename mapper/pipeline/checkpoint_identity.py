@@ -1,4 +1,4 @@
-"""What decides the result of a build: an unfinished one is gone on with only where all of it is the same."""
+"""Identity of a build: all that decides its result. An unfinished build is resumed only if it is the same."""
 
 import hashlib
 import json

@@ -45,7 +45,7 @@ class KnownMap:
 
     @property
     def sensor(self) -> Sensor:
-        """What its places were seen by."""
+        """Sensor by which its places were seen."""
         return sensor_of(self.places)
 
 

@@ -144,7 +144,7 @@ class Run:
 
     @cached_property
     def verdict(self) -> Verdict:
-        """Whether it is to be trusted, and why not; that of a run made before 2026-11-22 is found now."""
+        """Verdict on whether it is to be trusted; that of a run made before 2026-11-22 is found now."""
         if self.manifest.verdict is not None:
             return self.manifest.verdict
         return verdict_of(find_warnings(self.results, self.manifest))

@@ -44,7 +44,7 @@ class InputLog(Config):
     kind: str
     fingerprint: str
     notes: tuple[str, ...] = ()
-    """What opening and reading the log had to leave out or assume, and what is suspicious in its frames."""
+    """Notes: what was left out or assumed when the log was read, and what is suspicious in its frames."""
 
 
 class AppendedLog(InputLog):
@@ -99,14 +99,14 @@ class Counts(Config):
 
     @property
     def voxels_text(self) -> str:
-        """How many voxels are known, and occupied."""
+        """Numbers of voxels, as text."""
         if self.occupied is None:
             return f"{self.leaves} known voxels"
         return f"{self.occupied} occupied and {self.leaves - self.occupied} free voxels"
 
     @property
     def frames_text(self) -> str:
-        """How many frames had which outcome."""
+        """Numbers of frames by outcome, as text."""
         return f"{self.tracked} tracked, {self.doubtful} doubtful, {self.lost} lost, {self.skipped} skipped"
 
 
@@ -119,7 +119,7 @@ class RunWarning(Config):
     kind: str
     """E.g. "gap", "loops", "depth"; docs/VERDICT.md lists them."""
     sentence: str
-    """What was found, with the value and the limit."""
+    """Finding, with the value and the limit."""
     suggestion: str = ""
     """What to try."""
     where: str = ""
@@ -147,7 +147,7 @@ class Trial(Config):
 
     @property
     def text(self) -> str:
-        """What to try: the setting that lost and doubted least, if any helped by half."""
+        """Suggestion: the setting that lost and doubted least, if any helped by half."""
         best = min(self.tried, key=self.tried.__getitem__, default="")
         if best and self.tried[best] < self.unplaced and self.tried[best] <= self.unplaced // 2:
             return (
@@ -162,7 +162,7 @@ class Verdict(Config):
 
     state: Literal["trusted", "doubtful", "broken in parts"]
     sentences: tuple[str, ...] = ()
-    """Why it is not, and what to try."""
+    """Reasons against it, and what to try."""
 
 
 class SkippedFrame(Config):
@@ -202,7 +202,7 @@ class Levelling(Config):
 
 
 class DepthReach(Config):
-    """How far the depth of a camera counts in the maps."""
+    """Depth up to which a camera's measurements count in the maps."""
 
     noise: DepthNoiseConfig
     detail: str

@@ -13,7 +13,7 @@ if TYPE_CHECKING:  # compiled code, which takes longer to load than most files o
 
 
 class MapFolder(Protocol):
-    """What a run and a merged map have in common: maps, and the settings of what is made from them."""
+    """Interface of runs and merged maps: maps, and the settings of what is made from them."""
 
     @property
     def path(self) -> Path:

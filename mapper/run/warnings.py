@@ -1,4 +1,4 @@
-"""What is suspicious about a run: every warning there is, found in one place from its results."""
+"""Warnings about a run, all of them, from its results."""
 
 import re
 from collections import Counter

@@ -16,7 +16,7 @@ class Archivable:
 
 
 class Reader(Protocol):
-    """What reads data that was written; see ``mapper.runtime.archive.Archive``."""
+    """Reader of data that was written; see ``mapper.runtime.archive.Archive``."""
 
     def read(self, archived: "Archived[Any]", /) -> Any:
         """Return the data."""

@@ -1,4 +1,4 @@
-"""What a log holds as serialised ROS 2 messages: images, calibrations, clouds, poses and accelerations."""
+"""Serialised ROS 2 messages of a log: images, calibrations, clouds, poses and accelerations."""
 
 from typing import Any, NamedTuple
 
