@@ -107,7 +107,7 @@ class JobRunner:
         except FileNotFoundError:
             return None
         except (ValueError, TypeError, KeyError, AttributeError, DataError):
-            self.progress.note(f"{path}: not a finished result, or a damaged one; it is worked out again")
+            self.progress.note(f"{path}: not a finished result, or a damaged one; it is computed again")
             return None
         return None if result.failure else result
 
