@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mapper.graph.noise import with_model_error
-from tests.support.loop_closures import at
+from tests.support.planar import at
 
 
 def test_model_errors_grow_with_the_distance_between_the_views():

@@ -9,7 +9,8 @@ from mapper.core.errors import DataError, RunError
 from mapper.core.geometry import exp, transform
 from mapper.graph.model import Solution
 from mapper.loops.closure import Discrepancy, apply_solution, discrepancy, read_closures, write_closures
-from tests.support.loop_closures import at, loop
+from tests.support.loop_closures import loop
+from tests.support.planar import at
 
 
 def test_the_file_of_closures_comes_back_whole(tmp_path):

@@ -7,7 +7,8 @@ from mapper.graph.model import BetweenFactor
 from mapper.loops.config import GateConfig
 from mapper.loops.consistency_check import ConsistencyCheck
 from mapper.loops.odometry_chain import OdometryChain
-from tests.support.loop_closures import SURE, at, loop
+from tests.support.loop_closures import SURE, loop
+from tests.support.planar import at
 
 
 class FixedPoses:

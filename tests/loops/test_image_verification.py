@@ -10,7 +10,7 @@ from mapper.loops.config import ImageVerificationConfig
 from mapper.loops.image_verification import ImageVerifier
 from mapper.odometry.config import MatchConfig
 from tests.support.feature_room import Room
-from tests.support.loop_closures import at
+from tests.support.planar import at
 
 
 def test_two_views_of_one_place_give_their_relative_pose():

@@ -9,7 +9,8 @@ from mapper.graph.model import BetweenFactor
 from mapper.loops.closure import Discrepancy, exceeds
 from mapper.loops.config import GateConfig
 from mapper.loops.odometry_chain import OdometryChain, allowed
-from tests.support.loop_closures import SURE, at
+from tests.support.loop_closures import SURE
+from tests.support.planar import at
 
 
 def steps(length: int) -> list[BetweenFactor]:

@@ -1,19 +1,11 @@
-"""Loop closures and poses in the plane, made by hand."""
+"""Loop closures made by hand."""
 
 import numpy as np
 
-from mapper.core.geometry import exp
 from mapper.graph.model import PoseSigmas
 from mapper.loops.closure import LoopClosure
 
 SURE = PoseSigmas(rotation_rad=0.01, translation_m=0.01).information
-
-
-def at(x: float, y: float = 0.0, yaw: float = 0.0) -> np.ndarray:
-    """Return a pose in the plane."""
-    T = exp(np.array([0.0, 0.0, yaw]), np.zeros(3))
-    T[:2, 3] = [x, y]
-    return T
 
 
 def loop(i: int, j: int, T_i_j: np.ndarray | None = None, **rest) -> LoopClosure:
