@@ -84,7 +84,7 @@ def short_text(run: Run, metrics: Sequence[Metric]) -> str:
 
 
 def _resumed_text(timing: Timing) -> str:
-    """Return where processes went on with a build that was stopped; empty if it was not."""
+    """Return where a build that was stopped was resumed; empty if it was not stopped."""
     return "; ".join(resumption.text for resumption in timing.resumed)
 
 

@@ -47,7 +47,7 @@ def compare_into(
     overwrite: bool = False,
     progress: Progress = SILENT,
 ) -> Comparison:
-    """Compare methods on a log and leave a folder; a comparison that was stopped goes on where it was.
+    """Compare methods on a log and leave a folder; a comparison that was stopped is resumed.
 
     Args:
         out: Folder to create; until it is whole it is called ``OUT.partial``.

@@ -240,7 +240,7 @@ def open_map(folder: Path) -> MergedMap:
     """
     if not is_merged_map(folder):
         if is_merged_map(partial_of(folder)):
-            raise RunError(f"{folder}: not finished; the command that began it goes on where it stopped")
+            raise RunError(f"{folder}: not finished; the command that began it resumes it")
         raise RunError(f"{folder}: no merged map; make one with mapper merge RUN… --out {folder}")
     try:
         tree = json.loads((folder / MANIFEST_NAME).read_bytes())

@@ -33,7 +33,7 @@ class Stages:
     """Runs the jobs of each stage.
 
     Attributes:
-        runner: Keeps their results, so that a merge that was stopped goes on where it was.
+        runner: Keeps their results, so that a merge that was stopped is resumed.
         executor: Executor of the jobs.
         progress: Receives how many are done.
         costs: Costs of the jobs of every stage so far, in no order.
@@ -77,7 +77,7 @@ class Stages:
                 yield result.key.removeprefix(f"{stage}-"), kind.model_validate(record)
         if failures:
             more = f" (and {len(failures) - 1} more)" if len(failures) > 1 else ""
-            raise RunError(f"{failures[0]}{more}; what is done stays: give the same command to go on")
+            raise RunError(f"{failures[0]}{more}; finished jobs are kept: give the same command to resume")
 
 
 def _as_records(work: Callable[[], Config]) -> list[Record]:

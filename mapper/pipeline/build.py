@@ -54,7 +54,7 @@ def build(
 ) -> Run:
     """Track every frame, solve the graph once, level the world, then fuse every frame at its final pose.
 
-    A build that was killed or interrupted goes on where it was, and ends in the same bytes.
+    A build that was killed or interrupted is resumed, and ends in the same bytes.
 
     Args:
         source: The log.

@@ -21,7 +21,7 @@ IDENTITY = "identity.json"
 """File of a folder of checkpoints, written first."""
 _NAMED = 3
 _WITHOUT_EFFECT = {"octree": {"max_memory_mb"}}
-"""Settings that decide nothing: a build that ran out of memory may go on with another limit."""
+"""Settings that decide nothing: a build that ran out of memory may be resumed with another limit."""
 
 
 def identity_of(source: Log, config: BuildConfig, poses: Trajectory | None) -> dict[str, Any]:
@@ -83,7 +83,7 @@ def _digest_of(identity: Mapping[str, Any]) -> str:
 
 
 def kept_from_before(partial: Path, identity: Mapping[str, Any], *, fresh: bool) -> tuple[str, ...]:
-    """Return the names of what a build can go on from in a folder that an earlier process left.
+    """Return the names of the files from which a build can be resumed in a folder that was left.
 
     Raises:
         RunError: The folder has checkpoints of another build.

@@ -80,7 +80,7 @@ class Checkpoints:
         *,
         every_s: float = EVERY_S,
     ) -> None:
-        """Begin, or go on with what is in the folder.
+        """Begin, or resume from what is in the folder.
 
         Args:
             writer: Writer of the run.
@@ -227,13 +227,13 @@ class Checkpoints:
         writer.clock.seconds.update(state["seconds"])
 
     def resumed_at(self, step: Literal["track", "solve", "fuse"], frame: int) -> None:
-        """Report where the build goes on, and record it in the manifest."""
+        """Report where the build is resumed, and record it in the manifest."""
         here = Resumption(at=now_text(), step=step, frame=frame)
         timing = self.writer.manifest.timing
         timing = timing.model_copy(update={"resumed": (*timing.resumed, here)})
         self.writer.update(timing=timing)
         self._try(partial(write_text, self.folder / _TIMES, timing.model_dump_json()))
-        self.progress.note(f"an earlier process was stopped; going on with {here.text}")
+        self.progress.note(f"an earlier process was stopped; resuming with {here.text}")
 
     def is_due(self) -> bool:
         """Return whether it is time for the next checkpoint, and the last one is on the disk."""

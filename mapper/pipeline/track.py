@@ -96,7 +96,7 @@ def track_log(
         start: Odometry, loop detector and graph to begin with: the graph and the loops that are returned are
             those of all sessions, the tracks those of this log. None is those of a first session.
         observer: Receives every frame that is tracked now.
-        checkpoints: Tracking goes on after the frames that these have; None makes none.
+        checkpoints: Checkpoints, after whose frames tracking is resumed; None makes none.
 
     Raises:
         ConfigError: The odometry needs wheels or poses and there are none, or the loops need feature counts.

@@ -246,7 +246,7 @@ def open_run(path: AnyPath) -> Run:
     if not path.is_dir():
         partial = partial_of(path)
         if is_merged_map(partial):
-            raise RunError(f"{path}: not finished; the mapper merge that began it goes on where it was")
+            raise RunError(f"{path}: not finished; the mapper merge that began it resumes it")
         if (partial / files.MANIFEST).is_file():
             raise RunError(f"{path}: not finished: {_ending(partial)}")
         if path.exists():
@@ -316,5 +316,5 @@ def _ending(folder: Path) -> str:
         ending = "is still being built, or its process was killed"
     else:
         ending = f"{manifest.status}: {manifest.reason}"
-    goes_on = "; the same mapper build goes on where it was" if (folder / files.CHECKPOINTS).is_dir() else ""
-    return f"{folder} {ending}{goes_on}"
+    hint = "; the same mapper build resumes it" if (folder / files.CHECKPOINTS).is_dir() else ""
+    return f"{folder} {ending}{hint}"

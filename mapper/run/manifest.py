@@ -222,7 +222,7 @@ class DepthReach(Config):
 
 
 class Resumption(Config):
-    """A process that went on with a build where another one had ended."""
+    """Resumption of a build by another process."""
 
     at: str
     """UTC, ISO 8601."""
@@ -232,7 +232,7 @@ class Resumption(Config):
 
     @property
     def text(self) -> str:
-        """Step and frame at which the process went on; part of a sentence."""
+        """Step and frame at which the build was resumed; part of a sentence."""
         return f"{self.step} at frame {self.frame}" if self.step != "solve" else self.step
 
 

@@ -201,7 +201,7 @@ def atomic_folder(
 
 @contextmanager
 def resumable_folder(out: Path, *, mark: str) -> Iterator[Path]:
-    """Yield OUT to go on filling: a new folder, or one that an earlier session left unfinished or whole.
+    """Yield OUT to fill: a new folder, or one that an earlier session left unfinished or whole.
 
     Args:
         out: The folder.

@@ -1,4 +1,4 @@
-"""Resumable jobs: each result is kept in a file, so work that was stopped goes on where it was."""
+"""Resumable jobs: each result is kept in a file, so work that was stopped can be resumed."""
 
 import json
 import math
