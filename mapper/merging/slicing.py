@@ -78,7 +78,7 @@ def slice_map(
         workspace: With the tiles and their pieces.
         stages: Runs the jobs, one for each column of tiles.
         joined: The tiles.
-        manifest: Of the map, without what is found here.
+        manifest: Manifest of the map, without what is found here.
         placed: Its runs.
     """
     columns: dict[tuple[int, int], list[int]] = defaultdict(list)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from mapper.config.build import BuildConfig
 from mapper.config.loading import load_run_config
-from mapper.core.errors import MapperError, RunError
+from mapper.core.errors import MapperError, RunError, listed
 from mapper.core.paths import AnyPath
 from mapper.core.timebase import Stamps
 from mapper.core.trajectory import Trajectory
@@ -45,8 +45,6 @@ if TYPE_CHECKING:  # compiled code, which takes longer to load than most files o
     from mapper.octree.grid import OccupancyGrid
     from mapper.octree.map import OctreeMap
     from mapper.run.cloud import Cloud
-
-_NAMED = 5
 
 
 @dataclass(frozen=True)
@@ -302,7 +300,7 @@ def _not_a_run(path: Path) -> str:
     if path.is_file() and (path.parent / files.MANIFEST).is_file():
         return f"is a file of a run; give the folder {path.parent}"
     if path.is_dir() and (runs := sorted(child.parent.name for child in path.glob(f"*/{files.MANIFEST}"))):
-        return f"is no run itself, but holds {', '.join(runs[:_NAMED])}{', …' if len(runs) > _NAMED else ''}"
+        return f"is no run itself, but holds {listed(runs)}"
     try:
         open_source(path)
     except MapperError:
