@@ -165,4 +165,4 @@ HARD_LOGS: Mapping[str, HardLog] = {
         scene="street",
     ),
 }  # fmt: skip
-"""By the name of the log's folder."""
+"""Hard logs by the name of the log's folder."""

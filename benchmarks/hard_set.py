@@ -35,7 +35,8 @@ from mapper.evaluators.metrics.trajectory import align, associate, ate
 from mapper.loops.closure import accepted_loops
 from mapper.pipeline.components import largest_component
 from mapper.pipeline.solve import solve
-from mapper.pipeline.track import refuse_a_fragment, track_log
+from mapper.pipeline.track import track_log
+from mapper.pipeline.tracking_result import refuse_a_fragment
 from mapper.run.doubtful_frames import placed_by_neighbours
 from mapper.run.frame_outcomes import records_of
 from mapper.runtime.progress import SILENT
@@ -88,7 +89,7 @@ class Row:
         silent_at_s: When they begin.
         worst_silent_m: Largest error of their translations.
         loops: Accepted loops.
-        false_loops: Those of them that are wrong.
+        false_loops: Number of these that are wrong.
         seconds: Wall time of tracking and solving.
         refused: Why no path was made; empty if one was.
     """

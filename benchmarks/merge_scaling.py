@@ -48,7 +48,7 @@ PEER_RUNS = 2
 
 @dataclass(frozen=True)
 class Cost:
-    """What one merge in a process of its own cost."""
+    """Cost of one merge in a process of its own."""
 
     wall_s: float
     peak_mb: float

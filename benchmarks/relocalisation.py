@@ -44,7 +44,7 @@ def rendered(config: SynthConfig) -> Log:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """How one odometry fared on one log."""
+    """Result of one odometry on one log."""
 
     frames: int | None
     lost: int

@@ -25,7 +25,7 @@ _LINE_WIDTH = 110
 
 @dataclass(frozen=True, slots=True)
 class Output:
-    """What a verb prints, by the options that every verb has.
+    """Output of a verb: what it prints, by the options that every verb has.
 
     Attributes:
         json: One JSON document instead of lines; progress is shown on a terminal only.
@@ -53,7 +53,7 @@ class Output:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Answer:
-    """What a verb made or found.
+    """Answer of a verb: what it made or found.
 
     Attributes:
         document: For ``--json``; keys are stable and end in the unit: ``total_s``, ``path_length_m``.

@@ -23,11 +23,11 @@ from mapper.cli.options import (
     selection,
 )
 from mapper.cli.stepping import Stepping
+from mapper.core.errors import ConfigError, UntrustedError, ViewerError
 from mapper.runtime.result_paths import RUNS, name_of, place_of
 
 if TYPE_CHECKING:
     from mapper.config.build import BuildConfig
-    from mapper.core.errors import UntrustedError
     from mapper.evaluators.metrics.metric import Metric
     from mapper.run.folder import Run
     from mapper.run.observers import Observer
@@ -113,8 +113,6 @@ def build(
 
 
 def _untrusted(run: "Run") -> "UntrustedError | None":
-    from mapper.core.errors import UntrustedError
-
     verdict = run.verdict
     if verdict.state == "trusted":
         return None
@@ -168,8 +166,6 @@ def _preview(source: "Log", out: Path, progress: "Progress") -> "Observer":
 
 def _observer_factory(rerun: str | None, *, step: bool, overwrite: bool) -> "ObserverFactory | None":
     """Return the observer of a build, refusing at once what would fail at its end."""
-    from mapper.core.errors import ConfigError, ViewerError
-
     if rerun is None:
         if step:
             raise ConfigError("--step: there is nothing to see without --rerun")
@@ -218,8 +214,6 @@ def appended(
 
 
 def _refuse_both(config: Path | None, onto: Path, rerun: str | None) -> None:
-    from mapper.core.errors import ConfigError
-
     if rerun is not None:
         raise ConfigError(f"--rerun {rerun}: not with --onto; look at the new run with mapper view")
     if config is not None:

@@ -13,6 +13,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from mapper.core.errors import ConfigError, MapperError
+
 ASKED_BY = "_MAPPER_COMPLETE"
 """Environment variable that holds the shell's name."""
 LINE = "_MAPPER_LINE"
@@ -189,7 +191,6 @@ def _settings() -> list[tuple[str, str, list[str]]]:
     import json
 
     import mapper
-    from mapper.core.errors import MapperError
     from mapper.runtime.atomic import write_text
 
     package = Path(mapper.__file__).parent
@@ -227,15 +228,13 @@ def detected_shell() -> str:
     """
     import shellingham  # type: ignore[import-untyped]
 
-    from mapper.core.errors import ConfigError
-
     try:
         name = str(shellingham.detect_shell()[0])
     except shellingham.ShellDetectionFailure:
         name = Path(os.environ.get("SHELL", "")).name
     if name not in SCRIPTS:
         raise ConfigError(
-            f"shell {name or '(none)'}: no completion for it; tell one: --shell bash, zsh or fish"
+            f"shell {name or '(none)'}: no completion for it; choose one with --shell bash, zsh or fish"
         )
     return name
 

@@ -8,6 +8,7 @@ import typer
 
 from mapper.cli.answer import Answer, Output
 from mapper.cli.options import First, Last, Overrides, RequireTruth, Stride, merged, selection
+from mapper.core.errors import ConfigError
 from mapper.runtime.result_paths import LOGS, name_of, place_of
 
 
@@ -48,7 +49,6 @@ def convert(
     Example: mapper convert rgbd_dataset_freiburg1_xyz --out xyz.mcap
     """
     from mapper.config.loading import load_source_config
-    from mapper.core.errors import ConfigError
     from mapper.sources import open_source
     from mapper.sources.reading_checks import ReadingChecks
     from mapper.sources.writers import left_out, write_log

@@ -8,6 +8,7 @@ import typer
 
 from mapper.cli.answer import Answer, Output
 from mapper.cli.completion import run_folders
+from mapper.core.errors import ConfigError, MapperError
 from mapper.runtime.progress import SILENT
 
 if TYPE_CHECKING:
@@ -53,8 +54,6 @@ def doctor(
 
     Example: mapper doctor --json, or: mapper doctor runs/xyz, or after pip install: mapper doctor --warm
     """
-    from mapper.core.errors import MapperError
-
     if accept:
         _accept(run, accept)
     progress = output.progress() if warm or sys.stderr.isatty() else SILENT
@@ -76,7 +75,6 @@ def doctor(
 
 
 def _warmed(run: Path | None, progress: "Progress") -> "list[Finding]":
-    from mapper.core.errors import ConfigError
     from mapper.doctor.machine import check_kernels
     from mapper.pipeline.warm_up import compile_kernels
 
@@ -87,7 +85,6 @@ def _warmed(run: Path | None, progress: "Progress") -> "list[Finding]":
 
 
 def _accept(run: Path | None, names: "Sequence[str]") -> None:
-    from mapper.core.errors import ConfigError
     from mapper.octree.grid_file import read_grid
     from mapper.run import files
     from mapper.run.folder import open_run

@@ -6,6 +6,7 @@ import typer
 
 from mapper.cli.answer import Answer, Output
 from mapper.cli.options import MovedLogs, RunFolder
+from mapper.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from mapper.mapping.config import EditKind, Region
@@ -54,7 +55,6 @@ def edit(
 
     Example: mapper edit runs/xyz --erase --box 2.1 0.3 0.1 2.9 1.05 1.5
     """
-    from mapper.core.errors import ConfigError
     from mapper.pipeline.edit_map import add_region, undo_region
     from mapper.run.folder import moved_log, open_run
 

@@ -1,5 +1,6 @@
 """``mapper eval``: errors of a trajectory, and the quality of a map."""
 
+from collections.abc import Mapping
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -8,6 +9,7 @@ import typer
 
 from mapper.cli.answer import Answer, Output
 from mapper.cli.completion import run_folders
+from mapper.core.errors import DataError
 
 if TYPE_CHECKING:
     from mapper.core.timebase import Stamps
@@ -124,56 +126,79 @@ def evaluate(
     Example: mapper eval runs/xyz --align yaw --plot plots, or: mapper eval 00.txt --truth poses/00.txt, or:
     mapper eval runs/flat --map logs/flat --sharpness
     """
-    from mapper.core.errors import DataError
-    from mapper.evaluators.metrics.evaluate import ALIGNED, assess
     from mapper.evaluators.metrics.inputs import estimate_and_truth
     from mapper.run.manifest import is_merged_map
 
     if is_merged_map(estimate):
-        refused = {
-            "--truth": truth,
-            "--times": times,
-            "--log": log,
-            "--lengths": lengths,
-            "--map-world": map_world,
-            "--register": register,
-            "--sharpness": sharpness,
-            "--plot": plot,
-        }
-        for option in (name for name, value in refused.items() if value):
-            raise DataError(f"{estimate}: is a merged map; {option} is for a run: evaluate each by itself")
+        _refuse_for_merged_map(
+            estimate,
+            {
+                "--truth": truth,
+                "--times": times,
+                "--log": log,
+                "--lengths": lengths,
+                "--map-world": map_world,
+                "--register": register,
+                "--sharpness": sharpness,
+                "--plot": plot,
+            },
+        )
         return _of_merged_map(estimate, align, map_, tolerance, format_)
     run, trajectory, known = estimate_and_truth(estimate, truth, times)
-    if lengths is not None and known is None:
-        raise DataError(f"--lengths {lengths}: relative errors need a truth; tell one with --truth")
-    found = assess(
+    found = _path_errors(
         trajectory,
         known,
-        alignment=align.value,
+        align,
+        lengths,
         frames_ns=_frames_ns(run, log, used=sharpness),
-        lengths_m=None if lengths is None else _numbers(lengths),
         names=(str(estimate), str(truth) if truth else "its truth"),
     )
-    if lengths is not None and not any(map(len, found.lengths)):
-        raise DataError(f"--lengths {lengths}: the true path, where there are poses, has no stretch so long")
     metrics = list(found.metrics)
     if run is not None and known is not None:
         metrics += _loops_of(run, known)
-    name = estimate.resolve().name
-    sharp_log = _log_of(_needed(run, estimate, "--sharpness"), log) if sharpness else None
-    quality = None
-    if map_ is not None:
-        quality = _quality(
-            _needed(run, estimate, "--map"), map_, world=map_world, register=register, tolerance=tolerance
-        )
+    moved_log = _log_of(_needed(run, estimate, "--sharpness"), log) if sharpness else None
+    if map_ is None:
+        _refuse_without_map(map_world, register=register, tolerance=tolerance)
+        quality = None
+    else:
+        built = _needed(run, estimate, "--map")
+        quality = _map_quality(built, map_, world=map_world, register=register, tolerance=tolerance)
         metrics += quality.metrics
-    elif map_world or register or tolerance != _TOLERANCE:
-        raise DataError(
-            "--map-world, --register and --tolerance tell how to compare with --map, which is missing"
-        )
-    if sharp_log is not None:
+    if moved_log is not None:
         path = run.tracked_trajectory if run else trajectory
-        metrics += _sharpness_of(sharp_log, path, progress=output.progress())
+        metrics += _sharpness_of(moved_log, path, progress=output.progress())
+    if plot is not None:
+        _plot(plot, found, quality, align=align, name=estimate.resolve().name, map_=map_)
+    return _answer(run, metrics, found, format_)
+
+
+def _path_errors(
+    trajectory: "Trajectory",
+    truth: "Trajectory | None",
+    align: Align,
+    lengths: str | None,
+    *,
+    frames_ns: "Stamps | None",
+    names: tuple[str, str],
+) -> "Assessment":
+    """Return the errors of a path, over segments of the given lengths."""
+    from mapper.evaluators.metrics.evaluate import assess
+
+    if lengths is not None and truth is None:
+        raise DataError(f"--lengths {lengths}: relative errors need a truth; give one with --truth")
+    lengths_m = None if lengths is None else _numbers(lengths)
+    found = assess(
+        trajectory, truth, alignment=align.value, frames_ns=frames_ns, lengths_m=lengths_m, names=names
+    )
+    if lengths is not None and not any(map(len, found.lengths)):
+        raise DataError(
+            f"--lengths {lengths}: the true path, where there are poses, is shorter than that everywhere"
+        )
+    return found
+
+
+def _answer(run: "Run | None", metrics: "list[Metric]", found: "Assessment", format_: Format) -> Answer:
+    """Return the metrics and, of a run, its verdict."""
     text = _text(metrics, found, format_)
     document: dict[str, Any] = {"metrics": _every_metric(metrics, found)}
     if run is not None:
@@ -182,15 +207,39 @@ def evaluate(
         document["verdict"] = run.verdict
         if format_ in (Format.TEXT, Format.MARKDOWN):
             text += f"\n\n{verdict_text(run)}"
-    if plot is not None:
-        from mapper.evaluators.pictures.map_agreement import write_map_errors
-        from mapper.evaluators.pictures.path_errors import write_trajectory_errors
-
-        if quality is None or found.matched is not None:
-            write_trajectory_errors(plot, found, title=f"{name}, {ALIGNED[align.value]}")
-        if quality is not None and map_ is not None:
-            write_map_errors(plot, quality.check, title=f"{name} against {map_.resolve().name}")
     return Answer(document, text)
+
+
+def _plot(
+    folder: Path,
+    found: "Assessment",
+    quality: "MapQuality | None",
+    *,
+    align: Align,
+    name: str,
+    map_: Path | None,
+) -> None:
+    """Draw the errors of the path, and those of the map if it was compared."""
+    from mapper.evaluators.metrics.evaluate import ALIGNED
+    from mapper.evaluators.pictures.map_agreement import write_map_errors
+    from mapper.evaluators.pictures.path_errors import write_trajectory_errors
+
+    if quality is None or found.matched is not None:
+        write_trajectory_errors(folder, found, title=f"{name}, {ALIGNED[align.value]}")
+    if quality is not None and map_ is not None:
+        write_map_errors(folder, quality.check, title=f"{name} against {map_.resolve().name}")
+
+
+def _refuse_for_merged_map(folder: Path, options: Mapping[str, object]) -> None:
+    for option in (name for name, value in options.items() if value):
+        raise DataError(f"{folder}: is a merged map; {option} is for a run: evaluate the runs one by one")
+
+
+def _refuse_without_map(world: World | None, *, register: bool, tolerance: int) -> None:
+    if world or register or tolerance != _TOLERANCE:
+        raise DataError(
+            "--map-world, --register and --tolerance are for the comparison with --map, which is missing"
+        )
 
 
 def _of_merged_map(
@@ -215,14 +264,14 @@ def _of_merged_map(
 
 
 def _needed(run: "Run | None", path: Path, option: str) -> "Run":
-    from mapper.core.errors import DataError
-
     if run is None:
         raise DataError(f"{path}: a bare trajectory has no map; {option} wants a run folder")
     return run
 
 
-def _quality(run: "Run", path: Path, *, world: World | None, register: bool, tolerance: int) -> "MapQuality":
+def _map_quality(
+    run: "Run", path: Path, *, world: World | None, register: bool, tolerance: int
+) -> "MapQuality":
     from mapper.evaluators.metrics.map_quality import map_quality
     from mapper.evaluators.metrics.map_reference import read_reference
 
@@ -247,12 +296,11 @@ def _sharpness_of(source: "Log", trajectory: "Trajectory", *, progress: "Progres
 
 def _frames_ns(run: "Run | None", log: Path | None, *, used: bool) -> "Stamps | None":
     from mapper.config.loading import load_source_config
-    from mapper.core.errors import DataError
     from mapper.sources import open_source
 
     if run is not None:
         if log is not None and not used:
-            raise DataError(f"{log}: --log is for bare trajectories; {run.path} knows the frames of its log")
+            raise DataError(f"{log}: --log is for bare trajectories; {run.path} has the frames of its log")
         return run.frames_ns
     if log is None:
         return None
@@ -260,8 +308,6 @@ def _frames_ns(run: "Run | None", log: Path | None, *, used: bool) -> "Stamps | 
 
 
 def _numbers(text: str) -> list[float]:
-    from mapper.core.errors import DataError
-
     try:
         return [float(word) for word in text.split(",")]
     except ValueError:

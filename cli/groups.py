@@ -16,7 +16,7 @@ HELP = {"help_option_names": ["-h", "--help"], "max_content_width": 110}
 """Settings of every context."""
 
 PANELS = ("map", "look", "judge", "edit", "study", "tools")
-"""What verbs are for, in the order of the help."""
+"""Purposes of verbs, in the order of the help."""
 
 _MISUSED = 2
 _UsageError: type[Exception] = typer.BadParameter.__mro__[1]  # Typer gives it no public name
@@ -126,7 +126,7 @@ def _no_verb(word: str, known: Sequence[str]) -> str:
     if near := get_close_matches(word, known, n=2):
         return f"no verb {word!r}; did you mean {' or '.join(near)}?"
     if Path(word).exists():
-        return f"no verb {word!r}, but a file or folder: mapper inspect {word} tells what is in it"
+        return f"no verb {word!r}, but a file or folder: mapper inspect {word} shows what is in it"
     return f"no verb {word!r}"
 
 

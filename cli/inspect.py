@@ -8,6 +8,7 @@ import typer
 
 from mapper.cli.answer import Answer, Output
 from mapper.cli.options import Overrides
+from mapper.core.errors import DataError
 
 if TYPE_CHECKING:
     from mapper.sources.inspection import Inspection, LogFacts, Timing, TopicFacts
@@ -28,7 +29,6 @@ def inspect(
     import dataclasses
 
     from mapper.config.loading import load_config, load_source_config
-    from mapper.core.errors import DataError
     from mapper.sources.inspection import inspect_log
 
     overrides = set_ or []

@@ -8,6 +8,7 @@ import typer
 from mapper.cli.answer import Answer, Output, rows_text
 from mapper.cli.completion import run_folders
 from mapper.cli.options import First, Last, Overrides, Stride, merged, selection
+from mapper.core.errors import UntrustedError
 from mapper.runtime.result_paths import RUNS, name_of, place_of
 
 if TYPE_CHECKING:
@@ -53,7 +54,6 @@ def localise(
     Example: mapper localise logs/tuesday --in runs/flat --out runs/tuesday
     """
     from mapper.config.loading import overridden
-    from mapper.core.errors import UntrustedError
     from mapper.pipeline.known_map import load_known_map
     from mapper.pipeline.localise import localise as localise_log
     from mapper.sources import open_source

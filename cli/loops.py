@@ -9,6 +9,7 @@ import typer
 from mapper.cli.answer import Answer, Output
 from mapper.cli.groups import Verb
 from mapper.cli.options import MovedLogs, RunFolder
+from mapper.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from mapper.loops.closure import Discrepancy, LoopClosure
@@ -106,8 +107,6 @@ def _miss_text(miss: "Discrepancy | None") -> str:
 
 
 def _pair(option: str, text: str) -> tuple[int, int]:
-    from mapper.core.errors import ConfigError
-
     try:
         i, j = (int(word) for word in text.split())
     except ValueError:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from mapper.cli.completion import assignments_to, run_folders, setting_keys
+from mapper.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from mapper.runtime.executor import Workers
@@ -84,7 +85,6 @@ def workers_for(processes: int | None, scheduler: str | None, *, default: int) -
     Raises:
         ConfigError: There are no processes, or both are given.
     """
-    from mapper.core.errors import ConfigError
     from mapper.runtime.executor import Workers
 
     if processes is None:

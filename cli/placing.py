@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Annotated, assert_never
 
 import typer
 
+from mapper.core.errors import ConfigError
+
 if TYPE_CHECKING:
     from mapper.merging.merged_map import MergedMap
     from mapper.merging.placing import Placing
@@ -57,7 +59,6 @@ def placing_of(
         MapperError: A pose is missing; see :mod:`mapper.merging.placing` and
             :mod:`mapper.pipeline.place_runs`.
     """
-    from mapper.core.errors import ConfigError
     from mapper.merging.placing import Placing, as_built, by_poses, by_truth
 
     if poses is not None:

@@ -12,6 +12,7 @@ from mapper.cli.answer import Answer, Output
 from mapper.cli.completion import run_folders
 from mapper.cli.groups import Verb
 from mapper.cli.options import assignments
+from mapper.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -137,8 +138,6 @@ def _keep_out(built: "Run | MergedMap") -> "Callable[[Points], NDArray[np.bool_]
 
 def _point(text: str, name: str, counts: tuple[int, ...]) -> "Array":
     import numpy as np
-
-    from mapper.core.errors import ConfigError
 
     words = text.replace(",", " ").split()
     if len(words) not in counts or not all(_is_number(word) and isfinite(float(word)) for word in words):

@@ -8,6 +8,7 @@ import typer
 from mapper.cli.answer import Answer, Output
 from mapper.cli.console import files_text
 from mapper.cli.options import Overrides
+from mapper.core.errors import RegistrationError
 from mapper.runtime.atomic import refuse_existing
 
 if TYPE_CHECKING:
@@ -56,7 +57,6 @@ def register(
     from mapper.api.logs import read_frame
     from mapper.config.loading import overridden
     from mapper.config.register import check_method, register_config
-    from mapper.core.errors import RegistrationError
     from mapper.evaluators.register.files import (
         FOLDER,
         registration_record,

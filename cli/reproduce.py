@@ -12,6 +12,7 @@ from mapper.cli.answer import Answer, Output
 from mapper.cli.console import files_text
 from mapper.cli.environment import has_compiled_code
 from mapper.cli.options import First, Last, workers_for
+from mapper.core.errors import ConfigError
 
 
 class Paper(StrEnum):
@@ -99,8 +100,6 @@ def _given(assignments: Sequence[str]) -> dict[str, Path]:
     Raises:
         ConfigError: One is no ``NAME=PATH``, or two have the same name.
     """
-    from mapper.core.errors import ConfigError
-
     given: dict[str, Path] = {}
     for assignment in assignments:
         name, equals, path = assignment.partition("=")

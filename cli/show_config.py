@@ -8,6 +8,7 @@ import typer
 
 from mapper.cli.answer import Answer, Output, rows_text
 from mapper.cli.options import ConfigFile, Overrides, SettingKey
+from mapper.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from mapper.config.describe import Setting
@@ -71,8 +72,6 @@ def _asked_for(key: str, every: "Sequence[Setting]") -> "Sequence[Setting]":
         ConfigError: There are none; the nearest are named.
     """
     from difflib import get_close_matches
-
-    from mapper.core.errors import ConfigError
 
     key = key.strip(".")
     for found in (

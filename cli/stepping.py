@@ -3,6 +3,8 @@
 import sys
 from typing import TYPE_CHECKING
 
+from mapper.core.errors import ConfigError
+
 if TYPE_CHECKING:
     from mapper.core.geometry import Transform
     from mapper.mapping.fusion import Maps
@@ -20,8 +22,6 @@ class Stepping:
         Raises:
             ConfigError: Standard input is no terminal.
         """
-        from mapper.core.errors import ConfigError
-
         if not sys.stdin.isatty():
             raise ConfigError("--step: waits for Enter after each frame, but standard input is no terminal")
         self._other = other

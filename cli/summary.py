@@ -1,4 +1,4 @@
-"""What a run amounts to: the lines at the end of a build, all rows of ``--verbose``, and the same as JSON."""
+"""Summary of a run: the lines at the end of a build, all rows of ``--verbose``, and the same as JSON."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -85,7 +85,7 @@ def short_text(run: Run, metrics: Sequence[Metric]) -> str:
 
 
 def _resumed_text(timing: Timing) -> str:
-    """Return where processes went on with a build that was stopped; empty if it was not."""
+    """Return where a build that was stopped was resumed; empty if it was not stopped."""
     return "; ".join(resumption.text for resumption in timing.resumed)
 
 

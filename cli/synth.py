@@ -1,6 +1,6 @@
 """``mapper synth``: a synthetic log with exact truth."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, TypeVar
@@ -9,6 +9,7 @@ import typer
 
 from mapper.cli.answer import Answer, Output
 from mapper.cli.options import assignments, merged
+from mapper.core.errors import ConfigError
 from mapper.runtime.result_paths import LOGS, place_of
 
 Settings = TypeVar("Settings")
@@ -35,6 +36,23 @@ class SceneName(StrEnum):
     FIELD = "field"
     TUNNEL = "tunnel"
     STAIRCASE = "staircase"
+
+
+_NOT_OF: Mapping[SensorKind, tuple[str, ...]] = {
+    SensorKind.RGBD: ("--rings",),
+    SensorKind.LIDAR: ("--path", "--rooms", "--plane-at", "--uncalibrated"),
+    SensorKind.LINE_LASER: (
+        "--path",
+        "--rooms",
+        "--plane-at",
+        "--scene",
+        "--rings",
+        "--wheels",
+        "--moving",
+        "--uncalibrated",
+    ),
+}
+"""Options that have no meaning for a sensor."""
 
 
 def synth(
@@ -92,78 +110,69 @@ def synth(
     Example: mapper synth logs/spin --path spin --seconds 10 --set sensor.exposure_s=0.01, or: mapper synth
     logs/yard --sensor lidar --scene courtyard --rings 16
     """
+    options = {
+        "--path": path,
+        "--rooms": rooms,
+        "--plane-at": plane_at,
+        "--scene": scene,
+        "--rings": rings,
+        "--wheels": wheels or None,
+        "--moving": moving or None,
+        "--uncalibrated": uncalibrated or None,
+    }
+    _refuse(options, _NOT_OF[sensor], f"--sensor {sensor}")
+    given: dict[str, object] = {"duration_s": seconds, "seed": seed}
     if sensor is SensorKind.LINE_LASER:
-        _refuse(
-            {
-                "--path": path,
-                "--rooms": rooms,
-                "--plane-at": plane_at,
-                "--scene": scene,
-                "--rings": rings,
-                "--wheels": wheels or None,
-                "--moving": moving or None,
-                "--uncalibrated": uncalibrated or None,
-            },
-            f"--sensor {sensor}",
-        )
-        out = place_of(out, LOGS / sensor)
-        return _line_laser(out, assignments({"duration_s": seconds, "seed": seed}), noise, set_, output)
-
-    from mapper.config.loading import overridden
-    from mapper.simulation.config import (
-        CAMERA_SCENES,
-        LIDAR_SCENES,
-        MOVING_INDOORS,
-        MOVING_OUTDOORS,
-        PEDESTRIANS,
-        UNCALIBRATED,
-        SynthWheelsConfig,
-    )
-
-    out = place_of(out, LOGS / (scene or (SceneName.FLAT if sensor is SensorKind.RGBD else SceneName.STREET)))
-    common = {"duration_s": seconds, "seed": seed}
-    carried: dict[str, object] = {"wheels": SynthWheelsConfig() if wheels else None}
+        return _line_laser(place_of(out, LOGS / sensor), assignments(given), noise, set_, output)
+    if plane_at is not None:
+        _refuse(options, ("--path", "--scene"), "--plane-at")
     if sensor is SensorKind.RGBD:
-        from mapper.simulation import write_tum_log
-
-        _refuse({"--rings": rings}, f"--sensor {sensor}")
-        start = _scene(CAMERA_SCENES, scene or SceneName.FLAT, sensor)
-        carried |= {"sensor": start.sensor.model_copy(update=UNCALIBRATED if uncalibrated else {})}
-        if plane_at is not None:
-            _refuse({"--path": path, "--scene": scene}, "--plane-at")
-        if start.scene != "flat":
-            _refuse({"--rooms": rooms}, f"--scene {scene}")
-        given = (
-            common
-            | {"path": path, "rooms": rooms}
-            | (dict(MOVING_INDOORS) if moving else {})
-            | _at_wall(plane_at)
-            | _camera_noise(noise)
-        )
-        indoors = overridden(start.model_copy(update=carried), merged(assignments(given), set_))
-        with output.progress().stage("render") as report:
-            write_tum_log(out, indoors, on_progress=report)
+        name, kind, write = scene or SceneName.FLAT, "TUM", _write_camera_log
+        given |= {"path": path, "rooms": rooms} | _at_wall(plane_at) | _camera_noise(noise)
     else:
-        from mapper.simulation.lidar import write_lidar_log
-
-        _refuse(
-            {
-                "--path": path,
-                "--rooms": rooms,
-                "--plane-at": plane_at,
-                "--uncalibrated": uncalibrated or None,
-            },
-            f"--sensor {sensor}",
-        )
-        given = common | {"sensor.rings": rings} | _lidar_noise(noise)
-        if moving:
-            given |= MOVING_OUTDOORS if scene in (None, SceneName.STREET) else PEDESTRIANS
-        outdoors = _scene(LIDAR_SCENES, scene or SceneName.STREET, sensor).model_copy(update=carried)
-        outdoors = overridden(outdoors, merged(assignments(given), set_))
-        with output.progress().stage("scan") as report:
-            write_lidar_log(out, outdoors, on_progress=report)
-    kind = "TUM" if sensor is SensorKind.RGBD else "KITTI"
+        name, kind, write = scene or SceneName.STREET, "KITTI", _write_lidar_log
+        given |= {"sensor.rings": rings} | _lidar_noise(noise)
+    out = place_of(out, LOGS / name)
+    write(out, name, options, merged(assignments(given), set_), output)
     return Answer({"path": out, "format": kind}, f"{out}: a {kind} log; map it with mapper build {out}")
+
+
+def _write_camera_log(
+    out: Path, name: SceneName, options: Mapping[str, object], overrides: list[str], output: Output
+) -> None:
+    from mapper.config.loading import overridden
+    from mapper.simulation import write_tum_log
+    from mapper.simulation.config import CAMERA_SCENES, MOVING_INDOORS, UNCALIBRATED, SynthWheelsConfig
+
+    start = _scene(CAMERA_SCENES, name, SensorKind.RGBD)
+    if start.scene != "flat":
+        _refuse(options, ("--rooms",), f"--scene {name}")
+    changed: dict[str, object] = dict(MOVING_INDOORS) if options["--moving"] else {}
+    if options["--wheels"]:
+        changed["wheels"] = SynthWheelsConfig()
+    if options["--uncalibrated"]:
+        changed["sensor"] = start.sensor.model_copy(update=UNCALIBRATED)
+    config = overridden(start.model_copy(update=changed), overrides)
+    with output.progress().stage("render") as report:
+        write_tum_log(out, config, on_progress=report)
+
+
+def _write_lidar_log(
+    out: Path, name: SceneName, options: Mapping[str, object], overrides: list[str], output: Output
+) -> None:
+    from mapper.config.loading import overridden
+    from mapper.simulation.config import LIDAR_SCENES, MOVING_OUTDOORS, PEDESTRIANS, SynthWheelsConfig
+    from mapper.simulation.lidar import write_lidar_log
+
+    start = _scene(LIDAR_SCENES, name, SensorKind.LIDAR)
+    changed: dict[str, object] = {}
+    if options["--moving"]:
+        changed |= MOVING_OUTDOORS if name is SceneName.STREET else PEDESTRIANS
+    if options["--wheels"]:
+        changed["wheels"] = SynthWheelsConfig()
+    config = overridden(start.model_copy(update=changed), overrides)
+    with output.progress().stage("scan") as report:
+        write_lidar_log(out, config, on_progress=report)
 
 
 def _line_laser(
@@ -188,8 +197,6 @@ def _line_laser(
 
 def _scene(known: Mapping[str, Settings], name: SceneName, sensor: SensorKind) -> Settings:
     """Return the settings of a scene by its name."""
-    from mapper.core.errors import ConfigError
-
     if name not in known:
         raise ConfigError(
             f"--scene {name}: has no meaning with --sensor {sensor}; want one of {', '.join(known)}"
@@ -197,12 +204,11 @@ def _scene(known: Mapping[str, Settings], name: SceneName, sensor: SensorKind) -
     return known[name]
 
 
-def _refuse(options: dict[str, object], beside: str) -> None:
-    from mapper.core.errors import ConfigError
-
-    for name, value in options.items():
-        if value is not None:
-            raise ConfigError(f"{name} {value}: has no meaning with {beside}; leave it out")
+def _refuse(options: Mapping[str, object], names: Iterable[str], beside: str) -> None:
+    """Refuse the first of some options that is given beside another with which it has no meaning."""
+    for name in names:
+        if options[name] is not None:
+            raise ConfigError(f"{name} {options[name]}: has no meaning with {beside}; leave it out")
 
 
 def _at_wall(distance_m: float | None) -> dict[str, object]:

@@ -10,6 +10,7 @@ import typer
 from mapper.cli.answer import Answer, Output, made
 from mapper.cli.options import RunFolders
 from mapper.cli.report import distinct_names
+from mapper.core.errors import ConfigError
 from mapper.runtime.atomic import refuse_existing
 
 
@@ -58,7 +59,6 @@ def view(
 
     Example: mapper view runs/xyz --spawn, or: mapper view runs/xyz --html
     """
-    from mapper.core.errors import ConfigError
     from mapper.run.files import RERUN
     from mapper.run.folder import open_run
 

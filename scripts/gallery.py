@@ -31,7 +31,7 @@ class Entry:
     """A run of the gallery.
 
     Attributes:
-        name: Of the run, and of its pictures.
+        name: Name of the run, and of its pictures.
         title: Heading of the page's section.
         about: What is to be seen.
         commands: Lines that make it, each a command of mapper.

@@ -49,7 +49,7 @@ class Soak:
         faults: What should not be, a line each.
         log: The log; a synthetic one is made where there is none.
         settings: Arguments of every build.
-        kinds: Which trials are drawn.
+        kinds: Kinds of trials that are drawn.
         kills: How often a build was killed and went on.
         seconds: How long a verb took that was left to its end.
     """

@@ -10,6 +10,7 @@ import typer
 
 from mapper.cli.answer import Answer, Output
 from mapper.cli.options import First, Last, Overrides, Stride, merged, selection
+from mapper.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from mapper.evaluators.depth_camera.accuracy import Patch
@@ -95,15 +96,13 @@ def _distances(
     logs: Sequence[Path], plane_at: Sequence[float] | None, *, fit_plane: bool, keep_tilt: bool
 ) -> Sequence[float] | None:
     """Return the distance of each log's plane, or None where planes are to be fitted."""
-    from mapper.core.errors import ConfigError
-
     if fit_plane:
         if plane_at or keep_tilt:
             raise ConfigError("--fit-plane: finds the distances itself; leave --plane-at and --keep-tilt out")
         return None
     if not plane_at:
         raise ConfigError(
-            "tell the distance of each LOG's plane by --plane-at, or look for any by --fit-plane"
+            "give the distance of each LOG's plane with --plane-at, or search for planes with --fit-plane"
         )
     if len(plane_at) != len(logs):
         raise ConfigError(f"{len(logs)} logs and {len(plane_at)} --plane-at; want one for each log")
@@ -114,7 +113,6 @@ def _distances(
 
 
 def _patch(text: str) -> "Patch":
-    from mapper.core.errors import ConfigError
     from mapper.evaluators.depth_camera.accuracy import Patch
 
     try:

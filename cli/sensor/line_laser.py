@@ -8,6 +8,7 @@ import typer
 from mapper.cli.answer import Answer, Output
 from mapper.cli.console import files_text
 from mapper.cli.options import assignments
+from mapper.core.errors import RunError
 from mapper.runtime.result_paths import RUNS, name_of, place_of
 
 if TYPE_CHECKING:
@@ -124,7 +125,6 @@ def calibrate(
     Example: mapper sensor line-laser-calibrate drive/shots --wheelbase 0.26 --sensor-x 0.2 --out C.toml
     """
     from mapper.config.loading import overridden
-    from mapper.core.errors import RunError
     from mapper.evaluators.pictures.line_laser import write_calibration_picture
     from mapper.line_laser.calibration import calibrate as fit_laws
     from mapper.line_laser.calibration import calibration_text

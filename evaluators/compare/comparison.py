@@ -36,13 +36,13 @@ class Comparison:
     """The results of all methods on one log.
 
     Attributes:
-        path: Of the log.
+        path: Path of the log.
         log: Its name.
         sensor: What took it.
         config: How the methods were compared.
         truth: True poses of the body while the log was taken, if it has them.
         runs: Each method over the whole log.
-        step: Of the runs' relative errors.
+        step: Step of the runs' relative errors.
         trials: A record of every registration of every pair, as ``trials_of`` returns them.
         read_ms: CPU time of reading a frame, for all methods alike and not counted as theirs.
         scan_ms: CPU time of making its scan, likewise.
@@ -65,7 +65,7 @@ class Comparison:
 
     @property
     def trials_config(self) -> TrialsConfig:
-        """Which registrations were tried, and what counts as right."""
+        """Settings of the trials: registrations that were tried, and what counts as right."""
         return self.config.trials(self.sensor)
 
 
@@ -78,8 +78,8 @@ def compare(source: Log, config: CompareConfig, folder: Path, *, progress: Progr
 
     Args:
         source: The log.
-        config: Which methods, and how they are compared.
-        folder: Where the results of finished methods are kept: what is there is not run again.
+        config: Methods, and how they are compared.
+        folder: Folder of the results of finished methods, which are not run again.
         progress: Receives each method's counts, and notes of frames that cannot be read.
 
     Raises:

@@ -18,7 +18,7 @@ class GuessConfig(Config):
 
     @property
     def text(self) -> str:
-        """As in "0.2 m, 10°"."""
+        """The two limits, e.g. "0.2 m, 10°"."""
         return f"{self.offset_m:g} m, {math.degrees(self.turn_rad):.3g}°"
 
 

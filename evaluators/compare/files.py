@@ -47,12 +47,12 @@ def compare_into(
     overwrite: bool = False,
     progress: Progress = SILENT,
 ) -> Comparison:
-    """Compare methods on a log and leave a folder; a comparison that was stopped goes on where it was.
+    """Compare methods on a log and leave a folder; a comparison that was stopped is resumed.
 
     Args:
         out: Folder to create; until it is whole it is called ``OUT.partial``.
         source: The log.
-        config: Which methods, and how they are compared.
+        config: Methods, and how they are compared.
         overwrite: Replace a folder that is there, once the new one is whole.
         progress: As for ``compare``.
 

@@ -21,7 +21,7 @@ class PreparedFrame:
     """One frame as the methods get it.
 
     Attributes:
-        frame: As the log has it; an RGB-D frame is grey.
+        frame: Frame as the log has it; an RGB-D frame is grey.
         scan: Its points in an upright frame: x ahead, z up.
         T_body_scan: (4, 4) pose of that frame in the body.
     """

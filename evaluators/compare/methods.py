@@ -14,7 +14,7 @@ from mapper.evaluators.compare.frames import PreparedFrame
 from mapper.graph.model import PoseGraph
 from mapper.odometry.base import FrameOdometry, FrameResult
 from mapper.pipeline.components import largest_component
-from mapper.pipeline.track import TrackingResult
+from mapper.pipeline.tracking_result import TrackingResult
 from mapper.registration.base import Alignment, failed
 from mapper.runtime.progress import SILENT
 

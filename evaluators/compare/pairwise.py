@@ -64,10 +64,10 @@ def guesses_for(pair: Pair, guesses: Sequence[GuessConfig], *, level: bool, seed
     Distance and angle are drawn evenly from zero to their limits.
 
     Args:
-        pair: With the truth; its number and the seed settle what is drawn.
+        pair: Pair with its true motion; its number and the seed decide what is drawn.
         guesses: How far off.
         level: Off in x, y and heading only, as for a robot on level ground.
-        seed: Of everything random.
+        seed: Seed of all that is random.
     """
     drawn: list[Transform] = []
     for kind, guess in enumerate(guesses):
@@ -92,7 +92,7 @@ def trials_of(
 
     Args:
         method: The method.
-        pair: With the truth.
+        pair: Pair with its true motion.
         frames: Target and source.
         guesses: (4, 4) T_target_source of the body, one of each configured kind.
         config: The kinds of guesses, and what counts as right.

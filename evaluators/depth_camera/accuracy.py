@@ -109,9 +109,9 @@ class SeenPlane:
         distance_m: How far away it was measured.
         tilt_rad: Between its normal and the optical axis.
         measured_ratio: Share of its pixels that had a depth.
-        raw: Of the depth image as it is.
-        filtered: After DIF.
-        step_m: Of quantisation; None if too few depths occur.
+        raw: Errors of the depth image as it is.
+        filtered: Errors after DIF.
+        step_m: Step of quantisation; None if too few depths occur.
     """
 
     distance_m: float
@@ -152,9 +152,9 @@ class DepthLevel:
     """All planes at one distance.
 
     Attributes:
-        name: Of the log.
-        frames: How many showed planes there.
-        planes: So many.
+        name: Name of the log.
+        frames: Number of frames that showed planes there.
+        planes: Number of planes.
         typical: The median of each of their figures, Δd among them: the largest of all would grow with their
             number. Its distance is the true one where that is known.
         temporal_m: Standard deviation of a pixel from frame to frame; None where pixels cannot be compared.

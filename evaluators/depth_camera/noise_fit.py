@@ -23,7 +23,7 @@ class NoiseFit:
     """σ_z over z.
 
     Attributes:
-        form: Which terms it has.
+        form: Terms that the polynomial has.
         noise: The coefficients a, b, c.
         uncertainty: (3,) standard errors of these from the residuals of the fit; NaN where
             there are no more measurements than coefficients.

@@ -50,7 +50,8 @@ def study_depth(
 
     Args:
         sources: RGB-D logs of one camera.
-        distances_m: Of the plane before which the camera stands in each; None searches for planes.
+        distances_m: Distance of the plane before which the camera stands in each log; None searches for
+            planes.
         patch: Part of the image that is used; None is the usual one.
         keep_tilt: As :func:`mapper.evaluators.depth_camera.still.depth_at`.
         most_frames: As :func:`mapper.evaluators.depth_camera.tiles.depth_of_planes`.

@@ -42,7 +42,7 @@ class LabelScores:
 
     Attributes:
         images: How many.
-        counts: Of every method's detections.
+        counts: Counts of every method's detections.
         true_m: (N,) ranges in all columns in which a stripe was and was found.
         found_m: (N,) what was measured there.
     """
@@ -77,8 +77,8 @@ def score(
     """Return the scores of scans whose images have labels; the others do not count.
 
     Args:
-        scans: By their images.
-        labels: As :func:`read_labels` gives them.
+        scans: Scans by the names of their images.
+        labels: Labels from :func:`read_labels`.
         config: How a stripe is found.
 
     Raises:
@@ -120,7 +120,7 @@ def read_labels(path: Path, *, images: Sequence[Path], width_px: int) -> dict[st
 
     Args:
         path: Lines ``image,column,row_px,range_m``; an image without a stripe has none.
-        images: Of which one at least has to have labels.
+        images: Images, at least one of which has labels.
         width_px: W.
 
     Raises:

@@ -40,11 +40,11 @@ class Counts:
 
     Attributes:
         stripe_columns: Columns with a stripe.
-        marked: Pixels the method kept.
-        right: Those of them that show the stripe.
+        marked: Number of pixels that the method kept.
+        right: Number of these that show the stripe.
         reached: Columns whose stripe has such a pixel.
         rows: Columns for which the method gives one row.
-        right_rows: Those of them whose row is the stripe's.
+        right_rows: Number of these whose row is the stripe's.
     """
 
     stripe_columns: int = 0

@@ -104,7 +104,8 @@ def evaluate(
             or "sim3".
         times: File of seconds, one a line, for poses in KITTI text; else these pair by line.
         max_gap_s: Largest time between an estimated pose and its true one.
-        lengths_m: Of the segments of the relative errors; None chooses them by the length of the true path.
+        lengths_m: Lengths of the segments of the relative errors; None chooses them by the length of the true
+            path.
 
     Returns:
         The metrics: ``found["ATE RMSE"]`` is one of them, ``print(found)`` a table of all; distances are
@@ -157,7 +158,8 @@ def assess(
         alignment: How the estimate is aligned with the truth first.
         frames_ns: Stamps of all frames of the log, of which the estimate should have poses; None takes the
             time that the truth covers instead.
-        lengths_m: Of the segments of the relative errors; None chooses them by the length of the true path.
+        lengths_m: Lengths of the segments of the relative errors; None chooses them by the length of the true
+            path.
         max_gap_s: Largest time between an estimated pose and its true one.
         names: What to call the two in an error, for instance their file names.
 

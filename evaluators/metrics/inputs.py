@@ -1,4 +1,4 @@
-"""What is evaluated: a run, a trajectory, or a file of poses, and what it is compared with."""
+"""Inputs of an evaluation: a run, a trajectory or a file of poses, and the truth."""
 
 import os
 from pathlib import Path
@@ -33,7 +33,7 @@ def estimate_and_truth(
     if times is not None and not untimed:
         raise DataError(f"{times}: --times is for poses in KITTI text, which neither file is")
     if times is None and len(untimed) == 1 and truth is not None:
-        raise DataError(f"{untimed[0]}: KITTI text has no stamps to pair poses by; tell them with --times")
+        raise DataError(f"{untimed[0]}: KITTI text has no stamps to pair poses by; give them with --times")
     known = truth if isinstance(truth, Trajectory) or truth is None else _poses(truth, times)
     if isinstance(estimate, Trajectory):
         return None, estimate, known

@@ -20,7 +20,7 @@ from mapper.run.folder import Run
 from mapper.sources.cloud_files import read_cloud
 
 _PAIR_VOXELS = 3.0
-"""How far apart the points of a pair may be while a reference is registered."""
+"""Largest distance between the points of a pair while a reference is registered."""
 
 World = Literal["truth", "map"]
 """World of a reference: that of the log's truth, or the run's own, which is levelled."""

@@ -37,8 +37,8 @@ class Reference:
         name: What it is, for a reader.
         points: (N, 3) metres on its surfaces, no two in a quarter of the map's voxels; None for a world that
             is known exactly.
-        signed_distance_m: Of a world that is known exactly, else None.
-        log_odds_at: Of a map, else None.
+        signed_distance_m: Signed distance in a world that is known exactly, else None.
+        log_odds_at: Log-odds in a map, else None.
         in_truth: It is in the world of the log's truth.
     """
 

@@ -19,8 +19,8 @@ class Step:
     """The step of the relative errors, the same for every method.
 
     Attributes:
-        delta: How long.
-        unit: In what.
+        delta: Length of the step.
+        unit: Unit of the length.
     """
 
     delta: float
@@ -28,7 +28,7 @@ class Step:
 
     @property
     def text(self) -> str:
-        """As in "RPE over 1 s"."""
+        """Words for "RPE over …", e.g. "1 s"."""
         return "1 frame" if self.unit == "frames" else f"{self.delta:g} {self.unit}"
 
 
@@ -62,10 +62,10 @@ class OdometryRun:
         method: Its name.
         frames: Frames that it was given.
         failures: Frames that it could not place, or registrations that did not converge.
-        seconds: Of the CPU, without what is common to all methods.
+        seconds: CPU time, without what is common to all methods.
         trajectory: T_world_body, aligned with the truth where there is one.
         matched: The poses that have a true one, aligned with it; None without truth or with too few.
-        errors: Of these; nothing is known without truth or with too few.
+        errors: Errors of these poses; unknown without truth or with too few of them.
         steps_m: (S,) errors of the translation over one step; empty where no two poses are one apart.
         broke: Why the method did not come to the end of the log; empty when it did.
     """
@@ -87,7 +87,7 @@ class OdometryRun:
 
     @property
     def frames_per_s(self) -> float:
-        """Of the method alone, on one core."""
+        """Frames per second of CPU time of the method alone."""
         return self.frames / self.seconds if self.seconds > 0.0 else 0.0
 
 
@@ -104,9 +104,9 @@ def assess_run(run: OdometryRun, truth: Trajectory | None, step: Step) -> Odomet
     """Return a run with its path aligned with the truth, and its errors; as it is where few poses have one.
 
     Args:
-        run: With a trajectory in any frame.
+        run: Run with a trajectory in any frame.
         truth: T_world_body.
-        step: Of the relative errors.
+        step: Step of the relative errors.
     """
     if truth is None or not len(run.trajectory):
         return run

@@ -22,7 +22,7 @@ from mapper.runtime.progress import SILENT, Progress
 from mapper.sources.base import Log
 
 RADIUS_M: dict[Sensor, float] = {"rgbd": 0.2, "lidar": 0.5}
-"""Of the patches: small enough for walls to be flat, large against the errors of poses."""
+"""Radius of the patches: small enough for walls to be flat, large against the errors of poses."""
 
 _FRAMES, _POINTS, _PATCHES = 100, 200_000, 5_000
 _MIN_NEIGHBOURS = 15
@@ -97,7 +97,7 @@ def sharpness_metrics(views: Views, *, radius_m: float) -> list[Metric]:
 
     Args:
         views: The scans at their poses.
-        radius_m: Of the patches.
+        radius_m: Radius of the patches.
 
     Raises:
         DataError: No patch was seen in two frames, or all are lines.

@@ -1,7 +1,8 @@
 """Silent failures: stretches of a path that are wrong though no frame of them is doubtful or lost."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,14 +23,14 @@ class DoubtCheck:
     """Comparison of the frames that a run calls doubtful or lost with those that are wrong.
 
     Attributes:
-        windows: Pairs of placed frames a window apart that the truth covers, one from each frame on.
-        wrong: Windows whose relative pose is wrong, flagged or not.
-        silent: Wrong windows of which no frame is doubtful, lost or skipped.
-        silent_at_s: When the first frame of each silent window was taken, seconds after the log's first.
+        windows: Number of pairs of placed frames a window apart that the truth covers, one for each frame.
+        wrong: Number of windows whose relative pose is wrong, flagged or not.
+        silent: Number of wrong windows of which no frame is doubtful, lost or skipped.
+        silent_at_s: Time of the first frame of each silent window, seconds after the log's first.
         worst_m: Largest error of the translation over silent windows; 0 if there are none.
         worst_rad: Largest error of the rotation over them.
-        right: Placed frames that are right.
-        flagged_right: Those of them that are doubtful.
+        right: Number of placed frames that are right.
+        flagged_right: Number of these that are doubtful.
     """
 
     windows: int
@@ -70,45 +71,56 @@ def check_doubts(
     stamps_ns = stamps_of(records)
     placed = np.array([r.stamp_ns in of_stamp and r.node is not None for r in records], dtype=np.bool_)
     flagged = ~placed | np.array([record.outcome != "tracked" for record in records], dtype=np.bool_)
-    poses = np.array([trajectory.T_world_body[of_stamp.get(r.stamp_ns, 0)] for r in records]).reshape(
-        -1, 4, 4
-    )
+    index = [of_stamp.get(record.stamp_ns, 0) for record in records]
+    poses = trajectory.T_world_body[index].reshape(-1, 4, 4)
     partner, gap_ns = nearest(truth.stamps_ns, stamps_ns)
     T_truth: Array = truth.T_world_body[partner]
     known = np.flatnonzero(placed & (gap_ns <= MAX_TRUTH_GAP_NS))
-    flags_before = np.concatenate([[0], np.cumsum(flagged)])
-
-    wrong = 0
-    silent: list[tuple[float, float, float]] = []
     ends = np.searchsorted(stamps_ns[known], stamps_ns[known] + round(window_s * NS_PER_S))
-    for a, end in zip(known.tolist(), ends.tolist(), strict=True):
-        if end == len(known):
-            break
-        b = int(known[end])
-        error_rad, error_m = _error(poses, T_truth, a, b)
-        if np.linalg.norm(error_m) <= WRONG_M and np.linalg.norm(error_rad) <= WRONG_RAD:
-            continue
-        covariance = _covariance(records, placed, poses, a, b)
-        if (
-            covariance is not None
-            and _sigmas(np.concatenate([error_rad, error_m]), covariance) <= WRONG_SIGMAS
-        ):
-            continue
-        wrong += 1
-        if flags_before[b + 1] == flags_before[a]:
-            since_s = float(stamps_ns[a] - stamps_ns[0]) / NS_PER_S
-            silent.append((since_s, float(np.linalg.norm(error_m)), float(np.linalg.norm(error_rad))))
+    has_end = ends < len(known)
+    windows = list(zip(known[has_end].tolist(), known[ends[has_end]].tolist(), strict=True))
+    wrong = list(_wrong_windows(windows, records, placed, poses, T_truth))
+    flags_before = np.concatenate([[0], np.cumsum(flagged)])
+    silent = [window for window in wrong if flags_before[window.last + 1] == flags_before[window.first]]
     right = _right(poses, T_truth, known, flagged)
     return DoubtCheck(
-        windows=int((ends < len(known)).sum()),
-        wrong=wrong,
+        windows=len(windows),
+        wrong=len(wrong),
         silent=len(silent),
-        silent_at_s=tuple(since_s for since_s, _, _ in silent),
-        worst_m=max((error_m for _, error_m, _ in silent), default=0.0),
-        worst_rad=max((error_rad for _, _, error_rad in silent), default=0.0),
+        silent_at_s=tuple(float(stamps_ns[window.first] - stamps_ns[0]) / NS_PER_S for window in silent),
+        worst_m=max((window.error_m for window in silent), default=0.0),
+        worst_rad=max((window.error_rad for window in silent), default=0.0),
         right=int(right.sum()),
         flagged_right=int((right & flagged[known]).sum()),
     )
+
+
+class _WrongWindow(NamedTuple):
+    """Window whose relative pose is wrong, by the indices of its first and last frame."""
+
+    first: int
+    last: int
+    error_m: float
+    error_rad: float
+
+
+def _wrong_windows(
+    windows: Iterable[tuple[int, int]],
+    records: Sequence[FrameRecord],
+    placed: NDArray[np.bool_],
+    poses: Array,
+    T_truth: Array,
+) -> Iterator[_WrongWindow]:
+    """Yield the windows whose error is large and, where covariances are known, not explained by them."""
+    for a, b in windows:
+        twist_rad, twist_m = _error(poses, T_truth, a, b)
+        error_m, error_rad = float(np.linalg.norm(twist_m)), float(np.linalg.norm(twist_rad))
+        if error_m <= WRONG_M and error_rad <= WRONG_RAD:
+            continue
+        covariance = _covariance(records, placed, poses, a, b)
+        error = np.concatenate([twist_rad, twist_m])
+        if covariance is None or _sigmas(error, covariance) > WRONG_SIGMAS:
+            yield _WrongWindow(a, b, error_m, error_rad)
 
 
 def _error(poses: Array, T_truth: Array, a: int, b: int) -> tuple[Array, Array]:

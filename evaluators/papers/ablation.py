@@ -20,7 +20,7 @@ from mapper.odometry.config import IsvdOdometryConfig, MatchConfig
 from mapper.odometry.isvd_odometry import IsvdOdometry
 from mapper.odometry.isvd_registration import IsvdObservation, PairRegistration, RegisterPair, matched_pairs
 from mapper.pipeline.solve import solve
-from mapper.pipeline.track import TrackingResult, refuse_a_fragment
+from mapper.pipeline.tracking_result import TrackingResult, refuse_a_fragment
 from mapper.registration.base import Alignment
 from mapper.sources.base import Log
 
@@ -41,7 +41,7 @@ class VariantResult:
 
     @property
     def lost(self) -> int:
-        """How many frames were read, but not placed."""
+        """Number of frames that were read, but not placed."""
         return self.frames - (0 if self.estimate is None else len(self.estimate))
 
 

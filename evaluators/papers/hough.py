@@ -34,8 +34,8 @@ class HoughTrial:
     Attributes:
         pair: The scan and the map.
         method: One of ``METHODS``.
-        seed: Of the yaw, which is any, and of the offset, up to 10 m. A pair without a known truth is only
-            turned.
+        seed: Seed of the yaw, which is any, and of the offset, up to 10 m. A pair without a known truth is
+            only turned.
         picture: PNG file to draw; None draws none.
     """
 

@@ -58,11 +58,11 @@ class PairConfig(Config):
     scan: Path
     """A cloud of any kind that is read, in metres around its sensor, z up; relative to ``pairs.toml``."""
     map: Path
-    """The same; without a pose within 10 m of the scan."""
+    """A cloud like ``scan``; without a pose, one taken within 10 m of it."""
     sensor: str = ""
     """Pairs of one sensor are summed up together; HDL and VLP beside the paper's."""
     pose: Annotated[tuple[float, ...], Field(min_length=6, max_length=6)] | None = None
-    """Of the scan in the map: x y z in metres, roll pitch yaw in degrees."""
+    """Pose of the scan in the map: x y z in metres, roll pitch yaw in degrees."""
     within_m: PositiveFloat = RIGHT_M
     within_deg: PositiveFloat = RIGHT_DEG
     """Tolerance of a right answer."""
@@ -115,7 +115,7 @@ class LogPair:
 
     Attributes:
         log: The log.
-        index: Of the scan, among those with a true pose.
+        index: Index of the scan, among those with a true pose.
         sensor: ``ALL_RINGS`` or ``FEW_RINGS``.
         within: Tolerance of a right answer: metres and degrees.
     """

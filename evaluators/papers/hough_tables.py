@@ -50,7 +50,7 @@ def hough_reproduction(results: Iterable[JobResult], *, pictures: Path) -> Repro
     """Return both summed up, the printed table, ours in its layout by each method, and our errors.
 
     Args:
-        results: Of the jobs of :func:`~mapper.evaluators.papers.hough.hough_jobs`.
+        results: Results of the jobs of :func:`~mapper.evaluators.papers.hough.hough_jobs`.
         pictures: Folder of their pictures.
     """
     results = list(results)

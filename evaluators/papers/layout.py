@@ -48,7 +48,7 @@ def as_printed(table: PaperTable, *, with_spread: bool) -> Table:
 
     Args:
         table: The table.
-        with_spread: With the lowest and the highest of the seeds, where there are several.
+        with_spread: Whether the lowest and the highest of several seeds are shown.
     """
     decimals = _decimals(table)
     records: list[Record] = []

@@ -25,7 +25,7 @@ CONFIGS = Path(__file__).with_name("configs")
 
 
 class Place(NamedTuple):
-    """Where a figure stands in a paper."""
+    """Place of a figure in a paper."""
 
     table: str
     row: str
@@ -37,7 +37,7 @@ class Measurement(Hashable, Protocol):
 
     @property
     def name(self) -> str:
-        """What is measured, as a part of a file's name."""
+        """Name of the measurement, as a part of a file's name."""
         ...
 
     @property
@@ -52,7 +52,7 @@ class Measurement(Hashable, Protocol):
 
     @property
     def places(self) -> Sequence[Place]:
-        """Which figures it gives."""
+        """Places of the figures that it gives."""
         ...
 
     def configs(self) -> Mapping[str, BuildConfig]:
@@ -94,7 +94,7 @@ def open_with_truth(log: Path, config: BuildConfig) -> tuple[Log, Trajectory]:
     """
     source = open_source(log, config.source)
     if source.truth is None:
-        raise DataError(f"{log}: has no ground truth, so there is no error to tell")
+        raise DataError(f"{log}: has no ground truth, so its error is unknown")
     return source, source.truth
 
 

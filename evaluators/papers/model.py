@@ -38,17 +38,17 @@ class PaperCell:
 
     @property
     def median(self) -> float | None:
-        """Of our seeds."""
+        """Median over our seeds."""
         return median(self.ours) if self.ours else None
 
     @property
     def low(self) -> float | None:
-        """The best seed."""
+        """Least figure of our seeds."""
         return min(self.ours, default=None)
 
     @property
     def high(self) -> float | None:
-        """The worst seed."""
+        """Largest figure of our seeds."""
         return max(self.ours, default=None)
 
     @property
@@ -60,7 +60,7 @@ class PaperCell:
 
     @property
     def verdict(self) -> Verdict:
-        """By the ratio: up to 0.95 better, up to 1.10 as published, else worse.
+        """Verdict by the ratio: up to 0.95 better, up to 1.10 as published, else worse.
 
         Without a ratio: "failed" if all seeds did, "not run" if nothing was tried, as where the log is the
         author's own, "in part" if ours is of a part of the log, and "not printed" if there is nothing to
@@ -82,7 +82,7 @@ class PaperTable:
     Attributes:
         name: "Table 5.1".
         title: Its content, in a line.
-        source: As ``published.json`` gives it.
+        source: Source of the table, from ``published.json``.
         metric: "ATE RMSE"; what is printed in the cells.
         unit: "m"; empty where it differs by column, whose text then ends in its own, e.g. "x [mm]".
         cells: Row by row.

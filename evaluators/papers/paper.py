@@ -13,7 +13,7 @@ from mapper.runtime.resumable_jobs import JobResult
 
 @dataclass(frozen=True, slots=True)
 class Cut:
-    """Which frames of every sequence are used.
+    """Range of the frames that are used of every sequence.
 
     Attributes:
         first: Index of the first.

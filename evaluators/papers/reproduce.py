@@ -34,9 +34,9 @@ class Request:
         paper: The paper.
         logs: Folder in which to look for its logs.
         given: Logs of other names, by the paper's names.
-        tables: Which, e.g. "5.1"; empty is all.
+        tables: Names of the tables, e.g. "5.1"; empty is all.
         seeds: Number of draws of all that is random.
-        cut: Which frames are used.
+        cut: Frames that are used.
     """
 
     paper: PaperName
@@ -52,7 +52,7 @@ class Request:
         if self.paper == "hough":
             if self.given or self.tables or not self.cut.is_whole:
                 raise ConfigError(
-                    "hough has one table, of pairs of clouds: it knows no --log, --tables, --first or --last"
+                    "hough has one table, of pairs of clouds: it has no --log, --tables, --first or --last"
                 )
             return
         known = _PAPERS[self.paper].sequences

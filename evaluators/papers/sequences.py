@@ -36,7 +36,7 @@ def find_sequences(folder: Path, names: Sequence[str], given: Mapping[str, Path]
 
     Args:
         folder: Folder that is searched.
-        names: As the paper calls them, e.g. "fr1/xyz".
+        names: Names in the paper, e.g. "fr1/xyz".
         given: Paths of logs of other names; these win.
 
     Raises:

@@ -32,11 +32,11 @@ class ThesisJob:
     """Measurement of all settings of some tables on one sequence with one seed.
 
     Attributes:
-        tables: Of ``thesis_tables.tables()``; they use the same frames of the sequence.
-        sequence: As the thesis calls it.
+        tables: Tables from ``thesis_tables.tables()``; they use the same frames of the sequence.
+        sequence: Name of the sequence in the thesis.
         log: Its folder or file.
-        seed: Of RANSAC.
-        cut: Which frames are used.
+        seed: Seed of RANSAC.
+        cut: Frames that are used.
         paths: Folder for the trajectories.
     """
 
@@ -49,12 +49,12 @@ class ThesisJob:
 
     @property
     def name(self) -> str:
-        """What is measured."""
+        """Name of the measurement."""
         return f"thesis-{slug(self.sequence)}-{'-'.join(self.tables)}"
 
     @property
     def places(self) -> list[Place]:
-        """Which figures it gives."""
+        """Places of the figures that it gives."""
         return [place for variant in self._variants() for place in self._places(*variant)]
 
     def configs(self) -> dict[str, BuildConfig]:

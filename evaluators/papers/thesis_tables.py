@@ -47,8 +47,8 @@ class Ablation:
         table: Without what we measure; the thesis's figures of its own logs are in it.
         printed: The thesis's figures of logs that may be at hand.
         sequences: And how many of their first frames are used; None is all.
-        settings: By what they are called in the table.
-        places: Where figures belong.
+        settings: Settings by their names in the table.
+        places: Places of the figures.
         measure: How they are worked out.
         alone: It shares too little work with the others to be measured with them.
     """
@@ -165,7 +165,7 @@ def _icp_or_svd(test_logs: Figures) -> Ablation:
             unit="",
             cells=tuple(own),
             notes=(
-                "The thesis's own log is not at hand: its rows tell of another path, so there is no ratio.",
+                "The thesis's own log is not at hand: its rows are of another path, so there is no ratio.",
                 "Axes are the camera's at the start (x right, y down, z forward); roll turns about z, pitch "
                 "about x, yaw about y. “total” is the mean of the three amounts, as the printed totals are.",
             ),

@@ -40,7 +40,7 @@ class Printed:
     Attributes:
         key: In ``published.json``.
         table: Without its cells.
-        columns: Those that our method fills; the others are other systems.
+        columns: Columns that our method fills; the others are other systems.
     """
 
     key: str
@@ -92,10 +92,10 @@ class ZhaoJob:
     """Measurement of the method as published on one sequence with one seed.
 
     Attributes:
-        sequence: As the paper calls it.
+        sequence: Name of the sequence in the paper.
         log: Its folder or file.
-        seed: Of RANSAC.
-        cut: Which frames are used.
+        seed: Seed of RANSAC.
+        cut: Frames that are used.
     """
 
     sequence: str
@@ -105,12 +105,12 @@ class ZhaoJob:
 
     @property
     def name(self) -> str:
-        """What is measured."""
+        """Name of the measurement."""
         return f"zhao-{slug(self.sequence)}"
 
     @property
     def places(self) -> list[Place]:
-        """Which figures it gives."""
+        """Places of the figures that it gives."""
         return [
             Place(table, self.sequence, column)
             for table, printed in TABLES.items()

@@ -40,7 +40,7 @@ def write_trajectory_errors(folder: Path, found: Assessment, *, title: str) -> P
     """
     matched = found.matched
     if matched is None:
-        raise DataError(f"{folder}: nothing to draw without a truth; tell one with --truth")
+        raise DataError(f"{folder}: nothing to draw without a truth; give one with --truth")
     picture = made_folder(folder) / TRAJECTORY
     timed = have_clock(matched.stamps_ns)
     elapsed = (matched.stamps_ns - matched.stamps_ns[0]).astype(np.float64)
@@ -88,7 +88,7 @@ def draw_path(
     """Draw a path over the truth, from the side on which that is widest, coloured by its error.
 
     Args:
-        axes: Where.
+        axes: Axes to draw on.
         matched: The path, aligned with the truth.
         errors_m: (N,) distances from the truth.
         most_m: Error of the strongest colour; None is the largest.

@@ -26,7 +26,7 @@ class Stage:
     Attributes:
         name: "before", "Hough" or "refined".
         T_target_source: (4, 4) the motion by then.
-        distance: Of the source from the target under it.
+        distance: Distance of the source from the target under it.
     """
 
     name: str

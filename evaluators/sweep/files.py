@@ -18,8 +18,8 @@ def write_sweep(plan: Plan, results: Mapping[BuildName, JobResult], *, title: st
 
     Args:
         plan: The builds, and the folder of their results.
-        results: Of the builds.
-        title: Of the page.
+        results: Results of the builds.
+        title: Title of the page.
     """
     records = sweep_records(plan, results)
     write_text(plan.out / CSV, csv_text(records))

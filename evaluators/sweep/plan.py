@@ -51,7 +51,7 @@ class BuildName:
 
     @property
     def label(self) -> str:
-        """As in "desk, isvd, fine, seed 1"."""
+        """Names and seed in a line, e.g. "desk, isvd, fine, seed 1"."""
         seed = () if self.seed is None else (f"seed {self.seed}",)
         return ", ".join([self.log, self.method, self.configuration, *seed])
 

@@ -21,10 +21,10 @@ class Quantity:
     """Quantity that methods are compared by.
 
     Attributes:
-        key: Of the records.
-        title: With the unit.
+        key: Key in the records.
+        title: Title with the unit.
         shown: Turns a number into text.
-        best: Which one is marked, if any.
+        best: Function that picks the value to mark, if any is.
         needs_coverage: It compares only among variants that cover alike: one that leaves out hard frames
             has smaller errors.
     """
@@ -51,8 +51,8 @@ class Group:
     """The builds of one log by one method and configuration, which differ by their seed.
 
     Attributes:
-        records: Of those that finished.
-        failures: Number of those that did not.
+        records: Records of the builds that finished.
+        failures: Number of builds that did not.
     """
 
     records: tuple[Record, ...] = ()

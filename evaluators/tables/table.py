@@ -47,7 +47,7 @@ class Column:
     """A column as it is shown.
 
     Attributes:
-        key: Of the records.
+        key: Key in the records.
         title: What stands above it, with the unit.
         shown: Turns a value into text.
     """

@@ -57,7 +57,7 @@ class Setting:
     key: str
     """Dotted name, as ``--set`` takes it."""
     type: str
-    """What it takes, as "number > 0" or "5 numbers or none"; "table" where settings stand below it."""
+    """Type of its values, as "number > 0" or "5 numbers or none"; "table" where settings stand below it."""
     default: Any
     """Default as JSON has it: of a table a dictionary, None for none."""
     unit: str
@@ -93,7 +93,7 @@ def settings(sensor: Sensor = "rgbd") -> Iterator[Setting]:
     """Yield the description of every setting of ``mapper build``, tables before what they hold.
 
     Args:
-        sensor: Whose defaults are meant.
+        sensor: Sensor whose defaults are shown.
     """
     yield from settings_of(load_config(sensor=sensor))
 

@@ -41,7 +41,7 @@ def load_config(
         path: The file; None begins with the defaults.
         overrides: ``key.path=value`` as text, parsed by the model.
         settings: The same as values by dotted name; they come last.
-        sensor: Whose defaults hold where nothing else says anything.
+        sensor: Sensor whose defaults hold where nothing else is set.
 
     Raises:
         ConfigError: The file cannot be read or parsed, or the model refuses a name or a value.

@@ -3,7 +3,14 @@
 Library code raises or warns; only ``cli`` turns them into one line and, for an error, an exit status.
 """
 
+from collections.abc import Sequence
+
 _LONGEST = 800
+
+
+def listed(names: Sequence[str], *, most: int = 5) -> str:
+    """Return the first of some names for a message, with "…" for the others."""
+    return ", ".join(names[:most]) + (", …" if len(names) > most else "")
 
 
 class MapperError(Exception):

@@ -13,9 +13,9 @@ class Finding:
     """Result of one check.
 
     Attributes:
-        name: What was checked.
+        name: Name of the check.
         verdict: "warning" is worth knowing; "failed" keeps some verb from working.
-        detail: What was seen, in one line.
+        detail: Result in one line.
         remedy: What to do about it; empty when all is well.
     """
 

@@ -81,8 +81,8 @@ def tried(
     """Run a self-test in a process of its own, and return how it ended.
 
     Args:
-        name: Of the library.
-        version: Of the library.
+        name: Name of the library.
+        version: Version of the library.
         command: Ends with status 0 if the library works.
         again: How to install the library afresh.
         patience_s: Longer is a failure; None: a minute, and more where processes wait for processors.

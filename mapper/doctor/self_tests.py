@@ -279,7 +279,7 @@ SELF_TESTS: dict[str, Callable[[Path], None]] = {
     "typer": typer,
     "zstandard": zstandard,
 }
-"""By the name under which pip knows the library."""
+"""Tests by the name of the library at PyPI."""
 
 
 def _expect(is_so: object, message: str) -> None:

@@ -15,7 +15,7 @@ PACKAGES = {
     "libudev.so.1": "libudev1",
     "libusb-1.0.so.0": "libusb-1.0-0",
 }
-"""What ``readelf -d`` names in our wheels, beyond libc and what they bring themselves."""
+"""System libraries that ``readelf -d`` names in our wheels, without libc and those that wheels bring."""
 
 
 def check_system_libraries(wanted: Iterable[str] = tuple(PACKAGES)) -> Finding:

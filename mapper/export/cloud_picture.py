@@ -1,5 +1,6 @@
 """Pictures of a coloured cloud, from above and from the side."""
 
+from collections.abc import Collection
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -61,23 +62,12 @@ def write_cloud_views(
         "from above": _View(_turned(0.0, np.pi / 2), points, positions),
         "from the side": _View(_turned(_TURN_RAD, _TILT_RAD), points, positions),
     }
-    # Both views are as high as the page; its width is what they take.
-    widths_in = [_VIEW_IN * min(view.aspect, _WIDEST) for view in views.values()]
-    width_in = sum(widths_in) + 3 * _GAP_IN
-    height_in = _VIEW_IN + _HEAD_IN + _FOOT_IN
-    figure = new_figure(width_in, height_in, background=BACKDROP)
-    left_in = _GAP_IN
-    for (name, view), view_in in zip(views.items(), widths_in, strict=True):
-        axes = figure.add_axes(
-            (left_in / width_in, _FOOT_IN / height_in, view_in / width_in, _VIEW_IN / height_in)
-        )
+    figure, panels = _page_for(views.values())
+    for axes, (name, view) in zip(panels, views.items(), strict=True):
         _draw_view(axes, view, colors)
         axes.set_title(name, color=LINE, fontsize=11)
-        left_in += view_in + _GAP_IN
-    handles, labels = axes.get_legend_handles_labels()
     figure.legend(
-        handles,
-        labels,
+        *panels[-1].get_legend_handles_labels(),
         loc="lower left",
         ncols=3,
         frameon=False,
@@ -106,6 +96,23 @@ class _View:
         """Width over height."""
         width, height = self.high - self.low
         return float(width / height)
+
+
+def _page_for(views: Collection[_View]) -> "tuple[Figure, list[Axes]]":
+    """Return a page with axes side by side, one for each view, all of one height."""
+    widths_in = [_VIEW_IN * min(view.aspect, _WIDEST) for view in views]
+    width_in = sum(widths_in) + (len(views) + 1) * _GAP_IN
+    height_in = _VIEW_IN + _HEAD_IN + _FOOT_IN
+    figure = new_figure(width_in, height_in, background=BACKDROP)
+    axes, left_in = [], _GAP_IN
+    for view_in in widths_in:
+        axes.append(
+            figure.add_axes(
+                (left_in / width_in, _FOOT_IN / height_in, view_in / width_in, _VIEW_IN / height_in)
+            )
+        )
+        left_in += view_in + _GAP_IN
+    return figure, axes
 
 
 def _height_legend(figure: "Figure", heights_m: tuple[float, float]) -> None:

@@ -31,7 +31,7 @@ def write_grid(folder: Path, stem: str, grid: OccupancyGrid) -> None:
     """Write ``stem.pgm``, ``stem.yaml`` and ``stem.png``, each atomically; the YAML comes last.
 
     Args:
-        folder: Where; made if missing.
+        folder: Folder of the files; made if missing.
         stem: Name of the files without ending.
         grid: The slice; the world frame becomes the ROS map frame.
     """
@@ -46,7 +46,7 @@ def write_values(folder: Path, stem: str, values: NDArray[np.uint8], geometry: "
     """Write ``stem.pgm`` and ``stem.yaml`` in map_server's mode "raw", each atomically.
 
     Args:
-        folder: Where; made if missing.
+        folder: Folder of the files; made if missing.
         stem: Name of the files without ending.
         values: (H, W) what the cells are published as: 0 … 100, or 255 for unknown.
         geometry: A grid or costmap of these cells.
@@ -74,7 +74,7 @@ def _write_image(
 
 
 class _Geometry(Protocol):
-    """Where the cells of a grid or a costmap lie."""
+    """Position of the cells of a grid or a costmap."""
 
     @property
     def resolution_m(self) -> float: ...

@@ -25,7 +25,7 @@ def document(
     """Return a page's HTML.
 
     Args:
-        title: Of the window, as plain text.
+        title: Title of the window, as plain text.
         header: HTML inside the bar that stays on top.
         main: HTML of the sections.
         scripts: HTML of script elements.

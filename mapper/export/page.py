@@ -71,7 +71,7 @@ def scale_bar(axes: "Axes", low: Array, high: Array, *, color: str) -> None:
         axes: In metres.
         low: (2,) lower left corner of the map, metres.
         high: (2,) upper right corner.
-        color: Of the bar and its length.
+        color: Colour of the bar and its length.
     """
     length_m = round_length(0.2 * float(high[0] - low[0]))
     x, y = low + 0.035 * (high - low)

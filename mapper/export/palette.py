@@ -41,4 +41,4 @@ FREE_CELL: Rgb = PAPER
 OCCUPIED_CELL: Rgb = (35, 41, 54)
 
 RUNS: tuple[Rgb, ...] = (ESTIMATE, _SKY, _GREEN, (150, 120, 220), _ORANGE, (140, 110, 70))
-"""Of runs that are shown together."""
+"""Colours of runs that are shown together."""

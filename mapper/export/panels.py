@@ -68,9 +68,9 @@ def panel(
 
     Args:
         figure: What ``page`` returned for so many columns and rows.
-        number: Which panel.
-        columns: Of panels.
-        rows: Of panels.
+        number: Number of the panel.
+        columns: Number of columns of panels.
+        rows: Number of rows of panels.
         legend_in: The page's room for a legend.
         left_in: Each panel's room for what stands at its left.
     """

@@ -1,4 +1,4 @@
-"""Pictures of a run: the trajectory or a path over the slice, and a pose graph."""
+"""Pictures over a grid, seen from above: trajectories, planned paths, runs of a merged map, voxels."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -27,7 +27,6 @@ from mapper.export.page import (
 from mapper.export.palette import DOUBTFUL, END, ESTIMATE, FACTORS, PLAN, START, TRUTH, UNKNOWN_CELL, Rgb
 from mapper.export.panels import color_of
 from mapper.export.path_band import SIGMAS, band_image
-from mapper.graph.model import PoseGraph, Solution
 from mapper.octree.grid import FREE, OCCUPIED, OccupancyGrid
 from mapper.run.pose_covariances import UncertainPoses
 
@@ -35,7 +34,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _MARGIN_M = 0.3
-_ACCEPTED_WEIGHT = 0.5  # weight from which a factor counts as held
 _NAMED = 12  # of many runs only the first are in the legend
 _ARROWS = 6  # along a path
 _SWEPT_PX = 4  # pixels per cell
@@ -59,7 +57,7 @@ def write_summary(
         path: PNG file to write.
         grid: The slice, world frame.
         trajectory: The estimate, world frame.
-        truth: Where the body really was, already aligned to the world frame, or None.
+        truth: True path of the body, already aligned to the world frame, or None.
         loops_world: (L, 2, 3) ends of the loop closures, metres, world frame.
         title: Headline.
         lines: Figures worth knowing, shown below the headline.
@@ -161,7 +159,7 @@ def write_localised(
     Args:
         path: PNG file to write.
         grid: The map's slice.
-        poses: Of the frames that were placed, in the map's frame; at least one.
+        poses: Poses of the frames that were placed, in the map's frame; at least one.
         begins_ns: Stamps from which the path is drawn anew: what lies before each is not connected to it.
         recognised_world: (K, 3) where the map was recognised, metres.
         title: Headline.
@@ -169,7 +167,7 @@ def write_localised(
     """
     positions = poses.trajectory.positions_world
     parts = np.split(positions, np.searchsorted(poses.trajectory.stamps_ns, sorted(begins_ns)))
-    with _map_page(path, grid, [positions], title, lines) as axes, _over_grid(axes, grid, [positions]):
+    with _grid_page(path, grid, [positions], title, lines) as axes:
         for number, part in enumerate(part for part in parts if len(part)):
             label = "" if number else "estimate"
             axes.plot(*part[:, :2].T, color=hex_of(ESTIMATE), linewidth=1.3, label=label)
@@ -194,12 +192,12 @@ def write_path(
         path: PNG file to write.
         grid: Background of the path, world frame.
         waypoints_world: (N, 2) or (N, 3) metres, seen from above.
-        radius_m: Of the robot.
+        radius_m: Radius of the robot.
         title: Headline.
         lines: Figures worth knowing, shown below the headline.
     """
     ends = waypoints_world[:, :2]
-    with _map_page(path, grid, [ends], title, lines) as axes, _over_grid(axes, grid, [ends]):
+    with _grid_page(path, grid, [ends], title, lines) as axes:
         _draw_over(axes, _swept(grid, ends, radius_m), grid)
         axes.plot(*ends.T, color=hex_of(PLAN), linewidth=1.6, label=f"path, {2 * radius_m:g} m wide")
         axes.plot(*ends[1:-1].T, ".", color=hex_of(PLAN), markersize=5)
@@ -225,10 +223,9 @@ def write_merged(
         title: Headline.
         lines: Figures worth knowing, shown below the headline.
     """
-    with (
-        _map_page(path, grid, list(paths_world.values()), title, lines) as axes,
-        _over_grid(axes, grid, list(paths_world.values())) as (low, high),
-    ):
+    paths = list(paths_world.values())
+    low, high = _extent(grid, paths)
+    with _grid_page(path, grid, paths, title, lines) as axes:
         for draw, (start, end) in zip((axes.axvline, axes.axhline), zip(low, high, strict=True), strict=True):
             for border_m in np.arange(np.ceil(start / tile_m), np.floor(end / tile_m) + 1) * tile_m:
                 draw(border_m, color=hex_of(PLAN), linewidth=0.5, alpha=0.35)
@@ -255,7 +252,7 @@ def write_layers(
         lines: Figures worth knowing, shown below the headline.
     """
     paths_world = [centres for centres, _ in layers.values()]
-    with _map_page(path, grid, paths_world, title, lines) as axes, _over_grid(axes, grid, paths_world):
+    with _grid_page(path, grid, paths_world, title, lines) as axes:
         for name, (centres, color) in layers.items():
             cells = np.unique(np.floor(centres[:, :2] / grid.resolution_m).astype(np.int64), axis=0)
             corners = (cells - cells.min(axis=0, initial=0))[:, ::-1] if len(cells) else cells
@@ -305,44 +302,6 @@ def _over_grid(
     axes.legend(loc="best", fontsize=8, framealpha=0.92, edgecolor=LINE)
 
 
-def write_graph_views(path: Path, graph: PoseGraph, solution: Solution, *, title: str) -> None:
-    """Draw a pose graph before and after it was solved, from the side on which it is widest.
-
-    Args:
-        path: PNG file to write.
-        graph: Nodes at their first estimates.
-        solution: Of that graph; factors that weigh less than half are drawn dotted.
-        title: Headline.
-    """
-    from matplotlib.collections import LineCollection
-
-    place = {node: k for k, node in enumerate(graph.T_world_node)}
-    ends = np.array([(place[factor.i], place[factor.j]) for factor in graph.factors], np.int64).reshape(-1, 2)
-    solved = np.array(list(solution.T_world_node.values()))[:, :3, 3]
-    *_, axes_world = np.linalg.svd(solved - solved.mean(axis=0), full_matrices=False)
-    figure = new_figure(13.0, 6.9)
-    figure.text(0.03, 0.955, title, fontsize=14, fontweight="bold", color=INK)
-    costs = {"before": solution.error_before, "after": solution.error_after}
-    for column, (name, cost) in enumerate(costs.items()):
-        T_world_node = graph.T_world_node if name == "before" else solution.T_world_node
-        seen = np.array(list(T_world_node.values()))[:, :3, 3] @ axes_world[:2].T
-        axes = figure.add_axes((0.02 + 0.49 * column, 0.02, 0.47, 0.86))
-        for origin, color in FACTORS.items():
-            for accepted, style in ((True, "solid"), (False, "dotted")):
-                drawn = [
-                    factor.origin == origin and (weight >= _ACCEPTED_WEIGHT) == accepted
-                    for factor, weight in zip(graph.factors, solution.weights, strict=True)
-                ]
-                axes.add_collection(
-                    LineCollection(seen[ends[drawn]], colors=hex_of(color), linewidths=0.8, linestyles=style)
-                )
-        axes.plot(*seen.T, ".", color=hex_of(ESTIMATE), markersize=1.5)
-        axes.set_aspect("equal", adjustable="datalim")
-        axes.set_title(f"{name}: cost {cost:.6g}", color=FAINT, fontsize=11)
-        axes.set_axis_off()
-    save(figure, path)
-
-
 def _extent(grid: OccupancyGrid, paths_world: Sequence[Array]) -> tuple[Array, Array]:
     """Return the lower and upper corner, metres, around everything known."""
     rows, columns = np.nonzero((grid.cells == FREE) | (grid.cells == OCCUPIED))
@@ -382,3 +341,12 @@ def _map_page(
     quiet_frame(axes, label_size=8)
     yield axes
     save(figure, path)
+
+
+@contextmanager
+def _grid_page(
+    path: Path, grid: OccupancyGrid, paths_world: Sequence[Array], title: str, lines: Sequence[str]
+) -> Iterator["Axes"]:
+    """Write a page with a headline, a grid and what the caller draws over it, on axes in metres."""
+    with _map_page(path, grid, paths_world, title, lines) as axes, _over_grid(axes, grid, paths_world):
+        yield axes

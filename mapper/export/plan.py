@@ -44,7 +44,7 @@ def draw_plan(folder: Path, plan: Plan, *, grid: OccupancyGrid) -> None:
     """Write ``plan.json`` and ``plan.png`` into a map's folder; an earlier plan is replaced.
 
     Args:
-        folder: Of a run, or of a merged map.
+        folder: Folder of a run, or of a merged map.
         plan: The path.
         grid: What it is drawn over.
     """

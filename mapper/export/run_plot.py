@@ -20,7 +20,7 @@ def plot_run(run: "Run", axes: "Axes | None" = None) -> "Axes":
 
     Args:
         run: A finished run.
-        axes: Where to draw; None makes a figure of pyplot's.
+        axes: Axes to draw on; None makes a figure of pyplot's.
 
     Returns:
         The axes.

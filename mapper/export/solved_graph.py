@@ -5,7 +5,7 @@ from pathlib import Path
 
 from mapper.core.errors import RunError
 from mapper.core.trajectory import trajectory_from
-from mapper.export.picture import write_graph_views
+from mapper.export.graph_picture import write_graph_views
 from mapper.graph.components import components
 from mapper.graph.config import GraphConfig
 from mapper.graph.g2o import write_g2o
@@ -28,7 +28,7 @@ class SolvedGraph:
     Attributes:
         path: The file that the graph came from.
         graph: Nodes at their first estimates.
-        solution: Of that graph.
+        solution: Solution of that graph.
         config: What it was solved with.
         seconds: What reading and solving took, by name.
     """

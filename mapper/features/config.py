@@ -10,81 +10,76 @@ ScaleFactor = Annotated[float, Field(gt=1.0)]
 """Size of a pixel on one pyramid level relative to the next finer one."""
 
 
-class SurfConfig(Config):
-    """SURF (Bay et al. 2008), chosen by Somlyai (PhD thesis); octaves, layers and thresholds as OpenCV's."""
+class _DetectorConfig(Config):
+    """Settings of any detector."""
 
-    kind: Literal["surf"] = "surf"
+    kind: str
     max_features: PositiveInt = 1000
     """Largest number of features of an image, the strongest first. More in images of higher resolution; fewer
     are faster."""
+
+
+class _AdaptiveConfig(_DetectorConfig):
+    """Settings of a detector whose threshold is halved while there are too few features."""
+
+    threshold: float
+    min_threshold: float
+    min_features: PositiveInt = 300
+    """With fewer features the threshold is halved."""
+
+
+class SurfConfig(_AdaptiveConfig):
+    """SURF (Bay et al. 2008), chosen by Somlyai (PhD thesis); octaves, layers and thresholds as OpenCV's."""
+
+    kind: Literal["surf"] = "surf"
     threshold: PositiveFloat = 500.0
     """First threshold of the Hessian's determinant, grey levels²; halved while there are too few features."""
     min_threshold: PositiveFloat = 25.0
     """Last threshold; raise it if noise produces features."""
-    min_features: PositiveInt = 300
-    """With fewer features the threshold is halved."""
     octaves: PositiveInt = 4
     """Number of times that the filter's size doubles; more find larger features."""
     layers: PositiveInt = 3
     """Filter sizes per octave in which points are found."""
 
 
-class SiftConfig(Config):
+class SiftConfig(_AdaptiveConfig):
     """SIFT (Lowe 2004) by OpenCV."""
 
     kind: Literal["sift"] = "sift"
-    max_features: PositiveInt = 1000
-    """Largest number of features of an image, the strongest first. More in images of higher resolution; fewer
-    are faster."""
     threshold: PositiveFloat = 0.04
     """First contrast threshold; halved while there are too few features."""
     min_threshold: PositiveFloat = 0.01
     """Last threshold; raise it if noise produces features."""
-    min_features: PositiveInt = 300
-    """With fewer features the threshold is halved."""
 
 
-class AkazeConfig(Config):
+class AkazeConfig(_AdaptiveConfig):
     """AKAZE (Alcantarilla et al. 2013) by OpenCV."""
 
     kind: Literal["akaze"] = "akaze"
-    max_features: PositiveInt = 1000
-    """Largest number of features of an image, the strongest first. More in images of higher resolution; fewer
-    are faster."""
     threshold: PositiveFloat = 0.001
     """First threshold of the detector's response; halved while there are too few features."""
     min_threshold: PositiveFloat = 0.0001
     """Last threshold; raise it if noise produces features."""
-    min_features: PositiveInt = 300
-    """With fewer features the threshold is halved."""
 
 
-class OrbConfig(Config):
+class OrbConfig(_AdaptiveConfig):
     """ORB (Rublee et al. 2011) by OpenCV."""
 
     kind: Literal["orb"] = "orb"
-    max_features: PositiveInt = 1000
-    """Largest number of features of an image, the strongest first. More in images of higher resolution; fewer
-    are faster."""
     threshold: PositiveInt = 20
     """First FAST threshold, grey levels; halved while there are too few features."""
     min_threshold: PositiveInt = 5
     """Last threshold; raise it if noise produces features."""
-    min_features: PositiveInt = 300
-    """With fewer features the threshold is halved."""
     levels: PositiveInt = 8
     """Number of pyramid levels. More let features be found again over larger changes of distance."""
     scale_factor: ScaleFactor = 1.2
     """Size of a pixel on one pyramid level relative to the next finer one."""
 
 
-class UniformOrbConfig(Config):
+class UniformOrbConfig(_DetectorConfig):
     """ORB distributed evenly over the image by a quadtree (Zhao et al. 2020, §1.1)."""
 
     kind: Literal["uniform-orb"] = "uniform-orb"
-    max_features: PositiveInt = 1000
-    """Largest number of features of an image, the strongest first. More in images of higher resolution; fewer
-    are faster."""
     threshold: PositiveInt = 20
     """FAST threshold, grey levels, tried first in every cell."""
     min_threshold: PositiveInt = 7

@@ -43,7 +43,7 @@ class Part:
         known: Its factors that are inliers for certain.
         loops: Its factors that may be outliers.
         held: GTSAM's terms of ``known``, and the anchor.
-        start: Where the solver begins.
+        start: Poses at which the solver starts.
     """
 
     known: Sequence[BetweenFactor]

@@ -46,8 +46,8 @@ class _Place:
     Attributes:
         root: First node of its tree.
         parent: The node before it; its own for the root.
-        depth: Steps from the root.
-        T_root_node: Chained from the root.
+        depth: Number of steps from the root.
+        T_root_node: (4, 4) pose in the root, chained from it.
         covariance: (6, 6) accumulated since the root, in the root's tangent space.
     """
 

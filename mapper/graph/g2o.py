@@ -96,9 +96,9 @@ class _Form:
     """Meaning of the numbers of a line.
 
     Attributes:
-        ids: How many there are.
-        pose_numbers: How many a pose takes.
-        poses: Makes (N, 4, 4) of (N, pose_numbers).
+        ids: Number of node ids.
+        pose_numbers: Number of columns of a pose.
+        poses: Function that makes (N, 4, 4) poses of (N, pose_numbers).
         information_rows: Rows of the information matrix whose upper triangle follows; 0 for none.
     """
 

@@ -52,7 +52,7 @@ def compare(
         T_i_j_predicted: (4, 4) predicted.
         covariance: (6, 6) of both together, in j's tangent (rotation, translation), rad² and m².
         slack_m: Distance that is possible without any uncertainty: errors that no covariance describes.
-        slack_rad: Angle that is.
+        slack_rad: Angle that is possible without any uncertainty.
     """
     miss = inverse(T_i_j) @ T_i_j_predicted
     twist = np.concatenate(log(miss))

@@ -29,7 +29,7 @@ _DECIDED = 1e-3
 _DRIFT_SLACK = 3.0
 """Systematic drift grows with the path, not its square root: long loops disagree more than short ones."""
 _UNUSED_LOOP_RATIO = 4.0
-"""How many times the limit an unused loop may have: the path has not been optimised with it."""
+"""Factor on the limit of an unused loop: the path has not been optimised with it."""
 _CLUSTER_NODES = 10
 """Loops whose ends are at most so many nodes apart form a cluster, which is tried as one."""
 _MAX_CLUSTERS_TRIED = 8

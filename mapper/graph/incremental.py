@@ -7,16 +7,14 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from mapper.core.errors import GraphError
-from mapper.core.geometry import Transform, inverse, is_rigid
+from mapper.core.geometry import Transform, inverse
 from mapper.graph.config import GraphConfig
-from mapper.graph.model import BetweenFactor
+from mapper.graph.model import BetweenFactor, refuse_factor, refuse_node
 from mapper.graph.terms import Kernel, anchor, between, poses_of, values_of
 
 _HUBER = Kernel("huber", GraphConfig().robust_width)
-
-
 _LARGEST_RATIO = 1e16
-"""Of information that double precision can still add up."""
+"""Largest ratio of information that double precision can still add up."""
 
 
 class IncrementalSolver:
@@ -53,10 +51,7 @@ class IncrementalSolver:
         Raises:
             GraphError: The node is there already, or the estimate is not a rigid motion.
         """
-        if node in self._T_world_node:
-            raise GraphError(f"node {node} is in the graph already")
-        if not is_rigid(T_world_node):
-            raise GraphError(f"node {node}: its pose is not a finite rigid motion")
+        refuse_node(node, T_world_node, self._T_world_node)
         self._T_world_node[node] = T_world_node
         self._component[node], self._members[node] = node, [node]
 
@@ -67,9 +62,7 @@ class IncrementalSolver:
             GraphError: A factor names an unknown node.
         """
         for factor in factors:
-            for node in (factor.i, factor.j):
-                if node not in self._T_world_node:
-                    raise GraphError(f"factor {factor.i} → {factor.j}: node {node} is not in the graph")
+            refuse_factor(factor, self._T_world_node)
             if self._component[factor.i] != self._component[factor.j]:
                 self._join(factor)
             self._factors.append(factor)

@@ -8,7 +8,7 @@ from mapper.core.geometry import Array
 # g2o orders a pose's tangent (translation, rotation); ours is (rotation, translation).
 _SWAPPED = np.array([3, 4, 5, 0, 1, 2])
 _PLANAR = np.array([3, 4, 2])
-"""Where x, y and yaw stand in our tangent."""
+"""Indices of x, y and yaw in the tangent."""
 
 
 def swapped(information: Array) -> Array:

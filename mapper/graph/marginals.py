@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     import gtsam
 
 _HELD = PoseSigmas(rotation_rad=1e-6, translation_m=1e-6).information
-"""Of the first node: next to nothing beside any factor's, and yet within the digits of a solve."""
+"""Information of the first node: far less than any factor's, and yet within the digits of a solve."""
 _DIMENSION = 6
 
 

@@ -125,10 +125,7 @@ class PoseGraph:
         Raises:
             GraphError: The node exists, or the estimate is not a rigid motion.
         """
-        if node in self.T_world_node:
-            raise GraphError(f"node {node} is in the graph already")
-        if not is_rigid(T_world_node):
-            raise GraphError(f"node {node}: its pose is not a finite rigid motion")
+        refuse_node(node, T_world_node, self.T_world_node)
         self.T_world_node[node] = T_world_node
         self.stamps_ns[node] = stamp_ns
 
@@ -163,10 +160,23 @@ class PoseGraph:
             GraphError: A factor names an unknown node.
         """
         for factor in factors:
-            for node in (factor.i, factor.j):
-                if node not in self.T_world_node:
-                    raise GraphError(f"factor {factor.i} → {factor.j}: node {node} is not in the graph")
+            refuse_factor(factor, self.T_world_node)
             self.factors.append(factor)
+
+
+def refuse_node(node: int, T_world_node: Transform, known: Container[int]) -> None:
+    """Refuse a new node that is among the known ones, or whose pose is not a rigid motion."""
+    if node in known:
+        raise GraphError(f"node {node} is in the graph already")
+    if not is_rigid(T_world_node):
+        raise GraphError(f"node {node}: its pose is not a finite rigid motion")
+
+
+def refuse_factor(factor: BetweenFactor, known: Container[int]) -> None:
+    """Refuse a factor of which a node is not among the known ones."""
+    for node in (factor.i, factor.j):
+        if node not in known:
+            raise GraphError(f"factor {factor.i} → {factor.j}: node {node} is not in the graph")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

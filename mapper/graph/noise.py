@@ -19,7 +19,7 @@ def with_model_error(information: Array, T_i_j: Transform, *, scale: float = 1.0
     Args:
         information: (6, 6) of j's tangent (rotation, translation) from the features alone.
         T_i_j: (4, 4) the measurement.
-        scale: Of that error: less than 1 where residuals show less of it.
+        scale: Factor on the standard deviations of that error: less than 1 where residuals show less of it.
     """
     angle_rad = float(np.linalg.norm(rotation_log(T_i_j[:3, :3])))
     distance_m = float(np.linalg.norm(T_i_j[:3, 3]))

@@ -34,7 +34,7 @@ def optimize(graph: PoseGraph, config: GraphConfig, *, progress: Progress = SILE
 
     Args:
         graph: At least one node; it is not changed.
-        config: Which solve, and when to stop.
+        config: Solver, and when it stops.
         progress: Receives the iterations of each component, and how many there may be.
 
     Returns:

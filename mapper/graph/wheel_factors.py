@@ -115,7 +115,7 @@ def wheel_factor(
         j: The later node.
         odometer: Path length and turning between their times.
         noise: Standard deviations, at least, by the path and by the turning.
-        origin: Of the factor: "odometry" where wheels are the odometry.
+        origin: Origin of the factor: "odometry" where wheels are the odometry.
     """
     path_m, turn_rad = odometer.between(i.stamp_ns, j.stamp_ns)
     sigmas = PoseSigmas(

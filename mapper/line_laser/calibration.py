@@ -126,7 +126,7 @@ def calibrate(
     Args:
         shots: At three ranges at least, two of them with widths.
         size_px: Width and height of the images.
-        reach_m: Where the laser meets the floor.
+        reach_m: Distance at which the laser meets the floor.
         vehicle: What carries the sensor.
 
     Raises:

@@ -32,7 +32,7 @@ def hue(image: Image, *, from_deg: float, to_deg: float, saturation: int) -> Res
         image: (H, W, 3) RGB.
         from_deg: First of the hues, 0 to 360°.
         to_deg: Last of them; less than the first if they pass through 0.
-        saturation: Less is grey.
+        saturation: Least saturation; pixels with less are grey.
     """
     hues, saturations, values = cv2.split(cv2.cvtColor(image, cv2.COLOR_RGB2HSV))
     degrees = 2.0 * hues
@@ -47,7 +47,7 @@ def intensity(red: Response, *, threshold: int) -> Response:
 
     Args:
         red: (H, W) red channel: light of the laser is red whatever it falls on (§2.5.2).
-        threshold: k.
+        threshold: Least brightness, k.
     """
     return _at_least(red, threshold)
 
@@ -57,7 +57,7 @@ def weight(image: Image, *, threshold: int) -> Response:
 
     Args:
         image: (H, W, 3) RGB.
-        threshold: Less is not red.
+        threshold: Least redness.
     """
     return _at_least(cv2.transform(image, _TWO_RED), threshold)
 
@@ -67,8 +67,9 @@ def edges(red: Response, *, sigma_px: float, threshold: int) -> Response:
 
     Args:
         red: (H, W) red channel.
-        sigma_px: Of the Gaussian; about that of the stripe's own profile.
-        threshold: Of OpenCV's 5 × 5 mask, as a byte holds it: 150 is a stripe of some 20 levels.
+        sigma_px: Standard deviation of the Gaussian; about that of the stripe's own profile.
+        threshold: Least response of OpenCV's 5 × 5 mask, as a byte holds it: 150 is a stripe of some 20
+            levels.
     """
     smooth = cv2.GaussianBlur(red.astype(np.float32), (0, 0), sigma_px)
     return _at_least(cv2.convertScaleAbs(cv2.Laplacian(smooth, cv2.CV_32F, ksize=_LOG_APERTURE)), threshold)

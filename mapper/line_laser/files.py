@@ -27,7 +27,7 @@ def find_images(
     """Return a folder's images in time order, their stamps, and notes on what was assumed.
 
     Args:
-        folder: Of images; stamps are in their names, or in ``times.txt`` in it or beside it.
+        folder: Folder of images; stamps are in their names, or in ``times.txt`` in it or beside it.
         times: List of stamps that goes before both.
         rate_hz: Images a second without any stamps; None is 10.
 

@@ -51,8 +51,8 @@ def write_scans(
 
     Args:
         folder: Existing folder.
-        scans: By their images.
-        calibration: Which was used.
+        scans: Scans by the names of their images.
+        calibration: Calibration that was used.
         config: Likewise.
         notes: What was left out or assumed.
     """

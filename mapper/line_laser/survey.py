@@ -26,7 +26,7 @@ class Drive:
     """Scans with their poses by wheel odometry.
 
     Attributes:
-        scans: Those whose place is known.
+        scans: Scans whose pose is known.
         trajectory: T_world_sensor of each.
         grid: The map.
         notes: What was left out.
@@ -97,7 +97,7 @@ def sensor_poses(wheels: Path, calibration: LineLaserCalibration) -> tuple[Traje
         wheels,
         mounted,
         sensor="lidar",
-        wheelbase_by="calibrate with --wheelbase, or tell wheelbase_m under [vehicle] in the calibration",
+        wheelbase_by="calibrate with --wheelbase, or set wheelbase_m under [vehicle] in the calibration",
     )
 
 
@@ -111,9 +111,9 @@ def drive(
     """Return the map of scans at their poses by wheel odometry.
 
     Args:
-        scans: In time order.
+        scans: Scans in time order.
         T_world_sensor: Sensor poses by wheel odometry.
-        config: Of the map.
+        config: Settings of the map.
         progress: Receives the count of scans.
 
     Raises:

@@ -102,7 +102,7 @@ def verify_proposal(
     """Return the loop closure of a node with a proposed place, accepted or rejected.
 
     Args:
-        proposal: Of the known place.
+        proposal: Proposal of the known place.
         node: The later node.
         i: Description of the known place.
         j: Description of the node's own place.

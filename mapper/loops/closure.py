@@ -42,8 +42,8 @@ class LoopClosure:
         stamp_i_ns: Stamp of i's frame.
         stamp_j_ns: Stamp of j's frame.
         proposed_by: The kind of proposer.
-        similarity: Of two images' words (Zhao et al. 2020, eq. 10) or of two scans' heights; None if they
-            were not compared.
+        similarity: Similarity of two images' words (Zhao et al. 2020, eq. 10) or of two scans' heights; None
+            if they were not compared.
         matches: Features paired by descriptor, or upright points compared.
         inliers: Pairs that agree with the motion, in the image or in space.
         rmse_m: Root mean square distance of the agreeing points; None if none agreed.
@@ -138,7 +138,7 @@ def apply_solution(
     Args:
         loops: Every candidate; the accepted ones are the solved graph's last factors, in this order.
         T_world_before: Poses before the solve.
-        solution: Of that graph.
+        solution: Solution of that graph.
         min_weight: A loop that weighs less is rejected.
     """
     weights = iter(solution.weights[len(solution.weights) - len(accepted_loops(loops)) :])

@@ -140,8 +140,8 @@ class KeyframeLoopDetector(Generic[Place]):
         proposed by similarity only, and no gate applies.
 
         Args:
-            graph: Of that session, solved.
-            views: Of its nodes, in time order.
+            graph: Solved graph of that session.
+            views: Views of its nodes, in time order.
 
         Raises:
             ConfigError: Places are not recognised by similarity, or the views are of another sensor.

@@ -28,7 +28,7 @@ LOOPS_OF: Mapping[Sensor, PlaceLoopsConfig | ScanLoopsConfig] = {
     "rgbd": PlaceLoopsConfig(),
     "lidar": ScanLoopsConfig(),
 }
-"""How keyframes are compared where a run was built without loops."""
+"""Settings by which keyframes are compared where a run was built without loops."""
 
 
 def build_loop_detector(

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.errors import ConfigError
-from mapper.core.geometry import Array, adjoint, apply, inverse
+from mapper.core.geometry import Array, Points, Transform, adjoint, apply, inverse
 from mapper.features.frame_view import FrameView, ImageView
 from mapper.features.hamming import match_mutual_bits
 from mapper.features.matching import Pairs, homography_inliers, match_mutual
@@ -116,34 +116,44 @@ class ImageVerifier:
             _LM_ROUNDS,
             _LM_ITERATIONS,
         )
-        inliers = int(agree.sum())
+        inliers, rmse_m = int(agree.sum()), alignment.inlier_rmse_m
         wanted = max(config.min_inliers, config.min_inlier_ratio * len(pairs))
         if inliers < wanted:
             reason = f"reprojection: {inliers} of {len(pairs)} pairs agree, want {wanted:.0f}"
-            return Verification(matches, reason, inliers, alignment.inlier_rmse_m)
-        points_j = apply(T_j_i, points[agree])
-        miss_px = (
-            points_j[:, :2] / points_j[:, 2:] * intrinsics[:2] + intrinsics[2:4] - measured[agree, :2]
-        ) * (weights[agree, :1] ** 0.5)
+            return Verification(matches, reason, inliers, rmse_m)
+        seen = T_j_i, points[agree], measured[agree], weights[agree], intrinsics
+        residual_px = _residual_px(*seen)
         T_ci_cj, information, scale = alignment.T_target_source, alignment.information, 1.0
         if config.measure == "reprojection":
             T_ci_cj = inverse(T_j_i)
-            seen = T_j_i, points[agree], measured[agree], weights[agree], intrinsics
             # i's points were measured no better than j's pixels, so the information is halved.
             information = 0.5 * normal_matrix(*seen)
             scale = 1.0 / residual_statistics(*seen).variance_factor
         assert information is not None  # ISVD converged
         to_camera = adjoint(inverse(j.T_body_camera))
-        T_i_j = i.T_body_camera @ T_ci_cj @ inverse(j.T_body_camera)
         information = to_camera.T @ information @ to_camera
-        residual_px = float(np.sqrt((miss_px**2).sum(axis=1).mean()))
-        prior = with_model_error(information, T_i_j)
-        sigma_m = float(np.linalg.eigvalsh(np.linalg.inv(prior)[3:, 3:])[-1] ** 0.5)
-        information = with_model_error(scale * information, T_i_j)
+        T_i_j = i.T_body_camera @ T_ci_cj @ inverse(j.T_body_camera)
+        sigma_m = _largest_sigma_m(with_model_error(information, T_i_j))
         if sigma_m > MAX_SIGMA_M:
             reason = f"loose: translation known to {sigma_m:.2f} m, want {MAX_SIGMA_M} m"
-            return Verification(matches, reason, inliers, alignment.inlier_rmse_m, residual_px)
-        return Verification(matches, "", inliers, alignment.inlier_rmse_m, residual_px, T_i_j, information)
+            return Verification(matches, reason, inliers, rmse_m, residual_px)
+        information = with_model_error(scale * information, T_i_j)
+        return Verification(matches, "", inliers, rmse_m, residual_px, T_i_j, information)
+
+
+def _residual_px(
+    T_j_i: Transform, points: Points, measured: Array, weights: Array, intrinsics: Array
+) -> float:
+    """Return the root mean square of the weighted distances of projected points from their pixels."""
+    points_j = apply(T_j_i, points)
+    pixels = points_j[:, :2] / points_j[:, 2:] * intrinsics[:2] + intrinsics[2:4]
+    miss_px = (pixels - measured[:, :2]) * (weights[:, :1] ** 0.5)
+    return float(np.sqrt((miss_px**2).sum(axis=1).mean()))
+
+
+def _largest_sigma_m(information: Array) -> float:
+    """Return the standard deviation of a translation in its least certain direction."""
+    return float(np.linalg.eigvalsh(np.linalg.inv(information)[3:, 3:])[-1] ** 0.5)
 
 
 def _measurements(view: ImageView, features: NDArray[np.intp]) -> tuple[Array, Array, Array]:

@@ -55,7 +55,7 @@ class _InMap:
 
     @property
     def corrections(self) -> int:
-        """How often the poses of new nodes have changed so far; known ones do not move."""
+        """Number of times that the poses of new nodes have changed; known ones do not move."""
         return self._estimator.corrections
 
     def pose_of(self, node: int) -> Transform:
@@ -88,7 +88,7 @@ class MapConstraintDetector(Generic[Place]):
 
         Args:
             config: Settings.
-            known: Of the finished map.
+            known: Places of the finished map.
             verifier: Compares two places.
             similar: Empty; proposes similar places.
             nearby_for: Returns an empty proposer of the places near an estimate.

@@ -12,7 +12,7 @@ from mapper.loops.closure import Discrepancy, LoopClosure, discrepancy, exceeds
 from mapper.odometry.base import FrameResult
 
 Correction = Literal["batch", "proportional", "none"]
-"""How the graph is solved in the end (``graph.solve``)."""
+"""Solver of the final graph (``graph.solve``)."""
 
 _WORTH_SOLVING = Discrepancy(translation_m=0.02, rotation_rad=0.01)
 """A loop that moves no node farther waits to be solved with the next that does."""
@@ -26,7 +26,7 @@ class OnlinePoseEstimator(Protocol):
 
     @property
     def corrections(self) -> int:
-        """How often the poses of known nodes have changed so far."""
+        """Number of times that the poses of known nodes have changed."""
         ...
 
     def add(self, node: int, track: FrameResult) -> None:

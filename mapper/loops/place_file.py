@@ -34,7 +34,7 @@ def write_places(path: Path, places: Mapping[int, AnyPlace], nodes: Iterable[int
     Args:
         path: The file.
         places: What the nodes are recognised by.
-        nodes: Those to write; None is all.
+        nodes: Nodes to write; None is all.
     """
     with ExitStack() as stack:
         stack.enter_context(writing(path))

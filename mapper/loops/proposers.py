@@ -17,7 +17,7 @@ class NodePoses(Protocol):
 
     @property
     def corrections(self) -> int:
-        """How often the poses of known nodes have changed so far."""
+        """Number of times that the poses of known nodes have changed."""
         ...
 
     def pose_of(self, node: int) -> Transform:

@@ -49,7 +49,7 @@ class ScanContextProposer:
 
         Args:
             config: Scan contexts, and their least similarity.
-            among: Excludes places.
+            among: Function that excludes places.
             most: Largest number that is proposed, whatever the limit.
         """
         self._config = config

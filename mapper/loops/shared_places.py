@@ -121,8 +121,8 @@ class _Pair(NamedTuple):
     Attributes:
         first: Number of the earlier run.
         second: Number of the run.
-        proposal: Of the place.
-        node: Of the keyframe.
+        proposal: Proposal of the place.
+        node: Node of the keyframe.
     """
 
     first: int
@@ -175,9 +175,9 @@ class _Candidate(NamedTuple):
         rank: Number of more similar places that the earlier run has for the keyframe. Each keyframe is
             compared with the most similar one before any is with another: pairs lie along the whole path.
         dissimilarity: Similarity with its sign changed.
-        node: Of the keyframe.
+        node: Node of the keyframe.
         place: Number of the earlier run's place in the index.
-        proposal: Of that place.
+        proposal: Proposal of that place.
     """
 
     rank: int

@@ -12,7 +12,7 @@ from mapper.runtime.archived import Archived, archived
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoopSearch:
-    """What the search of loops from one node has cost most.
+    """Record of a search for loops from one node: the parts that take long to repeat.
 
     Attributes:
         place: Reference to the node's description; None if no loops were searched from it.

@@ -14,7 +14,7 @@ _TOLERANCE_RAD = np.radians(5.0)
 _ITERATIONS = 5
 _MIN_UPRIGHT = 30
 _MIN_AGREEING_RATIO = 0.4
-"""Of normals in random directions, one in nine lies within 5° of the axes of a right-angled frame."""
+"""Least share of normals within 5° of the axes: of random directions it is one in nine."""
 
 
 @dataclass(frozen=True, slots=True)

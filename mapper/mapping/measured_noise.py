@@ -35,7 +35,7 @@ class MeasuredNoise:
 
     Attributes:
         noise: Standard deviation of a depth, by depth.
-        detail: Where it comes from; part of a sentence.
+        detail: Source of the noise; part of a sentence.
         depths_m: (N,) depths of some pixels, to count how many a limit leaves out.
     """
 

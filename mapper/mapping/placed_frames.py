@@ -20,7 +20,7 @@ class PlacedFrame:
 
     Attributes:
         entry: The frame.
-        index: Of its pose in the trajectory.
+        index: Index of its pose in the trajectory.
         T_world_body: (4, 4) its final pose.
         twist: Its velocity there, for deskewing.
     """

@@ -80,7 +80,7 @@ class Differences:
 
     @property
     def doubt(self) -> str:
-        """Why the runs may not lie as they were placed; empty if nothing speaks against it."""
+        """Reason why the runs may not lie as they were placed; empty if there is none."""
         if self.same >= _LEAST_SAME * self.seen_again:
             return ""
         return (

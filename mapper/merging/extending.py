@@ -40,7 +40,7 @@ class KnownTile(NamedTuple):
 
     Attributes:
         path: Its file.
-        overlaps: Of its runs with the sum of those before each.
+        overlaps: Overlap of each of its runs with the sum of those before.
     """
 
     path: Path
@@ -95,7 +95,7 @@ def kept_in(known: MergedMap, placed: Sequence[Placed], config: OctreeConfig) ->
     Args:
         known: The map.
         placed: Its runs in their order, and then others.
-        config: Of the map that is to be made.
+        config: Settings of the new map's octree.
     """
     members = known.manifest.runs
     is_same = config == known.manifest.octree
@@ -126,8 +126,8 @@ def known_tiles(
     Args:
         known: The earlier map.
         placed: The runs of the map that is to be made, those of the earlier one first, from ``kept_in``.
-        manifest: Of the map that is to be made.
-        tiling: How that is cut.
+        manifest: Manifest of the new map.
+        tiling: Tiling of the new map.
     """
     before = known.manifest
     kept = {number for number, item in enumerate(placed) if item.kept is not None}

@@ -34,10 +34,10 @@ def floor_over(
     """Return the floor of a map whose occupied voxels are given tile by tile; see ``floor_of``.
 
     Args:
-        voxels: Of each tile, from ``occupied_voxels``.
-        extent: Of all tiles' blocks, from ``block_extent``.
+        voxels: Voxels of each tile, from ``occupied_voxels``.
+        extent: Extent of all tiles' blocks, from ``block_extent``.
         config: Limits of the robot.
-        paths_map: Of every run, (N, 3) where its sensor was, metres.
+        paths_map: (N, 3) positions of the sensor in every run, metres, the map's frame.
         resolution_m: Edge of a voxel.
         floor_z_m: Height of the floor in the map.
     """
@@ -97,7 +97,7 @@ def editors_of(manifest: MapManifest, paths_map: Sequence[Points]) -> list[MapEd
 
     Args:
         manifest: The map's.
-        paths_map: Of every run, (N, 3) where its sensor was, metres.
+        paths_map: (N, 3) positions of the sensor in every run, metres, the map's frame.
     """
     editors = []
     for run, path_map in zip(manifest.runs, paths_map, strict=True):

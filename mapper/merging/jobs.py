@@ -38,8 +38,8 @@ from mapper.runtime.atomic import atomic_file, write_bytes
 from mapper.runtime.progress import SILENT
 
 OCCUPIED, LOWEST, BAND, GROUND = "occupied", "lowest", "band", "ground"
-"""Pieces of a tile, or of a column of tiles: the occupied voxels, the lowest of each column, the slice's
-band, and the ground below it."""
+"""Pieces that are written of a tile: its occupied voxels and the lowest of each column; and of a column of
+tiles: the slice's band and the ground below it."""
 
 
 def stays_within_m(config: OctreeConfig) -> float:
@@ -54,8 +54,8 @@ class Workspace:
     Attributes:
         folder: The map that is being made.
         scratch: Folder that is removed at the end.
-        tiling: How the map is cut.
-        config: The map's.
+        tiling: Tiling of the map.
+        config: Settings of the map's octree.
     """
 
     folder: Path
@@ -88,7 +88,7 @@ class FusedRun(Config):
     """Result of fusing a run again."""
 
     voxels: int
-    """Known ones."""
+    """Number of known voxels."""
 
 
 class SplitRun(Config):
@@ -97,7 +97,7 @@ class SplitRun(Config):
     part_bytes: dict[int, int]
     """Size of the file of each tile in which the run has a known voxel."""
     voxels: int
-    """Known ones, in the run's own map."""
+    """Number of known voxels in the run's own map."""
     has_colors: bool
 
 
@@ -105,30 +105,30 @@ class JoinedTile(Config):
     """Result of summing a tile."""
 
     voxels: int
-    """Known ones."""
+    """Number of known voxels."""
     first: tuple[int, int]
     """x and y key of the first column of its blocks."""
     last: tuple[int, int]
-    """Just after the last column."""
+    """x and y key just after the last column of its blocks."""
     overlaps: tuple[Overlap, ...]
-    """Of each run with a known voxel here, with the sum of those before."""
+    """Overlap of each run with a known voxel in the tile with the sum of the runs before."""
     top: tuple[float, int]
     """Log-odds and mask of the tile's top in the ``.ot`` file."""
     color: tuple[int, int, int]
-    """Of the top, if the map has colours."""
+    """Colour of the top, if the map has colours."""
     nodes: int
-    """In the ``.ot`` file, the top included."""
+    """Number of nodes in the ``.ot`` file, the top included."""
     state: tuple[float, int]
     """Value and mask of the top in the ``.bt`` file."""
     children: int
-    """Nodes below the top in the ``.bt`` file."""
+    """Number of nodes below the top in the ``.bt`` file."""
 
 
 class SlicedColumn(Config):
     """Result of slicing a column of tiles."""
 
     known_columns: int
-    """Columns of voxels in which anything is known."""
+    """Number of columns of voxels in which anything is known."""
 
 
 def fuse_run(workspace: Workspace, run: int, path: Path, trajectory: Trajectory, octree: Path) -> FusedRun:
@@ -137,9 +137,9 @@ def fuse_run(workspace: Workspace, run: int, path: Path, trajectory: Trajectory,
     Frames that have moved by no more than half a voxel keep their update.
 
     Args:
-        workspace: Where.
-        run: Its place in the list.
-        path: The run.
+        workspace: Files of the merge.
+        run: Number of the run in the merge.
+        path: Folder of the run.
         trajectory: Poses in its own world of the frames to fuse.
         octree: File to write.
     """
@@ -177,11 +177,11 @@ def split_run(
     """Write a run's part of each tile as a file of its own.
 
     Args:
-        workspace: Where.
-        run: Its place in the list.
-        path: Its map.
+        workspace: Files of the merge.
+        run: Number of the run in the merge.
+        path: File of its octree.
         T_map_world: (4, 4) pose of its world in the map; None is the identity.
-        only: Tiles that are wanted; None is all.
+        only: Tiles to write; None is all.
     """
     octree = read_octree(path)
     part_bytes: dict[int, int] = {}
@@ -227,11 +227,11 @@ def join_tile(
     """Sum the runs' parts of a tile, and write the tile and its pieces of the OctoMap files.
 
     Args:
-        workspace: Where.
-        tile: Which.
-        runs: Places in the list of those with a known voxel here.
-        has_colors: Whether the map has any.
-        follows_ground: Whether the slice's band does.
+        workspace: Files of the merge.
+        tile: Code of the tile.
+        runs: Numbers of the runs with a known voxel in the tile.
+        has_colors: Whether the map has colours.
+        follows_ground: Whether the slice's band follows the ground.
     """
     octree = OctreeMap(workspace.config)
     overlaps = tuple(octree.add(read_octree(workspace.part(tile, run))) for run in runs)
@@ -252,12 +252,12 @@ def keep_tile(
     """Take over a tile of an earlier map, and write its pieces of the OctoMap files.
 
     Args:
-        workspace: Where.
-        tile: Which.
+        workspace: Files of the merge.
+        tile: Code of the tile.
         known: Its file in that map.
-        overlaps: Of its runs there.
-        has_colors: Whether the map has any.
-        follows_ground: Whether the slice's band does.
+        overlaps: Overlaps of its runs in that map.
+        has_colors: Whether the map has colours.
+        follows_ground: Whether the slice's band follows the ground.
     """
     with atomic_file(workspace.tile(tile)) as part:
         shutil.copyfile(known, part)
@@ -310,9 +310,9 @@ def slice_column(
     """Flatten the slice's band in tiles that lie over each other, and write the raster.
 
     Args:
-        workspace: Where.
-        tiles: Which, from below.
-        config: The band.
+        workspace: Files of the merge.
+        tiles: Codes of the tiles, the lowest first.
+        config: Settings of the slice.
         ground: File of the ground below the column of tiles, which the band follows; None if it is level.
         floor_z_m: Height of the floor in the map.
     """

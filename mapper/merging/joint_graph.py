@@ -22,12 +22,13 @@ class Tie(Config):
     """Loops between two runs."""
 
     first: int
-    """Place of the earlier run in the list of those that are in the graph."""
+    """Number of the earlier run among those that are in the graph."""
     second: int
+    """Number of the later run."""
     measured: int
-    """Keyframes of the second run that were measured from places of the first."""
+    """Number of keyframes of the second run that were measured from places of the first."""
     held: int
-    """Of these, the loops of the solved graph."""
+    """Number of these that are loops of the solved graph."""
     rms_m: float
     """Root mean square distance of a held loop's keyframe from where the loop has it."""
     rms_rad: float
@@ -39,8 +40,8 @@ class JointGraph:
     """All runs' pose graphs as one, at its solution.
 
     Attributes:
-        graph: In the map's frame, with the factors that hold.
-        first_nodes: What is added to the numbers of a run's own nodes, by the run's number; increasing.
+        graph: Pose graph in the map's frame, with the factors that hold.
+        first_nodes: Offset of a run's node numbers in the graph, by the run's number; increasing.
         loops: Every place measured between two runs, in the numbers of the joint graph, with its verdict.
         own_rejected: Number of loops within runs that the joint solve rejected.
     """
@@ -63,7 +64,7 @@ class JointGraph:
 
     @property
     def ties(self) -> tuple[Tie, ...]:
-        """What ties each pair of runs that share places."""
+        """Ties of the pairs of runs that share places."""
         place_of = {number: place for place, number in enumerate(self.first_nodes)}
         by_pair: dict[tuple[int, int], list[LoopClosure]] = {}
         for loop in self.loops:
@@ -100,10 +101,10 @@ def solve_jointly(
     first node of the first run is held.
 
     Args:
-        graphs: Of each run at its own solution, by number; the lowest is the first.
+        graphs: Graph of each run at its own solution, by number; the lowest is the first.
         T_map_worlds: (4, 4) first estimates of their worlds' poses.
         used: Shared places that agree on these poses.
-        others: Those that do not, which are recorded as rejected.
+        others: Shared places that do not, which are recorded as rejected.
         config: How the first run solved its graph.
 
     Raises:

@@ -20,7 +20,7 @@ def write_merged_map_page(path: AnyPath, merged: MergedMap, names: list[str]) ->
     Args:
         path: The page.
         merged: The map.
-        names: Of its runs, in their order.
+        names: Names of its runs, in their order.
 
     Raises:
         MapperError: A file of the map cannot be read.

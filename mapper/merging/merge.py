@@ -65,8 +65,8 @@ class Merged:
 
     Attributes:
         map: The merged map.
-        costs: Of the jobs of its stages: "split", one for each run, "join", one for each tile, and "slice",
-            one for each column of tiles; in no order.
+        costs: Costs of the jobs of each stage, in no order: "split" has a job for each run, "join" one for
+            each tile, "slice" one for each column of tiles.
         shuffle_bytes: Size of the files between the first two stages.
     """
 
@@ -89,7 +89,7 @@ def merge(
 
     No process ever holds more than one run's map, or one tile and one run's part of it. The bytes do not
     depend on where or in which order the jobs ran; the order of the runs shows in the last bit of a log-odds.
-    A merge that was stopped goes on where it was when it is started again with the same runs.
+    A merge that was stopped is resumed when it is started again with the same runs.
 
     A run that a joint graph has bent by more than half a voxel is fused again along its new poses first; the
     run itself stays as it is.

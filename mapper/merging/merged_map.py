@@ -48,32 +48,32 @@ class RunInMap(Config):
     """A run that was merged."""
 
     path: str
-    """Absolute."""
+    """Absolute path of the run's folder."""
     fingerprint: str
-    """Of its map.octree."""
+    """Fingerprint of the run's ``map.octree``."""
     T_map_world: tuple[tuple[float, ...], ...]
-    """4 × 4."""
+    """4 × 4 pose of the run's world in the map."""
     placed: str
-    """Source of its pose."""
+    """Source of that pose."""
     folder: str = ""
-    """Of its files in the map's folder: ``trajectory.tum``, the poses in the map of the frames that its maps
-    are made from, and ``map.octree`` with ``fused.tum``, if it was fused again."""
+    """Subfolder with its ``trajectory.tum``, the poses in the map of the frames that its maps are made from,
+    and with ``map.octree`` and ``fused.tum`` if it was fused again."""
     first_node: int | None = None
-    """Added to the numbers of its nodes in the joint graph; None without one."""
+    """Number of its node 0 in the joint graph; None without a joint graph."""
     moved_m: float = 0.0
-    """Largest distance by which the joint graph has moved any point of its map within its world."""
+    """Largest distance by which the joint graph moved a point of its map within its world."""
     fused_again: bool = False
-    """Whether its map was made again for that."""
+    """Whether it was fused again because of that."""
     voxels: int = 0
-    """Known ones, in its own map."""
+    """Number of known voxels in its own map."""
     has_colors: bool = False
-    """Whether any of them has one."""
+    """Whether any voxel of its map has a colour."""
     keepout: tuple[Region, ...] = ()
     """Its keep-out regions, in its own world."""
     shared_voxels: int = 0
-    """Those that are known in the sum of the runs before it as well."""
+    """Number of its voxels that are known in the sum of the runs before it as well."""
     agreement: float | None = None
-    """Of the shared voxels that are occupied in either, the share that is in both."""
+    """Of the shared voxels that are occupied in either, the share that is occupied in both."""
 
 
 class Tile(Config):
@@ -84,12 +84,12 @@ class Tile(Config):
     lower_m: Corner
     upper_m: Corner
     voxels: int
-    """Known ones."""
+    """Number of known voxels."""
     runs: tuple[int, ...]
-    """Places in the list of the runs with a known voxel here."""
+    """Numbers of the runs with a known voxel in the tile, by their place in ``MapManifest.runs``."""
     overlaps: tuple[tuple[int, int, int], ...] = ()
-    """Of each of them with the sum of those before it: voxels that are known in both, occupied in both, and
-    occupied in either."""
+    """Overlap of each of these runs with the sum of those before it: number of voxels that are known in both,
+    occupied in both, and occupied in either."""
 
 
 class MapManifest(Config):
@@ -102,18 +102,18 @@ class MapManifest(Config):
     slice: SliceConfig
     traversable: TraversableConfig = TraversableConfig()
     costmap: CostmapConfig = CostmapConfig()
-    """Those of the first run, as the slice's."""
+    """Settings of the first run, as are those of slice and floor."""
     tile_m: float
     floor_z_m: float
     runs: tuple[RunInMap, ...]
     ties: tuple[Tie, ...] = ()
-    """What ties the runs in the joint graph."""
+    """Loops between runs in the joint graph, by pair of runs."""
     left_out: Mapping[str, str] = {}
-    """Why each of the other runs that were given is not in the map, by its path."""
+    """Reason why each of the other runs that were given is not in the map, by its path."""
     tiles: tuple[Tile, ...] = ()
     voxels: int = 0
     area_km2: float = 0.0
-    """Of the columns in which anything is known."""
+    """Area of the columns in which anything is known."""
     notes: tuple[str, ...] = ()
 
     @property
@@ -240,7 +240,7 @@ def open_map(folder: Path) -> MergedMap:
     """
     if not is_merged_map(folder):
         if is_merged_map(partial_of(folder)):
-            raise RunError(f"{folder}: not finished; the command that began it goes on where it stopped")
+            raise RunError(f"{folder}: not finished; the command that began it resumes it")
         raise RunError(f"{folder}: no merged map; make one with mapper merge RUN… --out {folder}")
     try:
         tree = json.loads((folder / MANIFEST_NAME).read_bytes())

@@ -24,9 +24,9 @@ def write_whole_ot(path: Path, workspace: Workspace, tiles: Tiles, *, has_colors
 
     Args:
         path: File to write.
-        workspace: With the tiles' pieces.
-        tiles: Increasing.
-        has_colors: Whether the map has any.
+        workspace: Files of the merge, with the tiles' pieces.
+        tiles: Results of the tiles, in Morton order.
+        has_colors: Whether the map has colours.
     """
     ordered = list(tiles)
     upper = _upper(workspace, tiles, [joined.top for joined in tiles.values()])

@@ -31,7 +31,7 @@ class InMap:
     """A run as it lies in a merged map that exists already.
 
     Attributes:
-        folder: Of its files in that map.
+        folder: Folder of its files in that map.
         trajectory_map: As of ``Placed``: its voxels lie within half a voxel of it.
         moved_m: As of ``Placed``, when it was merged.
         fused_again: Whether it was fused again then.
@@ -146,7 +146,7 @@ def by_poses(runs: Sequence[Run], path: Path) -> list[Placed]:
     names = Counter(_name(run) for run in runs)
     for name, count in names.items():
         if count > 1:
-            raise RunError(f"{name}: {count} runs are called so, and {path} tells them by name; rename one")
+            raise RunError(f"{name}: {count} runs have this name, and {path} names runs by it; rename one")
         if name not in poses:
             raise DataError(f"{path}: has no line for {name}; want {name} tx ty tz qx qy qz qw")
     return [Placed(run, poses[_name(run)], f"by {path.name}") for run in runs]
@@ -201,7 +201,7 @@ def _fit_to_truth(run: Run) -> tuple[Transform, float]:
     """Return T_truth_world, and the RMS distance in metres that it leaves."""
     truth, trajectory = run.truth, run.trajectory
     if truth is None:
-        raise RunError(f"{run.path}: has no truth to be placed by; tell its pose with --poses")
+        raise RunError(f"{run.path}: has no truth to be placed by; give its pose with --poses")
     index, gap_ns = nearest(truth.stamps_ns, trajectory.stamps_ns)
     near = gap_ns <= MAX_TRUTH_GAP_NS
     if np.count_nonzero(near) < 3:

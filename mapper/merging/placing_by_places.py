@@ -18,10 +18,10 @@ from mapper.loops.odometry_chain import NodePath, allowed
 from mapper.loops.shared_places import SharedPlace
 
 LEAST_PLACES = 3
-"""Fewer places that agree tie no run to another."""
+"""Least number of places that agree to tie two runs."""
 _LEAST_LEAD = 2.0
-"""How many times the places of the best pose are to be those of any other: where rooms look alike, a run may
-fit in several."""
+"""Least ratio of the places that agree with the best pose to those that agree with any other: where rooms
+look alike, a run may fit in several."""
 _TIED_APART = "shares places only with runs that nothing ties to the first"
 
 
@@ -45,7 +45,7 @@ class SolvedWorlds:
     """Runs placed by the places that they share; runs are known by their numbers.
 
     Attributes:
-        worlds: Of run 0 and of the runs tied to it.
+        worlds: Poses of run 0 and of the runs tied to it, by number.
         refused: A reason for every run that shares places and is not tied to another by them.
         contradicting: Pairs of runs whose shared places were not used, as stronger ones contradict them.
         used: The shared places by which they lie there, those of a pair together.
@@ -60,12 +60,12 @@ class SolvedWorlds:
 def solve_worlds(shared: Sequence[SharedPlace], gate: GateConfig) -> SolvedWorlds:
     """Return the poses of the runs that shared places tie to run 0.
 
-    Two runs are tied by the largest set of shared places that agree with one of them. The strongest ties span
-    the runs; one that closes a circle of runs has to agree with the others of the circle. Then all runs are
-    solved together, each as a rigid body, by least squares over their places. Run 0 is held.
+    Two runs are tied by the largest set of shared places that agree with one of them. The strongest ties make
+    a spanning tree of the runs; every other tie closes a cycle of the tree, and has to agree with it. Then
+    all runs are solved together, each as a rigid body, by least squares over their places. Run 0 is held.
 
     Args:
-        shared: As measured; some may be false.
+        shared: Shared places as measured; some may be false.
         gate: How far two places may disagree, by the distance between them: the drift within a run.
     """
     pairs = defaultdict[tuple[int, int], list[SharedPlace]](list)
@@ -78,17 +78,17 @@ def solve_worlds(shared: Sequence[SharedPlace], gate: GateConfig) -> SolvedWorld
             ties[pair] = agreeing
         for number in pair:
             refused[number] = refused.get(number, reason) if reason else _TIED_APART
-    span = _spanned(ties)
-    tied = {pair: places for pair, places in ties.items() if pair[0] in span.T_map_worlds}
-    contradicting = [pair for pair in tied if pair not in span.tree and not span.agrees(pair, ties, gate)]
+    tree = _spanning_tree(ties)
+    tied = {pair: places for pair, places in ties.items() if pair[0] in tree.T_map_worlds}
+    contradicting = [pair for pair in tied if pair not in tree.pairs and not tree.agrees(pair, ties, gate)]
     used = [place for pair, places in tied.items() if pair not in contradicting for place in places]
-    T_map_worlds = _solved(span.T_map_worlds, used, gate) if used else span.T_map_worlds
-    worlds = {number: _judged(number, T_map_worlds, used) for number in sorted(T_map_worlds)}
+    T_map_worlds = _solved(tree.T_map_worlds, used, gate) if used else tree.T_map_worlds
+    worlds = {number: _with_residuals(number, T_map_worlds, used) for number in sorted(T_map_worlds)}
     return SolvedWorlds(worlds, refused, contradicting, used)
 
 
 def _consensus(places: Sequence[SharedPlace], gate: GateConfig) -> tuple[list[SharedPlace], str]:
-    """Return the places that agree on the pose of one run in the other, or why they tie the two not."""
+    """Return the places that agree on the pose of one run in the other, or why they do not tie the two."""
     agree = _agreement(places, gate)
     best = int(agree.sum(axis=1).argmax())
     inside = agree[best]
@@ -107,7 +107,7 @@ def _consensus(places: Sequence[SharedPlace], gate: GateConfig) -> tuple[list[Sh
 
 
 def _agreement(places: Sequence[SharedPlace], gate: GateConfig) -> NDArray[np.bool_]:
-    """Return (N, N) whether two places lie alike in both runs, by what these may have drifted between."""
+    """Return (N, N) whether two places have the same relative pose in both runs, within the drift between."""
     agree = np.eye(len(places), dtype=bool)
     for (a, one), (b, other) in combinations(enumerate(places), 2):
         in_second = inverse(one.T_second_body) @ other.T_second_body
@@ -125,20 +125,21 @@ def _are_several(T_world_bodies: Sequence[Transform], gate: GateConfig) -> bool:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Span:
-    """Runs along the tree of strongest ties.
+class _SpanningTree:
+    """Spanning tree of the runs by their strongest ties, with run 0 as its root.
 
     Attributes:
-        T_map_worlds: (4, 4) poses of their worlds in that of run 0.
-        before: The run before each on the way from run 0, but for run 0.
+        T_map_worlds: (4, 4) poses of the runs' worlds in that of run 0.
+        parents: Parent of every run but run 0.
     """
 
     T_map_worlds: Mapping[int, Transform]
-    before: Mapping[int, int]
+    parents: Mapping[int, int]
 
     @property
-    def tree(self) -> set[tuple[int, int]]:
-        return {(min(pair), max(pair)) for pair in self.before.items()}
+    def pairs(self) -> set[tuple[int, int]]:
+        """Ties of the tree."""
+        return {(min(pair), max(pair)) for pair in self.parents.items()}
 
     def agrees(
         self,
@@ -146,18 +147,18 @@ class _Span:
         ties: Mapping[tuple[int, int], Sequence[SharedPlace]],
         gate: GateConfig,
     ) -> bool:
-        """Return whether most places of a pair lie where the tree has them, within the circle's drift.
+        """Return whether most places of a pair lie where the tree has them, within the drift of its cycle.
 
-        That is the drift on the way from place to place through the runs of the circle.
+        That is the drift along a path that leads from place to place through the runs of the cycle.
         """
-        circle = [self._bodies_map(ties[step])[:, :3, 3] for step in self._steps(*pair)]
+        cycle = [self._bodies_map(ties[step])[:, :3, 3] for step in self._path(*pair)]
         agreeing = 0
         for place in ties[pair]:
             T_map_first, T_map_second = (self.T_map_worlds[number] for number in pair)
             T_map_body = T_map_second @ place.T_second_body
             begin_m = at_m = T_map_body[:3, 3]
             path_m = 0.0
-            for places_m in circle:
+            for places_m in cycle:
                 next_m = places_m[np.linalg.norm(places_m - at_m, axis=1).argmin()]
                 path_m, at_m = path_m + float(np.linalg.norm(next_m - at_m)), next_m
             path = NodePath(path_m + float(np.linalg.norm(begin_m - at_m)), 0.0)
@@ -168,37 +169,40 @@ class _Span:
     def _bodies_map(self, places: Sequence[SharedPlace]) -> Array:
         return np.array([self.T_map_worlds[place.second] @ place.T_second_body for place in places])
 
-    def _steps(self, first: int, second: int) -> list[tuple[int, int]]:
-        """Return the tree's pairs on the way from the second run to the first."""
-        ways = [[number] for number in (first, second)]
-        for way in ways:
-            while way[-1] in self.before:
-                way.append(self.before[way[-1]])
-        from_first, from_second = (list(pairwise(way)) for way in ways)
-        up = [step for step in from_second if step not in from_first]
-        down = [step for step in from_first if step not in from_second]
-        return [(min(step), max(step)) for step in (*up, *reversed(down))]
+    def _path(self, first: int, second: int) -> list[tuple[int, int]]:
+        """Return the tree's ties on the path from the second run to the first."""
+        up, down = (self._to_root(number) for number in (second, first))
+        steps = [step for step in up if step not in down]
+        steps += reversed([step for step in down if step not in up])
+        return [(min(step), max(step)) for step in steps]
+
+    def _to_root(self, number: int) -> list[tuple[int, int]]:
+        """Return the steps from a run to run 0."""
+        runs = [number]
+        while runs[-1] in self.parents:
+            runs.append(self.parents[runs[-1]])
+        return list(pairwise(runs))
 
 
-def _spanned(ties: Mapping[tuple[int, int], Sequence[SharedPlace]]) -> _Span:
-    """Return the worlds along the tree of strongest ties from run 0."""
-    T_map_worlds, before = {0: np.eye(4)}, dict[int, int]()
+def _spanning_tree(ties: Mapping[tuple[int, int], Sequence[SharedPlace]]) -> _SpanningTree:
+    """Return the maximum spanning tree from run 0 (Prim 1957): a tie is as strong as it has places."""
+    T_map_worlds, parents = {0: np.eye(4)}, dict[int, int]()
     by_strength = sorted(ties, key=lambda pair: (-len(ties[pair]), pair))
     while pair := next((p for p in by_strength if (p[0] in T_map_worlds) != (p[1] in T_map_worlds)), None):
         first, second = pair
         middle = ties[pair][len(ties[pair]) // 2]
         T_first_second = middle.T_first_body @ inverse(middle.T_second_body)
         if first in T_map_worlds:
-            T_map_worlds[second], before[second] = T_map_worlds[first] @ T_first_second, first
+            T_map_worlds[second], parents[second] = T_map_worlds[first] @ T_first_second, first
         else:
-            T_map_worlds[first], before[first] = T_map_worlds[second] @ inverse(T_first_second), second
-    return _Span(T_map_worlds, before)
+            T_map_worlds[first], parents[first] = T_map_worlds[second] @ inverse(T_first_second), second
+    return _SpanningTree(T_map_worlds, parents)
 
 
 def _solved(
     T_map_worlds: Mapping[int, Transform], places: Sequence[SharedPlace], gate: GateConfig
 ) -> dict[int, Transform]:
-    """Return the worlds by which all places agree best."""
+    """Return the worlds' poses by least squares over all places."""
     at_body = PoseSigmas(gate.slack_rad, gate.slack_m).information
     factors = []
     for place in places:
@@ -211,10 +215,10 @@ def _solved(
     return solution.T_world_node | {0: np.eye(4)}  # held but for rounding
 
 
-def _judged(
+def _with_residuals(
     number: int, T_map_worlds: Mapping[int, Transform], places: Sequence[SharedPlace]
 ) -> WorldByPlaces:
-    """Return the pose of a run, judged by the places that it shares with any other."""
+    """Return the pose of a run's world with the residuals of the places that it shares with any other."""
     misses_m = [
         discrepancy(
             np.eye(4),

@@ -43,7 +43,7 @@ from mapper.octree.ground_height import (
 from mapper.octree.slice import floor_below, free_path, grid_of
 
 _MOST_CELLS = 2000  # more than a page has pixels
-_MAX_TILT = np.cos(np.deg2rad(5.0))
+_MAX_TILT_RAD = np.deg2rad(5.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,8 +54,8 @@ class Sliced:
         columns: Results of all columns of tiles.
         grid: The slice; None if there is none.
         keepout: The runs' keep-out regions in its cells; None if there are none.
-        storeys: The traversable floor, a storey each; none if there is none.
-        missing: Why there is no slice or no floor.
+        storeys: Storeys of the traversable floor; empty if there is none.
+        missing: Reasons why there is no slice or no floor.
     """
 
     columns: Sequence[SlicedColumn]
@@ -78,7 +78,7 @@ def slice_map(
         workspace: With the tiles and their pieces.
         stages: Runs the jobs, one for each column of tiles.
         joined: The tiles.
-        manifest: Of the map, without what is found here.
+        manifest: Manifest of the map, without what is found here.
         placed: Its runs.
     """
     columns: dict[tuple[int, int], list[int]] = defaultdict(list)
@@ -93,21 +93,21 @@ def slice_map(
     missing = _why_no_floor(extent, placed)
     floor = None if missing else _floor(workspace, joined, extent, manifest, paths_map)
     driven = None if floor is None else driven_ground(floor)
-    first, shape = _raster(extent, driven)
+    raster = _raster(workspace, extent, driven)
     if manifest.slice.above == "ground":
-        _save_ground(workspace, columns.values(), first, shape, manifest, driven)
+        _save_ground(raster, columns.values(), manifest, driven)
     done = _sliced_columns(workspace, stages, columns.values(), manifest)
     if not _is_level(placed):
         return Sliced(done, None, None, (), missing)
-    seen = np.zeros(shape, np.uint8)
+    seen = np.zeros(raster.shape, np.uint8)
     for tiles in columns.values():
-        _join_piece(np.bitwise_or, seen, first, workspace, tiles[0], BAND)
+        raster.join(np.bitwise_or, seen, tiles[0], BAND)
     heights = {"resolution_m": manifest.octree.resolution_m, "floor_z_m": manifest.floor_z_m}
     if driven is not None:
         free_path(seen, driven, manifest.slice, **heights)
     grid = None
     try:
-        grid = grid_of(seen, manifest.slice, first=first, **heights)
+        grid = grid_of(seen, manifest.slice, first=raster.first, **heights)
     except DataError as error:
         missing.append(f"no {error}")
     editors = editors_of(manifest, paths_map)
@@ -117,7 +117,7 @@ def slice_map(
 
 
 def _is_level(placed: Sequence[Placed]) -> bool:
-    return all(item.T_map_world[2, 2] >= _MAX_TILT for item in placed)
+    return all(item.T_map_world[2, 2] >= np.cos(_MAX_TILT_RAD) for item in placed)
 
 
 def _why_no_floor(extent: Extent, placed: Sequence[Placed]) -> list[str]:
@@ -179,41 +179,84 @@ def _keepout(
     return None if first is None else reduce(with_obstacles, others, first)
 
 
-def _raster(extent: Extent, driven: DrivenGround | None) -> tuple[NDArray[np.int64], tuple[int, int]]:
-    """Return the x and y keys of the first column of the map's raster, and its shape."""
+@dataclass(frozen=True, slots=True)
+class _Raster:
+    """Raster of the map's columns of voxels, into which pieces of tiles are joined.
+
+    Attributes:
+        workspace: Files of the merge, with the tiles' pieces.
+        first: (2,) x and y keys of the first column.
+        shape: H, W.
+    """
+
+    workspace: Workspace
+    first: NDArray[np.int64]
+    shape: tuple[int, int]
+
+    def rows(self, rows: slice) -> "_Raster":
+        """Return the part of the raster between two rows."""
+        stop = min(rows.stop, self.shape[0])
+        first = np.array([self.first[0], self.first[1] + rows.start])
+        return _Raster(self.workspace, first, (stop - rows.start, self.shape[1]))
+
+    def join(self, operation: np.ufunc, whole: NDArray[Any], tile: int, piece: str) -> None:
+        """Join a tile's piece into an array of the raster's shape."""
+        array = np.load(self.workspace.piece(tile, piece), mmap_mode="r")
+        into, own = self.overlap(self.workspace.window(tile)[0], array.shape)
+        operation(whole[into], array[own], out=whole[into])
+
+    def overlap(
+        self, first: NDArray[np.int64], size: tuple[int, ...]
+    ) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
+        """Return the rows and columns that a window covers, in the raster and in the window.
+
+        Args:
+            first: (2,) x and y keys of the window's first column.
+            size: H, W of the window.
+        """
+        corner = (first - self.first)[::-1]
+        low = np.maximum(corner, 0)
+        high = np.maximum(np.minimum(corner + size, self.shape), low)
+        rows, columns = (slice(a, b) for a, b in zip(low.tolist(), high.tolist(), strict=True))
+        own_low, own_high = (low - corner).tolist(), (high - corner).tolist()
+        own_rows, own_columns = (slice(a, b) for a, b in zip(own_low, own_high, strict=True))
+        return (rows, columns), (own_rows, own_columns)
+
+
+def _raster(workspace: Workspace, extent: Extent, driven: DrivenGround | None) -> _Raster:
+    """Return the raster of the ground under the path, or else of all tiles."""
     if driven is not None:
-        return driven.first, (driven.swept.shape[0], driven.swept.shape[1])
+        return _Raster(workspace, driven.first, (driven.swept.shape[0], driven.swept.shape[1]))
     first, last = extent
-    return first, (int(last[1] - first[1]), int(last[0] - first[0]))
+    return _Raster(workspace, first, (int(last[1] - first[1]), int(last[0] - first[0])))
 
 
 def _save_ground(
-    workspace: Workspace,
+    raster: _Raster,
     columns: Collection[Sequence[int]],
-    first: NDArray[np.int64],
-    shape: tuple[int, int],
     manifest: MapManifest,
     driven: DrivenGround | None,
 ) -> None:
     """Write the ground below every column of tiles; see ``ground_heights``."""
-    rows = defaultdict(list)
+    workspace = raster.workspace
+    tiles_of_row = defaultdict(list)
     for tiles in columns:
         for tile in tiles:
-            rows[int(workspace.window(tile)[0][1])].append(tile)
+            tiles_of_row[int(workspace.window(tile)[0][1])].append(tile)
     resolution_m, floor = manifest.octree.resolution_m, known_floor(driven)
     ground = ground_from_lowest(
-        _Lowest(workspace, rows, first, shape),
-        first=first,
+        _Lowest(raster, tiles_of_row),
+        first=raster.first,
         resolution_m=resolution_m,
         floor_z_m=manifest.floor_z_m,
         floor=floor,
     )
     nearest = None if floor is None else nearest_heights(floor)
     for tiles in columns:
-        corner, size = workspace.window(tiles[0])
-        heights_m = ground.under(first=corner, shape=size)
+        first, size = workspace.window(tiles[0])
+        heights_m = ground.under(first=first, shape=size)
         if nearest is not None:
-            inside, own = _overlap(corner - first, size, shape)
+            inside, own = raster.overlap(first, size)
             level, distances = nearest
             snap_to_floor(heights_m[own], level[inside], distances[inside], resolution_m=resolution_m)
         save_array(workspace.piece(tiles[0], GROUND), heights_m)
@@ -221,55 +264,29 @@ def _save_ground(
 
 @dataclass(frozen=True, slots=True)
 class _Lowest:
-    """The tops of the lowest occupied voxels in all columns of the map, read when they are asked for.
+    """Tops of the lowest occupied voxels in all columns of the map, read when they are asked for.
 
     Attributes:
-        workspace: With the tiles' pieces.
-        tiles: By the y key of their first row.
-        first: (2,) x and y keys of the map's first column.
-        shape: H, W.
+        raster: Raster of the map.
+        tiles_of_row: Tiles by the y key of their first row.
     """
 
-    workspace: Workspace
-    tiles: Mapping[int, Sequence[int]]
-    first: NDArray[np.int64]
-    shape: tuple[int, int]
+    raster: _Raster
+    tiles_of_row: Mapping[int, Sequence[int]]
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """H, W of the map."""
+        return self.raster.shape
 
     def __getitem__(self, rows: slice) -> NDArray[np.int32]:
-        x, y = int(self.first[0]), int(self.first[1]) + rows.start
-        band = np.full((min(rows.stop, self.shape[0]) - rows.start, self.shape[1]), NOTHING, np.int32)
-        voxels = self.workspace.tiling.voxels
-        for row in range(y // voxels * voxels, y + len(band), voxels):
-            for tile in self.tiles.get(row, ()):
-                _join_piece(np.minimum, band, np.array([x, y]), self.workspace, tile, LOWEST)
-        return band
-
-
-def _join_piece(
-    join: np.ufunc, whole: NDArray[Any], first: NDArray[np.int64], workspace: Workspace, tile: int, piece: str
-) -> None:
-    """Join a tile's piece into a raster whose first column has these keys."""
-    array = np.load(workspace.piece(tile, piece), mmap_mode="r")
-    into, own = _overlap(workspace.window(tile)[0] - first, array.shape, whole.shape)
-    join(whole[into], array[own], out=whole[into])
-
-
-def _overlap(
-    corner: NDArray[np.int64], size: tuple[int, ...], shape: tuple[int, ...]
-) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
-    """Return the part of a raster that a window covers, in the raster's rows and columns and in its own.
-
-    Args:
-        corner: (2,) x and y of the window's first column in the raster.
-        size: H, W of the window.
-        shape: H, W of the raster.
-    """
-    low = np.maximum(corner[::-1], 0)
-    high = np.maximum(np.minimum(corner[::-1] + size, shape), low)
-    rows, columns = (slice(a, b) for a, b in zip(low.tolist(), high.tolist(), strict=True))
-    own_low, own_high = low - corner[::-1], high - corner[::-1]
-    own_rows, own_columns = (slice(a, b) for a, b in zip(own_low.tolist(), own_high.tolist(), strict=True))
-    return (rows, columns), (own_rows, own_columns)
+        band = self.raster.rows(rows)
+        lowest = np.full(band.shape, NOTHING, np.int32)
+        voxels, y = self.raster.workspace.tiling.voxels, int(band.first[1])
+        for row in range(y // voxels * voxels, y + len(lowest), voxels):
+            for tile in self.tiles_of_row.get(row, ()):
+                band.join(np.minimum, lowest, tile, LOWEST)
+        return lowest
 
 
 def draw(path: Path, grid: OccupancyGrid, placed: Sequence[Placed], manifest: MapManifest) -> None:

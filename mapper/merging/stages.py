@@ -21,7 +21,7 @@ class Cost(NamedTuple):
 
     Attributes:
         seconds: Wall time.
-        peak_memory_mb: Of its process, since that began.
+        peak_memory_mb: Peak memory of its process, since that began.
     """
 
     seconds: float
@@ -33,10 +33,10 @@ class Stages:
     """Runs the jobs of each stage.
 
     Attributes:
-        runner: Keeps their results, so that a merge that was stopped goes on where it was.
-        executor: Where they run.
+        runner: Keeps their results, so that a merge that was stopped is resumed.
+        executor: Executor of the jobs.
         progress: Receives how many are done.
-        costs: Of the jobs of every stage so far, in no order.
+        costs: Costs of the jobs of every stage so far, in no order.
     """
 
     runner: JobRunner
@@ -51,8 +51,8 @@ class Stages:
 
         Args:
             stage: What the jobs are called together.
-            work: By name, which is what a job is known by when the merge is started again.
-            kind: Of the results.
+            work: Functions by job name; a merge that is started again recognises its jobs by these names.
+            kind: Type of the results.
 
         Raises:
             RunError: A job failed twice; the others were done.
@@ -77,7 +77,7 @@ class Stages:
                 yield result.key.removeprefix(f"{stage}-"), kind.model_validate(record)
         if failures:
             more = f" (and {len(failures) - 1} more)" if len(failures) > 1 else ""
-            raise RunError(f"{failures[0]}{more}; what is done stays: give the same command to go on")
+            raise RunError(f"{failures[0]}{more}; finished jobs are kept: give the same command to resume")
 
 
 def _as_records(work: Callable[[], Config]) -> list[Record]:

@@ -17,7 +17,7 @@ class Tiling:
 
     Attributes:
         resolution_m: Edge of a voxel.
-        levels: Of the octree below a tile's top: its edge is 2 to this power, in voxels.
+        levels: Levels of the octree below a tile's top: its edge is 2 to this power, in voxels.
     """
 
     resolution_m: float
@@ -25,7 +25,7 @@ class Tiling:
 
     @property
     def depth(self) -> int:
-        """Of the tiles' tops in the octree."""
+        """Depth of the tiles' tops in the octree."""
         return KEY_BITS - self.levels
 
     @property

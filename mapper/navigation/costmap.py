@@ -42,7 +42,7 @@ def inflate(
         grid: The slice or the floor.
         robot_radius_m: r, the inscribed radius; 0 is a point.
         inflation_radius_m: Distance up to which there are costs; at least r.
-        cost_scaling: s, per metre.
+        cost_scaling: Decay of the cost with distance, s, 1/m.
 
     Raises:
         DataError: A radius or the scaling is negative or not finite, or the inflation ends inside the robot.

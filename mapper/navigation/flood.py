@@ -7,11 +7,11 @@ from numba import njit
 from numpy.typing import NDArray
 
 from mapper.navigation.config import TraversableConfig
-from mapper.octree.columns import Tops
+from mapper.octree.columns import Columns, Tops
 
 _ALLOWANCE = 1e-6  # of a voxel: 0.1 m is two voxels of 5 cm, whatever the rounding of the division
 OFF_PLANE = 0.75
-"""Of a voxel: rounding to voxels moves a surface by half of one."""
+"""Largest distance of floor from its plane, in voxels: rounding to voxels moves a surface by half of one."""
 _SAMPLES = 4  # of a slope's window, on each side
 
 Mask = NDArray[np.bool_]
@@ -58,92 +58,133 @@ def limits_of(config: TraversableConfig, cell_m: float) -> Limits:
 
 
 @njit(cache=True, nogil=True)
-def mark_surfaces(starts: Indices, tops: Tops, room: int, marked: Mask) -> None:
-    """Mark the voxels with at least ``room`` free voxels above."""
+def find_surfaces(columns: Columns, room: int) -> Mask:
+    """Return the (N,) mask of the voxels with at least ``room`` free voxels above."""
+    starts, tops = columns.starts, columns.tops
+    found = np.zeros(len(tops), np.bool_)
     for column in range(len(starts) - 1):
         end = starts[column + 1]
         for n in range(starts[column], end):
-            marked[n] = n + 1 == end or tops[n + 1] - tops[n] > room
+            found[n] = n + 1 == end or tops[n + 1] - tops[n] > room
+    return found
 
 
 @njit(cache=True, nogil=True)
 def flood(
-    starts: Indices,
-    tops: Tops,
-    shape: tuple[int, int],
-    column_of: NDArray[np.int32],
-    limits: Limits,
-    seeds: Indices,
-    open_: Mask,
-    reached: Mask,
-) -> None:
-    """Mark the open surfaces that steps connect to the seeds, over gaps where no neighbour does.
+    columns: Columns, column_of: NDArray[np.int32], limits: Limits, seeds: Indices, open_: Mask
+) -> Mask:
+    """Return the mask of the open surfaces that steps connect to the seeds, over gaps without a neighbour.
 
     Args:
-        starts: As in ``Columns``.
-        tops: As in ``Columns``, (N,).
-        shape: H, W.
+        columns: The occupied voxels, of which there are N.
         column_of: (N,) number of each voxel's column.
-        limits: Of the robot.
+        limits: Limits of the robot.
         seeds: Indices of the voxels to begin at.
         open_: (N,) mask of the voxels whose tops may be entered.
-        reached: (N,) result.
     """
-    height, width = shape
     total = 0
-    for n in range(len(tops)):
+    for n in range(len(open_)):
         total += open_[n]
-    queue, gaps = np.empty(total, np.int32), np.empty(total, np.int32)
-    count = done = gap_count = gap_done = 0
+    reached = np.zeros(len(open_), np.bool_)
+    queue, edges = np.empty(total, np.int32), np.empty(total, np.int32)
+    count = done = edge_count = edges_done = 0
     for n in seeds:
         if open_[n] and not reached[n]:
             reached[n] = True
             queue[count] = n
             count += 1
-    reach = limits.gap + 1
     while True:
         while done < count:
             here = queue[done]
             done += 1
-            row, column = column_of[here] // width, column_of[here] % width
-            is_edge = False
-            for y in range(row - 1, row + 2):
-                for x in range(column - 1, column + 2):
-                    if y == row and x == column:
-                        continue
-                    found = -1
-                    if 0 <= y < height and 0 <= x < width:
-                        found = _within_step(starts, tops, y * width + x, tops[here], limits.step, open_)
-                    if found < 0:
-                        is_edge = True
-                    elif not reached[found]:
-                        reached[found] = True
-                        queue[count] = found
-                        count += 1
-            if is_edge and reach > 1:
-                gaps[gap_count] = here
-                gap_count += 1
-        if gap_done == gap_count:
-            return
-        here = gaps[gap_done]
-        gap_done += 1
-        row, column = column_of[here] // width, column_of[here] % width
-        for y in range(max(row - reach, 0), min(row + reach + 1, height)):
-            for x in range(max(column - reach, 0), min(column + reach + 1, width)):
+            found, is_edge = _enter_neighbours(
+                columns, column_of[here], here, limits, open_, reached, queue[count:]
+            )
+            count += found
+            if is_edge and limits.gap > 0:
+                edges[edge_count] = here
+                edge_count += 1
+        if edges_done == edge_count:
+            return reached
+        here = edges[edges_done]
+        edges_done += 1
+        count += _cross_gaps(columns, column_of[here], here, limits, open_, reached, queue[count:])
+
+
+@njit(cache=True, nogil=True)
+def _enter_neighbours(
+    columns: Columns,
+    column: int,
+    here: int,
+    limits: Limits,
+    open_: Mask,
+    reached: Mask,
+    entered: NDArray[np.int32],
+) -> tuple[int, bool]:
+    """Enter the surfaces a step away in the eight columns around.
+
+    Returns:
+        Number of surfaces that are written to ``entered``, and whether any of the columns has none.
+    """
+    starts, tops = columns.starts, columns.tops
+    height, width = columns.shape
+    row, x_here = column // width, column % width
+    count, is_edge = 0, False
+    for y in range(row - 1, row + 2):
+        for x in range(x_here - 1, x_here + 2):
+            if y == row and x == x_here:
+                continue
+            found = -1
+            if 0 <= y < height and 0 <= x < width:
                 found = _within_step(starts, tops, y * width + x, tops[here], limits.step, open_)
-                if (
-                    found >= 0
-                    and not reached[found]
-                    and _nothing_between(starts, tops, width, row, column, y, x, tops[here], limits)
-                ):
-                    reached[found] = True
-                    queue[count] = found
-                    count += 1
+            if found < 0:
+                is_edge = True
+            elif not reached[found]:
+                reached[found] = True
+                entered[count] = found
+                count += 1
+    return count, is_edge
+
+
+@njit(cache=True, nogil=True)
+def _cross_gaps(
+    columns: Columns,
+    column: int,
+    here: int,
+    limits: Limits,
+    open_: Mask,
+    reached: Mask,
+    entered: NDArray[np.int32],
+) -> int:
+    """Enter the surfaces a step away beyond a gap in which nothing is known; return their number."""
+    starts, tops, width = columns.starts, columns.tops, columns.shape[1]
+    low_y, high_y, low_x, high_x = around(column, limits.gap + 1, columns.shape)
+    count = 0
+    for y in range(low_y, high_y):
+        for at in range(y * width + low_x, y * width + high_x):
+            found = _within_step(starts, tops, at, tops[here], limits.step, open_)
+            is_new = found >= 0 and not reached[found]
+            if is_new and _nothing_between(columns, column, at, tops[here], limits):
+                reached[found] = True
+                entered[count] = found
+                count += 1
+    return count
+
+
+@njit(cache=True, nogil=True)
+def around(column: int, reach: int, shape: tuple[int, int]) -> tuple[int, int, int, int]:
+    """Return the ranges, as first and end, of the rows and of the columns within a reach of a column."""
+    height, width = shape
+    y, x = column // width, column % width
+    return max(y - reach, 0), min(y + reach + 1, height), max(x - reach, 0), min(x + reach + 1, width)
 
 
 @njit(cache=True, nogil=True)
 def _within_step(starts: Indices, tops: Tops, column: int, top: int, step: int, open_: Mask) -> int:
-    """Return the open surface of a column that is nearest to a height and within a step of it, or −1."""
+    """Return the open surface of a column that is nearest to a height and within a step of it, or −1.
+
+    This is called so often that it takes arrays: numba counts references to those it takes from a tuple.
+    """
     found = -1
     for n in range(starts[column], starts[column + 1]):
         away = abs(tops[n] - top)
@@ -153,24 +194,25 @@ def _within_step(starts: Indices, tops: Tops, column: int, top: int, step: int, 
 
 
 @njit(cache=True, nogil=True)
-def _nothing_between(
-    starts: Indices, tops: Tops, width: int, row: int, column: int, y: int, x: int, top: int, limits: Limits
-) -> bool:
+def _nothing_between(columns: Columns, begin: int, end: int, top: int, limits: Limits) -> bool:
     """Return whether the columns on the line between two hold neither an obstacle nor a drop."""
-    parts = max(abs(y - row), abs(x - column))
+    width = columns.shape[1]
+    y, x = begin // width, begin % width
+    rows, across = end // width - y, end % width - x
+    parts = max(abs(rows), abs(across))
     for part in range(1, parts):
-        v = row + int(np.rint((y - row) * part / parts))
-        u = column + int(np.rint((x - column) * part / parts))
-        if _is_blocked(starts, tops, v * width + u, top, limits):
+        v = y + int(np.rint(rows * part / parts))
+        u = x + int(np.rint(across * part / parts))
+        if _is_blocked(columns, v * width + u, top, limits):
             return False
     return True
 
 
 @njit(cache=True, nogil=True)
-def _is_blocked(starts: Indices, tops: Tops, column: int, top: int, limits: Limits) -> bool:
+def _is_blocked(columns: Columns, column: int, top: int, limits: Limits) -> bool:
     """Return whether a column holds an obstacle above a floor's height, or lies more than a step below."""
-    for n in range(starts[column], starts[column + 1]):
-        rise = tops[n] - top
+    for n in range(columns.starts[column], columns.starts[column + 1]):
+        rise = columns.tops[n] - top
         if -limits.room <= rise < -limits.step or limits.step < rise <= limits.room:
             return True
     return False
@@ -178,26 +220,21 @@ def _is_blocked(starts: Indices, tops: Tops, column: int, top: int, limits: Limi
 
 @njit(cache=True, nogil=True)
 def _plane(
-    starts: Indices,
-    tops: Tops,
-    shape: tuple[int, int],
-    place: tuple[int, int, int],
-    window: int,
-    limits: Limits,
-    used: Mask,
+    columns: Columns, column: int, top: int, window: int, limits: Limits, used: Mask
 ) -> tuple[float, float, float]:
     """Return the least-squares plane through the floor around: height above ``top``, rises along x and y.
 
     Floor that is too much higher or lower for any slope that the robot can take is left out: it is another
     storey. Where the floor is a single line or point, the plane is level along it.
     """
-    height, width = shape
-    row, column, top = place
+    starts, tops = columns.starts, columns.tops
+    height, width = columns.shape
+    row, x_here = column // width, column % width
     stride = max(1, window // _SAMPLES)
     count = sx = sy = sz = sxx = syy = sxy = sxz = syz = 0.0
     for dy in range(-(window // stride) * stride, window + 1, stride):
         for dx in range(-(window // stride) * stride, window + 1, stride):
-            y, x = row + dy, column + dx
+            y, x = row + dy, x_here + dx
             if not (0 <= y < height and 0 <= x < width):
                 continue
             most = limits.step + 2.0 * limits.slope * np.sqrt(dx * dx + dy * dy)
@@ -224,66 +261,55 @@ def _plane(
 
 
 @njit(cache=True, nogil=True)
-def mark_steep(
-    starts: Indices,
-    tops: Tops,
-    shape: tuple[int, int],
-    column_of: NDArray[np.int32],
-    limits: Limits,
-    candidates: Mask,
-    marked: Mask,
-) -> None:
-    """Mark the candidates around which the plane through all of them is too steep, in either window."""
-    for n in range(len(tops)):
+def find_steep(columns: Columns, column_of: NDArray[np.int32], limits: Limits, candidates: Mask) -> Mask:
+    """Return the mask of the candidates around which their plane is too steep, in either window."""
+    found = np.zeros(len(candidates), np.bool_)
+    for n in range(len(candidates)):
         if candidates[n]:
-            place = (column_of[n] // shape[1], column_of[n] % shape[1], tops[n])
             for window in (limits.least_window, limits.window):
-                _, a, b = _plane(starts, tops, shape, place, window, limits, candidates)
-                marked[n] |= np.sqrt(a * a + b * b) > limits.slope
+                _, a, b = _plane(columns, column_of[n], columns.tops[n], window, limits, candidates)
+                found[n] |= np.sqrt(a * a + b * b) > limits.slope
+    return found
 
 
 @njit(cache=True, nogil=True)
-def mark_plane(
-    starts: Indices,
-    tops: Tops,
-    shape: tuple[int, int],
+def find_on_plane(
+    columns: Columns,
     column_of: NDArray[np.int32],
     limits: Limits,
     candidates: Mask,
     floor: Mask,
     slopes: tuple[float, float],
     tolerance: float,
-    marked: Mask,
-) -> None:
-    """Mark the candidates that lie in the plane of the floor next to them.
+) -> Mask:
+    """Return the mask of the candidates that lie in the plane of the floor next to them.
 
     Args:
-        starts: As in ``Columns``.
-        tops: As in ``Columns``, (N,).
-        shape: H, W.
+        columns: The occupied voxels, of which there are N.
         column_of: (N,) number of each voxel's column.
-        limits: Of the robot.
+        limits: Limits of the robot.
         candidates: (N,) mask of the voxels to look at.
-        floor: (N,) mask of the voxels that planes are laid through.
+        floor: (N,) mask of the voxels to which planes are fitted.
         slopes: Least and largest slope of the plane, rise over run.
         tolerance: Largest distance from the plane, in voxels.
-        marked: (N,) result.
     """
-    height, width = shape
-    for n in range(len(tops)):
-        if not candidates[n]:
-            continue
-        row, column = column_of[n] // width, column_of[n] % width
-        is_at_floor = False
-        for y in range(max(row - limits.window, 0), min(row + limits.window + 1, height)):
-            for x in range(max(column - limits.window, 0), min(column + limits.window + 1, width)):
-                if (
-                    not is_at_floor
-                    and _within_step(starts, tops, y * width + x, tops[n], limits.step, floor) >= 0
-                ):
-                    is_at_floor = True
-        if is_at_floor:
-            place = (row, column, tops[n])
-            above, a, b = _plane(starts, tops, shape, place, limits.window, limits, floor)
+    found = np.zeros(len(candidates), np.bool_)
+    for n in range(len(candidates)):
+        column, top = column_of[n], columns.tops[n]
+        if candidates[n] and _is_at_floor(columns, column, top, limits, floor):
+            above, a, b = _plane(columns, column, top, limits.window, limits, floor)
             slope = np.sqrt(a * a + b * b)
-            marked[n] |= abs(above) <= tolerance and slopes[0] <= slope <= slopes[1]
+            found[n] = abs(above) <= tolerance and slopes[0] <= slope <= slopes[1]
+    return found
+
+
+@njit(cache=True, nogil=True)
+def _is_at_floor(columns: Columns, column: int, top: int, limits: Limits, floor: Mask) -> bool:
+    """Return whether floor lies within a step of a height in any column of the slope's window."""
+    low_y, high_y, low_x, high_x = around(column, limits.window, columns.shape)
+    starts, tops, width = columns.starts, columns.tops, columns.shape[1]
+    for y in range(low_y, high_y):
+        for at in range(y * width + low_x, y * width + high_x):
+            if _within_step(starts, tops, at, top, limits.step, floor) >= 0:
+                return True
+    return False

@@ -4,21 +4,19 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mapper.core.errors import DataError
 from mapper.core.geometry import Points
 from mapper.navigation.config import TraversableConfig
 from mapper.navigation.flood import (
     OFF_PLANE,
-    Indices,
     Limits,
     Mask,
+    find_on_plane,
+    find_steep,
+    find_surfaces,
     flood,
     limits_of,
-    mark_plane,
-    mark_steep,
-    mark_surfaces,
 )
 from mapper.navigation.footprint import with_footprint
 from mapper.navigation.path_ground import PathGround, joined, path_ground
@@ -101,27 +99,23 @@ def floor_of(
         for positions_world in paths_world
     )
     columns, driven = with_footprint(columns, path, limits, radius_m=config.footprint_m)
-    is_surface = np.zeros(len(columns.tops), np.bool_)
-    mark_surfaces(columns.starts, columns.tops, limits.room, is_surface)
-    is_surface |= driven
+    is_surface = find_surfaces(columns, limits.room) | driven
     seeds = np.flatnonzero(driven)
     if not len(seeds):
         floor = floor_z_m / columns.resolution_m
         # A floor at z = 0 lies in the voxel above or in that below.
         seeds = np.flatnonzero(is_surface & (np.abs(columns.tops - floor) <= limits.step))
-    column_of = columns.column_of.astype(np.int32)
-    by_steps = _flooded(columns, column_of, limits, seeds, is_surface)
-    steep, plain = np.zeros_like(by_steps), np.zeros_like(by_steps)
-    mark_steep(columns.starts, columns.tops, columns.shape, column_of, limits, by_steps, steep)
-    steep &= ~driven
-    reached = _flooded(columns, column_of, limits, seeds[~steep[seeds]], by_steps & ~steep)
+    around = columns, columns.column_of.astype(np.int32), limits
+    by_steps = flood(*around, seeds, is_surface)
+    steep = find_steep(*around, by_steps) & ~driven
+    seeds = seeds[~steep[seeds]]
+    reached = flood(*around, seeds, by_steps & ~steep)
     # Where floor meets a steep bank, the plane through both is too steep for what still is floor. And a slope
     # that the path led over, such as stairs, is one that can be taken across its width.
-    candidates = by_steps & ~reached
-    place = (columns.starts, columns.tops, columns.shape, column_of, limits, candidates)
-    mark_plane(*place, reached, (0.0, limits.slope), OFF_PLANE, plain)
-    mark_plane(*place, driven, (limits.slope, np.inf), OFF_PLANE + limits.step / 2.0, plain)
-    reached = _flooded(columns, column_of, limits, seeds[~steep[seeds]], reached | plain)
+    others = by_steps & ~reached
+    level = find_on_plane(*around, others, reached, (0.0, limits.slope), OFF_PLANE)
+    stairs = find_on_plane(*around, others, driven, (limits.slope, np.inf), OFF_PLANE + limits.step / 2.0)
+    reached = flood(*around, seeds, reached | level | stairs)
     return Floor(columns, reached, by_steps & ~reached, driven, path, limits)
 
 
@@ -134,12 +128,3 @@ def driven_ground(floor: Floor) -> DrivenGround:
     swept = np.zeros(columns.shape, np.bool_)
     swept.ravel()[column_of[floor.driven & floor.reached]] = True
     return DrivenGround(heights, swept, columns.first)
-
-
-def _flooded(
-    columns: Columns, column_of: NDArray[np.int32], limits: Limits, seeds: Indices, open_: Mask
-) -> Mask:
-    """Return a mask of the open surfaces that steps connect to the seeds."""
-    reached = np.zeros(len(columns.tops), np.bool_)
-    flood(columns.starts, columns.tops, columns.shape, column_of, limits, seeds, open_, reached)
-    return reached

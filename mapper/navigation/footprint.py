@@ -24,8 +24,8 @@ def with_footprint(
     Args:
         columns: The map's occupied voxels.
         path: Ground along the path.
-        limits: Of the robot.
-        radius_m: Of the footprint.
+        limits: Limits of the robot.
+        radius_m: Radius of the footprint.
     """
     if not len(path):
         return columns, np.zeros(len(columns.tops), np.bool_)
@@ -34,17 +34,7 @@ def with_footprint(
     heights = path.points_world[:, 2] / cell_m
     rooms = np.minimum(np.rint(path.sensor_m / cell_m).astype(np.int64), limits.room)
     near = max(limits.step, round(_NEAR_GROUND_M / cell_m))
-    column, top = _swept(
-        columns.starts,
-        columns.tops,
-        columns.shape,
-        places,
-        heights,
-        rooms,
-        radius_m / cell_m,
-        limits.step,
-        near,
-    )
+    column, top = _swept(columns, places, heights, rooms, radius_m / cell_m, limits.step, near)
     if not len(column):  # obstacles everywhere below the path
         return columns, np.zeros(len(columns.tops), np.bool_)
     keys = np.unique((column << 17) | (top + KEY_ZERO))
@@ -54,16 +44,12 @@ def with_footprint(
     middle = (new + np.append(new[1:], len(keys)) - 1) // 2
     column, top = column[middle], top[middle].astype(np.int32)
     columns = columns.with_tops(column, top)
-    driven = np.zeros(len(columns.tops), np.bool_)
-    _mark_tops(columns.starts, columns.tops, column, top, driven)
-    return columns, driven
+    return columns, _with_tops(columns, column, top)
 
 
 @njit(cache=True, nogil=True)
 def _swept(
-    starts: Indices,
-    tops: Tops,
-    shape: tuple[int, int],
+    columns: Columns,
     places: Array,
     heights: Array,
     rooms: Indices,
@@ -74,47 +60,41 @@ def _swept(
     """Return the columns within a radius of the path and the ground in each, as often as passed.
 
     Args:
-        starts: As in ``Columns``.
-        tops: As in ``Columns``.
-        shape: H, W.
+        columns: The map's occupied voxels.
         places: (N, 2) x and y of the path in columns.
-        heights: (N,) of the ground in voxels.
+        heights: (N,) height of the ground in voxels.
         rooms: (N,) number of voxels above the ground in which an obstacle blocks.
-        radius: Of the footprint, in columns.
+        radius: Radius of the footprint, in columns.
         step: Largest step of the robot, in voxels.
         near: A surface within this distance of the path's ground, in the path's own column, is that ground.
     """
-    columns, found = [], []
+    height, width = columns.shape
+    passed, found = [], []
     for i in range(len(places)):
         x, y = places[i]
         for row in range(int(np.floor(y - radius)), int(np.floor(y + radius)) + 1):
             for column in range(int(np.floor(x - radius)), int(np.floor(x + radius)) + 1):
-                if not (0 <= row < shape[0] and 0 <= column < shape[1]):
+                if not (0 <= row < height and 0 <= column < width):
                     continue
                 aside_x = max(column - x, 0.0, x - column - 1)
                 aside_y = max(row - y, 0.0, y - row - 1)
                 is_own = aside_x == 0.0 and aside_y == 0.0
                 if not is_own and aside_x * aside_x + aside_y * aside_y >= radius * radius:
                     continue
-                top = _ground_in(
-                    starts[row * shape[1] + column],
-                    starts[row * shape[1] + column + 1],
-                    tops,
-                    heights[i],
-                    (step, rooms[i], near if is_own else step),
-                    is_own,
-                )
+                limits = step, rooms[i], near if is_own else step
+                top = _ground_in(columns, row * width + column, heights[i], limits, is_own)
                 if top != NOWHERE:
-                    columns.append(row * shape[1] + column)
+                    passed.append(row * width + column)
                     found.append(top)
-    return np.array(columns, dtype=np.int64), np.array(found, dtype=np.int64)
+    return np.array(passed, dtype=np.int64), np.array(found, dtype=np.int64)
 
 
 @njit(cache=True, nogil=True)
 def _ground_in(
-    begin: int, end: int, tops: Tops, height: float, limits: tuple[int, int, int], crosses_drops: bool
+    columns: Columns, column: int, height: float, limits: tuple[int, int, int], crosses_drops: bool
 ) -> int:
     """Return the top of the path's ground in a column, seen or not; NOWHERE if it is blocked."""
+    tops, begin, end = columns.tops, columns.starts[column], columns.starts[column + 1]
     best = NOWHERE
     step, room, near = limits
     for n in range(begin, end):
@@ -132,9 +112,10 @@ def _ground_in(
 
 
 @njit(cache=True, nogil=True)
-def _mark_tops(starts: Indices, tops: Tops, columns: Indices, wanted: Tops, marked: Mask) -> None:
-    """Mark the voxels with these tops in these columns."""
-    for i in range(len(columns)):
-        for n in range(starts[columns[i]], starts[columns[i] + 1]):
-            if tops[n] == wanted[i]:
-                marked[n] = True
+def _with_tops(columns: Columns, wanted: Indices, tops: Tops) -> Mask:
+    """Return the mask of the voxels with some tops, each in its column."""
+    found = np.zeros(len(columns.tops), np.bool_)
+    for i in range(len(wanted)):
+        for n in range(columns.starts[wanted[i]], columns.starts[wanted[i] + 1]):
+            found[n] |= columns.tops[n] == tops[i]
+    return found

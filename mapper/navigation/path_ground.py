@@ -9,7 +9,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from mapper.core.geometry import Array, Points
-from mapper.octree.columns import Columns, Tops
+from mapper.octree.columns import Columns
 from mapper.octree.keys import KEY_ZERO
 
 _MAX_HEIGHT_M = 4.0
@@ -28,7 +28,7 @@ class PathGround:
     Attributes:
         points_world: (N, 3) metres: x and y of the sensor, z of the ground below it; a voxel apart at most.
         sensor_m: (N,) height of the sensor above it.
-        share_seen: Of these points, those with a surface of the map at them.
+        share_seen: Share of these points that have a surface of the map at them.
     """
 
     points_world: Points
@@ -80,11 +80,7 @@ def path_ground(
         return NO_PATH
     highest = int(np.ceil(_MAX_HEIGHT_M / cell_m))
     low = (points[:, :2] / cell_m - (columns.first - KEY_ZERO)).astype(np.float64)
-    votes = np.zeros((len(points), highest + 1), np.float32)
-    _vote(
-        columns.starts, columns.tops, columns.shape, low, points[:, 2] / cell_m,
-        radius_m / cell_m, room_m / cell_m, votes,
-    )  # fmt: skip
+    votes = _votes(columns, low, points[:, 2] / cell_m, radius_m / cell_m, room_m / cell_m, highest)
     height = _steadiest(votes, _CHANGE_PER_M * cell_m)
     seen = votes[np.arange(len(points)), height] > 0.0
     ground = points - np.column_stack([np.zeros((len(points), 2)), height * cell_m])
@@ -141,30 +137,25 @@ def _driven(
 
 
 @njit(cache=True, nogil=True)
-def _vote(
-    starts: NDArray[np.int64],
-    tops: Tops,
-    shape: tuple[int, int],
-    places: Array,
-    sensor_z: Array,
-    radius: float,
-    room: float,
-    votes: NDArray[np.float32],
-) -> None:
-    """Write, for each height of the sensor, the share of the columns around with a surface that far below.
+def _votes(
+    columns: Columns, places: Array, sensor_z: Array, radius: float, room: float, highest: int
+) -> NDArray[np.float32]:
+    """Return, for each height of the sensor, the share of the columns around with a surface that far below.
 
     Args:
-        starts: As in ``Columns``.
-        tops: As in ``Columns``.
-        shape: H, W.
+        columns: The map's occupied voxels.
         places: (N, 2) x and y in columns.
         sensor_z: (N,) heights in voxels.
-        radius: Around each place, in columns.
-        room: Free voxels above a surface, at most up to the sensor.
-        votes: (N, highest + 1) result.
+        radius: Distance from each place, in columns.
+        room: Number of free voxels that a surface needs above it, at most up to the sensor.
+        highest: Largest height of the sensor above the ground, in voxels.
+
+    Returns:
+        (N, highest + 1) shares, 0 … 1.
     """
-    height, width = shape
-    highest = votes.shape[1] - 1
+    starts, tops = columns.starts, columns.tops
+    height, width = columns.shape
+    votes = np.zeros((len(places), highest + 1), np.float32)
     for i in range(len(places)):
         x, y = places[i]
         count = 0
@@ -187,6 +178,7 @@ def _vote(
                     votes[i, int(np.rint(below))] += 1.0
         for k in range(highest + 1):
             votes[i, k] /= count
+    return votes
 
 
 @njit(cache=True, nogil=True)

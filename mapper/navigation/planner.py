@@ -47,7 +47,7 @@ class Plan:
 
     @property
     def map_name(self) -> str:
-        """What it was planned on: "octree", "slice" or "traversable"."""
+        """Map that it was planned on: "octree", "slice" or "traversable"."""
         return "octree" if self.dimensions == 3 and not self.storeys else self.config.layer
 
     @property

@@ -7,9 +7,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from mapper.navigation.flood import Indices, Mask
+from mapper.navigation.flood import Indices, Limits, Mask, around
 from mapper.navigation.floor import Floor
-from mapper.octree.columns import NOWHERE, Tops, starts_of
+from mapper.octree.columns import NOWHERE, Columns, starts_of
 
 Heights = NDArray[np.int32]
 
@@ -35,16 +35,16 @@ def storeys_of(floor: Floor, *, with_links: bool = False) -> tuple[list[Heights]
     if not (np.diff(column_of) == 0).any():
         heights.ravel()[column_of] = tops
         return [heights], []
-    starts = starts_of(column_of, len(columns.starts) - 1)
+    columns = columns._replace(starts=starts_of(column_of, len(columns.starts) - 1), tops=tops)
     limits, driven = floor.limits, floor.driven[reached]
     storey = np.full(len(tops), _NONE, np.int32)
     sources = np.zeros(len(tops), np.bool_)
     sources[np.argmin(np.where(driven, tops, tops.max())) if driven.any() else np.argmin(tops)] = True
-    _climb(starts, tops, columns.shape, column_of, limits.step, limits.gap, sources, storey)
+    _climb(columns, column_of, limits, sources, storey)
     # Floors that lie over each other are separate storeys; all else goes to the nearer of them.
-    shared = np.diff(starts)[column_of] > 1
+    shared = np.diff(columns.starts)[column_of] > 1
     storey[~shared] = _NONE
-    _climb(starts, tops, columns.shape, column_of, limits.step, limits.gap, shared, storey)
+    _climb(columns, column_of, limits, shared, storey)
     cell_m = columns.resolution_m
     sizes = np.bincount(storey)
     kept = [
@@ -56,53 +56,44 @@ def storeys_of(floor: Floor, *, with_links: bool = False) -> tuple[list[Heights]
     reach = round(_OVERLAP_M / cell_m)
 
     def extended(own: Mask) -> Heights:
-        _extend(starts, tops, columns.shape, column_of, limits.step, reach, own)
+        _extend(columns, column_of, limits.step, reach, own)
         heights = np.full(columns.shape, NOWHERE, np.int32)
         heights.ravel()[column_of[own]] = tops[own]
         return heights
 
-    around = starts, tops, columns.shape, column_of, limits.step, limits.gap
     pairs = combinations(kept, 2) if with_links else ()
-    borders = [_border(*around, storey, *pair) for pair in pairs]
+    borders = [_border(columns, column_of, limits, storey, pair) for pair in pairs]
     links = [extended(border) for border in borders if border.any()]
     return [extended(storey == number) for number in kept], links
 
 
 @njit(cache=True, nogil=True)
 def _border(
-    starts: Indices,
-    tops: Tops,
-    shape: tuple[int, int],
+    columns: Columns,
     column_of: Indices,
-    step: int,
-    gap: int,
+    limits: Limits,
     storey: NDArray[np.int32],
-    one: int,
-    other: int,
+    pair: tuple[int, int],
 ) -> Mask:
     """Return the mask of the surfaces of two storeys from which a step, or a gap, leads to the other."""
-    height, width = shape
+    starts, tops, width = columns.starts, columns.tops, columns.shape[1]
     border = np.zeros(len(tops), np.bool_)
     for n in range(len(tops)):
-        if storey[n] != one:
+        if storey[n] != pair[0]:
             continue
-        row, column = column_of[n] // width, column_of[n] % width
-        for y in range(max(row - gap - 1, 0), min(row + gap + 2, height)):
-            for x in range(max(column - gap - 1, 0), min(column + gap + 2, width)):
-                for m in range(starts[y * width + x], starts[y * width + x + 1]):
-                    if storey[m] == other and abs(tops[m] - tops[n]) <= step:
-                        border[n] = border[m] = True
+        low_y, high_y, low_x, high_x = around(column_of[n], limits.gap + 1, columns.shape)
+        for y in range(low_y, high_y):
+            for m in range(starts[y * width + low_x], starts[y * width + high_x]):  # a row of columns
+                if storey[m] == pair[1] and abs(tops[m] - tops[n]) <= limits.step:
+                    border[n] = border[m] = True
     return border
 
 
 @njit(cache=True, nogil=True)
 def _climb(
-    starts: Indices,
-    tops: Tops,
-    shape: tuple[int, int],
+    columns: Columns,
     column_of: Indices,
-    step: int,
-    gap: int,
+    limits: Limits,
     sources: Mask,
     storey: NDArray[np.int32],
 ) -> None:
@@ -110,7 +101,7 @@ def _climb(
 
     Sources without a storey are of storey 0, as are surfaces that neither steps nor gaps lead to.
     """
-    height, width = shape
+    starts, tops, width = columns.starts, columns.tops, columns.shape[1]
     cost = np.full(len(tops), 1 << 30, np.int64)
     heap = [(np.int64(0), np.int64(0), np.int64(0))]  # climb so far, surface, storey of the one before
     heap.clear()
@@ -127,17 +118,16 @@ def _climb(
             is_done[n] = True
             if storey[n] == _NONE:
                 storey[n] = _free_storey(starts, column_of[n], n, storey, wanted)
-            row, column = column_of[n] // width, column_of[n] % width
-            for reach in (1, gap + 1):
+            for reach in (1, limits.gap + 1):
                 level_surfaces = 0
-                for y in range(max(row - reach, 0), min(row + reach + 1, height)):
-                    for x in range(max(column - reach, 0), min(column + reach + 1, width)):
-                        for m in range(starts[y * width + x], starts[y * width + x + 1]):
-                            climb = abs(tops[m] - tops[n])
-                            level_surfaces += climb <= step
-                            if climb <= step and so_far + climb < cost[m]:
-                                cost[m] = so_far + climb
-                                heappush(heap, (cost[m], np.int64(m), np.int64(storey[n])))
+                low_y, high_y, low_x, high_x = around(column_of[n], reach, columns.shape)
+                for y in range(low_y, high_y):
+                    for m in range(starts[y * width + low_x], starts[y * width + high_x]):  # a row of columns
+                        climb = abs(tops[m] - tops[n])
+                        level_surfaces += climb <= limits.step
+                        if climb <= limits.step and so_far + climb < cost[m]:
+                            cost[m] = so_far + climb
+                            heappush(heap, (cost[m], np.int64(m), np.int64(storey[n])))
                 if level_surfaces == 9:  # floor all around, itself included
                     break
         while rest < len(tops) and is_done[rest]:
@@ -161,12 +151,10 @@ def _free_storey(starts: Indices, column: int, surface: int, storey: NDArray[np.
 
 
 @njit(cache=True, nogil=True)
-def _extend(
-    starts: Indices, tops: Tops, shape: tuple[int, int], column_of: Indices, step: int, reach: int, own: Mask
-) -> None:
+def _extend(columns: Columns, column_of: Indices, step: int, reach: int, own: Mask) -> None:
     """Add the surfaces that up to a number of steps lead to, in columns where the storey has none."""
-    height, width = shape
-    taken = np.zeros(height * width, np.bool_)
+    starts, tops, width = columns.starts, columns.tops, columns.shape[1]
+    taken = np.zeros(len(starts) - 1, np.bool_)
     queue = np.empty(len(tops), np.int64)
     count = done = 0
     for n in range(len(tops)):
@@ -179,9 +167,9 @@ def _extend(
         while done < end:
             n = queue[done]
             done += 1
-            row, column = column_of[n] // width, column_of[n] % width
-            for y in range(max(row - 1, 0), min(row + 2, height)):
-                for x in range(max(column - 1, 0), min(column + 2, width)):
+            low_y, high_y, low_x, high_x = around(column_of[n], 1, columns.shape)
+            for y in range(low_y, high_y):
+                for x in range(low_x, high_x):
                     at = y * width + x
                     if taken[at]:
                         continue

@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from mapper.navigation.config import TraversableConfig
 from mapper.navigation.distance_transform import NONE, squares_to_boxes
-from mapper.navigation.flood import Indices, Limits, Mask
+from mapper.navigation.flood import Limits, Mask
 from mapper.navigation.floor import Floor
 from mapper.navigation.storeys import Heights, storeys_of
-from mapper.octree.columns import NOWHERE, Tops
+from mapper.octree.columns import NOWHERE, Columns
 from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from mapper.octree.ground_height import nearest_heights
 from mapper.octree.keys import KEY_ZERO
@@ -81,9 +81,8 @@ def _storey(floor: Floor, heights: Heights, config: TraversableConfig, is_home: 
     cells = np.full(columns.shape, UNKNOWN, np.int8)
     if reached.any():
         level, distances = nearest_heights(heights)
-        blocked = np.zeros(columns.shape, np.bool_)
         is_near = distances * columns.resolution_m <= _NEAR_M
-        _add_obstacles(columns.starts, columns.tops, floor.steep, level, reached, is_near, limits, blocked)
+        blocked = _obstacles(columns, limits, floor.steep, level, ~reached, is_near)
         riser = max(limits.step, round(_RISER_M / columns.resolution_m))
         _add_edges(heights, _driven(floor, heights), limits.step, riser, blocked)
         closed = _closed(reached, limits.gap)
@@ -111,27 +110,26 @@ def _known(cells: NDArray[np.int8], axis: int) -> slice:
 
 
 @njit(cache=True, nogil=True)
-def _add_obstacles(
-    starts: Indices,
-    tops: Tops,
-    steep: Mask,
-    level: Heights,
-    reached: Mask,
-    is_near: Mask,
-    limits: Limits,
-    blocked: Mask,
-) -> None:
-    """Mark columns with an obstacle between step and head height; near the floor, drops and steep parts."""
+def _obstacles(
+    columns: Columns, limits: Limits, steep: Mask, level: Heights, wanted: Mask, is_near: Mask
+) -> Mask:
+    """Return the (H, W) mask of the wanted columns that a robot cannot pass.
+
+    These have an obstacle between step and head height above the floor's level or, near floor, a drop or a
+    steep part.
+    """
     height, width = level.shape
+    blocked = np.zeros(level.shape, np.bool_)
     for row in range(height):
         for column in range(width):
-            if reached[row, column]:
+            if not wanted[row, column]:
                 continue
-            for n in range(starts[row * width + column], starts[row * width + column + 1]):
-                rise = tops[n] - level[row, column]
+            for n in range(columns.starts[row * width + column], columns.starts[row * width + column + 1]):
+                rise = columns.tops[n] - level[row, column]
                 is_unfit = rise < -limits.step or (steep[n] and rise <= limits.room)
                 if limits.step < rise <= limits.room or (is_near[row, column] and is_unfit):
                     blocked[row, column] = True
+    return blocked
 
 
 def _driven(floor: Floor, heights: Heights) -> Mask:

@@ -1,7 +1,6 @@
 """Occupied voxels of an octree by column, in order of height, for ground plans and surfaces."""
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -21,9 +20,8 @@ NOWHERE = -(1 << 30)
 """Height of the floor in a column without any, in voxels."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Columns:
-    """Occupied voxels of every column, in order of height.
+class Columns(NamedTuple):
+    """Occupied voxels of every column, in order of height; compiled functions take it as it is.
 
     Attributes:
         starts: (H·W + 1,) start of each column's voxels; columns run along x first.
@@ -53,7 +51,7 @@ class Columns:
         starts = starts_of(added >> 17, len(self.starts) - 1)
         starts += self.starts
         tops = np.insert(self.tops, places, (added & (1 << 17) - 1) - KEY_ZERO)
-        return Columns(starts, tops, self.shape, self.first, self.resolution_m)
+        return self._replace(starts=starts, tops=tops)
 
 
 def starts_of(columns: NDArray[np.int64], count: int) -> NDArray[np.int64]:

@@ -1,4 +1,4 @@
-"""What an octree returns: its known voxels, and the ends of rays cast through it."""
+"""Results of octree queries: known voxels, and the ends of rays cast through the map."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -184,7 +184,7 @@ def voxels_of(
 
     Args:
         path: Path of the file, for errors.
-        columns: Of ``parse_map``.
+        columns: Columns from ``parse_map``.
 
     Raises:
         MapFileError: The arrays contradict each other.
@@ -200,7 +200,7 @@ def restore_attributes(
 
     Args:
         path: Path of the file, for errors.
-        columns: Of ``parse_map``.
+        columns: Columns from ``parse_map``.
         blocks: The map's.
         layer: The map's attributes, still empty.
 

@@ -31,7 +31,7 @@ def floor_below(
 
     Args:
         grid: The slice, from ``cut_slice``.
-        config: As it was cut.
+        config: Settings by which it was cut.
         floor_z_m: Height of the floor in the world.
         driven: The ground that was driven on, of the same map; None if none is known.
     """

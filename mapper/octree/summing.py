@@ -13,8 +13,8 @@ class Overlap(NamedTuple):
 
     Attributes:
         shared: Number of voxels that are known in both maps.
-        both_occupied: Those that are occupied in both.
-        either_occupied: Those that are occupied in at least one.
+        both_occupied: Number of voxels that are occupied in both.
+        either_occupied: Number of voxels that are occupied in at least one.
     """
 
     shared: int

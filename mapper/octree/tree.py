@@ -22,7 +22,7 @@ NODE = np.dtype([("value", "<f4"), ("mask", "u1")])
 """A node as in an ``.ot`` file: log-odds, and a bit for each child that exists."""
 
 _VOXELS, _PAIRS, _QUADS, _TOP = 0, 512, 576, 584
-"""Where nodes of edge 1, 2, 4 and 8 voxels begin in the pyramid of a block."""
+"""Index in the pyramid of a block at which the nodes of edge 1, 2, 4 and 8 voxels begin."""
 _PYRAMID = _TOP + 1
 _WORDS = _PYRAMID - BLOCK_VOXELS
 _STACK = 8 * (BLOCK_DEPTH + 1)

@@ -80,9 +80,9 @@ def enter_next_child(pending, prefix, depth):
     """Go down from a node to its lowest child that is still to come; return the child's depth.
 
     Args:
-        pending: By depth on the path, a bit for each child that is still to come; the child's is cleared.
-        prefix: By depth, the Morton code of the node on the path; the child's is written.
-        depth: Of the node.
+        pending: Bits, by depth on the path, for each child that is still to come; the child's is cleared.
+        prefix: Morton codes, by depth, of the nodes on the path; the child's is written.
+        depth: Depth of the node.
     """
     child = 0
     while not (pending[depth] >> child) & 1:

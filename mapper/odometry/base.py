@@ -146,7 +146,7 @@ class Odometry(Protocol[Observation]):
         """Return the view for place recognition. Pure.
 
         Args:
-            observation: Of the frame.
+            observation: Observation of the frame.
             twist: Motion of the body during a scan's sweep; not used for images.
 
         Raises:

@@ -1,10 +1,14 @@
 """Frames that ISVD odometry has tracked, and registrations of a new one against them."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from mapper.core.deskew import Twist
-from mapper.core.geometry import Array, Transform
+from mapper.core.geometry import Array, Transform, exp, inverse, log, mean_rotation, transform
 from mapper.features.matching import Pairs
+from mapper.odometry.config import IsvdOdometryConfig
 from mapper.odometry.isvd_registration import IsvdObservation
 from mapper.registration.base import Alignment
 from mapper.runtime.archived import Archived, archived
@@ -16,8 +20,8 @@ class TrackedFrame:
 
     Attributes:
         node: Its node.
-        observation: As its rows were read.
-        T_world_body: (4, 4) as estimated when it was tracked.
+        observation: Observation as its rows were read.
+        T_world_body: (4, 4) pose as estimated when it was tracked.
         twist: Velocity of the body in the image.
     """
 
@@ -65,3 +69,30 @@ class PoseCandidate:
     weight: float
     pairs: Pairs
     T_world_body: Transform
+
+
+def mean_pose(candidates: Sequence[PoseCandidate], config: IsvdOdometryConfig) -> Transform:
+    """Return T_world_body, the mean of the candidates' poses (alg. 7, lines 21–27).
+
+    Args:
+        candidates: Registrations of a frame, the nearest earlier frame's first.
+        config: Settings of the average.
+    """
+    if config.average == "information":
+        first = candidates[0].T_world_body
+        total = np.sum([candidate.information for candidate in candidates], axis=0)
+        pull = np.sum(
+            [c.information @ np.concatenate(log(inverse(first) @ c.T_world_body)) for c in candidates],
+            axis=0,
+        )
+        mean = np.linalg.solve(total, pull)
+        return first @ exp(mean[:3], mean[3:])
+    weights = np.array([candidate.weight for candidate in candidates])
+    if config.average == "mean":
+        weights = np.ones(len(candidates))
+    poses = np.array([candidate.T_world_body for candidate in candidates])
+    translation: Array = weights @ poses[:, :3, 3] / weights.sum()
+    R_world_body = poses[0, :3, :3]
+    if config.rotation == "mean":
+        R_world_body = mean_rotation(poses[:, :3, :3], weights)
+    return transform(R_world_body, translation)

@@ -1,7 +1,6 @@
 """ISVD odometry: each frame registered against several earlier ones (Somlyai, PhD thesis, alg. 7)."""
 
 import math
-from collections import deque
 from collections.abc import Iterable, Sequence
 
 import numpy as np
@@ -10,7 +9,7 @@ from numpy.typing import NDArray
 from mapper.core.deskew import Twist
 from mapper.core.errors import FrameError
 from mapper.core.frames import Frame, PinholeCamera, RgbdFrame
-from mapper.core.geometry import Array, Transform, apply, exp, inverse, log, mean_rotation, transform
+from mapper.core.geometry import Array, Transform, apply, inverse
 from mapper.core.timebase import NS_PER_S
 from mapper.features.base import Detector
 from mapper.features.factory import build_detector
@@ -27,13 +26,13 @@ from mapper.odometry.base import (
     lost_frame,
 )
 from mapper.odometry.config import IsvdOdometryConfig, MatchConfig
-from mapper.odometry.isvd_frames import Keyframe, PoseCandidate, TrackedFrame, kept
+from mapper.odometry.isvd_earlier_frames import EarlierFrames
+from mapper.odometry.isvd_frames import PoseCandidate, TrackedFrame, mean_pose
 from mapper.odometry.isvd_readout import readout_in_pair
 from mapper.odometry.isvd_registration import IsvdObservation, PairRegistration, RegisterPair
 from mapper.odometry.local_map.readout_time import ReadoutTime
 from mapper.odometry.local_map.rolling_shutter import RollingShutter
 from mapper.odometry.registration_errors import RegistrationErrors
-from mapper.odometry.sharpest_keyframe import SharpestKeyframes
 from mapper.registration.base import Alignment
 from mapper.sensing.config import KINECT_NOISE
 from mapper.sensing.depth_filter import dif
@@ -43,9 +42,6 @@ _VIRTUAL_BASELINE_PX_M = 40.0
 """bf: depth z counts as the disparity bf / z (Mur-Artal & Tardós 2017)."""
 _DEPTH_SHARE = 0.01
 """Error of depths beside the sensor's noise, as a share: its scale, and the slope where a feature lies."""
-_NEW_VIEW, _NEAR_VIEW = 0.15, 0.6
-"""Differences of views: from this on a frame is a keyframe, up to this it is registered against one."""
-_HALF_VIEW_RAD = 0.5
 _PAIRS_SHARING, _PAIRS_COUNTED = 4, 200
 """Pairs of images that tell the readout time: a new image is in one, a keyframe in some 20, their geometric
 mean; and how many of them the estimate is from."""
@@ -81,13 +77,8 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
         self._detector = detector or build_detector(config.detector)
         self._registration = PairRegistration(config.registration, by_pixels=config.residual == "pixels")
         self._register_pair = register or self._registration
-        self._recent: deque[TrackedFrame] = deque(
-            maxlen=max(config.previous_frames, config.keyframe_interval)
-        )
-        self._keyframes: list[Keyframe] = []
-        self._sharpest = SharpestKeyframes(config.keyframe_interval)
+        self._earlier = EarlierFrames(config)
         self._next_node = 0
-        self._turn = 0
         self._nearest_match: tuple[IsvdObservation, PoseCandidate] | None = None
         self._readout = ReadoutTime(
             config.readout_s, windows_sharing=_PAIRS_SHARING, windows_counted=_PAIRS_COUNTED
@@ -131,19 +122,15 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
     def track(self, observation: IsvdObservation) -> FrameResult:
         """Track the next frame, in time order."""
         self._nearest_match = None
-        if not self._recent:
+        last = self._earlier.last
+        if last is None:
             return self._add_node(observation, np.eye(4), [], method="start")
         if not self._follows(observation):
             self._shutter.restart()  # the motion before a gap is not that in this image
-        corrected, earlier = self._shutter.predicted(observation), self._earlier()
-        for match, method in ((self._config.match, "isvd"), (self._config.fallback, "fallback")):
-            candidates = self._register(corrected, earlier, match)
-            if candidates:
-                return self._add_node(observation, self._combine(candidates), candidates, method=method)
-        candidates = self._relocalise(corrected)
+        candidates, method = self._candidates(self._shutter.predicted(observation))
         if candidates:
-            return self._add_node(observation, self._combine(candidates), candidates, method="relocalised")
-        last = self._recent[-1]
+            pose = mean_pose(candidates, self._config)
+            return self._add_node(observation, pose, candidates, method=method)
         return lost_frame(observation.stamp_ns, last.T_world_body, features=len(observation.features))
 
     def view(self, observation: IsvdObservation, twist: Twist | None = None, /) -> ImageView:
@@ -183,7 +170,8 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
 
     def _follows(self, observation: IsvdObservation) -> bool:
         """Return whether a frame is soon after the last tracked one."""
-        return observation.stamp_ns - self._recent[-1].observation.stamp_ns <= STEADY_NS
+        last = self._earlier.last
+        return last is not None and observation.stamp_ns - last.observation.stamp_ns <= STEADY_NS
 
     def _corrected(self, frame: TrackedFrame) -> IsvdObservation:
         """Return what a frame observed, by the readout time as it is known now."""
@@ -193,28 +181,16 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
         exact: Array = pixels.astype(np.float64)
         return camera.undistort(exact) if self._config.undistort else exact
 
-    def _earlier(self) -> list[TrackedFrame]:
-        """Return the MP earlier frames to register the next frame against, the one before it first."""
-        count = self._config.previous_frames
-        if self._config.earlier == "frames":
-            return list(self._recent)[-count:][::-1]
-        last = self._recent[-1]
-        keyframes = [keyframe for keyframe in self._keyframes if keyframe.node != last.node]
-        differences = self._view_differences(last, keyframes)
-        nearest = np.argsort(differences, kind="stable")[: count - 1]
-        return [last, *(keyframes[i].loaded() for i in nearest if differences[i] <= _NEAR_VIEW)]
-
-    def _view_differences(self, frame: TrackedFrame, others: Sequence[Keyframe]) -> Array:
-        """Return (N,) how far views are apart: by shift relative to the depth of the scene, and by turn."""
-        if not others:
-            return np.empty(0)
-        poses = np.array([other.T_world_body for other in others])
-        depth_m = np.nanmedian(_VIRTUAL_BASELINE_PX_M / frame.observation.measured[:, 2])
-        shift = np.linalg.norm(poses[:, :3, 3] - frame.T_world_body[:3, 3], axis=1) / depth_m
-        traces = np.einsum("nij,ij->n", poses[:, :3, :3], frame.T_world_body[:3, :3])
-        turn = np.arccos(np.clip(0.5 * (traces - 1.0), -1.0, 1.0)) / _HALF_VIEW_RAD
-        difference: Array = shift + turn
-        return difference
+    def _candidates(self, observation: IsvdObservation) -> tuple[list[PoseCandidate], str]:
+        """Return the registrations of a frame, and how they were found; none if all failed."""
+        earlier = self._earlier.to_register()
+        for match, method in ((self._config.match, "isvd"), (self._config.fallback, "fallback")):
+            if candidates := self._register(observation, earlier, match):
+                return candidates, method
+        keyframes = (keyframe.loaded() for keyframe in self._earlier.to_relocalise())
+        candidates = self._register(observation, keyframes, self._config.match)
+        # Of keyframes from anywhere, only that counts with which most pairs agree.
+        return sorted(candidates, key=lambda candidate: -candidate.alignment.pairs)[:1], "relocalised"
 
     def _register(
         self, observation: IsvdObservation, earlier: Iterable[TrackedFrame], match: MatchConfig
@@ -239,45 +215,6 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
             return True
         return not check.contradiction(found.T_target_source, begin_ns, end_ns)
 
-    def _combine(self, candidates: Sequence[PoseCandidate]) -> Transform:
-        """Return T_world_body; the nearest earlier frame comes first (alg. 7, lines 21–27)."""
-        if self._config.average == "information":
-            first = candidates[0].T_world_body
-            total = np.sum([candidate.information for candidate in candidates], axis=0)
-            pull = np.sum(
-                [c.information @ np.concatenate(log(inverse(first) @ c.T_world_body)) for c in candidates],
-                axis=0,
-            )
-            mean = np.linalg.solve(total, pull)
-            return first @ exp(mean[:3], mean[3:])
-        weights = np.array([candidate.weight for candidate in candidates])
-        if self._config.average == "mean":
-            weights = np.ones(len(candidates))
-        poses = np.array([candidate.T_world_body for candidate in candidates])
-        translation: Array = weights @ poses[:, :3, 3] / weights.sum()
-        R_world_body = poses[0, :3, :3]
-        if self._config.rotation == "mean":
-            R_world_body = mean_rotation(poses[:, :3, :3], weights)
-        return transform(R_world_body, translation)
-
-    def _relocalise(self, observation: IsvdObservation) -> list[PoseCandidate]:
-        """Return the registration against a keyframe that most pairs agree with; none if all failed."""
-        keyframes = (keyframe.loaded() for keyframe in self._keyframes_to_try())
-        candidates = self._register(observation, keyframes, self._config.match)
-        return sorted(candidates, key=lambda candidate: -candidate.alignment.pairs)[:1]
-
-    def _keyframes_to_try(self) -> list[Keyframe]:
-        """Return the keyframes nearest to the last tracked pose, and some of the others in turn."""
-        count = self._config.relocalisation_keyframes
-        last_world = self._recent[-1].T_world_body[:3, 3]
-        by_distance = sorted(
-            self._keyframes, key=lambda k: float(np.linalg.norm(k.T_world_body[:3, 3] - last_world))
-        )
-        far = by_distance[count:]
-        in_turn = [far[(self._turn + i) % len(far)] for i in range(min(count, len(far)))]
-        self._turn += len(in_turn)
-        return by_distance[:count] + in_turn
-
     def _add_node(
         self,
         observation: IsvdObservation,
@@ -289,10 +226,10 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
         """Make the frame a node, with a factor from each candidate.
 
         Args:
-            observation: As its rows were read.
-            T_world_body: (4, 4) its pose.
+            observation: Observation as its rows were read.
+            T_world_body: (4, 4) pose of the frame.
             candidates: Its registrations, the nearest earlier frame's first.
-            method: What found them.
+            method: Word for what found them.
         """
         node = self._next_node
         self._next_node += 1
@@ -301,12 +238,7 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
         self._learn(tracked, candidates)
         if candidates:
             self._nearest_match = self._corrected(tracked), candidates[0]
-        self._recent.append(tracked)
-        if self._config.earlier == "frames":
-            keyframe = self._sharpest.add(node, len(observation.features))
-            self._keyframes.extend(kept(frame) for frame in self._recent if frame.node == keyframe)
-        elif not (self._view_differences(tracked, self._keyframes) < _NEW_VIEW).any():
-            self._keyframes.append(kept(tracked))
+        self._earlier.add(tracked)
         nearest = candidates[0].alignment if candidates else None
         self._errors.add(observation.stamp_ns, candidates)
         # All rest on this frame's features. Were the earlier ones' the same, too, each factor would have its
@@ -342,8 +274,9 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
 
     def _follow(self, observation: IsvdObservation, T_world_body: Transform) -> Twist:
         """Return the velocity of the body in a frame's image, by its pose and that of the frame before."""
-        if self._recent and self._follows(observation):
-            before, T_body_camera = self._recent[-1], observation.T_body_camera
+        before = self._earlier.last
+        if before is not None and self._follows(observation):
+            T_body_camera = observation.T_body_camera
             T_before_camera = inverse(before.T_world_body @ T_body_camera) @ T_world_body @ T_body_camera
             elapsed_ns = observation.stamp_ns - before.observation.stamp_ns
             self._shutter.follow(T_before_camera, elapsed_ns / NS_PER_S)

@@ -48,6 +48,12 @@ class IsvdObservation(Archivable):
     camera: PinholeCamera
     T_body_camera: Transform
 
+    @property
+    def depths_m(self) -> Array:
+        """(N,) depths in the camera, metres; NaN without one."""
+        depths_m: Array = self.intrinsics[4] / self.measured[:, 2]
+        return depths_m
+
     def swept(self, sweep_camera: Array, /) -> "IsvdObservation":
         """Return the observation as a global shutter would have read it, when the middle row was read.
 
@@ -59,7 +65,7 @@ class IsvdObservation(Archivable):
             return self
         pixels, depth_m = of_middle_row(
             self.measured[:, :2],
-            self.intrinsics[4] / self.measured[:, 2],
+            self.depths_m,
             self.intrinsics,
             self.camera.height_px,
             sweep_camera,
@@ -86,7 +92,7 @@ class PairRegistration:
         """Set the method.
 
         Args:
-            config: Of ISVD.
+            config: Settings of ISVD.
             by_pixels: Refine ISVD's motion by the pixels, which is also a second test of it.
         """
         self._config = config

@@ -36,7 +36,7 @@ class RegistrationErrors:
 
     @property
     def repetition(self) -> float:
-        """By how much errors that frames repeat raise the variance of a mean over them; 1 if they do not."""
+        """Factor by which errors that frames repeat raise the variance of a mean over them; 1 without any."""
         return max(1.0, 1.0 + 2.0 * self._repeated / self._own)
 
     def add(self, stamp_ns: int, candidates: Sequence[PoseCandidate]) -> None:

@@ -15,15 +15,8 @@ from mapper.pipeline.components import component_of
 from mapper.pipeline.fuse import carry_times, fuse_into
 from mapper.pipeline.reobserve import reobserve
 from mapper.pipeline.solve import solve
-from mapper.pipeline.track import (
-    Start,
-    depth_cautions,
-    from_tracking,
-    refuse_a_fragment,
-    save_places,
-    track_log,
-    wheel_measurements,
-)
+from mapper.pipeline.track import Start, depth_cautions, track_log, wheel_measurements
+from mapper.pipeline.tracking_result import from_tracking, refuse_a_fragment, save_places
 from mapper.run.edits_file import edits_text, parse_edits, write_edits
 from mapper.run.folder import Run, open_run
 from mapper.run.manifest import Manifest, Timing, library_versions, now_text

@@ -23,16 +23,9 @@ from mapper.pipeline.checkpoints import (
 )
 from mapper.pipeline.components import largest_component
 from mapper.pipeline.solve import solve
-from mapper.pipeline.track import (
-    TrackingResult,
-    depth_cautions,
-    first_session,
-    from_tracking,
-    refuse_a_fragment,
-    save_places,
-    track_log,
-)
+from mapper.pipeline.track import depth_cautions, first_session, track_log
 from mapper.pipeline.tracking_checkpoints import TrackingCheckpoints
+from mapper.pipeline.tracking_result import TrackingResult, from_tracking, refuse_a_fragment, save_places
 from mapper.run import files
 from mapper.run.folder import Run, open_run
 from mapper.run.manifest import Levelling, RunWarning, Solve
@@ -61,7 +54,7 @@ def build(
 ) -> Run:
     """Track every frame, solve the graph once, level the world, then fuse every frame at its final pose.
 
-    A build that was killed or interrupted goes on where it was, and ends in the same bytes.
+    A build that was killed or interrupted is resumed, and ends in the same bytes.
 
     Args:
         source: The log.

@@ -1,4 +1,4 @@
-"""What decides the result of a build: an unfinished one is gone on with only where all of it is the same."""
+"""Identity of a build: all that decides its result. An unfinished build is resumed only if it is the same."""
 
 import hashlib
 import json
@@ -9,7 +9,7 @@ from typing import Any
 
 from mapper.config.build import BuildConfig
 from mapper.core.config import flattened
-from mapper.core.errors import RunError
+from mapper.core.errors import RunError, listed
 from mapper.core.trajectory import Trajectory
 from mapper.run import files
 from mapper.run.fingerprint import fingerprint
@@ -19,9 +19,8 @@ from mapper.sources.base import Log
 
 IDENTITY = "identity.json"
 """File of a folder of checkpoints, written first."""
-_NAMED = 3
 _WITHOUT_EFFECT = {"octree": {"max_memory_mb"}}
-"""Settings that decide nothing: a build that ran out of memory may go on with another limit."""
+"""Settings that decide nothing: a build that ran out of memory may be resumed with another limit."""
 
 
 def identity_of(source: Log, config: BuildConfig, poses: Trajectory | None) -> dict[str, Any]:
@@ -83,7 +82,7 @@ def _digest_of(identity: Mapping[str, Any]) -> str:
 
 
 def kept_from_before(partial: Path, identity: Mapping[str, Any], *, fresh: bool) -> tuple[str, ...]:
-    """Return the names of what a build can go on from in a folder that an earlier process left.
+    """Return the names of the files from which a build can be resumed in a folder that was left.
 
     Raises:
         RunError: The folder has checkpoints of another build.
@@ -95,10 +94,9 @@ def kept_from_before(partial: Path, identity: Mapping[str, Any], *, fresh: bool)
     except (OSError, ValueError):
         return ()  # it was killed before anything else was written, or is damaged
     if differences := _differences(known, identity):
-        named = ", ".join(differences[:_NAMED]) + (", …" if len(differences) > _NAMED else "")
         raise RunError(
-            f"{partial}: an unfinished build with {named}; finish it with the arguments it had, or begin "
-            "anew with --fresh"
+            f"{partial}: an unfinished build with {listed(differences, most=3)}; finish it with the "
+            "arguments it had, or begin anew with --fresh"
         )
     return (MANIFEST_NAME, files.CHECKPOINTS, files.SCAN_UPDATES)
 

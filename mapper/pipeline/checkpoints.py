@@ -1,4 +1,4 @@
-"""Checkpoints of a build, so that one that was stopped goes on where it was and ends in the same bytes.
+"""Checkpoints of a build, so that one that was stopped is resumed and ends in the same bytes.
 
 They lie in a folder of their own in ``OUT.partial``, and come from three steps:
 
@@ -8,8 +8,8 @@ They lie in a folder of their own in ``OUT.partial``, and come from three steps:
 - while frames are fused, the file of their updates, with a digest of what of it is on the disk
   (``fuse_checkpoints``).
 
-What is written is copied in the thread that works, between two frames; another thread writes it and waits
-for the disk. A disk that is full ends the checkpoints, not the build.
+What is written is copied in the main thread, between two frames; another thread writes it and waits for the
+disk. A full disk ends the checkpoints, not the build.
 """
 
 import shutil
@@ -38,13 +38,35 @@ from mapper.runtime.state_pickle import dump, dumps, load, loads
 from mapper.runtime.timing import peak_memory_mb
 
 EVERY_S = 4.0
-"""Seconds between two checkpoints."""
+"""Seconds between two checkpoints, at least."""
 _SHARE, _LONGEST_S = 0.015, 9.0
-"""A checkpoint that costs more of the CPU time between two waits, but no longer than this."""
+"""Largest share of the CPU time that checkpoints take; after so many seconds one is due whatever it costs."""
 _TIMES = "resumed.json"
 _JOURNAL = "tracking.journal"
 
 Result = TypeVar("Result")
+
+
+class _Schedule:
+    """Schedule of checkpoints: seconds between them, and more where one takes much of the CPU time."""
+
+    def __init__(self, every_s: float) -> None:
+        """Begin now; with 0 s one is always due."""
+        self.cost_s = 0.0
+        self._every_s = every_s
+        self.restart()
+
+    def restart(self) -> None:
+        """Count from now on."""
+        self._last_s, self._last_cpu_s = time.monotonic(), time.process_time()
+
+    def is_due(self, *, is_busy: bool) -> bool:
+        """Return whether it is time for the next checkpoint, unless the last one is still being written."""
+        if self._every_s <= 0.0:
+            return True
+        since_s, since_cpu_s = time.monotonic() - self._last_s, time.process_time() - self._last_cpu_s
+        is_cheap = self.cost_s <= _SHARE * since_cpu_s
+        return not is_busy and since_s >= self._every_s and (is_cheap or since_s > _LONGEST_S)
 
 
 class Checkpoints:
@@ -58,11 +80,11 @@ class Checkpoints:
         *,
         every_s: float = EVERY_S,
     ) -> None:
-        """Begin, or go on with what is in the folder.
+        """Begin, or resume from what is in the folder.
 
         Args:
-            writer: Of the run.
-            identity: What decides the result.
+            writer: Writer of the run.
+            identity: All that decides the result.
             progress: Receives notes.
             every_s: Seconds between two checkpoints, at least; 0 keeps one of every frame, and waits for it.
         """
@@ -71,9 +93,7 @@ class Checkpoints:
         self.progress = progress
         self.is_off = False
         self.is_solved = False
-        self._every_s = every_s
-        self._cost_s = 0.0
-        self._last_s, self._last_cpu_s = time.monotonic(), time.process_time()
+        self._schedule = _Schedule(every_s)
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="checkpoint")
         self._pending: Future[None] | None = None
         self._written: list[Archived[Any]] = []
@@ -108,9 +128,9 @@ class Checkpoints:
             shutil.rmtree(self.folder, ignore_errors=True)  # it would fail again
 
     def result(self, step: Literal["tracked", "solved"], work: Callable[[], Result]) -> Result:
-        """Return the result of a step: as an earlier process left it, or worked out and kept.
+        """Return the result of a step: as an earlier process left it, or computed and stored.
 
-        The manifest and the times so far belong to it.
+        The manifest and the times so far are stored with it.
         """
         versions, damaged = StateFile(self.folder, step).versions()
         for path in versions.values():
@@ -126,7 +146,7 @@ class Checkpoints:
             known: Result = state["result"]
             return known
         if damaged:
-            self.progress.note(f"what an earlier process has {step} is damaged; it is worked out again")
+            self.progress.note(f"what an earlier process has {step} is damaged; it is computed again")
         result = work()
         self._wait()
         if not self.is_off:
@@ -147,8 +167,8 @@ class Checkpoints:
         """Copy a result, or a state on the way to it; return the function that writes it and its journal.
 
         Args:
-            states: Where to write it.
-            number: Of its version.
+            states: File of the state.
+            number: Number of its version.
             result: The result.
             fixed: Parts of it that are not written, by name.
         """
@@ -207,24 +227,19 @@ class Checkpoints:
         writer.clock.seconds.update(state["seconds"])
 
     def resumed_at(self, step: Literal["track", "solve", "fuse"], frame: int) -> None:
-        """Report where the build goes on, and record it in the manifest."""
+        """Report where the build is resumed, and record it in the manifest."""
         here = Resumption(at=now_text(), step=step, frame=frame)
         timing = self.writer.manifest.timing
         timing = timing.model_copy(update={"resumed": (*timing.resumed, here)})
         self.writer.update(timing=timing)
         self._try(partial(write_text, self.folder / _TIMES, timing.model_dump_json()))
-        self.progress.note(f"an earlier process was stopped; going on with {here.text}")
+        self.progress.note(f"an earlier process was stopped; resuming with {here.text}")
 
     def is_due(self) -> bool:
         """Return whether it is time for the next checkpoint, and the last one is on the disk."""
-        if self.is_off:
+        is_busy = self._pending is not None and not self._pending.done()
+        if self.is_off or not self._schedule.is_due(is_busy=is_busy):
             return False
-        if self._every_s > 0.0:
-            since_s, since_cpu_s = time.monotonic() - self._last_s, time.process_time() - self._last_cpu_s
-            is_cheap = self._cost_s <= _SHARE * since_cpu_s
-            is_busy = self._pending is not None and not self._pending.done()
-            if is_busy or since_s < self._every_s or not (is_cheap or since_s > _LONGEST_S):
-                return False
         self._wait()
         return not self.is_off
 
@@ -232,9 +247,9 @@ class Checkpoints:
         """Take a checkpoint now, and write it in another thread.
 
         Args:
-            take: Copies what changes, and returns the function that writes it.
+            take: Function that copies what changes, and returns the function that writes it.
         """
-        self._last_s, self._last_cpu_s = time.monotonic(), time.process_time()
+        self._schedule.restart()
         began_s = time.thread_time()
         try:
             write = take()
@@ -246,7 +261,7 @@ class Checkpoints:
         def timed() -> None:
             began_s = time.thread_time()
             write()
-            self._cost_s = taken_s + time.thread_time() - began_s
+            self._schedule.cost_s = taken_s + time.thread_time() - began_s
 
         self._pending = self._thread.submit(timed)
 
@@ -259,7 +274,7 @@ class Checkpoints:
             self.archive.release(written)
 
     def _try(self, work: Callable[[], None]) -> None:
-        """Do what writes; if that fails, go on without checkpoints, and give back their room."""
+        """Call a function that writes; if it fails, go on without checkpoints, and free their space."""
         try:
             work()
         except OSError as error:
@@ -271,8 +286,8 @@ class Checkpoints:
         if not self.is_off:
             self.is_off = True
             self.progress.note(
-                f"checkpoints cannot be written ({reason}); the build goes on without, and begins anew if it "
-                "is stopped"
+                f"checkpoints cannot be written ({reason}); the build goes on without, and starts again "
+                "if it is stopped"
             )
             shutil.rmtree(self.folder, ignore_errors=True)
 

@@ -9,7 +9,7 @@ import numpy as np
 from mapper.graph.components import components
 from mapper.loops.closure import LoopClosure
 from mapper.odometry.base import Diagnostics, FrameResult
-from mapper.pipeline.track import TrackingResult
+from mapper.pipeline.tracking_result import TrackingResult
 from mapper.run.frame_outcomes import DISCONNECTED
 from mapper.runtime.progress import Progress
 

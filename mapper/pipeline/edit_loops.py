@@ -46,7 +46,7 @@ def edit_loops(
         source: The log that the run was built from.
         run: A finished run.
         add: Pairs of nodes that show one place.
-        remove: Loops that do not.
+        remove: Pairs of nodes of loops that are wrong.
         progress: Receives stages, counts and notes.
 
     Raises:

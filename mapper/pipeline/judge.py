@@ -55,10 +55,10 @@ def judge(
     manifest has a trial already.
 
     Args:
-        writer: Of the run; its manifest has the warnings of tracking and fusing.
+        writer: Writer of the run; its manifest has the warnings of tracking and fusing.
         source: The log.
-        config: As the run was built.
-        results: Of the solved run.
+        config: Settings by which the run was built.
+        results: Results of the solved run.
         progress: Receives the stage of the trial.
     """
     warnings = find_warnings(results, writer.manifest)

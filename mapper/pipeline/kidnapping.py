@@ -13,7 +13,7 @@ from mapper.loops.closure import discrepancy, exceeds
 from mapper.loops.config import GateConfig
 from mapper.loops.odometry_chain import NodePath, allowed
 from mapper.pipeline.components import disconnected
-from mapper.pipeline.track import TrackingResult
+from mapper.pipeline.tracking_result import TrackingResult
 from mapper.runtime.progress import Progress
 
 _WINDOW, _LEAST = 5, 3
@@ -42,7 +42,7 @@ def without_jumps(
     out.
 
     Args:
-        tracking: With constraints from the map's node.
+        tracking: Tracking result with constraints from the map's node.
         map_node: That node.
         gate: Drift that the odometry may have.
         progress: Receives a note on each cut.

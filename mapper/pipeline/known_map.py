@@ -36,7 +36,7 @@ class KnownMap:
     Attributes:
         path: Folder of the run or of the merged map.
         config: Settings by which its places were observed: those of its first run.
-        places: Of all of its runs, in the map's frame.
+        places: Places of all of its runs, in the map's frame.
     """
 
     path: Path
@@ -45,7 +45,7 @@ class KnownMap:
 
     @property
     def sensor(self) -> Sensor:
-        """What its places were seen by."""
+        """Sensor by which its places were seen."""
         return sensor_of(self.places)
 
 

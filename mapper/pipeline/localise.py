@@ -1,6 +1,7 @@
 """Localising: a new log placed in a finished map, which stays as it is."""
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import compress
 from pathlib import Path
@@ -27,14 +28,8 @@ from mapper.pipeline.components import component_of
 from mapper.pipeline.kidnapping import without_jumps
 from mapper.pipeline.known_map import KnownMap, detector_of, loops_between_days
 from mapper.pipeline.solve import solve
-from mapper.pipeline.track import (
-    Start,
-    TrackingResult,
-    depth_cautions,
-    from_tracking,
-    track_log,
-    wheel_measurements,
-)
+from mapper.pipeline.track import Start, depth_cautions, track_log, wheel_measurements
+from mapper.pipeline.tracking_result import TrackingResult, from_tracking
 from mapper.run import files
 from mapper.run.localised import LocalisedManifest, find_stretches
 from mapper.run.pose_covariances import uncertain_poses, write_poses
@@ -49,8 +44,8 @@ from mapper.sources.base import Log
 _LEAST_CONSTRAINTS = 3
 """A part of the path that fewer constraints tie to the map is not localised."""
 _FAR, _FAR_BEYOND = 3.0, 0.2
-"""Times ``loops.agreement_path_m``: the path from the nearest constraint from which on frames are doubtful,
-between two constraints, and where there is one on one side only: there nothing would show a jump."""
+"""Distances along the path to the nearest constraint beyond which a frame is doubtful, as factors on
+``loops.agreement_path_m``: between two constraints, and with one on one side only, which hides a jump."""
 
 
 def localise(
@@ -199,22 +194,8 @@ def _doubtful_unless_confirmed(
     held = {loop.j for loop in accepted_loops(tracking.loops)}
     failed = {loop.j for loop in tracking.loops} - held
     for nodes in components(graph.without_loops()):
-        if held.isdisjoint(nodes):
-            continue
-        in_order = sorted(nodes)
-        positions = np.array([graph.T_world_node[node][:3, 3] for node in in_order])
-        path_m = distances_along(positions)
-        known = sorted(held.intersection(nodes))
-        known_m = path_m[np.searchsorted(in_order, known)]
-        begin = max((node for node in failed.intersection(nodes) if node < known[0]), default=-1)
-        end = min((node for node in failed.intersection(nodes) if node > known[-1]), default=in_order[-1] + 1)
-        for node, at_m in zip(in_order, path_m.tolist(), strict=True):
-            is_between = known[0] <= node <= known[-1]
-            limit_m = loops.agreement_path_m * (_FAR if is_between else _FAR_BEYOND)
-            if not begin < node < end:
-                doubts[node] = "the map was searched in vain here, at the end of what was recognised"
-            elif np.abs(known_m - at_m).min() > limit_m:
-                doubts[node] = f"more than {limit_m:g} m of path from the nearest place that was recognised"
+        if not held.isdisjoint(nodes):
+            doubts |= _unconfirmed(graph, sorted(nodes), held, failed, loops.agreement_path_m)
     slack = Discrepancy(loops.gate.slack_m, loops.gate.slack_rad)
     contradicting = {
         loop.j
@@ -227,6 +208,35 @@ def _doubtful_unless_confirmed(
         for track in tracking.tracks
     )
     return replace(tracking, tracks=tracks)
+
+
+def _unconfirmed(
+    graph: PoseGraph, nodes: Sequence[int], held: set[int], failed: set[int], path_m: float
+) -> dict[int, str]:
+    """Return the doubts about the nodes of one part of the path that no constraint nearby confirms.
+
+    Args:
+        graph: The graph at its solution.
+        nodes: Nodes of the part, in order.
+        held: Nodes with a constraint that holds, some of them in this part.
+        failed: Nodes from which the map was searched in vain.
+        path_m: Length of path over which two constraints are compared.
+    """
+    positions = np.array([graph.T_world_node[node] for node in nodes])[:, :3, 3]
+    reached_m = distances_along(positions)
+    known = sorted(held.intersection(nodes))
+    known_m = reached_m[np.searchsorted(nodes, known)]
+    begin = max((node for node in failed.intersection(nodes) if node < known[0]), default=-1)
+    end = min((node for node in failed.intersection(nodes) if node > known[-1]), default=nodes[-1] + 1)
+    doubts = {}
+    for node, at_m in zip(nodes, reached_m.tolist(), strict=True):
+        is_between = known[0] <= node <= known[-1]
+        limit_m = path_m * (_FAR if is_between else _FAR_BEYOND)
+        if not begin < node < end:
+            doubts[node] = "the map was searched in vain here, at the end of what was recognised"
+        elif np.abs(known_m - at_m).min() > limit_m:
+            doubts[node] = f"more than {limit_m:g} m of path from the nearest place that was recognised"
+    return doubts
 
 
 def _write(writer: RunWriter, source: Log, known: KnownMap, tracking: TrackingResult) -> None:

@@ -25,8 +25,8 @@ def reobserve(
     Args:
         source: The log.
         trajectory: Poses of the body: scans are deskewed by its motion.
-        stamps_ns: Of the frames; each has a pose.
-        config: Which odometry.
+        stamps_ns: Stamps of the frames; each has a pose.
+        config: Settings of the odometry.
         progress: Receives the stage and its counts.
 
     Raises:

@@ -37,9 +37,9 @@ def solve(graph: PoseGraph, loops: Sequence[LoopClosure], config: GraphConfig) -
     """Return the graph at its solution, without the loops that the solver rejected.
 
     Args:
-        graph: With a factor for each accepted loop, after all the others and in the loops' order.
-        loops: Every candidate.
-        config: Which solve.
+        graph: Graph with a factor for each accepted loop, after all the others and in the loops' order.
+        loops: All loop candidates.
+        config: Settings of the solver.
 
     Raises:
         GraphError: The graph cannot be solved.

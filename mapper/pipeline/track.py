@@ -1,96 +1,32 @@
 """The first pass over a log: every frame tracked in order, and the pose graph that grows from it."""
 
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
 from mapper.config.build import BuildConfig
-from mapper.core.errors import ConfigError, FrameError, TrackingError
-from mapper.core.frames import Sensor
-from mapper.core.trajectory import Trajectory, trajectory_from
+from mapper.core.errors import ConfigError, FrameError
+from mapper.core.trajectory import Trajectory
 from mapper.features.frame_view import FrameView
 from mapper.graph.model import BetweenFactor, PoseGraph
 from mapper.graph.wheel_factors import WheelMeasurements, wheel_conflict
 from mapper.loops.closure import LoopClosure, accepted_loops
 from mapper.loops.detector import LoopDetector
 from mapper.loops.factory import build_loop_detector, build_verifier
-from mapper.loops.place_file import AnyPlace, write_places
 from mapper.loops.verification_log import VerificationLog
 from mapper.odometry.base import FrameResult, HindsightOdometry, Odometry, SensorCheck
 from mapper.odometry.factory import build_odometry, odometry_for
 from mapper.pipeline.tracking_checkpoints import FrameCheckpoint, TrackingCheckpoints
-from mapper.run import files
-from mapper.run.doubtful_frames import placed_by_neighbours
-from mapper.run.frame_outcomes import records_of
+from mapper.pipeline.tracking_result import BY_POSES, TrackingResult
 from mapper.run.manifest import RunWarning
 from mapper.run.observers import NULL_OBSERVER, Observer, Step
-from mapper.run.stored_tracking import StoredTracking
-from mapper.run.writer import RunWriter
 from mapper.runtime.ordered_map import ordered_map
 from mapper.runtime.progress import Progress
 from mapper.sources.base import FrameRef, Log, Skipped
 from mapper.sources.depth_scale import depth_warnings
 from mapper.sources.reading_checks import ReadingChecks
-
-_BY_POSES = ("wheels", "given")
-"""Kinds of odometry without tracking: frames have the poses of wheels, or known ones."""
-
-_HINTS: Mapping[str, str] = {
-    "rgbd": "is there texture, and depth in the images?",
-    "lidar": "do the scans overlap, and are their units metres?",
-    "wheels": "do the wheels' readings cover the frames' times, without gaps beyond odometry.max_gap_s?",
-    "given": "do the given poses cover the frames' times, without gaps beyond odometry.max_gap_s?",
-}
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class TrackingResult:
-    """Result of the first pass over a log.
-
-    Attributes:
-        tracks: One per frame that could be read, in time order.
-        skipped: The frames that could not be read.
-        graph: Nodes at the odometry's estimates, with every factor, those of the loops last.
-        loops: Every loop candidate with its verdict.
-        frame_ms: Wall milliseconds that each frame took to read, detect and track, by stamp.
-        warnings: What is suspicious about the frames that were read.
-        places: What the nodes are recognised by, of those that were searched for loops.
-    """
-
-    tracks: tuple[FrameResult, ...]
-    skipped: tuple[Skipped, ...]
-    graph: PoseGraph
-    loops: tuple[LoopClosure, ...]
-    frame_ms: Mapping[int, float]
-    warnings: Sequence[RunWarning] = ()
-    places: Mapping[int, AnyPlace] = field(default_factory=dict)
-
-    @property
-    def placed(self) -> list[FrameResult]:
-        """The results of the frames that were not lost."""
-        return [track for track in self.tracks if track.node is not None]
-
-    @property
-    def tracked(self) -> list[FrameResult]:
-        """The results of the frames that were placed without a doubt."""
-        return [track for track in self.placed if not track.doubts]
-
-    def trajectory(self) -> Trajectory:
-        """Return T_world_body = T_world_node · T_node_body of every frame that was not lost."""
-        return self._poses(self.placed)
-
-    def tracked_trajectory(self) -> Trajectory:
-        """Return the same of the frames that were placed without a doubt."""
-        return self._poses(self.tracked)
-
-    def _poses(self, tracks: Sequence[FrameResult]) -> Trajectory:
-        return trajectory_from(
-            (track.stamp_ns, self.graph.T_world_node[track.node] @ track.T_node_body)
-            for track in tracks
-            if track.node is not None
-        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -99,8 +35,8 @@ class Start:
 
     Attributes:
         odometry: Before its first frame.
-        detector: With the places of earlier sessions.
-        graph: Of earlier sessions, without loops.
+        detector: Loop detector with the places of earlier sessions.
+        graph: Graph of earlier sessions, without loops.
         loops: The candidates of earlier sessions.
         searches: The detector's verifier, if its searches can be repeated; None if there are none.
     """
@@ -125,7 +61,7 @@ def first_session(
     Raises:
         ConfigError: The odometry needs wheels or poses and there are none, or the loops need feature counts.
     """
-    if config.odometry.kind in _BY_POSES and config.loops.kind == "thesis":
+    if config.odometry.kind in BY_POSES and config.loops.kind == "thesis":
         raise ConfigError(
             "loops.kind=thesis looks from frames with many features, and "
             f"odometry.kind={config.odometry.kind} counts none; want loops.kind=places, scans or none"
@@ -160,7 +96,7 @@ def track_log(
         start: Odometry, loop detector and graph to begin with: the graph and the loops that are returned are
             those of all sessions, the tracks those of this log. None is those of a first session.
         observer: Receives every frame that is tracked now.
-        checkpoints: Tracking goes on after the frames that these have; None makes none.
+        checkpoints: Checkpoints, after whose frames tracking is resumed; None makes none.
 
     Raises:
         ConfigError: The odometry needs wheels or poses and there are none, or the loops need feature counts.
@@ -306,64 +242,10 @@ def _in_hindsight(
 
 def wheel_measurements(source: Log, config: BuildConfig) -> WheelMeasurements:
     """Return the log's wheel measurements, for factors; none where wheels are the odometry."""
-    wheels = None if config.odometry.kind in _BY_POSES else source.wheels
+    wheels = None if config.odometry.kind in BY_POSES else source.wheels
     return WheelMeasurements(wheels, config.graph.wheels)
-
-
-def refuse_a_fragment(tracking: TrackingResult, config: BuildConfig, *, sensor: Sensor) -> None:
-    """Refuse to make a map from too little.
-
-    Raises:
-        TrackingError: Fewer frames were tracked, without a doubt, than the configuration asks for.
-    """
-    read, tracked = len(tracking.tracks), len(tracking.tracked)
-    enough = max(config.min_tracked_frames, config.min_tracked_ratio * read)
-    if tracked >= enough:
-        return
-    if read == 0 and tracking.skipped:
-        raise TrackingError(
-            f"none of {len(tracking.skipped)} frames could be read; the first: {tracking.skipped[0].reason}"
-        )
-    unread = ""
-    if tracking.skipped:
-        unread = f"; {len(tracking.skipped)} could not be read, the first: {tracking.skipped[0].reason}"
-    if tracked == read:
-        raise TrackingError(
-            f"only {read} {'frame was' if read == 1 else 'frames were'} read, want at least {enough:.0f} "
-            f"(min_tracked_frames); give more of the log{unread}"
-        )
-    hint = _HINTS[config.odometry.kind if config.odometry.kind in _BY_POSES else sensor]
-    doubtful = len(tracking.placed) - tracked
-    found = f"only {tracked} of {read} frames read could be tracked"
-    if doubtful:
-        found += f", {doubtful} more are doubtful"
-    raise TrackingError(
-        f"{found}, want at least {enough:.0f}; {hint} "
-        f"(min_tracked_frames and min_tracked_ratio set the limit){unread}"
-    )
-
-
-def save_places(writer: RunWriter, tracking: TrackingResult) -> None:
-    """Write the places of the nodes that are in the graph; none, if no loops were searched."""
-    nodes = [node for node in tracking.places if node in tracking.graph.T_world_node]
-    if nodes:
-        write_places(writer.folder / files.PLACES, tracking.places, nodes)
 
 
 def depth_cautions(source: Log) -> list[RunWarning]:
     """Return what is implausible about an RGB-D log's depth, before it is tracked."""
     return [RunWarning(kind="depth", sentence=text, weight="doubt") for text in depth_warnings(source)]
-
-
-def from_tracking(tracking: TrackingResult, truth: Trajectory | None) -> StoredTracking:
-    """Return what the first pass over a log found."""
-    records = records_of(tracking.tracks, tracking.skipped)
-    return StoredTracking(
-        records=records,
-        skipped=tracking.skipped,
-        frame_ms=tracking.frame_ms,
-        trajectory=placed_by_neighbours(tracking.trajectory(), tracking.graph, records),
-        graph=tracking.graph,
-        loops=tracking.loops,
-        truth=truth,
-    )

@@ -54,7 +54,7 @@ class TrackingState:
     """State of tracking between two frames.
 
     Attributes:
-        odometry: After the last frame.
+        odometry: Odometry after the last frame.
         frames: All frames so far.
     """
 
@@ -76,7 +76,7 @@ class TrackingCheckpoints:
 
         Args:
             odometry: Before its first frame.
-            checks: Of the log's frames; takes over what is known of those that are not read again.
+            checks: Checks of the log's frames; they take over what is known of those that are not read again.
         """
         checkpoints = self._checkpoints
         self._fixed = fixed_parts(odometry, _FIXED_PARTS)

@@ -21,10 +21,10 @@ class Alignment:
 
     Attributes:
         T_target_source: (4, 4) pose of the source in the target.
-        converged: False means "no answer", for the given ``reason``.
+        converged: Whether there is an answer; if not, ``reason`` says why.
         inlier_ratio: Share of the pairs that agree with the motion, 0 … 1.
         inlier_rmse_m: Root mean square distance of those pairs, metres.
-        pairs: How many pairs agree.
+        pairs: Number of pairs that agree.
         reason: Why it did not converge; empty when it did.
         information: (6, 6) Fisher information of the source's tangent (rotation, translation), where known.
         residuals: Statistics of the residuals that the information rests on, where known.

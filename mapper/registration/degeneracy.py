@@ -35,7 +35,7 @@ class Degeneracy:
 
     @property
     def reason(self) -> str:
-        """Why an answer with this degeneracy is refused; empty when every motion is observable."""
+        """Reason to refuse an answer with this degeneracy; empty when every motion is observable."""
         return f"degenerate: no surface shows {self.text}" if self.text else ""
 
 

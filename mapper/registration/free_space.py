@@ -18,8 +18,8 @@ from mapper.core.geometry import Array, Transform, inverse
 MARGIN_RATIO = 0.01
 """Share of the range that is added to the margin: what an error of the rotation adds, and a range's noise."""
 MIN_RETURNS = 3
-"""Of the nine directions around a point so many need a return for the point to contradict; where the range
-image has fewer, it has holes."""
+"""Number of the nine directions around a point that need a return for the point to contradict: where the
+range image has fewer, it has holes."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -11,7 +11,7 @@ from mapper.core.linear import solve_positive, twist_exp
 from mapper.registration.kd_tree import STACK, search
 
 POINT, PLANE, GAUSSIAN = 0, 1, 2
-"""What is minimised: distances between points, to planes (Chen & Medioni 1992), between Gaussians."""
+"""Distances that are minimised: between points, to planes (Chen & Medioni 1992), between Gaussians."""
 
 FLATNESS = 1.0 - 1e-3
 """A surface's covariance is I − FLATNESS · n nᵀ: a thousandth as thick as wide (Segal et al. 2009)."""

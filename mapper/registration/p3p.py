@@ -29,7 +29,7 @@ def ransac_p3p(
         intrinsics: (≥ 4,) fx, fy, cx, cy.
         tolerance_px: A pair is an inlier when its point projects this close to its pixel (β in the paper).
         iterations: Largest number of draws; fewer once a better one has become unlikely.
-        seed: Of the draws; see ``drawing_order``.
+        seed: Seed of the draws; see ``drawing_order``.
     """
     fx, fy, cx, cy = intrinsics[:4]
     order = drawing_order(len(pixels), seed)

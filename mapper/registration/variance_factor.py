@@ -18,8 +18,8 @@ class ResidualStatistics:
     Attributes:
         variance: Their mean square in standard deviations: features may be found better or worse than their
             weights say.
-        design_effect: By how much residuals that agree within a cell of the image carry less information than
-            independent ones (Kish 1965, §5.4); about 1 if they are independent.
+        design_effect: Factor by which residuals that agree within a cell of the image carry less information
+            than independent ones (Kish 1965, §5.4); about 1 if they are independent.
         cell_scores: (12, 6) sums of the residuals' gradients in each cell, whitened, relative to what
             independent ones amount to: their squares add up to about the design effect. None of too few
             residuals.
@@ -31,7 +31,7 @@ class ResidualStatistics:
 
     @property
     def variance_factor(self) -> float:
-        """By how much the inverse of the normal matrix has to be multiplied to be the covariance."""
+        """Factor on the inverse of the normal matrix that makes it the covariance."""
         return max(1.0, self.design_effect) * self.variance
 
 

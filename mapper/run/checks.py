@@ -79,13 +79,13 @@ def _counted(run: Run) -> Iterator[Finding]:
             yield Finding(name, "failed", str(error), remedy)
             continue
         if found == wanted:
-            yield Finding(name, "well", f"{found}, as the manifest tells")
+            yield Finding(name, "well", f"{found}, as in the manifest")
         else:
-            yield Finding(name, "failed", f"has {found}, the manifest tells {wanted}", remedy)
+            yield Finding(name, "failed", f"has {found}, the manifest has {wanted}", remedy)
     yield Finding(
         files.MANIFEST,
         "warning",
-        "tells no digests: the run is of an older version, and its maps are not checked",
+        "has no digests: the run is of an older version, and its maps are not checked",
         f"mapper fuse {run.path} makes the maps again and records digests of all files",
     )
 

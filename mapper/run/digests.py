@@ -31,8 +31,8 @@ def digests_of(folder: Path, names: Iterable[str] | None = None) -> dict[str, Fi
 
     Args:
         folder: The run.
-        names: Which; None takes all that a verb may have written. Those that are missing are left out, and
-            the manifest, which will hold the digests.
+        names: Names of the files; None takes all that a verb may have written. Missing files are left out,
+            and the manifest, which will hold the digests.
     """
     wanted = set(files.RUN.files if names is None else names) - {files.MANIFEST}
     there = sorted(name for name in wanted if (folder / name).is_file())

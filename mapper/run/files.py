@@ -31,7 +31,7 @@ MCAP = "run.mcap"
 SUMMARY = "summary.png"
 SCAN_UPDATES = "scan_updates.bin"
 FORMER_SCAN_UPDATES = "sights.bin"
-"""What ``scan_updates.bin`` was called before 2026-11-22; it is still read."""
+"""Name of ``scan_updates.bin`` before 2026-11-22, which is still read."""
 EDITS = "edits.toml"
 CONFIG = "config.json"
 MANIFEST = MANIFEST_NAME

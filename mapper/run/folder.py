@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from mapper.config.build import BuildConfig
 from mapper.config.loading import load_run_config
-from mapper.core.errors import MapperError, RunError
+from mapper.core.errors import MapperError, RunError, listed
 from mapper.core.paths import AnyPath
 from mapper.core.timebase import Stamps
 from mapper.core.trajectory import Trajectory
@@ -45,8 +45,6 @@ if TYPE_CHECKING:  # compiled code, which takes longer to load than most files o
     from mapper.octree.grid import OccupancyGrid
     from mapper.octree.map import OctreeMap
     from mapper.run.cloud import Cloud
-
-_NAMED = 5
 
 
 @dataclass(frozen=True)
@@ -144,7 +142,7 @@ class Run:
 
     @cached_property
     def verdict(self) -> Verdict:
-        """Whether it is to be trusted, and why not; that of a run made before 2026-11-22 is found now."""
+        """Verdict on whether it is to be trusted; that of a run made before 2026-11-22 is found now."""
         if self.manifest.verdict is not None:
             return self.manifest.verdict
         return verdict_of(find_warnings(self.results, self.manifest))
@@ -246,7 +244,7 @@ def open_run(path: AnyPath) -> Run:
     if not path.is_dir():
         partial = partial_of(path)
         if is_merged_map(partial):
-            raise RunError(f"{path}: not finished; the mapper merge that began it goes on where it was")
+            raise RunError(f"{path}: not finished; the mapper merge that began it resumes it")
         if (partial / files.MANIFEST).is_file():
             raise RunError(f"{path}: not finished: {_ending(partial)}")
         if path.exists():
@@ -257,9 +255,7 @@ def open_run(path: AnyPath) -> Run:
             f"{path}: is a merged map, not a run; mapper eval, view --html, export and plan take it"
         )
     if is_localised_log(path):
-        raise RunError(
-            f"{path}: is a localised log, not a run; the map that it lies in is told in its manifest"
-        )
+        raise RunError(f"{path}: is a localised log, not a run; its manifest names the map that it lies in")
     if not (path / files.MANIFEST).exists():
         raise RunError(f"{path}: {_not_a_run(path)}")
     manifest = read_manifest(path / files.MANIFEST)
@@ -304,7 +300,7 @@ def _not_a_run(path: Path) -> str:
     if path.is_file() and (path.parent / files.MANIFEST).is_file():
         return f"is a file of a run; give the folder {path.parent}"
     if path.is_dir() and (runs := sorted(child.parent.name for child in path.glob(f"*/{files.MANIFEST}"))):
-        return f"is no run itself, but holds {', '.join(runs[:_NAMED])}{', …' if len(runs) > _NAMED else ''}"
+        return f"is no run itself, but holds {listed(runs)}"
     try:
         open_source(path)
     except MapperError:
@@ -318,5 +314,5 @@ def _ending(folder: Path) -> str:
         ending = "is still being built, or its process was killed"
     else:
         ending = f"{manifest.status}: {manifest.reason}"
-    goes_on = "; the same mapper build goes on where it was" if (folder / files.CHECKPOINTS).is_dir() else ""
-    return f"{folder} {ending}{goes_on}"
+    hint = "; the same mapper build resumes it" if (folder / files.CHECKPOINTS).is_dir() else ""
+    return f"{folder} {ending}{hint}"

@@ -66,8 +66,8 @@ class FrameRecord:
         doubts: Why the pose may be wrong, a few words each.
         sigmas: Standard deviations of the pose relative to its node, or of a keyframe's to the keyframe
             before it: rotation about and translation along the body's x, y, z (rad, m). None if unknown.
-        pose_in_node: Of a doubtful frame that is no node: its pose as tracked, x y z (m) and qx qy qz qw, to
-            which neighbours were added. None of all others.
+        pose_in_node: Pose as tracked of a doubtful frame that is no node, to which neighbours were added: x y
+            z (m) and qx qy qz qw. None for all other frames.
     """
 
     stamp_ns: int

@@ -1,4 +1,4 @@
-"""What is suspicious about a run's pose graph: its loops, its wheel factors, its uncertainty."""
+"""Warnings about a run's pose graph: its loops, its wheel factors, its uncertainty."""
 
 from collections.abc import Iterator, Sequence
 

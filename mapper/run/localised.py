@@ -21,7 +21,7 @@ class Stretch(Config):
 
     state: StretchState
     begin_s: float
-    """Of its first frame, since the log's first."""
+    """Time of its first frame, in seconds since the log's first."""
     end_s: float
     frames: int
     constraints: int
@@ -51,7 +51,7 @@ def find_stretches(
 
     Args:
         records: Outcome of every frame, in time order.
-        poses: Of the frames that were placed.
+        poses: Poses of the frames that were placed.
         constrained_ns: Stamps of the keyframes that were recognised in the map.
     """
     return list(_stretches(records, poses, np.array(sorted(constrained_ns), np.int64)))

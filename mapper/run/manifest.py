@@ -40,11 +40,11 @@ class InputLog(Config):
     """A log that was read."""
 
     path: str
-    """Absolute."""
+    """Absolute path."""
     kind: str
     fingerprint: str
     notes: tuple[str, ...] = ()
-    """What opening and reading the log had to leave out or assume, and what is suspicious in its frames."""
+    """Notes: what was left out or assumed when the log was read, and what is suspicious in its frames."""
 
 
 class AppendedLog(InputLog):
@@ -55,7 +55,7 @@ class AppendedLog(InputLog):
     shift_ns: int
     """Nanoseconds added to its stamps."""
     begins_ns: int
-    """Its first frame, on the run's clock."""
+    """Stamp of its first frame, on the run's clock."""
 
 
 class Input(InputLog):
@@ -77,13 +77,13 @@ class Counts(Config):
 
     listed: int = 0
     read: int = 0
-    """Listed and not skipped."""
+    """Frames that are not skipped."""
     skipped: int = 0
-    """Could not be read; ``skipped`` says why."""
+    """Frames that could not be read; ``Manifest.skipped`` says why."""
     lost: int = 0
-    """Read, but not placed."""
+    """Frames that were read, but not placed."""
     doubtful: int = 0
-    """Placed, but the pose may be wrong; ``frames.csv`` says why."""
+    """Frames that were placed, but whose pose may be wrong; ``frames.csv`` says why."""
     tracked: int = 0
     nodes: int = 0
     factors: int = 0
@@ -93,20 +93,20 @@ class Counts(Config):
     leaves: int = 0
     """Known voxels of the octree, free and occupied."""
     occupied: int | None = None
-    """Occupied ones of them; None in runs of before it was counted."""
+    """Occupied voxels of the octree; None in runs that were made before they were counted."""
     cloud_points: int = 0
     dynamic_points: int = 0
 
     @property
     def voxels_text(self) -> str:
-        """How many voxels are known, and occupied."""
+        """Numbers of voxels, as text."""
         if self.occupied is None:
             return f"{self.leaves} known voxels"
         return f"{self.occupied} occupied and {self.leaves - self.occupied} free voxels"
 
     @property
     def frames_text(self) -> str:
-        """How many frames had which outcome."""
+        """Numbers of frames by outcome, as text."""
         return f"{self.tracked} tracked, {self.doubtful} doubtful, {self.lost} lost, {self.skipped} skipped"
 
 
@@ -114,12 +114,12 @@ Weight = Literal["note", "doubt", "break"]
 
 
 class RunWarning(Config):
-    """Something suspicious about a run."""
+    """Warning: something suspicious about a run."""
 
     kind: str
     """E.g. "gap", "loops", "depth"; docs/VERDICT.md lists them."""
     sentence: str
-    """What was found, with the value and the limit."""
+    """Finding, with the value and the limit."""
     suggestion: str = ""
     """What to try."""
     where: str = ""
@@ -147,7 +147,7 @@ class Trial(Config):
 
     @property
     def text(self) -> str:
-        """What to try: the setting that lost and doubted least, if any helped by half."""
+        """Suggestion: the setting that lost and doubted least, if any helped by half."""
         best = min(self.tried, key=self.tried.__getitem__, default="")
         if best and self.tried[best] < self.unplaced and self.tried[best] <= self.unplaced // 2:
             return (
@@ -158,11 +158,11 @@ class Trial(Config):
 
 
 class Verdict(Config):
-    """Whether a run is to be trusted."""
+    """Verdict on whether a run is to be trusted."""
 
     state: Literal["trusted", "doubtful", "broken in parts"]
     sentences: tuple[str, ...] = ()
-    """Why it is not, and what to try."""
+    """Reasons against it, and what to try."""
 
 
 class SkippedFrame(Config):
@@ -187,7 +187,7 @@ class Solve(Config):
     loops."""
     loop_residual_sigma: float | None = None
     """Median Mahalanobis distance of the accepted loops from the prediction of odometry and wheels: 2.3 where
-    all information is honest, many times that where odometry was wrong somewhere and did not know."""
+    all covariances are right, many times that where those of the odometry are too small."""
     loops_rejected: float | None = None
     """Share of the loops that reached the solver and were rejected by it."""
 
@@ -198,17 +198,17 @@ class Levelling(Config):
     method: str
     detail: str
     has_floor: bool = True
-    """The floor was seen; else its height is a guess."""
+    """Whether the floor was seen; otherwise its height is a guess."""
 
 
 class DepthReach(Config):
-    """How far the depth of a camera counts in the maps."""
+    """Depth up to which a camera's measurements count in the maps."""
 
     noise: DepthNoiseConfig
     detail: str
-    """Where the noise comes from; part of a sentence."""
+    """Source of the noise; part of a sentence."""
     limit_m: float
-    """Where its standard deviation is a voxel's edge: farther returns only tell that space is free."""
+    """Depth at which its standard deviation is a voxel's edge: farther returns only mark space as free."""
     counted_ratio: float
     """Share of the measured depths within this limit."""
 
@@ -222,7 +222,7 @@ class DepthReach(Config):
 
 
 class Resumption(Config):
-    """A process that went on with a build where another one had ended."""
+    """Resumption of a build by another process."""
 
     at: str
     """UTC, ISO 8601."""
@@ -232,7 +232,7 @@ class Resumption(Config):
 
     @property
     def text(self) -> str:
-        """Where the process went on, part of a sentence."""
+        """Step and frame at which the build was resumed; part of a sentence."""
         return f"{self.step} at frame {self.frame}" if self.step != "solve" else self.step
 
 
@@ -252,7 +252,7 @@ class Timing(Config):
     """Seconds of log mapped per wall second."""
     peak_memory_mb: float = 0.0
     resumed: tuple[Resumption, ...] = ()
-    """Of a build that was killed or interrupted; its times are the sums over all processes."""
+    """Resumptions of a build that was killed or interrupted; its times are the sums over all processes."""
 
 
 class FileDigest(Config):

@@ -13,11 +13,11 @@ if TYPE_CHECKING:  # compiled code, which takes longer to load than most files o
 
 
 class MapFolder(Protocol):
-    """What a run and a merged map have in common: maps, and the settings of what is made from them."""
+    """Interface of runs and merged maps: maps, and the settings of what is made from them."""
 
     @property
     def path(self) -> Path:
-        """Its folder."""
+        """Folder of the run or map."""
         ...
 
     @property

@@ -112,7 +112,7 @@ def save_frames(writer: RunWriter, tracked: StoredTracking, *, nodes: int) -> No
     """Write the files about frames and loops, without the graph, and count what is in them.
 
     Args:
-        writer: Of the run, or of a localised log.
+        writer: Writer of the run, or of a localised log.
         tracked: What to write.
         nodes: Number of the graph's nodes that are of the log.
     """

@@ -12,7 +12,7 @@ def verdict_of(warnings: Sequence[RunWarning], trial: Trial | None = None) -> Ve
     """Return the verdict: the heaviest weight of any warning, and the sentences that weigh more than a note.
 
     Args:
-        warnings: As ``find_warnings`` returns them.
+        warnings: Warnings from ``find_warnings``.
         trial: What a trial of other settings found, which is the suggestion for frames lost and doubtful.
     """
     heavy = [with_trial(warning, trial) for warning in warnings if warning.weight != "note"]

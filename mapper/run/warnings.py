@@ -1,4 +1,4 @@
-"""What is suspicious about a run: every warning there is, found in one place from its results."""
+"""Warnings about a run, all of them, from its results."""
 
 import re
 from collections import Counter
@@ -41,8 +41,8 @@ def find_warnings(results: RunResults, manifest: Manifest) -> list[RunWarning]:
     docs/VERDICT.md lists the kinds and their limits.
 
     Args:
-        results: Of the solved run.
-        manifest: With the input's notes, the skipped frames and the levelling.
+        results: Results of the solved run.
+        manifest: Manifest with the input's notes, the skipped frames and the levelling.
     """
     known = [warning for warning in manifest.warnings if warning.kind in INPUT_KINDS]
     reported = {warning.sentence for warning in known}
@@ -69,9 +69,9 @@ def merge_warnings(name: str, *, agreement: float | None, shared_voxels: int) ->
     """Return a warning if a run's walls are not where those of the runs merged before it are.
 
     Args:
-        name: Of the run.
-        agreement: Of the shared voxels that are occupied in either, the share that is in both.
-        shared_voxels: Known in both.
+        name: Name of the run.
+        agreement: Of the shared voxels that are occupied in either, the share that is occupied in both.
+        shared_voxels: Number of voxels that are known in both.
     """
     if agreement is None or shared_voxels < _LEAST_SHARED_VOXELS or agreement >= _LEAST_AGREEMENT:
         return []
@@ -91,8 +91,8 @@ def localisation_warnings(results: RunResults, manifest: Manifest) -> list[RunWa
     """Return all that is suspicious about a log that was localised in a map, what weighs most first.
 
     Args:
-        results: Of the localised log; a frame without a known pose in the map is lost.
-        manifest: With the input's notes and the skipped frames.
+        results: Results of the localised log; a frame without a known pose in the map is lost.
+        manifest: Manifest with the input's notes and the skipped frames.
     """
     timeline, records = TimeLine.of(results, manifest), results.records
     found = [

@@ -29,7 +29,7 @@ class RunWriter:
     """A run folder being filled; its manifest says "building" until the end is known.
 
     Attributes:
-        folder: Where the files go.
+        folder: Folder of the files.
         clock: Times the stages.
         manifest: What will be written at the end; ``update`` replaces parts of it.
     """
@@ -105,7 +105,7 @@ def write_run(
         config: Every setting.
         overwrite: Replace a run that is there; one that holds a user's own files only with ``takes_over``.
         takes_over: The caller copies a user's own files from the run that is replaced.
-        kind: Of the folder; only one of the same kind is replaced.
+        kind: Kind of the folder; only one of the same kind is replaced.
         keeps: Returns the names of what an earlier process left in ``OUT.partial`` that stays.
 
     Raises:

@@ -1,1 +1,1 @@
-"""How work runs: executors, and jobs whose results are kept."""
+"""Execution: executors, resumable jobs, threads, progress, and atomic files and folders."""

@@ -30,7 +30,7 @@ class Archive:
         """Start with what the journal has.
 
         Args:
-            journal: Of the build.
+            journal: Journal of the build.
             recent_bytes: Largest size of the data in memory that is on the disk as well.
         """
         self._journal = journal

@@ -16,7 +16,7 @@ class Archivable:
 
 
 class Reader(Protocol):
-    """What reads data that was written; see ``mapper.runtime.archive.Archive``."""
+    """Reader of data that was written; see ``mapper.runtime.archive.Archive``."""
 
     def read(self, archived: "Archived[Any]", /) -> Any:
         """Return the data."""
@@ -33,7 +33,7 @@ class Archived(Generic[Data]):
         self._data = data
         self._reader = reader
         self.place = place
-        """Where an archive has it; None if none does."""
+        """Place in the archive; None if it is in none."""
 
     @property
     def data(self) -> Data:

@@ -12,13 +12,12 @@ from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
 
-from mapper.core.errors import RunError, SourceError, WriteError
+from mapper.core.errors import RunError, SourceError, WriteError, listed
 
 MANIFEST_NAME = "manifest.json"
 """File that tells what a folder of ours is."""
 
 _TEMPORARY = ".*.part*"
-_NAMED = 5
 _DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO}
 _NO_FOLLOW = getattr(os, "O_NOFOLLOW", 0)
 _FOLDER = getattr(os, "O_DIRECTORY", None)
@@ -201,7 +200,7 @@ def atomic_folder(
 
 @contextmanager
 def resumable_folder(out: Path, *, mark: str) -> Iterator[Path]:
-    """Yield OUT to go on filling: a new folder, or one that an earlier session left unfinished or whole.
+    """Yield OUT to fill: a new folder, or one that an earlier session left unfinished or whole.
 
     Args:
         out: The folder.
@@ -238,9 +237,9 @@ def _refuse_to_lose(out: Path, kind: FolderKind, *, overwrite: bool, takes_over:
     if not kind.wrote(out):
         raise RunError(f"{out}: is not {kind.name}, so --overwrite will not replace it; choose another --out")
     if not takes_over and (foreign := kind.foreign_files(out)):
-        names = ", ".join(foreign[:_NAMED]) + (", …" if len(foreign) > _NAMED else "")
         raise RunError(
-            f"{out}: holds files that are not of {kind.name}: {names}; move them, or choose another --out"
+            f"{out}: holds files that are not of {kind.name}: {listed(foreign)}; move them, or choose "
+            "another --out"
         )
 
 

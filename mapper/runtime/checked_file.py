@@ -51,8 +51,8 @@ class CheckedFormat:
         """Return header and body of a file's bytes, which begin with the magic.
 
         Args:
-            path: Names the file in errors.
-            data: All of it.
+            path: Path of the file, for errors.
+            data: All bytes of the file.
 
         Raises:
             MapperError: ``error``: the file is of another version, truncated or damaged.

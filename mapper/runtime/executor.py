@@ -29,7 +29,7 @@ _ADDRESS = re.compile(r"(tcp|tls|wss?)://.+:\d+")
 
 @dataclass(frozen=True, slots=True)
 class Workers:
-    """Where jobs run.
+    """Workers: this process, processes of this machine, or a Dask cluster.
 
     Attributes:
         processes: Workers on this machine, each with one thread per library; 1 works in this process.

@@ -15,7 +15,7 @@ def extra(name: str, purpose: str) -> Iterator[None]:
     """Import libraries of an extra while inside.
 
     Args:
-        name: Of the extra, as in pyproject.toml.
+        name: Name of the extra, as in pyproject.toml.
         purpose: What they are needed for, as a message begins.
 
     Raises:
@@ -31,8 +31,8 @@ def require(library: str, name: str, purpose: str) -> None:
     """Refuse a job at its start that will need a library of an extra; the library is not loaded.
 
     Args:
-        library: As it is imported.
-        name: Of the extra.
+        library: Name by which the library is imported.
+        name: Name of the extra.
         purpose: What it is needed for, as a message begins.
 
     Raises:

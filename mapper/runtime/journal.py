@@ -123,7 +123,7 @@ class StateFile:
     """Numbered versions of a state, of which the last two are kept.
 
     Attributes:
-        folder: Where the two files are.
+        folder: Folder of the two files.
         name: What both names begin with.
     """
 

@@ -50,7 +50,7 @@ def read_text(
     Args:
         path: As of :func:`read_regular`.
         error: What is raised.
-        encoding: Of the text.
+        encoding: Encoding of the text.
         may_be_pipe: As of :func:`read_regular`.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Resumable jobs: each result is kept in a file, so work that was stopped goes on where it was."""
+"""Resumable jobs: each result is kept in a file, so work that was stopped can be resumed."""
 
 import json
 import math
@@ -69,7 +69,7 @@ class JobRunner:
     next time.
 
     Attributes:
-        folder: Where the results are; a Dask cluster's workers must see it as well.
+        folder: Folder of the results; a Dask cluster's workers must see it as well.
         progress: Receives notes of damaged files.
     """
 
@@ -84,8 +84,8 @@ class JobRunner:
         """Yield the result of every job as it finishes, in any order.
 
         Args:
-            jobs: With different keys.
-            executor: Where they run.
+            jobs: Jobs with different keys.
+            executor: Executor that runs them.
             attempts: How often a job is begun before it has failed.
         """
         folder = self.folder.resolve()
@@ -107,7 +107,7 @@ class JobRunner:
         except FileNotFoundError:
             return None
         except (ValueError, TypeError, KeyError, AttributeError, DataError):
-            self.progress.note(f"{path}: not a finished result, or a damaged one; it is worked out again")
+            self.progress.note(f"{path}: not a finished result, or a damaged one; it is computed again")
             return None
         return None if result.failure else result
 

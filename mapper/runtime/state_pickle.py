@@ -26,7 +26,7 @@ _BUILTINS = frozenset({"set", "frozenset", "bytearray", "complex", "range", "sli
 
 
 class Writes(Protocol):
-    """What bytes can be written to."""
+    """Writable file: takes bytes."""
 
     def write(self, data: Any, /) -> object:
         """Take some bytes."""

@@ -41,7 +41,7 @@ class Skin:
     Attributes:
         texture: Index in the atlas.
         px_per_m: Scale; None stretches the image over the whole face.
-        offset_m: Where the face's top left corner lies in the image, columns and rows, metres.
+        offset_m: Position of the face's top left corner in the image, columns and rows, metres.
     """
 
     texture: int

@@ -59,7 +59,7 @@ class SynthWheelsConfig(Config):
 
 
 class DisturbanceConfig(Config):
-    """What disturbs a recording; by default nothing does."""
+    """Disturbances of a recording; by default there are none."""
 
     gap_start_s: NonNegativeFloat = 0.0
     gap_duration_s: NonNegativeFloat = 0.0
@@ -186,7 +186,7 @@ CAMERA_SCENES: Mapping[str, SynthConfig] = {
     "white-room": SynthConfig(texture_contrast=0.0, posters_per_room=0),
     "twin-rooms": SynthConfig(scene="twin-rooms"),
 }
-"""Where ``mapper synth`` begins with a camera."""
+"""Settings with which ``mapper synth`` begins, by scene of a camera."""
 
 MOVING_INDOORS: Mapping[str, int] = {"people": 4, "moving_boxes": 1}
 MOVING_OUTDOORS: Mapping[str, int] = {"cars": 10, "cyclists": 6, "pedestrians": 16}
@@ -390,7 +390,7 @@ LIDAR_SCENES: Mapping[str, LidarSynthConfig] = {
         sensor=_PUCK,
     ),
 }
-"""Where ``mapper synth`` begins."""
+"""Settings with which ``mapper synth`` begins, by scene of a LiDAR."""
 
 IDEAL_LIDAR = LidarSensorConfig(range_noise_m=0.0, dropout_ratio=0.0, min_range_m=0.0)
 """Exact ranges."""

@@ -1,4 +1,4 @@
-"""What moves in the world and is never part of the truth: boxes, low enough for the camera, and people."""
+"""Moving objects, which are never part of the truth: boxes, low enough for the camera, and people."""
 
 from dataclasses import dataclass, replace
 from typing import Any

@@ -40,8 +40,8 @@ class Wall:
 
     Attributes:
         axis: 0 if it runs along x, 1 along y.
-        low_m: Where it begins along that axis.
-        high_m: Where it ends.
+        low_m: Its lower end along that axis.
+        high_m: Its upper end.
         across_m: Its middle line on the other axis.
         door_m: Middle of its door along the axis, if it has one.
         room_below: Room on the smaller side of ``across_m``; None is outdoors.

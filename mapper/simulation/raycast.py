@@ -167,48 +167,75 @@ def _trace(
     surface: NDArray[np.int32],
 ) -> None:
     """Fill depth and surface of every pixel; ``order`` lists boxes from near to far."""
-    fx, fy, cx, cy = intrinsics
     height, width = depth.shape
-    rows = (height + _TILE_PX - 1) // _TILE_PX
-    columns = (width + _TILE_PX - 1) // _TILE_PX
-    deepest = np.full((rows, columns), np.inf)
+    deepest = np.full((-(-height // _TILE_PX), -(-width // _TILE_PX)), np.inf)
     for b in order:
         u0, v0, u1, v1 = rectangles[b]
-        ox, oy, oz = origin_box[b]
-        hx, hy, hz = halves[b]
-        R = R_box_camera[b]
         for tile_v in range(v0 // _TILE_PX, (v1 + _TILE_PX - 1) // _TILE_PX):
+            top, bottom = tile_v * _TILE_PX, min((tile_v + 1) * _TILE_PX, height)
             for tile_u in range(u0 // _TILE_PX, (u1 + _TILE_PX - 1) // _TILE_PX):
                 if nearest[b] >= deepest[tile_v, tile_u]:
                     continue
-                touched = False
-                left, right = max(u0, tile_u * _TILE_PX), min(u1, (tile_u + 1) * _TILE_PX)
-                for v in range(max(v0, tile_v * _TILE_PX), min(v1, (tile_v + 1) * _TILE_PX)):
-                    y = (v - cy) / fy
-                    bx, by, bz = R[0, 1] * y + R[0, 2], R[1, 1] * y + R[1, 2], R[2, 1] * y + R[2, 2]
-                    for u in range(left, right):
-                        x = (u - cx) / fx
-                        ix = 1.0 / (R[0, 0] * x + bx)
-                        iy = 1.0 / (R[1, 0] * x + by)
-                        iz = 1.0 / (R[2, 0] * x + bz)
-                        # A slab is entered at centre − half and left at centre + half.
-                        mx, my, mz = -ox * ix, -oy * iy, -oz * iz
-                        wx, wy, wz = hx * abs(ix), hy * abs(iy), hz * abs(iz)
-                        enter = max(mx - wx, my - wy, mz - wz)
-                        leave = min(mx + wx, my + wy, mz + wz)
-                        if enter <= leave and enter > _NEAR_M and enter < depth[v, u]:
-                            if enter == mx - wx:
-                                face = 0 if ix > 0.0 else 1
-                            elif enter == my - wy:
-                                face = 2 if iy > 0.0 else 3
-                            else:
-                                face = 4 if iz > 0.0 else 5
-                            depth[v, u] = enter
-                            surface[v, u] = 6 * b + face
-                            touched = True
-                if touched:
-                    worst = 0.0
-                    for v in range(tile_v * _TILE_PX, min((tile_v + 1) * _TILE_PX, height)):
-                        for u in range(tile_u * _TILE_PX, min((tile_u + 1) * _TILE_PX, width)):
-                            worst = max(worst, depth[v, u])
-                    deepest[tile_v, tile_u] = worst
+                left, right = tile_u * _TILE_PX, min((tile_u + 1) * _TILE_PX, width)
+                part = max(left, u0), max(top, v0), min(right, u1), min(bottom, v1)
+                if _trace_box(b, halves[b], R_box_camera[b], origin_box[b], intrinsics, part, depth, surface):
+                    deepest[tile_v, tile_u] = depth[top:bottom, left:right].max()
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _trace_box(
+    b: int,
+    half: Array,
+    R: Array,
+    origin: Array,
+    intrinsics: Array,
+    part: tuple[int, int, int, int],
+    depth: Array,
+    surface: NDArray[np.int32],
+) -> bool:
+    """Fill the pixels of a part of the image in which a box is the nearest; return whether there are any.
+
+    Args:
+        b: Number of the box.
+        half: (3,) half of its edges, metres.
+        R: (3, 3) R_box_camera.
+        origin: (3,) position of the camera in the box's frame, metres.
+        intrinsics: fx, fy, cx, cy in pixels.
+        part: First column and row, and those after the last.
+        depth: (H, W) metres, written.
+        surface: (H, W) 6 · box + face, written.
+    """
+    fx, fy, cx, cy = intrinsics
+    left, top, right, bottom = part
+    centre, size = (origin[0], origin[1], origin[2]), (half[0], half[1], half[2])
+    touched = False
+    for v in range(top, bottom):
+        y = (v - cy) / fy
+        bx, by, bz = R[0, 1] * y + R[0, 2], R[1, 1] * y + R[1, 2], R[2, 1] * y + R[2, 2]
+        for u in range(left, right):
+            x = (u - cx) / fx
+            ray = R[0, 0] * x + bx, R[1, 0] * x + by, R[2, 0] * x + bz
+            enter, leave, face = _slabs(centre, size, ray)
+            if enter <= leave and enter > _NEAR_M and enter < depth[v, u]:
+                depth[v, u], surface[v, u] = enter, 6 * b + face
+                touched = True
+    return touched
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _slabs(
+    origin: tuple[float, float, float], half: tuple[float, float, float], ray: tuple[float, float, float]
+) -> tuple[float, float, int]:
+    """Return where a ray enters and leaves a box, in lengths of the ray, and the face by which it enters."""
+    ix, iy, iz = 1.0 / ray[0], 1.0 / ray[1], 1.0 / ray[2]
+    # A slab is entered at centre − half and left at centre + half.
+    mx, my, mz = -origin[0] * ix, -origin[1] * iy, -origin[2] * iz
+    wx, wy, wz = half[0] * abs(ix), half[1] * abs(iy), half[2] * abs(iz)
+    enter = max(mx - wx, my - wy, mz - wz)
+    if enter == mx - wx:
+        face = 0 if ix > 0.0 else 1
+    elif enter == my - wy:
+        face = 2 if iy > 0.0 else 3
+    else:
+        face = 4 if iz > 0.0 else 5
+    return enter, min(mx + wx, my + wy, mz + wz), face

@@ -14,7 +14,7 @@ _S_AXIS = np.array([1, 1, 0, 0, 0, 0])
 _S_SIGN = np.array([-1.0, 1.0, 1.0, -1.0, 1.0, 1.0])
 _T_AXIS = np.array([2, 2, 2, 2, 1, 1])
 _T_SIGN = np.array([-1.0, -1.0, -1.0, -1.0, 1.0, -1.0])
-"""Which way a face's columns (s) and rows (t) run in the box's frame, so that print reads rightly."""
+"""Directions of a face's columns (s) and rows (t) in the box's frame, so that print is not mirrored."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

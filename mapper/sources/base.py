@@ -43,7 +43,8 @@ class ImageFiles:
         depth: 16-bit depth image.
         depth_stamp_ns: Time of the depth image, nanoseconds.
         depth_units_per_m: Depth image units per metre.
-        recorded_units_per_m: Those of the recording that it is encoded from; None if they are the same.
+        recorded_units_per_m: Units per metre of the recording that it is encoded from; None if they are the
+            same.
     """
 
     colour: ImageFile

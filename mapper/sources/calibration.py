@@ -22,7 +22,7 @@ class Calibration:
     """Intrinsics of a log's images, whose size may not be known before one is read.
 
     Attributes:
-        origin: Where it comes from, for messages.
+        origin: Source of the calibration, for messages.
         fx_px: Focal length along a row.
         fy_px: Focal length along a column; negative where the camera's y axis points up (ICL-NUIM).
         cx_px: Principal point's column.

@@ -68,7 +68,7 @@ class LogFacts:
 
     Attributes:
         name: What the log calls itself.
-        kind: Which format it is in.
+        kind: Format of the log.
         sensor: "rgbd" or "lidar".
         frames: How its frames follow each other.
         content: The first frame that can be read, in words, or that none can.

@@ -65,7 +65,7 @@ class _Component(NamedTuple):
 
 @dataclass
 class _Headers:
-    """What the segments before a scan have set."""
+    """State that the segments before a scan have set."""
 
     height_px: int = 0
     width_px: int = 0

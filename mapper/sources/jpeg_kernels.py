@@ -28,9 +28,9 @@ def read_scan(
 
     Args:
         data: (N,) the file.
-        at: Where the coded data start.
+        at: Index at which the coded data start.
         mcus: Minimum coded units in the scan.
-        interval: Of these between two restart markers; 0 for none.
+        interval: Number of units between two restart markers; 0 for none.
         component_of: (B,) of the scan's C components, which each block of a unit belongs to.
         counts: (2 C, 16) codes of each length in every component's tables, of DC and of AC.
         symbols: (2 C, 256) symbols of these codes.

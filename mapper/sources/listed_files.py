@@ -11,7 +11,7 @@ def within(folder: Path, name: str, *, where: str) -> Path:
     """Return the path of a file that a list in a log's folder names.
 
     Args:
-        folder: Where the names begin.
+        folder: Folder that the names are relative to.
         name: Relative to it.
         where: Place of the name, for the message.
 

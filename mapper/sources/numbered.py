@@ -64,7 +64,7 @@ class Place:
     """Images of one kind in a folder.
 
     Attributes:
-        name: Of the folder.
+        name: Name of the folder.
         numbered: Path and microseconds of the images whose names have one number, by that number.
         images: All images, whatever their names.
     """
@@ -75,7 +75,7 @@ class Place:
 
     @property
     def total(self) -> int:
-        """How many images there are."""
+        """Number of images."""
         return len(self.images)
 
 
@@ -194,7 +194,7 @@ def stamped(images: Sequence[NumberedPair], *, rate_hz: float) -> tuple[list[Fra
 
 @dataclass(frozen=True, slots=True)
 class _Unit:
-    """What numbers count that are times, and by how many of these they usually advance."""
+    """Unit of numbers that are times, and the usual step in it."""
 
     name: str
     ns: int

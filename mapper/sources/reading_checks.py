@@ -21,7 +21,7 @@ _FEWEST_FRAMES, _LONG_NS = 3, NS_PER_S
 
 @dataclass(frozen=True, slots=True)
 class _Reading:
-    """What the checks keep of a frame: checksums of its two images, or the number of its far returns."""
+    """Data of a frame that the checks keep: checksums of its two images, or the number of its far returns."""
 
     image: int | None = None
     depth: int | None = None

@@ -147,7 +147,7 @@ def find_calibration(
     The calibration has depth units only where the user or a file states them.
 
     Args:
-        folder: Where a file of them may lie.
+        folder: Folder that may hold a calibration file.
         config: What the user set.
         known: The camera that the log's format or name implies.
         depth_units_per_m: The format's own depth image units per metre, where nothing else states them.

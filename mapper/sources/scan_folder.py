@@ -172,7 +172,7 @@ def _read_truth(
     posed = [] if lines is None else [(i, line) for i, line in enumerate(lines) if line < len(T_world_posed)]
     notes = []
     if len(posed) < len(files):
-        notes.append(f"{path.name}: {len(T_world_posed)} poses tell of {len(posed)} of {len(files)} scans")
+        notes.append(f"{path.name}: {len(T_world_posed)} poses for {len(posed)} of {len(files)} scans")
     if not posed:
         return None, notes
     T_world_lidar = T_world_posed

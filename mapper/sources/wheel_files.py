@@ -43,8 +43,8 @@ def read_wheels(folder: Path, config: WheelsConfig, *, sensor: Sensor) -> tuple[
     """Return T_odom_body of a log's wheels, if its folder has a file of them, and notes.
 
     Args:
-        folder: Where ``wheels.txt`` (``stamp tx ty tz qx qy qz qw`` of the base) or ``encoders.txt``
-            (``stamp path_m steering_rad``) may lie.
+        folder: Folder that may hold ``wheels.txt`` (``stamp tx ty tz qx qy qz qw`` of the base) or
+            ``encoders.txt`` (``stamp path_m steering_rad``).
         config: The wheelbase, and where the body is.
         sensor: What the body is.
 

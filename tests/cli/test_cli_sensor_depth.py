@@ -88,7 +88,7 @@ def test_without_a_folder_nothing_is_written_and_planes_need_no_distance(walls, 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ([], "tell the distance of each LOG's plane by --plane-at, or look for any by --fit-plane"),
+        ([], "give the distance of each LOG's plane with --plane-at, or search for planes with --fit-plane"),
         (["--plane-at", "0.7", "--plane-at", "1"], "1 logs and 2 --plane-at; want one for each log"),
         (["--plane-at", "-1"], "--plane-at -1: want metres before the camera"),
         (["--plane-at", "nan"], "--plane-at nan: want metres before the camera"),

@@ -125,7 +125,7 @@ def test_leaves_larger_than_a_tile_are_pruned_across_tiles(tmp_path, config):
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_a_merge_that_was_stopped_goes_on_where_it_was(runs, merged, tmp_path, monkeypatch):
+def test_a_merge_that_was_stopped_is_resumed(runs, merged, tmp_path, monkeypatch):
     out, joined = tmp_path / "map", []
 
     def join(workspace, tile, *arguments, **settings):
@@ -139,12 +139,12 @@ def test_a_merge_that_was_stopped_goes_on_where_it_was(runs, merged, tmp_path, m
 
     monkeypatch.setattr("mapper.merging.merge.join_tile", join)
     monkeypatch.setattr(resumable_jobs, "run_jobs", jobs)
-    with pytest.raises(RunError, match=r"join \d+: OSError: the disk is gone.*\(and 1 more\).*to go on"):
+    with pytest.raises(RunError, match=r"join \d+: OSError: the disk is gone.*\(and 1 more\).*to resume"):
         merged_map_of(as_built(runs), out)
     assert not out.exists()
     with pytest.raises(RunError, match="not finished"):
         open_map(out)
-    with pytest.raises(RunError, match="not finished; the mapper merge that began it goes on"):
+    with pytest.raises(RunError, match="not finished; the mapper merge that began it resumes it"):
         open_run(out)
     lost = joined[3:5]
     joined.clear()

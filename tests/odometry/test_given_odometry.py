@@ -15,7 +15,8 @@ from mapper.odometry.config import GivenOdometryConfig
 from mapper.odometry.factory import build_odometry
 from mapper.odometry.given_poses import poses_for
 from mapper.pipeline.build import build
-from mapper.pipeline.track import refuse_a_fragment, track_log
+from mapper.pipeline.track import track_log
+from mapper.pipeline.tracking_result import refuse_a_fragment
 from mapper.run.folder import open_run
 from mapper.runtime.progress import SILENT
 from mapper.simulation import CameraSimulator, make_scene

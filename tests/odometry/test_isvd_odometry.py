@@ -163,7 +163,7 @@ def test_weighted_mean_is_equation_4_1s():
     odometry = IsvdOdometry(config(**PUBLISHED, rotation="mean"))
     tracks = follow(odometry, wall, poses[:5])
     new = wall.seen_from(poses[5], 5)
-    candidates = odometry._register(new, list(odometry._recent)[-4:][::-1], config().match)
+    candidates = odometry._register(new, odometry._earlier.to_register(), config().match)
 
     track = odometry.track(new)
 
@@ -184,7 +184,7 @@ def test_covariances_weigh_the_average():
     odometry = IsvdOdometry(config())
     follow(odometry, wall, poses[:5])
     new = wall.seen_from(poses[5], 5)
-    candidates = odometry._register(new, odometry._earlier(), config().match)
+    candidates = odometry._register(new, odometry._earlier.to_register(), config().match)
 
     T = odometry.track(new).T_world_body
 

@@ -16,7 +16,8 @@ from mapper.octree.config import OctreeConfig
 from mapper.octree.map import OctreeMap
 from mapper.odometry.config import WheelsOdometryConfig
 from mapper.odometry.factory import build_odometry
-from mapper.pipeline.track import refuse_a_fragment, track_log
+from mapper.pipeline.track import track_log
+from mapper.pipeline.tracking_result import refuse_a_fragment
 from mapper.runtime.ordered_map import ordered_map
 from mapper.runtime.progress import SILENT
 from mapper.simulation import CameraSimulator, make_scene, write_tum_log

@@ -3,24 +3,19 @@
 import numpy as np
 import pytest
 
-from mapper.core.geometry import exp, inverse
+from mapper.core.geometry import inverse
 from mapper.graph.components import align_components
 from mapper.graph.config import GraphConfig
 from mapper.graph.model import BetweenFactor, PoseGraph, PoseSigmas
 from mapper.loops.closure import LoopClosure
 from mapper.pipeline.components import DISCONNECTED, largest_component
 from mapper.pipeline.solve import solve
-from mapper.pipeline.track import TrackingResult
+from mapper.pipeline.tracking_result import TrackingResult
 from mapper.runtime.progress import SILENT
 from tests.support.feature_room import track
+from tests.support.planar import at
 
 SURE = PoseSigmas(rotation_rad=0.01, translation_m=0.01).information
-
-
-def at(x: float, yaw: float = 0.0) -> np.ndarray:
-    T = exp(np.array([0.0, 0.0, yaw]), np.zeros(3))
-    T[0, 3] = x
-    return T
 
 
 class Listener:
@@ -38,7 +33,7 @@ class Listener:
 def two_parts(*, tied: bool) -> TrackingResult:
     """Nodes 0 to 2 and, begun anew and turned round, 3 to 7; truly all a metre apart on a line."""
     truth = {node: at(float(node)) for node in range(8)}
-    turned = at(2.0, 2.5)
+    turned = at(2.0, yaw=2.5)
     estimates = {node: T if node < 3 else turned @ inverse(truth[3]) @ T for node, T in truth.items()}
     graph = PoseGraph()
     tracks = []

@@ -2,24 +2,20 @@
 
 import numpy as np
 
-from mapper.core.geometry import exp
 from mapper.core.timebase import NS_PER_S
 from mapper.graph.components import components
 from mapper.graph.model import BetweenFactor, PoseGraph, PoseSigmas
 from mapper.loops.closure import LoopClosure
 from mapper.loops.config import GateConfig
 from mapper.pipeline.kidnapping import without_jumps
-from mapper.pipeline.track import TrackingResult
+from mapper.pipeline.tracking_result import TrackingResult
 from mapper.run.frame_outcomes import DISCONNECTED
 from mapper.runtime.progress import SILENT
 from tests.support.feature_room import track
+from tests.support.planar import at
 
 MAP = 100
 SURE = PoseSigmas(rotation_rad=0.01, translation_m=0.05).information
-
-
-def at(x_m, y_m=0.0):
-    return exp(np.zeros(3), np.array([x_m, y_m, 0.0]))
 
 
 def path(true_x_m, constrained, wrong=()):

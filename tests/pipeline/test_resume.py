@@ -1,4 +1,4 @@
-"""A build that was stopped goes on where it was, and ends in the bytes of one that was not."""
+"""A build that was stopped is resumed, and ends in the bytes of one that was not."""
 
 import errno
 import json
@@ -44,7 +44,7 @@ def test_tracking_goes_on_at_the_frame_where_it_was_stopped(desk_log, desk_run, 
     for frames in (9, 8):
         stopped(desk_log, out, observer=StopAt(frames))
     assert read_manifest(partial_of(out) / "manifest.json").status == "interrupted"
-    with pytest.raises(RunError, match="the same mapper build goes on where it was"):
+    with pytest.raises(RunError, match="the same mapper build resumes it"):
         open_run(out)
 
     run = start(desk_log, out)
@@ -105,7 +105,7 @@ def test_fusing_goes_on_without_casting_again(desk_log, desk_run, street, street
         run = start(log, out)
         assert_same(run, wanted)
         assert resumed(run) == [("fuse", frame - 1), ("fuse", frame + 3)]
-        assert f"an earlier process was stopped; going on with fuse at frame {frame - 1}" in progress.notes
+        assert f"an earlier process was stopped; resuming with fuse at frame {frame - 1}" in progress.notes
 
 
 def test_a_solve_is_not_made_twice(desk_log, desk_run, tmp_path, monkeypatch):
@@ -161,7 +161,7 @@ def test_other_settings_are_refused_until_it_is_begun_anew(desk_log, unfinished)
 
 def test_the_command_goes_on_and_says_so(desk_log, desk_run, unfinished):
     told = mapper("build", desk_log, "--out", unfinished, "--set", REPEATABLE)
-    assert "an earlier process was stopped; going on with track at frame " in told.stderr
+    assert "an earlier process was stopped; resuming with track at frame " in told.stderr
     assert "resumed" in told.stdout
     assert_same(open_run(unfinished), desk_run)
 

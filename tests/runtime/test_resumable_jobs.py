@@ -109,7 +109,7 @@ def test_a_file_that_is_no_cell_is_worked_out_again(diary, tmp_path, text):
     (again,) = run_cells([cell(diary, 1)], tmp_path / "cells", progress=observer)
     assert again.records == result.records
     assert told(diary)["1"] == 2
-    assert observer.notes == [f"{file}: not a finished result, or a damaged one; it is worked out again"]
+    assert observer.notes == [f"{file}: not a finished result, or a damaged one; it is computed again"]
     assert json.loads(file.read_text())["records"] == json.loads(good)["records"]
 
 

@@ -24,17 +24,14 @@ from mapper.simulation.source import CameraSimulator
 from mapper.sources import open_source
 from mapper.sources.config import SourceConfig, WheelsConfig
 from mapper.sources.trajectory_files import write_tum
+from tests.support.planar import at
 
 S = 1_000_000_000
 R_BASE_OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 
-def planar(x, y, yaw):
-    return transform(exp(np.array([0.0, 0.0, yaw]), np.zeros(3))[:3, :3], np.array([x, y, 0.0]))
-
-
 def on_a_line(n, *, step_m=0.5, turn_rad=0.0):
-    T = [np.linalg.matrix_power(planar(step_m, 0.0, turn_rad), k) for k in range(n)]
+    T = [np.linalg.matrix_power(at(step_m, 0.0, turn_rad), k) for k in range(n)]
     return Trajectory(np.arange(n, dtype=np.int64) * S // 10, np.array(T))
 
 
@@ -53,7 +50,7 @@ def test_a_held_wheel_drives_an_exact_arc_at_any_rate():
             np.arange(n, dtype=np.int64), path_m, np.full(n, steering_rad), wheelbase_m=wheelbase_m
         )
         np.testing.assert_allclose(wheels.T_world_body[0], np.eye(4), atol=0)
-        quarter = planar(radius_m, radius_m, np.pi / 2.0)
+        quarter = at(radius_m, radius_m, np.pi / 2.0)
         np.testing.assert_allclose(wheels.T_world_body[-1], quarter, atol=1e-12)
 
 
@@ -80,7 +77,7 @@ def test_factors_follow_time_and_are_less_certain_the_longer_the_path():
     config = WheelFactorsConfig()
     near, far = wheel_factors(stamps_ns, wheels, config)
     assert [(f.i, f.j, f.origin) for f in (near, far)] == [(7, 3, "wheel"), (3, 5, "wheel")]
-    np.testing.assert_allclose(near.T_i_j, planar(0.5, 0.0, 0.1), atol=1e-12)
+    np.testing.assert_allclose(near.T_i_j, at(0.5, 0.0, 0.1), atol=1e-12)
     np.testing.assert_allclose(
         far.T_i_j, inverse(wheels.T_world_body[1]) @ wheels.T_world_body[10], atol=1e-12
     )
@@ -112,7 +109,7 @@ def test_wheels_that_slip_are_told():
     stamps_ns = {k: k * S // 2 for k in range(5)}
     graph = PoseGraph()
     for k, stamp_ns in stamps_ns.items():  # the third step has two metres, of which the wheels know nothing
-        graph.add_node(k, stamp_ns, planar(2.5 * k + (2.0 if k > 2 else 0.0), 0.0, 0.0))
+        graph.add_node(k, stamp_ns, at(2.5 * k + (2.0 if k > 2 else 0.0), 0.0, 0.0))
     steps = [BetweenFactor(k, k + 1, np.eye(4), np.eye(6)) for k in range(4)]
     driven = wheel_factors(stamps_ns, on_a_line(21), WheelFactorsConfig())
     connected, broken = (PoseGraph(graph.T_world_node, stamps_ns, kept) for kept in (steps, steps[:2]))

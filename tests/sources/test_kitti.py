@@ -142,7 +142,7 @@ def test_fewer_poses_than_scans_are_the_truth_of_the_first(tmp_path):
     poses(folder / "poses.txt", T_WORLD_LIDAR[:3])
     source = open_source(folder)
     assert source.truth.stamps_ns.tolist() == stamps_of(source)[:3]
-    assert "poses.txt: 3 poses tell of 3 of 5 scans" in source.notes
+    assert "poses.txt: 3 poses for 3 of 5 scans" in source.notes
 
 
 def test_another_truth_can_be_named(tmp_path):

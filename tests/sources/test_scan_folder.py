@@ -273,7 +273,7 @@ def test_poses_that_pair_with_no_scan_are_no_truth(tmp_path):
     write_kitti(folder / "poses.txt", Trajectory(np.arange(5), POSES[:5]))
     source = open_source(folder)
     assert source.truth is None
-    assert "poses.txt: 5 poses tell of 0 of 3 scans" in source.notes
+    assert "poses.txt: 5 poses for 0 of 3 scans" in source.notes
 
 
 def test_point_times_count_from_the_stamp_of_the_scan(tmp_path):

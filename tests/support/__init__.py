@@ -1,1 +1,1 @@
-"""What several test files share: small logs and runs, oracles, and jobs for worker processes."""
+"""Shared by test files: small logs and runs, oracles, and jobs for worker processes."""

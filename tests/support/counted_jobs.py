@@ -11,7 +11,7 @@ from mapper.core.errors import SourceError
 
 
 def told(diary: Path) -> Counter[str]:
-    """How often each job was begun."""
+    """Number of times that each job was begun."""
     return Counter(diary.read_text().split()) if diary.exists() else Counter()
 
 

@@ -1,4 +1,4 @@
-"""What lies in a folder, to see whether it has changed."""
+"""Content of a folder, to see whether it has changed."""
 
 import hashlib
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""What the C++ library makes of the same scans, and the real scans to try."""
+"""Results of the C++ library from the same scans, and the real scans to try."""
 
 import cv2
 import numpy as np

@@ -1,4 +1,4 @@
-"""Where the repository and the shared recorded data are."""
+"""Paths of the repository and of the shared recorded data."""
 
 from pathlib import Path
 

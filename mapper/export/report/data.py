@@ -38,7 +38,7 @@ class Figure:
 
     Attributes:
         name: What it is.
-        value: With its unit.
+        value: Value with its unit.
         question: What it answers first of all; empty if it is only one of all numbers.
     """
 

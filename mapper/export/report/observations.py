@@ -1,4 +1,4 @@
-"""When each occupied voxel was first hit, and how often, from a run's stored scan updates."""
+"""Observations of occupied voxels: the first hit and the number of hits, from a run's stored scan updates."""
 
 from dataclasses import dataclass
 

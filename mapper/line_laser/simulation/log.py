@@ -35,7 +35,7 @@ def write_line_laser_log(out: Path, config: LineLaserSynthConfig, *, progress: P
 
     Args:
         out: Folder to make; it must not exist.
-        config: What to record.
+        config: Settings of the drive and the sensor.
         progress: Receives the count of images.
 
     Raises:

@@ -24,7 +24,7 @@ class Patch:
     """Something flat on a wall.
 
     Attributes:
-        wall: Which.
+        wall: Wall that the patch is on.
         along_m: From where to where along the wall.
         up_m: From where to where above the floor.
         kind: "lamp" shines by itself, "red" is painted, "dull" returns no laser light.

@@ -43,9 +43,9 @@ def score_planes(points, triples, min_cosine, low_m, high_m, tolerance_m, below_
         triples: (K, 3) indices of the points through which planes are laid.
         min_cosine: Least z of the normal.
         low_m: Least height of the origin above the plane, d.
-        high_m: Largest.
+        high_m: Largest height of the origin above the plane.
         tolerance_m: Largest distance of an inlier.
-        below_weight: Of a point more than twice as far below.
+        below_weight: Weight of a point more than twice as far below.
     """
     best = np.zeros(4)
     best_score = -1.0
@@ -124,11 +124,11 @@ def thin_obstacles(points, T, floor, cell_m, low_m, high_m, voxel_m, voxel_edge)
         points: (N, 3).
         T: (4, 4) moves them to the level frame.
         floor: (edge, edge) height of the ground in each column of a centred grid of ``cell_m``.
-        cell_m: Its cell.
-        low_m: Lowest height above the floor.
-        high_m: Highest.
+        cell_m: Edge of its cells.
+        low_m: Least height above the floor.
+        high_m: Largest height above the floor.
         voxel_m: Edge of a voxel.
-        voxel_edge: Voxels across; beyond, points are dropped.
+        voxel_edge: Number of voxels across; points beyond are dropped.
     """
     edge = len(floor)
     half, scale = 0.5 * edge, 1.0 / cell_m

@@ -106,7 +106,7 @@ def find_obstacles(
     Args:
         points_body: (N, 3) float32 metres, body frame.
         T_level_body: (4, 4) from the body frame to the level frame.
-        ground: Of the same points, from ``find_ground``.
+        ground: Ground of the same points, from ``find_ground``.
         config: Heights, radius and voxels.
 
     Returns:

@@ -16,9 +16,9 @@ def draw_volume(obstacles, heights, voxel_m, edge, low_m, layers):
         obstacles: (N, 3) of which x and y are used, within edge · voxel_m / 2 of 0.
         heights: (N,) above the ground, the third coordinate.
         voxel_m: Edge of a voxel.
-        edge: Voxels across.
+        edge: Number of voxels across.
         low_m: Height at which the lowest layer begins.
-        layers: Voxels high.
+        layers: Number of layers.
     """
     volume = np.zeros((layers, edge, edge), uint8)
     for n in range(len(obstacles)):
@@ -66,15 +66,15 @@ def hill_climb(volume, points, heights, motion, voxel_m, low_m, step_m, step_rad
     The best of six neighbours is taken until none is better; then the steps are halved.
 
     Args:
-        volume: As for ``overlap_of``, as are the points, the heights, the motion and the lengths.
-        points: See there.
-        heights: See there.
-        motion: Where the search begins.
-        voxel_m: See there.
-        low_m: See there.
+        volume: (Z, Y, X) of ``draw_volume``, its origin in the middle of x and y.
+        points: (N, 2) or (N, 3) x and y of the points, metres, level frame.
+        heights: (N,) heights of the points above the ground, metres.
+        motion: Motion at which the search begins.
+        voxel_m: Edge of a voxel of the volume.
+        low_m: Height of its lowest layer above the ground.
         step_m: First step along x and y.
         step_rad: First step of α.
-        halvings: How often the steps are halved.
+        halvings: Number of times that the steps are halved.
     """
     here = motion.copy()
     best = overlap_of(volume, points, heights, here, voxel_m, low_m)

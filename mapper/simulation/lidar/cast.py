@@ -76,7 +76,7 @@ def cast(world: World, origins: Array, directions: Array, max_range_m: float, me
     A ray that starts inside a solid does not see it.
 
     Args:
-        world: Where the rays go.
+        world: World that the rays are cast into.
         origins: (A, 3) world frame, metres.
         directions: (A, E, 3) unit vectors, world frame.
         max_range_m: Length of the rays.

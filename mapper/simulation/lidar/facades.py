@@ -6,7 +6,7 @@ from mapper.simulation.builder import Place
 from mapper.simulation.lidar.solids import Site
 
 _FOOT_M = 1.5
-"""How far walls reach below the ground at their middle, so that none floats above a slope."""
+"""Depth of walls below the ground at their middle, so that none floats above a slope."""
 _NARROWEST_M, _WIDEST_M = 7.0, 17.0
 _GAP_CHANCE = 0.18
 

@@ -25,7 +25,7 @@ _ASIDE_M = 0.5
 """Largest distance of another day's line from the first day's."""
 _TUNNEL_TURN_M = 1.0
 _TUNNEL_START_SHARE = 0.77
-"""Of the way from the middle of the lower side: just after the turn at the left end."""
+"""Share of the way from the middle of the lower side: just after the turn at the left end."""
 _SPEED_SWING, _SPEED_PERIOD_S = 0.25, 9.0
 
 

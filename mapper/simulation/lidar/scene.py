@@ -30,7 +30,7 @@ _FIELD_MARGIN_M = 25.0
 _TUNNEL_END_M, _TUNNEL_SIDE_M, _TUNNEL_HEIGHT_M = 3.0, 2.5, 4.5
 _TRIES = 40
 _STAYING_SHARE = 0.4
-"""Of the movable things, those that are there on another day too, if at another spot."""
+"""Share of the movable things that are there on another day too, if at another spot."""
 
 Count = tuple[Callable[[Site, Place, np.random.Generator], None], int, int]
 """A thing, and how many of it there are at least and at most."""

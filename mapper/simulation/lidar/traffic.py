@@ -30,7 +30,7 @@ class _Mover:
 
     Attributes:
         solids: Its parts, standing on the world's origin, facing along x.
-        start_m: Where along the route it is at the start.
+        start_m: Position along the route at the start.
         offset_m: How far to the left of the route it keeps.
         speed_mps: Its speed while it goes; negative against the sensor's direction.
         go_s: How long it goes.

@@ -21,7 +21,7 @@ MOST_BYTES = 1 << 30
 
 _LONGEST_REASON = 150
 _RUST_PANIC = "PanicException"
-"""What an error in a library written in Rust becomes; Python has it under ``BaseException``."""
+"""Name of the exception that a panic in a Rust library becomes; it derives from ``BaseException``."""
 
 
 @contextmanager

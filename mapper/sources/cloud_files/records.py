@@ -9,7 +9,7 @@ _WIDTHS = (3, 5, 6, 7, 8)  # x y z; with intensity and ring (nuScenes); with a t
 _BLOCKS, _BLOCK_NUMBERS = 8, 3360  # in parts of whole records of every width up to 8
 _LEAST_STEP = 0.01
 _BETTER, _BETTER_OF_EIGHT = 0.2, 1.2
-"""How much smaller logarithms of steps show other records: those of the right width were smaller by 0.3 in
+"""Difference of logarithms of steps that shows other records: those of the right width were smaller by 0.3 in
 shuffled clouds and by 1.5 to 4 in sweeps; where upper and lower rings take turns, those of eight
 by 0.6, of padded ones by 2.5."""
 _ALIKE_RATIO, _SAMPLES = 2.0, 5000

@@ -1,4 +1,4 @@
-"""What a log holds as serialised ROS 2 messages: images, calibrations, clouds, poses and accelerations."""
+"""Serialised ROS 2 messages of a log: images, calibrations, clouds, poses and accelerations."""
 
 from typing import Any, NamedTuple
 
@@ -17,7 +17,7 @@ class SerializedMessage(NamedTuple):
 
     Attributes:
         stamp_ns: Time of the message.
-        topic: Where it is published.
+        topic: Topic on which it is published.
         type: E.g. "sensor_msgs/msg/Image".
         cdr: The message as CDR, little-endian.
     """

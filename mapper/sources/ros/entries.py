@@ -69,7 +69,7 @@ def rgbd_entry(
         depth: Depth image, registered to it.
         camera: Camera of both.
         units_per_m: 16-bit depth units per metre.
-        float_units_per_m: Those of depth that is recorded as 32-bit numbers; None if it is not.
+        float_units_per_m: Units per metre of depth that is recorded as 32-bit numbers; None if it is not.
         colour_suffix: Ending of a colour image's file.
     """
     depth_file = _DepthFile(depth, units_per_m, float_units_per_m or 1.0)

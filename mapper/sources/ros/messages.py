@@ -41,7 +41,7 @@ class FileMessage:
     Attributes:
         stamp_ns: Time of the image.
         frame: Coordinate frame of its camera.
-        format: As the message has it, e.g. "jpeg" or "16UC1; compressedDepth png".
+        format: Format in the message's words, e.g. "jpeg" or "16UC1; compressedDepth png".
         data: The file.
     """
 

@@ -109,7 +109,7 @@ class Contents(ABC):
     """Blocks of a recording, and the messages in them; a subclass for each format of files.
 
     Attributes:
-        blocks: Where the blocks lie, in the order of the file.
+        blocks: Places of the blocks, in the order of the file.
         expected: How many messages the file says that it holds, if it says so.
         notes: What is lost already, a sentence each.
     """

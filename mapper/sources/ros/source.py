@@ -123,7 +123,7 @@ def _lidar(reader: RecordingReader, clouds: Series, config: SourceConfig) -> _Fr
     if T_body_frame is None:
         raise SourceError(
             f"{reader.recording.path}: source.body_frame={body}: tf does not connect it to the clouds' "
-            f"frame {frame}; it tells of {', '.join(reader.tree.frames) or 'no frames'}"
+            f"frame {frame}; its frames: {', '.join(reader.tree.frames) or 'no frames'}"
         )
     if "optical" in body:
         notes.append(f"points are in {body}, whose z looks forward; source.body_frame can take another")

@@ -3,17 +3,11 @@
 import numpy as np
 import pytest
 
-from mapper.core.geometry import exp
 from mapper.core.timebase import NS_PER_S
 from mapper.core.trajectory import Trajectory
 from mapper.evaluators.metrics.loops import loop_metrics, revisits_of
 from mapper.loops.closure import LoopClosure
-
-
-def pose(x: float, yaw: float = 0.0) -> np.ndarray:
-    T = exp(np.array([0.0, 0.0, yaw]), np.zeros(3))
-    T[0, 3] = x
-    return T
+from tests.support.planar import at
 
 
 @pytest.fixture
@@ -21,7 +15,7 @@ def truth() -> Trajectory:
     """Ten seconds out along x at 0.5 m/s and ten seconds back, a pose a second."""
     x = [0.5 * (k if k <= 10 else 20 - k) for k in range(21)]
     stamps_ns = np.arange(21) * NS_PER_S
-    return Trajectory(stamps_ns, np.array([pose(value) for value in x]))
+    return Trajectory(stamps_ns, np.array([at(value) for value in x]))
 
 
 def closure(i: int, j: int, x: float, *, verdict: str = "accepted") -> LoopClosure:
@@ -33,7 +27,7 @@ def closure(i: int, j: int, x: float, *, verdict: str = "accepted") -> LoopClosu
         proposed_by="places",
         verdict=verdict,
         reason="" if verdict == "accepted" else "isvd: no",
-        T_i_j=pose(x),
+        T_i_j=at(x),
         information=np.eye(6),
     )
 
@@ -49,7 +43,7 @@ def test_revisits_are_near_alike_and_long_ago(truth):
 
 def test_looking_the_other_way_is_no_revisit(truth):
     T = truth.T_world_body.copy()
-    T[11:, :3, :3] = pose(0.0, np.pi)[:3, :3]
+    T[11:, :3, :3] = at(0.0, yaw=np.pi)[:3, :3]
     assert not revisits_of(truth.stamps_ns, Trajectory(truth.stamps_ns, T)).any()
 
 

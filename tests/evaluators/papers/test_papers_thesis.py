@@ -18,7 +18,8 @@ from mapper.evaluators.papers.thesis_tables import tables
 from mapper.evaluators.study.seeds import seeded
 from mapper.odometry.config import IsvdOdometryConfig
 from mapper.pipeline.solve import solve
-from mapper.pipeline.track import TrackingResult, track_log
+from mapper.pipeline.track import track_log
+from mapper.pipeline.tracking_result import TrackingResult
 from mapper.registration.config import IsvdConfig
 from mapper.runtime.progress import SILENT
 from mapper.runtime.resumable_jobs import JobResult

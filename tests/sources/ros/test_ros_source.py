@@ -248,7 +248,7 @@ def test_truth_is_led_to_the_sensor_by_tf(tmp_path, name):
     expected = own.points_body @ T_BASE_LIDAR[:3, :3].T + T_BASE_LIDAR[:3, 3]
     np.testing.assert_allclose(moved.points_body, expected, atol=1e-5)
     with pytest.raises(
-        SourceError, match=r"body_frame=wheel: tf does not connect .* tells of base_link, lidar, odom"
+        SourceError, match=r"body_frame=wheel: tf does not connect .* frames: base_link, lidar, odom"
     ):
         open_source(tmp_path / name, SourceConfig(body_frame="wheel"))
 

@@ -1,4 +1,4 @@
-"""No circle of imports, those inside functions included: every module can be read after those it imports."""
+"""No import cycles, imports inside functions included: every module can be read after those it imports."""
 
 import ast
 from collections.abc import Iterator
@@ -47,7 +47,7 @@ def importing() -> dict[str, set[str]]:
     return graph
 
 
-def test_no_circle_of_modules():
+def test_there_is_no_import_cycle():
     graph = importing()
     assert "mapper.octree.map" in graph["mapper.octree.reading"]
     assert "mapper.octree.writing" in graph["mapper.octree.map"]  # imported inside a method

@@ -1,0 +1,132 @@
+"""Result of the first pass over a log: every frame's result, and the graph before it is solved."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+from mapper.config.build import BuildConfig
+from mapper.core.errors import TrackingError
+from mapper.core.frames import Sensor
+from mapper.core.trajectory import Trajectory, trajectory_from
+from mapper.graph.model import PoseGraph
+from mapper.loops.closure import LoopClosure
+from mapper.loops.place_file import AnyPlace, write_places
+from mapper.odometry.base import FrameResult
+from mapper.run import files
+from mapper.run.doubtful_frames import placed_by_neighbours
+from mapper.run.frame_outcomes import records_of
+from mapper.run.manifest import RunWarning
+from mapper.run.stored_tracking import StoredTracking
+from mapper.run.writer import RunWriter
+from mapper.sources.base import Skipped
+
+BY_POSES = ("wheels", "given")
+"""Kinds of odometry without tracking: frames have the poses of wheels, or known ones."""
+
+_HINTS: Mapping[str, str] = {
+    "rgbd": "is there texture, and depth in the images?",
+    "lidar": "do the scans overlap, and are their units metres?",
+    "wheels": "do the wheels' readings cover the frames' times, without gaps beyond odometry.max_gap_s?",
+    "given": "do the given poses cover the frames' times, without gaps beyond odometry.max_gap_s?",
+}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrackingResult:
+    """Result of the first pass over a log.
+
+    Attributes:
+        tracks: Results of the frames that could be read, in time order.
+        skipped: The frames that could not be read.
+        graph: Nodes at the odometry's estimates, with every factor, those of the loops last.
+        loops: Every loop candidate with its verdict.
+        frame_ms: Wall milliseconds that each frame took to read, detect and track, by stamp.
+        warnings: Warnings about the frames that were read.
+        places: Places by node, of the nodes that were searched for loops.
+    """
+
+    tracks: tuple[FrameResult, ...]
+    skipped: tuple[Skipped, ...]
+    graph: PoseGraph
+    loops: tuple[LoopClosure, ...]
+    frame_ms: Mapping[int, float]
+    warnings: Sequence[RunWarning] = ()
+    places: Mapping[int, AnyPlace] = field(default_factory=dict)
+
+    @property
+    def placed(self) -> list[FrameResult]:
+        """The results of the frames that were not lost."""
+        return [track for track in self.tracks if track.node is not None]
+
+    @property
+    def tracked(self) -> list[FrameResult]:
+        """The results of the frames that were placed without a doubt."""
+        return [track for track in self.placed if not track.doubts]
+
+    def trajectory(self) -> Trajectory:
+        """Return T_world_body = T_world_node · T_node_body of every frame that was not lost."""
+        return self._poses(self.placed)
+
+    def tracked_trajectory(self) -> Trajectory:
+        """Return the same of the frames that were placed without a doubt."""
+        return self._poses(self.tracked)
+
+    def _poses(self, tracks: Sequence[FrameResult]) -> Trajectory:
+        return trajectory_from(
+            (track.stamp_ns, self.graph.T_world_node[track.node] @ track.T_node_body)
+            for track in tracks
+            if track.node is not None
+        )
+
+
+def refuse_a_fragment(tracking: TrackingResult, config: BuildConfig, *, sensor: Sensor) -> None:
+    """Refuse to make a map from too little.
+
+    Raises:
+        TrackingError: Fewer frames were tracked, without a doubt, than the configuration asks for.
+    """
+    read, tracked = len(tracking.tracks), len(tracking.tracked)
+    enough = max(config.min_tracked_frames, config.min_tracked_ratio * read)
+    if tracked >= enough:
+        return
+    if read == 0 and tracking.skipped:
+        raise TrackingError(
+            f"none of {len(tracking.skipped)} frames could be read; the first: {tracking.skipped[0].reason}"
+        )
+    unread = ""
+    if tracking.skipped:
+        unread = f"; {len(tracking.skipped)} could not be read, the first: {tracking.skipped[0].reason}"
+    if tracked == read:
+        raise TrackingError(
+            f"only {read} {'frame was' if read == 1 else 'frames were'} read, want at least {enough:.0f} "
+            f"(min_tracked_frames); give more of the log{unread}"
+        )
+    hint = _HINTS[config.odometry.kind if config.odometry.kind in BY_POSES else sensor]
+    doubtful = len(tracking.placed) - tracked
+    found = f"only {tracked} of {read} frames read could be tracked"
+    if doubtful:
+        found += f", {doubtful} more are doubtful"
+    raise TrackingError(
+        f"{found}, want at least {enough:.0f}; {hint} "
+        f"(min_tracked_frames and min_tracked_ratio set the limit){unread}"
+    )
+
+
+def save_places(writer: RunWriter, tracking: TrackingResult) -> None:
+    """Write the places of the nodes that are in the graph; none, if no loops were searched."""
+    nodes = [node for node in tracking.places if node in tracking.graph.T_world_node]
+    if nodes:
+        write_places(writer.folder / files.PLACES, tracking.places, nodes)
+
+
+def from_tracking(tracking: TrackingResult, truth: Trajectory | None) -> StoredTracking:
+    """Return the result as a run stores it: doubtful frames are placed by their neighbours."""
+    records = records_of(tracking.tracks, tracking.skipped)
+    return StoredTracking(
+        records=records,
+        skipped=tracking.skipped,
+        frame_ms=tracking.frame_ms,
+        trajectory=placed_by_neighbours(tracking.trajectory(), tracking.graph, records),
+        graph=tracking.graph,
+        loops=tracking.loops,
+        truth=truth,
+    )
