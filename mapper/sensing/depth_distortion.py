@@ -1,6 +1,6 @@
 """Depth distortion: a smooth error of a camera's inverse depth that is the same in all its images."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,11 +24,15 @@ _MIN_PLANE_SHARE = 0.12
 _MAX_PLANES = 3
 _REFITS = 3
 
-_WAVES = (5, 7)
+_WAVES = (7, 9)
 """Half periods down and across the image of the finest cosines."""
 _PRIOR_PER_M = 0.004
 _SIGMA_PER_M, _ROBUST_PER_M = 0.011, 0.012
 """Of a cell's residual, which its neighbours share in part, and from which it counts less (Cauchy)."""
+
+_REPETITIONS = 2
+"""Cells that distortion takes off their plane are left out at first, which hides a fifth to a half of it, so
+what is left is measured again with the last result removed."""
 
 _MIN_FRAMES = 15
 _MIN_VARIATION = 0.1
@@ -38,6 +42,7 @@ _MIN_CORRELATION = 0.8
 _MIN_RMS_PER_M = 0.0015
 """Sensors without distortion give up to 0.0008, by surfaces that are not quite plane; others 0.0027 on."""
 
+_Cells = NDArray[np.intp]
 _Evidence = tuple[Array, Array]
 """Normal matrix and right side of the least squares that determine the cosines' factors."""
 
@@ -89,39 +94,50 @@ def measure_distortion(images_m: Iterable[DepthImage], rays: NDArray[np.floating
         agree on it, or if all frames have the same view.
     """
     side = max(rays.shape[1] // _COLUMNS, 1)
-    directions = _homogeneous(_samples(rays, side).mean(axis=2))
+    directions = _homogeneous(_samples(rays, side).mean(axis=2)).reshape(-1, 3)
     down, across = _waves(rays.shape[:2], side)
-    cosines = (down[:, None, :, None] * across[None, :, None, :]).reshape(*directions.shape[:2], -1)
+    cosines = (down[:, None, :, None] * across[None, :, None, :]).reshape(len(directions), -1)
     generator = np.random.default_rng(0)
     seen: list[Array] = []
-    evidence: list[_Evidence] = []
+    planes: list[list[_Cells]] = []
     for depth_m in images_m:
-        inverse = _cells(depth_m, side)
-        known = inverse > 0.0
-        if known.mean() < _MIN_KNOWN:
-            continue
-        found = _evidence(inverse[known], directions[known], cosines[known], generator)
-        if found is not None:
+        inverse = _cells(depth_m, side).ravel()
+        if (inverse > 0.0).mean() >= _MIN_KNOWN and (found := _planes(inverse, directions, generator)):
             seen.append(inverse)
-            evidence.append(found)
-    if len(evidence) < _MIN_FRAMES:
-        return None
+            planes.append(found)
     inverses = np.array(seen)
-    if _variation(inverses) < _MIN_VARIATION:
+    if len(seen) < _MIN_FRAMES or _variation(inverses) < _MIN_VARIATION:
         return None
-    half = len(evidence) // 2
-    parts = [_factors(part) for part in (evidence, evidence[:half], evidence[half:])]
-    planes = [_fitted(directions.reshape(-1, 3), (cosines @ part).ravel()) for part in parts]
-    errors = [
-        (cosines @ part - directions @ plane).ravel() for part, plane in zip(parts, planes, strict=True)
+    evidence = [
+        _evidence(inverse, directions, cosines, of) for inverse, of in zip(inverses, planes, strict=True)
     ]
-    rms_per_m = float(np.sqrt((errors[0] ** 2).mean()))
-    if rms_per_m < _MIN_RMS_PER_M or not np.corrcoef(errors[1], errors[2])[0, 1] >= _MIN_CORRELATION:
+    half = len(evidence) // 2
+    factors = _factors(evidence)
+    error, first, second = (
+        _curved(cosines @ part, directions)
+        for part in (factors, _factors(evidence[:half]), _factors(evidence[half:]))
+    )
+    if (
+        np.sqrt((error**2).mean()) < _MIN_RMS_PER_M
+        or not np.corrcoef(first, second)[0, 1] >= _MIN_CORRELATION
+    ):
         return None
+    for _ in range(_REPETITIONS):
+        evidence = []
+        for k, inverse in enumerate(inverses):
+            left = np.where(inverse > 0.0, inverse - error, 0.0)
+            planes[k] = _refitted(left, directions, planes[k])
+            evidence.append(_evidence(left, directions, cosines, planes[k]))
+        factors = _factors(evidence, factors)
+        error = _curved(cosines @ factors, directions)
     down, across = _waves(rays.shape[:2], 1)
-    error_per_m = down @ parts[0].reshape(down.shape[1], -1) @ across.T - _homogeneous(rays) @ planes[0]
-    median_depth_m = float(1.0 / np.median(inverses[inverses > 0.0]))
-    return DepthDistortion(error_per_m.astype(np.float32), rms_per_m, median_depth_m)
+    everywhere = (down @ factors.reshape(down.shape[1], -1) @ across.T).ravel()
+    error_per_m = _curved(everywhere, _homogeneous(rays).reshape(-1, 3)).reshape(rays.shape[:2])
+    return DepthDistortion(
+        error_per_m.astype(np.float32),
+        rms_per_m=float(np.sqrt((error**2).mean())),
+        median_depth_m=float(1.0 / np.median(inverses[inverses > 0.0])),
+    )
 
 
 def _homogeneous(rays: NDArray[np.floating]) -> Array:
@@ -158,51 +174,72 @@ def _waves(shape: tuple[int, ...], side: int) -> tuple[Array, Array]:
     return down, across
 
 
-def _evidence(
-    inverse: Array, directions: Array, cosines: Array, generator: np.random.Generator
-) -> _Evidence | None:
-    """Return what the planes of (N,) cells of one image tell about the factors; None if there are none."""
-    normal, side, count = np.zeros((cosines.shape[1],) * 2), np.zeros(cosines.shape[1]), 0
-    for cells in _planes(inverse, directions, generator):
+def _evidence(inverse: Array, directions: Array, cosines: Array, planes: Iterable[_Cells]) -> _Evidence:
+    """Return what an image's planes tell about the cosines' factors."""
+    normal, side = np.zeros((cosines.shape[1],) * 2), np.zeros(cosines.shape[1])
+    for cells in planes:
         basis, _ = np.linalg.qr(directions[cells])
         residual = inverse[cells] - basis @ (basis.T @ inverse[cells])
         rows = cosines[cells] - basis @ (basis.T @ cosines[cells])
         weighted = rows.T / (_SIGMA_PER_M**2 * (1.0 + (residual / _ROBUST_PER_M) ** 2))
-        normal, side, count = normal + weighted @ rows, side + weighted @ residual, count + 1
-    return (normal, side) if count else None
+        normal, side = normal + weighted @ rows, side + weighted @ residual
+    return normal, side
 
 
-def _planes(inverse: Array, directions: Array, generator: np.random.Generator) -> Iterator[NDArray[np.intp]]:
-    """Yield the cells on each of an image's large planes, the largest first (RANSAC)."""
-    left, least = np.arange(len(inverse)), max(_MIN_PLANE_SHARE * len(inverse), 4.0)
-    for _ in range(_MAX_PLANES):
-        if len(left) < least:
-            return
+def _planes(inverse: Array, directions: Array, generator: np.random.Generator) -> list[_Cells]:
+    """Return the cells on each of an image's large planes, the largest first (RANSAC)."""
+    left, planes = np.flatnonzero(inverse > 0.0), list[_Cells]()
+    least = max(_MIN_PLANE_SHARE * len(left), 4.0)
+    while len(planes) < _MAX_PLANES and len(left) >= least:
         triples = left[generator.integers(0, len(left), (_RANSAC_SAMPLES, 3))]
         corners = directions[triples]
         triples, corners = (
             part[np.abs(np.linalg.det(corners)) > _SAFE_DETERMINANT] for part in (triples, corners)
         )
         if not len(triples):
-            return
-        planes = np.linalg.solve(corners, inverse[triples][..., None])[..., 0]
+            break
+        candidates = np.linalg.solve(corners, inverse[triples][..., None])[..., 0]
         some = left[:: max(len(left) // _SCORED_CELLS, 1)]
-        near = np.abs(directions[some] @ planes.T - inverse[some, None]) < _ON_PLANE_PER_M
-        cells = some[near[:, near.sum(axis=0).argmax()]]
-        for _ in range(_REFITS):
-            plane = _fitted(directions[cells], inverse[cells])
-            cells = left[np.abs(directions[left] @ plane - inverse[left]) < _ON_PLANE_PER_M]
+        near = np.abs(directions[some] @ candidates.T - inverse[some, None]) < _ON_PLANE_PER_M
+        cells = _on_plane_of(some[near[:, near.sum(axis=0).argmax()]], left, inverse, directions)
         if len(cells) < least:
-            return
-        yield cells
+            break
+        planes.append(cells)
         left = np.setdiff1d(left, cells, assume_unique=True)
+    return planes
 
 
-def _factors(evidence: Sequence[_Evidence]) -> Array:
-    """Return the cosines' factors, 1/m, with a prior of 0."""
-    normal = sum((normal for normal, _ in evidence), np.eye(len(evidence[0][1])) / _PRIOR_PER_M**2)
-    sides = np.sum([side for _, side in evidence], axis=0)
-    return np.asarray(np.linalg.solve(normal, sides), dtype=np.float64)
+def _refitted(inverse: Array, directions: Array, planes: Sequence[_Cells]) -> list[_Cells]:
+    """Return the cells on each of an image's planes, some of whose cells are known."""
+    left, refitted = np.flatnonzero(inverse > 0.0), list[_Cells]()
+    for plane in planes:
+        refitted.append(_on_plane_of(plane, left, inverse, directions))
+        left = np.setdiff1d(left, refitted[-1], assume_unique=True)
+    return refitted
+
+
+def _on_plane_of(some: _Cells, left: _Cells, inverse: Array, directions: Array) -> _Cells:
+    """Return those of the cells that are left which lie on the plane of some of them."""
+    for _ in range(_REFITS):
+        plane = _fitted(directions[some], inverse[some])
+        some = left[np.abs(directions[left] @ plane - inverse[left]) < _ON_PLANE_PER_M]
+    return some
+
+
+def _factors(evidence: Sequence[_Evidence], removed: Array | None = None) -> Array:
+    """Return the cosines' factors, 1/m, with a prior of 0, from what is left when some are removed."""
+    normal = np.sum([normal for normal, _ in evidence], axis=0)
+    side = np.sum([side for _, side in evidence], axis=0)
+    if removed is not None:
+        side = side + normal @ removed
+    prior = np.eye(len(side)) / _PRIOR_PER_M**2
+    return np.asarray(np.linalg.solve(normal + prior, side), dtype=np.float64)
+
+
+def _curved(values: Array, directions: Array) -> Array:
+    """Return (N,) values without the part that is affine in the (N, 3) rays."""
+    curved: Array = values - directions @ _fitted(directions, values)
+    return curved
 
 
 def _fitted(rows: Array, values: Array) -> Array:
@@ -211,7 +248,7 @@ def _fitted(rows: Array, values: Array) -> Array:
 
 
 def _variation(inverse: Array) -> float:
-    """Return by how much the inverse depth of a cell varies over (F, R, C) images: σ / mean, median."""
+    """Return by how much the inverse depth of a cell varies over (F, N) images: σ / mean, median."""
     known = inverse > 0.0
     count = known.sum(axis=0)
     often = count >= _MIN_FRAMES
