@@ -1,6 +1,6 @@
 """Depth distortion: a smooth error of a camera's inverse depth that is the same in all its images."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,11 +24,15 @@ _MIN_PLANE_SHARE = 0.12
 _MAX_PLANES = 3
 _REFITS = 3
 
-_ORDERS = (5, 7)
+_ORDERS = (7, 9)
 """Half periods down and across the image of the finest cosines."""
 _PRIOR_PER_M = 0.004
 _SIGMA_PER_M, _ROBUST_PER_M = 0.011, 0.012
 """Of a cell's residual, which its neighbours share in part, and from which it counts less (Cauchy)."""
+
+_REPETITIONS = 2
+"""Cells that distortion takes off their plane are left out at first, which hides a fifth to a half of it, so
+what is left is measured again with the last result removed."""
 
 _MIN_FRAMES = 15
 _MIN_VARIATION = 0.1
@@ -38,6 +42,7 @@ _MIN_CORRELATION = 0.8
 _MIN_RMS_PER_M = 0.0015
 """Sensors without distortion give up to 0.0008, by surfaces that are not quite plane; others 0.0027 on."""
 
+_Cells = NDArray[np.intp]
 _NormalEquations = tuple[Array, Array]
 """(D, D) normal matrix and (D,) right side of the least squares for the D coefficients of the cosines."""
 
@@ -94,39 +99,86 @@ def measure_distortion(images_m: Iterable[DepthImage], rays: NDArray[np.floating
         agree on it, or if all frames have the same view.
     """
     side = max(rays.shape[1] // _COLUMNS, 1)
-    directions = _homogeneous(_samples(rays, side).mean(axis=2))
-    down, across = _cosine_bases(rays.shape[:2], side)
-    cosines = (down[:, None, :, None] * across[None, :, None, :]).reshape(*directions.shape[:2], -1)
-    generator = np.random.default_rng(0)
-    seen: list[Array] = []
-    equations: list[_NormalEquations] = []
-    for depth_m in images_m:
-        inverse = _cells(depth_m, side)
-        known = inverse > 0.0
-        if known.mean() < _MIN_KNOWN:
-            continue
-        found = _normal_equations(inverse[known], directions[known], cosines[known], generator)
-        if found is not None:
-            seen.append(inverse)
-            equations.append(found)
-    if len(equations) < _MIN_FRAMES:
+    grid = _grid(rays, side)
+    inverses, planes = _images_of_planes(images_m, grid, side)
+    if len(planes) < _MIN_FRAMES or _variation(inverses) < _MIN_VARIATION:
         return None
-    inverses = np.array(seen)
-    if _variation(inverses) < _MIN_VARIATION:
-        return None
+    equations = [grid.normal_equations(*image) for image in zip(inverses, planes, strict=True)]
     half = len(equations) // 2
-    parts = [_coefficients(part) for part in (equations, equations[:half], equations[half:])]
-    planes = [_fitted(directions.reshape(-1, 3), (cosines @ part).ravel()) for part in parts]
-    errors = [
-        (cosines @ part - directions @ plane).ravel() for part, plane in zip(parts, planes, strict=True)
-    ]
-    rms_per_m = float(np.sqrt((errors[0] ** 2).mean()))
-    if rms_per_m < _MIN_RMS_PER_M or not np.corrcoef(errors[1], errors[2])[0, 1] >= _MIN_CORRELATION:
+    coefficients, first, second = map(_coefficients, (equations, equations[:half], equations[half:]))
+    error = grid.error(coefficients)
+    if np.sqrt((error**2).mean()) < _MIN_RMS_PER_M:
         return None
+    if not np.corrcoef(grid.error(first), grid.error(second))[0, 1] >= _MIN_CORRELATION:
+        return None
+    for _ in range(_REPETITIONS):
+        left = np.where(inverses > 0.0, inverses - error, 0.0)
+        planes = [_refitted(*image, grid.rays) for image in zip(left, planes, strict=True)]
+        equations = [grid.normal_equations(*image) for image in zip(left, planes, strict=True)]
+        coefficients = _coefficients(equations, coefficients)
+        error = grid.error(coefficients)
+    return DepthDistortion(
+        _error_of_pixels(coefficients, rays).astype(np.float32),
+        rms_per_m=float(np.sqrt((error**2).mean())),
+        median_depth_m=float(1.0 / np.median(inverses[inverses > 0.0])),
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Grid:
+    """Cells of an image, N of them, and what an error of the inverse depth is a sum of.
+
+    Attributes:
+        rays: (N, 3) rays x, y, 1 of the cells' middles.
+        cosines: (N, D) cosines there.
+    """
+
+    rays: Array
+    cosines: Array
+
+    def error(self, coefficients: Array) -> Array:
+        """Return the (N,) error of the inverse depth with these (D,) coefficients, 1/m."""
+        return _curved(self.cosines @ coefficients, self.rays)
+
+    def normal_equations(self, inverse: Array, planes: Iterable[_Cells]) -> _NormalEquations:
+        """Return the normal equations of an image's (N,) inverse depths on its planes."""
+        normal, side = np.zeros((self.cosines.shape[1],) * 2), np.zeros(self.cosines.shape[1])
+        for cells in planes:
+            basis, _ = np.linalg.qr(self.rays[cells])
+            residual = inverse[cells] - basis @ (basis.T @ inverse[cells])
+            rows = self.cosines[cells] - basis @ (basis.T @ self.cosines[cells])
+            weighted = rows.T / (_SIGMA_PER_M**2 * (1.0 + (residual / _ROBUST_PER_M) ** 2))
+            normal, side = normal + weighted @ rows, side + weighted @ residual
+        return normal, side
+
+
+def _grid(rays: NDArray[np.floating], side: int) -> _Grid:
+    """Return square cells of so many pixels a side."""
+    directions = _homogeneous(_samples(rays, side).mean(axis=2)).reshape(-1, 3)
+    down, across = _cosine_bases(rays.shape[:2], side)
+    return _Grid(directions, (down[:, None, :, None] * across[None, :, None, :]).reshape(len(directions), -1))
+
+
+def _error_of_pixels(coefficients: Array, rays: NDArray[np.floating]) -> Array:
+    """Return the (H, W) error of the inverse depth of every pixel, 1/m."""
     down, across = _cosine_bases(rays.shape[:2], 1)
-    error_per_m = down @ parts[0].reshape(down.shape[1], -1) @ across.T - _homogeneous(rays) @ planes[0]
-    median_depth_m = float(1.0 / np.median(inverses[inverses > 0.0]))
-    return DepthDistortion(error_per_m.astype(np.float32), rms_per_m, median_depth_m)
+    everywhere = (down @ coefficients.reshape(down.shape[1], -1) @ across.T).ravel()
+    return _curved(everywhere, _homogeneous(rays).reshape(-1, 3)).reshape(rays.shape[:2])
+
+
+def _images_of_planes(
+    images_m: Iterable[DepthImage], grid: _Grid, side: int
+) -> tuple[Array, list[list[_Cells]]]:
+    """Return the (F, N) inverse depths of the images that show large planes, 1/m, and each one's planes."""
+    generator = np.random.default_rng(0)
+    inverses: list[Array] = []
+    planes: list[list[_Cells]] = []
+    for depth_m in images_m:
+        inverse = _cells(depth_m, side).ravel()
+        if (inverse > 0.0).mean() >= _MIN_KNOWN and (found := _planes(inverse, grid.rays, generator)):
+            inverses.append(inverse)
+            planes.append(found)
+    return np.array(inverses), planes
 
 
 def _homogeneous(rays: NDArray[np.floating]) -> Array:
@@ -163,51 +215,60 @@ def _cosine_bases(shape: tuple[int, ...], side: int) -> tuple[Array, Array]:
     return down, across
 
 
-def _normal_equations(
-    inverse: Array, directions: Array, cosines: Array, generator: np.random.Generator
-) -> _NormalEquations | None:
-    """Return the normal equations of the planes of (N,) cells of one image; None if there are no planes."""
-    normal, side, count = np.zeros((cosines.shape[1],) * 2), np.zeros(cosines.shape[1]), 0
-    for cells in _planes(inverse, directions, generator):
-        basis, _ = np.linalg.qr(directions[cells])
-        residual = inverse[cells] - basis @ (basis.T @ inverse[cells])
-        rows = cosines[cells] - basis @ (basis.T @ cosines[cells])
-        weighted = rows.T / (_SIGMA_PER_M**2 * (1.0 + (residual / _ROBUST_PER_M) ** 2))
-        normal, side, count = normal + weighted @ rows, side + weighted @ residual, count + 1
-    return (normal, side) if count else None
-
-
-def _planes(inverse: Array, directions: Array, generator: np.random.Generator) -> Iterator[NDArray[np.intp]]:
-    """Yield the cells on each of an image's large planes, the largest first (RANSAC)."""
-    left, least = np.arange(len(inverse)), max(_MIN_PLANE_SHARE * len(inverse), 4.0)
-    for _ in range(_MAX_PLANES):
-        if len(left) < least:
-            return
+def _planes(inverse: Array, directions: Array, generator: np.random.Generator) -> list[_Cells]:
+    """Return the cells on each of an image's large planes, the largest first (RANSAC)."""
+    left, planes = np.flatnonzero(inverse > 0.0), list[_Cells]()
+    least = max(_MIN_PLANE_SHARE * len(left), 4.0)
+    while len(planes) < _MAX_PLANES and len(left) >= least:
         triples = left[generator.integers(0, len(left), (_RANSAC_SAMPLES, 3))]
         corners = directions[triples]
         triples, corners = (
             part[np.abs(np.linalg.det(corners)) > _SAFE_DETERMINANT] for part in (triples, corners)
         )
         if not len(triples):
-            return
-        planes = np.linalg.solve(corners, inverse[triples][..., None])[..., 0]
+            break
+        candidates = np.linalg.solve(corners, inverse[triples][..., None])[..., 0]
         some = left[:: max(len(left) // _SCORED_CELLS, 1)]
-        near = np.abs(directions[some] @ planes.T - inverse[some, None]) < _ON_PLANE_PER_M
-        cells = some[near[:, near.sum(axis=0).argmax()]]
-        for _ in range(_REFITS):
-            plane = _fitted(directions[cells], inverse[cells])
-            cells = left[np.abs(directions[left] @ plane - inverse[left]) < _ON_PLANE_PER_M]
+        near = np.abs(directions[some] @ candidates.T - inverse[some, None]) < _ON_PLANE_PER_M
+        cells = _on_plane_of(some[near[:, near.sum(axis=0).argmax()]], left, inverse, directions)
         if len(cells) < least:
-            return
-        yield cells
+            break
+        planes.append(cells)
         left = np.setdiff1d(left, cells, assume_unique=True)
+    return planes
 
 
-def _coefficients(equations: Sequence[_NormalEquations]) -> Array:
-    """Return the (D,) coefficients of the cosines, 1/m, with a prior of 0."""
-    normal = sum((normal for normal, _ in equations), np.eye(len(equations[0][1])) / _PRIOR_PER_M**2)
-    sides = np.sum([side for _, side in equations], axis=0)
-    return np.asarray(np.linalg.solve(normal, sides), dtype=np.float64)
+def _refitted(inverse: Array, planes: Sequence[_Cells], directions: Array) -> list[_Cells]:
+    """Return the cells on each of an image's planes, some of whose cells are known."""
+    left, refitted = np.flatnonzero(inverse > 0.0), list[_Cells]()
+    for plane in planes:
+        refitted.append(_on_plane_of(plane, left, inverse, directions))
+        left = np.setdiff1d(left, refitted[-1], assume_unique=True)
+    return refitted
+
+
+def _on_plane_of(some: _Cells, left: _Cells, inverse: Array, directions: Array) -> _Cells:
+    """Return those of the cells that are left which lie on the plane of some of them."""
+    for _ in range(_REFITS):
+        plane = _fitted(directions[some], inverse[some])
+        some = left[np.abs(directions[left] @ plane - inverse[left]) < _ON_PLANE_PER_M]
+    return some
+
+
+def _coefficients(equations: Sequence[_NormalEquations], removed: Array | None = None) -> Array:
+    """Return the cosines' coefficients, 1/m, with a prior of 0, from what is left when some are removed."""
+    normal = np.sum([normal for normal, _ in equations], axis=0)
+    side = np.sum([side for _, side in equations], axis=0)
+    if removed is not None:
+        side = side + normal @ removed
+    prior = np.eye(len(side)) / _PRIOR_PER_M**2
+    return np.asarray(np.linalg.solve(normal + prior, side), dtype=np.float64)
+
+
+def _curved(values: Array, directions: Array) -> Array:
+    """Return (N,) values without the part that is affine in the (N, 3) rays."""
+    curved: Array = values - directions @ _fitted(directions, values)
+    return curved
 
 
 def _fitted(rows: Array, values: Array) -> Array:
@@ -216,7 +277,7 @@ def _fitted(rows: Array, values: Array) -> Array:
 
 
 def _variation(inverse: Array) -> float:
-    """Return by how much the inverse depth of a cell varies over (F, R, C) images: σ / mean, median."""
+    """Return by how much the inverse depth of a cell varies over (F, N) images: σ / mean, median."""
     known = inverse > 0.0
     count = known.sum(axis=0)
     often = count >= _MIN_FRAMES

@@ -88,7 +88,11 @@ class _UndistortedEntry(WrappedEntry):
             return frame
         if frame.depth_m.shape != distortion.error_per_m.shape:  # of another camera
             return frame
-        return replace(frame, depth_m=distortion.corrected(frame.depth_m))
+        return replace(
+            frame,
+            depth_m=distortion.corrected(frame.depth_m),
+            removed_distortion_per_m=distortion.rms_per_m,
+        )
 
     def scan(self) -> Scan:
         """Read the returns alone.

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from mapper.core.geometry import angle_between, apply, exp, inverse
+from mapper.core.frames import ray_table
+from mapper.core.geometry import angle_between, apply, exp, inverse, log
 from mapper.odometry.local_map.depth_alignment import Landmarks, align_depth, observes_all
 from mapper.odometry.local_map.depth_surfaces import depth_cells, surface_of
 from tests.support.depth_rooms import CAMERA, CORNER, box_depth
@@ -175,3 +176,33 @@ def test_what_the_keyframe_could_not_see_contradicts_nothing():
     assert found.weakest_ratio > 0.9
     assert found.visible_ratio < 0.85
     assert error_m(found, truth) < 0.006
+
+
+def bent(T_world_camera, error_per_m=0.0, *, rms_per_m=0.004):
+    inverse_depth = 1.0 / box_depth(T_world_camera, ROOM) + error_per_m
+    return depth_cells((1.0 / inverse_depth).astype(np.float32), CAMERA, distortion_per_m=rms_per_m)
+
+
+def test_distortion_that_planes_do_not_show_is_in_the_covariance():
+    rng = np.random.default_rng(0)
+    truth = CORNER @ exp(np.array([0.02, 0.25, 0.02]), np.array([0.1, 0.0, 0.3]))
+    rays = np.dstack([ray_table(CAMERA), np.ones((120, 160))]) / [0.35, 0.26, 1.0]
+    independent, lasting = [], []
+    for _ in range(12):
+        error_per_m = rays @ rng.normal(0.0, 0.004, 3)
+        found = aligned(bent(CORNER, error_per_m), CORNER, bent(truth, error_per_m), guess=truth)
+        error = np.concatenate(log(found.T_camera_world @ truth))
+        independent.append(error @ found.information @ error)
+        lasting.append(error @ found.lasting_information @ error)
+    assert np.median(independent) > 100.0, "as if the errors of pixels were independent"
+    assert max(lasting) < 9.0
+    assert np.median(lasting) > 0.1
+
+
+def test_a_camera_that_stands_still_is_where_it_was_whatever_the_distortion():
+    elsewhere = CORNER @ exp(np.array([0.0, 0.1, 0.0]), np.array([0.1, 0.0, 0.1]))
+    still, after = (
+        aligned(bent(CORNER), CORNER, bent(T_world_camera), guess=T_world_camera).systematic
+        for T_world_camera in (CORNER, elsewhere)
+    )
+    assert np.trace(still[3:, 3:]) < 0.01 * np.trace(after[3:, 3:])

@@ -74,6 +74,17 @@ def test_its_keyframes_are_joined_by_what_depth_knows(white_room):
         assert (sigma_m < 0.02).all()
 
 
+def test_poses_are_less_certain_after_distortion_was_removed(white_room):
+    poses, tracks, factors = white_room
+    frames = [replace(frame, removed_distortion_per_m=0.005) for frame in walk(poses, ROOM)]
+    corrected, links = track(frames)
+    for one, other in zip(tracks[1:], corrected[1:], strict=True):
+        np.testing.assert_array_equal(one.T_world_body, other.T_world_body)
+        assert np.trace(other.covariance) > np.trace(one.covariance)
+    for one, other in zip(factors, links, strict=True):
+        assert np.trace(np.linalg.inv(other.information)) > 1.2 * np.trace(np.linalg.inv(one.information))
+
+
 def test_it_is_the_same_every_time(white_room):
     poses, tracks, _ = white_room
     again, _ = track(walk(poses, ROOM)[:10])

@@ -31,6 +31,8 @@ def test_frames_are_corrected_by_what_the_log_shows(bent):
     np.testing.assert_array_equal(frame.depth_m, distortion_of(bent).corrected(recorded.depth_m))
     exact_m = images(frames=4, sigma_per_m=0.0)[3]
     assert np.abs(frame.depth_m - exact_m).mean() < 0.7 * np.abs(recorded.depth_m - exact_m).mean()
+    assert frame.removed_distortion_per_m == distortion_of(bent).rms_per_m
+    assert recorded.removed_distortion_per_m == 0.0
     assert frame.image is recorded.image
     scan = selected(bent, ON).entry_at(3).scan()
     np.testing.assert_array_equal(scan.points_body, frame.scan().points_body)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from mapper.core.geometry import Array, Points, Transform, is_rigid
 from mapper.odometry.base import Diagnostics
-from mapper.odometry.local_map.depth_kernels import compare, descend, seen_through
+from mapper.odometry.local_map.depth_kernels import bent_by_distortion, compare, descend, seen_through
 from mapper.odometry.local_map.depth_surfaces import (
     DepthCells,
     DepthSurface,
@@ -36,6 +36,13 @@ _MIN_SHARE, _NOISE_SHARES = 0.004, 2.5
 depth image gives 0.002, and the normals' noise gives their variance."""
 _FEW = 0.02  # of all surface; a direction that less faces is left to the degeneracy check
 _LEAST_SCALE = 0.5  # of the assumed noise, however well the surfaces fit
+_UNSEEN_PER_M, _UNSEEN_SHARE = 0.0004, 1.0
+"""Distortion of inverse depth that no plane shows, each of its three parts (root mean square): half of the
+largest that passes for none, and as much as was measured. Simulated sensors have 0.4 of that, at most 0.9."""
+_LINKS_ALIKE = 2.0
+"""Links of four keyframes in a row have the same error, while the graph takes them as independent."""
+_LEAST_OBSERVED = 1e-4
+"""Eigenvalue of the surfaces' information, relative to the largest, below which a motion does not follow."""
 _OBSERVED_SIGMA_M = 0.05
 """A motion that landmarks know this well, as a displacement of the points, is observed by them."""
 
@@ -68,6 +75,8 @@ class DepthAlignment:
     Attributes:
         T_camera_world: (4, 4).
         information: (6, 6) of the camera's tangent (rotation, translation), from planes and the prediction.
+        systematic: (6, 6) covariance by distortion of depth that planes do not show: the next frames have the
+            same error.
         is_landmark_inlier: (L,) which landmarks agree with the pose.
         points: Number of points of the depth image that lie on surfaces of the keyframes, or in front.
         agreeing: (K,) how many of them agree with each keyframe.
@@ -84,6 +93,7 @@ class DepthAlignment:
 
     T_camera_world: Transform
     information: Array
+    systematic: Array
     is_landmark_inlier: NDArray[np.bool_]
     points: int
     agreeing: NDArray[np.int64]
@@ -95,6 +105,11 @@ class DepthAlignment:
     rmse_m: float
     unobservable: str
     observes_next: bool
+
+    @property
+    def lasting_information(self) -> Array:
+        """(6, 6) information with the distortion, which frames of one place have in common."""
+        return np.asarray(np.linalg.inv(np.linalg.inv(self.information) + self.systematic), np.float64)
 
     def diagnostics(self, image: Diagnostics) -> Diagnostics:
         """Return the figures on a frame's tracking; those of its image only if landmarks took part."""
@@ -162,9 +177,14 @@ def align_depth(
     pairs, seen = int(fit.agreeing.sum()), int((fit.verdict != 0).sum())
     scale = max(fit.squares / pairs, _LEAST_SCALE**2)
     plane_counts = np.maximum((model.planes[..., 3] > 0.0).sum(axis=(1, 2)), 1)
+    known = _known_by(landmarks, is_inlier, T_found)
+    information = projected(fit.information / scale, degeneracy)
     return DepthAlignment(
         T_camera_world=T_found,
-        information=projected(fit.information / scale, degeneracy) + prior,
+        information=information + prior,
+        systematic=_systematic(
+            model, int(fit.agreeing[:keyframes].argmax()), T_found, cells, information, known + prior
+        ),
         is_landmark_inlier=is_inlier,
         points=seen,
         agreeing=fit.agreeing[:keyframes],
@@ -176,7 +196,7 @@ def align_depth(
         ),
         visible_ratio=seen / len(points),
         rmse_m=float(np.sqrt(fit.squares_m / pairs)),
-        unobservable=_unobserved(degeneracy, _known_by(landmarks, is_inlier, T_found)),
+        unobservable=_unobserved(degeneracy, known),
         observes_next=observes_all(surface_of(cells)) if degeneracy.unobservable_count else True,
     )
 
@@ -244,6 +264,45 @@ def _minimum(
         if degeneracy.unobservable_count == 0 or kept.trace() < 6.0:
             return T_found, is_inlier, fit, degeneracy
         kept = _observable(degeneracy)
+
+
+def _systematic(
+    model: _PlaneModel,
+    nearest: int,
+    T_camera_world: Transform,
+    cells: DepthCells,
+    information: Array,
+    others: Array,
+) -> Array:
+    """Return the (6, 6) covariance of a pose by distortion that turns planes into other planes.
+
+    A distortion that is affine in the ray moves the surfaces of both images, and the pose follows by as much
+    as the surfaces' part of the information allows (Schmidt 1966: a parameter that is not estimated).
+
+    Args:
+        model: The alignment.
+        nearest: Which of its surfaces the pose is relative to.
+        T_camera_world: (4, 4) the pose.
+        cells: The depth image.
+        information: (6, 6) by the surfaces.
+        others: (6, 6) by what else decides the pose.
+    """
+    H, B = bent_by_distortion(
+        T_camera_world,
+        model.points,
+        model.sigmas,
+        model.planes[nearest],
+        model.T_surfaces_world[nearest],
+        cells.rays,
+        model.optics,
+        model.cell_px,
+    )
+    share = information @ np.linalg.pinv(information + others)
+    moved: Array = np.linalg.pinv(H, rcond=_LEAST_OBSERVED) @ B
+    spread = np.append(cells.rays.reshape(-1, 2).std(axis=0), 1.0)
+    sigma = (_UNSEEN_PER_M + _UNSEEN_SHARE * cells.distortion_per_m) / spread
+    moved = share.T @ (moved * (_LINKS_ALIKE * sigma))
+    return moved @ moved.T
 
 
 def _seen_through_ratio(

@@ -283,6 +283,47 @@ def compare(T_camera_world, points, sigmas, planes, T_keyframes_world, optics, c
 
 
 @njit(cache=True, nogil=True)
+def bent_by_distortion(T_camera_world, points, sigmas, planes, T_keyframe_world, rays, optics, cell_px):  # type: ignore[no-untyped-def]
+    """Return what an error of all inverse depths that is affine in the ray (x, y, 1) does to an alignment.
+
+    Args:
+        T_camera_world: (4, 4) of the depth image.
+        points: (N, 3) of it, camera frame.
+        sigmas: (N, 2) as for ``descend``.
+        planes: (R, C, 4) of one keyframe.
+        T_keyframe_world: (4, 4).
+        rays: (R, C, 2) of all cells.
+        optics: As for ``descend``.
+        cell_px: As for ``descend``.
+
+    Returns:
+        (6, 6) information of the agreeing distances, and (6, 3) Σ w · Jᵀ · ∂ distance / ∂ error.
+    """
+    H, B = np.zeros((6, 6)), np.zeros((6, 3))
+    row, change = np.empty(6), np.empty(3)
+    T = between(T_keyframe_world, T_camera_world)
+    for i in range(len(points)):
+        p = points[i]
+        distance = _plane_row(planes, optics, cell_px, T, p, row)
+        sigma = _sigma_m(row, p, sigmas[i])
+        if not abs(distance) <= _MARGIN_M + _MARGIN_SIGMAS * sigma:
+            continue
+        line, column, z = cell_of(T, p, optics, cell_px, planes.shape)
+        here = -(row[3] * p[0] + row[4] * p[1] + row[5] * p[2]) * p[2]
+        there = planes[line, column, 3] * z
+        change[0] = there * rays[line, column, 0] - here * p[0] / p[2]
+        change[1] = there * rays[line, column, 1] - here * p[1] / p[2]
+        change[2] = there - here
+        w = 1.0 / (sigma * sigma)
+        for a in range(6):
+            for b in range(6):
+                H[a, b] += w * row[a] * row[b]
+            for b in range(3):
+                B[a, b] += w * row[a] * change[b]
+    return H, B
+
+
+@njit(cache=True, nogil=True)
 def seen_through(  # type: ignore[no-untyped-def]
     T_camera_world, inverse_depth, planes, rays, T_keyframes_world, optics, cell_px, noise
 ):

@@ -34,11 +34,13 @@ class DepthCells:
         inverse_depth: (R, C) float32 mean of 1 / z, per metre; 0 where there is no surface.
         cell_px: Edge of a cell.
         camera: Intrinsics of the image.
+        distortion_per_m: Root mean square of the distortion that was removed from it, 1/m.
     """
 
     inverse_depth: NDArray[np.float32]
     cell_px: int
     camera: PinholeCamera
+    distortion_per_m: float = 0.0
 
     @property
     def rays(self) -> Array:
@@ -88,17 +90,18 @@ class DepthSurface:
         return found
 
 
-def depth_cells(depth_m: DepthImage, camera: PinholeCamera) -> DepthCells:
+def depth_cells(depth_m: DepthImage, camera: PinholeCamera, *, distortion_per_m: float = 0.0) -> DepthCells:
     """Return a depth image as means over square cells, 80 in a row.
 
     Args:
         depth_m: (H, W) metres; 0 is no measurement.
         camera: Its intrinsics.
+        distortion_per_m: Root mean square of the distortion that was removed from it, 1/m.
     """
     cell_px = max(camera.width_px // _COLUMNS, 1)
     inverse_depth = np.zeros((camera.height_px // cell_px, camera.width_px // cell_px), np.float32)
     _average(depth_m, cell_px, max(cell_px // _SAMPLES, 1), np.float32(1.0 + _MAX_DEPTH_RANGE), inverse_depth)
-    return DepthCells(inverse_depth, cell_px, camera)
+    return DepthCells(inverse_depth, cell_px, camera, distortion_per_m)
 
 
 def surface_of(cells: DepthCells) -> DepthSurface:

@@ -201,7 +201,9 @@ def observe_image(
         disparity_sigma_px = np.where(np.isnan(depth_m), disparity_sigma_px, known_px)
     sensor_m = np.hypot(depth_sigma_m(config.depth_noise or KINECT_NOISE, depth_m), _SCALE_ERROR * depth_m)
     sensor_px = np.fmin(config.virtual_baseline_px_m / depth_m**2 * sensor_m, disparity_sigma_px)
-    cells = depth_cells(frame.depth_m, camera) if config.align_depth else None
+    cells = None
+    if config.align_depth:
+        cells = depth_cells(frame.depth_m, camera, distortion_per_m=frame.removed_distortion_per_m)
     measured = {
         "stamp_ns": frame.stamp_ns,
         "pixels": pixels,

@@ -39,6 +39,7 @@ from mapper.odometry.local_map.pose_information import (
     frame_information,
     keyframe_residuals,
     relative_information,
+    with_systematic,
 )
 from mapper.odometry.local_map.pose_tracker import PoseTracker, TrackedPose, unmatched
 from mapper.odometry.local_map.readout_time import ReadoutTime
@@ -167,6 +168,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
             information = links[0].information
         else:
             information = self._residuals.honest(_OWN_SHARE * information, result.T_node_body)
+            information = with_systematic(information, tracked_pose)
             if doubt.phrases:
                 information = inflated(information, sigma_rad=doubt.sigma_rad, sigma_m=doubt.sigma_m)
         if doubt.repeats:
@@ -251,9 +253,8 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         T_i_j = inverse(keyframes[i].body_pose) @ keyframes[j].body_pose
         information = relative_information(self._map, i, j)
         information = self._residuals.honest(information, T_i_j) / math.sqrt(shared_by)
-        doubtful = self._map.keyframes[j]
-        if doubtful.doubt_m > 0.0:
-            information = inflated(information, sigma_rad=doubtful.doubt_rad, sigma_m=doubtful.doubt_m)
+        if (doubt_m := keyframes[j].doubt_m) > 0.0:
+            information = inflated(information, sigma_rad=keyframes[j].doubt_rad, sigma_m=doubt_m)
         return BetweenFactor(i, j, T_i_j, information)
 
     def _not_found(self, observation: ImageObservation) -> FrameResult:
@@ -357,7 +358,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
             new=is_new,
             neighbour=neighbour,
             twist_camera=self._shutter.twist_camera,
-            depth_information=None if tracked_pose.depth is None else tracked_pose.depth.information,
+            depth_information=None if tracked_pose.depth is None else tracked_pose.depth.lasting_information,
         )
         if config.triangulate and tracked_pose.few_move:  # without depth nothing tells what moves
             add_triangulated(self._map, index, except_for=tracked_pose.moving)
@@ -415,6 +416,5 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
     def _lost(self, observation: ImageObservation) -> FrameResult:
         self._lost_frames += 1
         self._velocity.restart()
-        last = self._last
-        T_world_body = np.eye(4) if last is None else last.body_pose
+        T_world_body = np.eye(4) if self._last is None else self._last.body_pose
         return lost_frame(observation.stamp_ns, T_world_body, features=len(observation), residual_unit="px")

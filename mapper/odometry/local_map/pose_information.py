@@ -80,6 +80,15 @@ def keyframe_residuals(landmark_map: LandmarkMap, index: int) -> ResidualStatist
     )
 
 
+def with_systematic(information: Array, tracked_pose: TrackedPose) -> Array:
+    """Return the (6, 6) information of a frame's pose, less what distortion of its depth may have changed."""
+    if tracked_pose.depth is None:
+        return information
+    Ad_body_camera = adjoint(tracked_pose.observation.T_body_camera)
+    systematic = Ad_body_camera @ tracked_pose.depth.systematic @ Ad_body_camera.T
+    return covariance_of(covariance_of(information) + systematic)
+
+
 def covariance_of(information: Array) -> Array:
     """Return the covariance of an (N, N) information matrix."""
     return np.asarray(np.linalg.inv(information), np.float64)
