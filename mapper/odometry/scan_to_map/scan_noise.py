@@ -71,7 +71,7 @@ def surface_covariance(fit: ScanFit) -> Array:
 def independent_covariance(fit: ScanFit, blend: Blend) -> Array:
     """Return the (6, 6) covariance of a pose without the errors that the last pose has alike.
 
-    That is of the distances, and of what these leave open.
+    That is of the distances, and of what these leave open; what few pairs show, the same ones show both.
     """
     return surface_covariance(fit) + _along(fit, blend.open_m)
 
@@ -157,6 +157,7 @@ class ScanNoise:
         least_rad = _LEAST_RAD + _MODEL_RAD_M * off_m
         least_m = np.hypot(_LEAST_M + _MODEL_M_M * off_m, _MODEL_SHARE_M * off_m * moved_m)
         covariance = surface + np.diag(np.square([least_rad] * 3 + [least_m] * 3)) + at_stamps
+        covariance += _along(fit, fit.observability * fit.shown_m)
         unseen, step = self._since_seen.add(blend, T_last_scan, elapsed_s)
         if fit.observability.min() >= 1.0:
             self._unseen = 0
