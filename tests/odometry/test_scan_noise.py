@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mapper.core.geometry import exp, inverse, log
+from mapper.core.frames import Scan
+from mapper.core.geometry import apply, exp, inverse, log
 from mapper.odometry.scan_to_map.keyframe_tree import KeyframeTree
 from mapper.odometry.scan_to_map.observed_part import MEASURED, Blend
 from mapper.odometry.scan_to_map.scan_fit import fit_of
@@ -58,6 +59,48 @@ def test_a_pose_off_the_surfaces_is_uncertain_by_as_much():
 
     assert right[3] < 0.01
     assert 0.03 < held[3] < 0.1
+
+
+def field_scan(T_world_body, posts_m, *, seed):
+    """Return a scan of level ground with some square posts."""
+    rng = np.random.default_rng(seed)
+    ground = np.column_stack([rng.uniform(-20.0, 20.0, (9000, 2)), np.full(9000, -1.8)])
+    faces = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])[
+        rng.integers(0, 4, (len(posts_m), 400))
+    ]
+    across = rng.uniform(-0.7, 0.7, (len(posts_m), 400, 1)) * faces[..., ::-1]
+    sides = np.array(posts_m)[:, None] + 0.7 * faces + across
+    posts = np.concatenate([sides, rng.uniform(-1.8, 3.0, (len(posts_m), 400, 1))], axis=2).reshape(-1, 3)
+    world = np.concatenate([ground, posts])
+    world += rng.normal(0.0, 0.02, world.shape)
+    return Scan(seed, apply(inverse(T_world_body), world).astype(np.float32))
+
+
+def field_fit(posts_m):
+    key = keyframe(field_scan(np.eye(4), posts_m, seed=1))
+    scan = keyframe(field_scan(OFF, posts_m, seed=2)).deskewed
+    return fit_of(key, scan, OFF, max_pair_distance_m=0.5)
+
+
+def test_the_pairs_on_one_post_do_not_measure_a_rotation_about_it():
+    alone, three = field_fit([(8.0, 4.0)]), field_fit([(8.0, 4.0), (-6.0, 7.0), (3.0, -9.0)])
+
+    assert alone.shown_m[0] > 1.0  # of the outer points
+    assert three.observability.min() == 1.0
+    assert 0.0 < three.shown_m[0] < 0.05
+    assert alone.shown_m[5] == three.shown_m[5] == 0.0  # many pairs show it
+
+
+def test_the_error_of_a_motion_that_few_pairs_show_is_part_of_the_covariance():
+    fit = field_fit([(8.0, 4.0), (-6.0, 7.0), (3.0, -9.0)])
+    to_motion = np.linalg.inv(fit.degeneracy.motions.T)[0]
+    variances = []
+    for shown_m in (0.0, 0.3):
+        shown = replace(fit, shown_m=np.array([shown_m, 0.0, 0.0, 0.0, 0.0, 0.0]))
+        noise = ScanNoise().of(shown, MEASURED, OFF, OFF, 0.1, np.zeros((6, 6)))
+        variances.append(to_motion @ noise.covariance @ to_motion)
+
+    assert variances[1] - variances[0] == pytest.approx(0.09, rel=1e-6)
 
 
 @pytest.mark.parametrize(("motion", "sigma"), [(3, 0.03), (2, 0.0132)])

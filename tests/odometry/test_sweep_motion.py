@@ -82,10 +82,52 @@ def test_the_expected_velocity_goes_on_as_it_changed():
     turn = np.array([0.0, 0.0, 1.0])
     motion.follow(500_000_000, exp(0.5 * turn, np.zeros(3)), measured=(Twist(turn, np.zeros(3)), np.eye(6)))
 
-    twist, covariance = motion.velocity(1_000_000_000, exp(1.5 * turn, np.zeros(3)))
+    twist, covariance = motion.velocity(1_000_000_000, exp(1.5 * turn, np.zeros(3)), np.zeros((6, 6)))
 
     np.testing.assert_allclose(twist.rotation_radps, 2.5 * turn, atol=1e-9)  # 3/2 · 2 − 1/2 · 1
     np.testing.assert_allclose(np.diag(covariance), [0.75 + 0.25] * 3 + [0.25] * 3)
+
+
+def velocity_errors(told, *, count=300):
+    """Return the errors of the velocity along x, of steps of 0.2 m whose poses are off by 0.1 m along it."""
+    rng = np.random.default_rng(1)
+    motion, errors_mps = MotionModel(0, np.eye(4)), []
+    for k in range(1, count):
+        time_ns, is_known = k * 100_000_000, k <= 60
+        off_m = rng.normal(0.0, 0.01 if is_known else 0.1)
+        T_world_body = exp(np.zeros(3), np.array([0.2 * k + off_m, 0.0, 0.0]))
+        expected = motion.velocity(time_ns, T_world_body, told)
+        measured = None if is_known else expected
+        motion.follow(time_ns, T_world_body, is_certain=is_known, pose_covariance=told, measured=measured)
+        errors_mps.append(abs(motion.twist.translation_mps[0] - 2.0))
+    return errors_mps[100:]
+
+
+def test_poses_that_nothing_shows_along_a_direction_do_not_change_the_expected_velocity():
+    assert np.mean(velocity_errors(np.diag([1e-6] * 3 + [0.01] + [1e-6] * 2))) < 0.5
+    assert np.mean(velocity_errors(np.zeros((6, 6)))) > 1.5
+
+
+def test_the_variance_of_the_expected_velocity_is_that_of_its_errors():
+    """Random accelerations over steps of 0.1 s, and poses off by as much as these move the body."""
+    rng = np.random.default_rng(2)
+    step_s, density, off_m = 0.1, 30.0, 0.05
+    variances = density * np.array([[step_s**3 / 3.0, step_s**2 / 2.0], [step_s**2 / 2.0, step_s]])
+    told = np.diag([1e-8] * 3 + [off_m**2] * 3)
+    normalised = []
+    for _ in range(40):
+        motion, x_m, speed_mps = MotionModel(0, np.eye(4)), 0.0, 0.0
+        for k in range(1, 60):
+            moved_m, changed_mps = rng.multivariate_normal([0.0, 0.0], variances)
+            x_m, speed_mps = x_m + speed_mps * step_s + moved_m, speed_mps + changed_mps
+            T_world_body = exp(np.zeros(3), np.array([x_m + rng.normal(0.0, off_m), 0.0, 0.0]))
+            expected = motion.velocity(k * 100_000_000, T_world_body, told)
+            motion.follow(k * 100_000_000, T_world_body, pose_covariance=told, measured=expected)
+            if k > 20:
+                error_mps = expected[0].translation_mps[0] - speed_mps
+                normalised.append(error_mps**2 / expected[1][3, 3])
+
+    assert 0.5 < np.mean(normalised) < 2.0
 
 
 def test_the_rotation_changes_as_much_after_it_was_measured():

@@ -13,6 +13,7 @@ _MIN_ELAPSED_S = 0.005  # over less, an error of millimetres becomes a large vel
 _ERRORS, _FEWEST_ERRORS = 50, 5  # of recent predictions: of so many the median is taken, of fewer none
 _MEDIAN_LENGTH = 1.538  # of a vector of three independent normal errors, in standard deviations
 _LEAST_M, _LEAST_RAD, _LEAST_SHARE = 2e-3, 1e-3, 0.02
+_NO_VARIANCE = 1e-12  # (rad/s)² and (m/s)²: keeps a covariance of nothing invertible
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,11 +30,13 @@ class MotionModel:
     Attributes:
         T_world_last: (4, 4) pose in the middle of the last scan that was placed.
         twist: Velocity until then.
+        pose_covariance: (6, 6) of that pose in the map, in its tangent.
     """
 
     def __init__(self, time_ns: int, T_world_last: Transform) -> None:
         self.T_world_last = T_world_last
         self.twist: Twist = STILL
+        self.pose_covariance = np.zeros((6, 6))
         self._time_ns = time_ns
         self._elapsed_s = 0.0
         self._placed = 0
@@ -84,19 +87,30 @@ class MotionModel:
         change = twist.rotation_radps - self.mean_twist(time_ns, T_world_body).rotation_radps
         return max(usual, 2.0 * float(np.linalg.norm(change)) / elapsed_s)
 
-    def velocity(self, time_ns: int, T_world_body: Transform) -> tuple[Twist, Array]:
+    def velocity(self, time_ns: int, T_world_body: Transform, pose_covariance: Array) -> tuple[Twist, Array]:
         """Return the expected velocity at a pose, and its (6, 6) covariance, rotation before translation.
 
-        Under white noise of the acceleration (Anderson & Barfoot 2015) the velocity w₁ after an interval t,
-        given that before it, w₀, and the mean m, is 3/2 m − 1/2 w₀, with the variance qt/4; that of the pose
-        predicted with w₀ is qt³/3.
+        Under white noise of the acceleration (Anderson & Barfoot 2015) the pose predicted over an interval t
+        with the velocity before it, w₀, has an error of the variance S = qt³/3, w₀ one of 3S/t², and both
+        have the covariance 3/2 S/t. Of the mean velocity m, whose poses have errors of the variance R, a gain
+        of 3/2 S (S + R)⁻¹ is taken: 3/2 m − 1/2 w₀ with the variance 3/4 S/t² where poses are exact, and w₀
+        where they are not known.
+
+        Args:
+            time_ns: Of the pose.
+            T_world_body: (4, 4) the pose.
+            pose_covariance: (6, 6) of it in the map, in its tangent.
         """
-        mean = self.mean_twist(time_ns, T_world_body)
-        expected = Twist(
-            1.5 * mean.rotation_radps - 0.5 * self.twist.rotation_radps,
-            1.5 * mean.translation_mps - 0.5 * self.twist.translation_mps,
-        )
-        return expected, np.diag(0.75 * self.velocity_sigmas(time_ns) ** 2) + 0.25 * self._covariance
+        elapsed_s = max(self.elapsed_s(time_ns), _MIN_ELAPSED_S)
+        changed = np.diag(self.velocity_sigmas(time_ns) ** 2 + _NO_VARIANCE)  # S/t²
+        of_mean = (self.pose_covariance + pose_covariance) / elapsed_s**2
+        gain = 1.5 * changed @ np.linalg.inv(changed + of_mean)
+        before, mean = _vector(self.twist), _vector(self.mean_twist(time_ns, T_world_body))
+        expected = before + gain @ (mean - before)
+        kept = np.eye(6) - gain
+        covariance = 3.0 * changed - 1.5 * (gain @ changed + changed @ gain.T)
+        covariance += gain @ (changed + of_mean) @ gain.T + kept @ self._covariance @ kept.T
+        return Twist(expected[:3], expected[3:]), covariance
 
     def velocity_sigmas(self, time_ns: int) -> Array:
         """Return (6,) standard deviations of what the velocity changes until a time, rad/s and m/s."""
@@ -120,6 +134,7 @@ class MotionModel:
         T_world_body: Transform,
         *,
         is_certain: bool = True,
+        pose_covariance: Array | None = None,
         measured: tuple[Twist, Array] | None = None,
     ) -> None:
         """Take over the pose of a scan; an uncertain one says nothing on the errors of predictions.
@@ -128,6 +143,7 @@ class MotionModel:
             time_ns: Of the pose.
             T_world_body: (4, 4) the pose.
             is_certain: Whether it is.
+            pose_covariance: (6, 6) of the pose in the map, in its tangent; None is that it is exact.
             measured: Velocity then and its (6, 6) covariance; None is the mean one since the last scan.
         """
         elapsed_s = self.elapsed_s(time_ns)
@@ -146,8 +162,13 @@ class MotionModel:
                 self.twist, self._covariance = measured
             self._elapsed_s = elapsed_s if measured is None else 0.0
         self.T_world_last, self._time_ns = T_world_body, time_ns
+        self.pose_covariance = np.zeros((6, 6)) if pose_covariance is None else pose_covariance
 
 
 def _time_s2(elapsed_s: float, before_s: float) -> float:
     """Return what an acceleration is multiplied by: from the middle of one interval over the next."""
     return 0.5 * elapsed_s * (elapsed_s + before_s)
+
+
+def _vector(twist: Twist) -> Array:
+    return np.concatenate([twist.rotation_radps, twist.translation_mps])

@@ -19,7 +19,7 @@ from mapper.odometry.scan_to_map.motion_model import MotionModel
 from mapper.odometry.scan_to_map.pose_search import PoseCandidate, PoseSearch
 from mapper.odometry.scan_to_map.scan_fit import ScanKeyframe
 from mapper.odometry.scan_to_map.scan_matcher import DeskewedScan, ScanMatcher
-from mapper.odometry.scan_to_map.scan_noise import ScanNoise
+from mapper.odometry.scan_to_map.scan_noise import ScanNoise, independent_covariance
 from mapper.odometry.scan_to_map.scan_observation import ScanObservation, observe_scan
 from mapper.odometry.scan_to_map.sweep_motion import SweepMotion, sweep_motion
 
@@ -107,7 +107,10 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
         sweep: SweepMotion | None = None
         sweep_of_middle, settled = observation.sweep(observation.middle_s), np.zeros(3)
         for _ in range(_ROUNDS):
-            expected, covariance = motion.velocity(time_ns, T_world_middle)
+            of_pose = (
+                motion.pose_covariance if found is None else independent_covariance(found.fit, found.blend)
+            )
+            expected, covariance = motion.velocity(time_ns, T_world_middle, of_pose)
             before = motion.twist if sweep is None else sweep.twist
             measured = sweep_motion(
                 self._keyframes,
@@ -134,7 +137,8 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
             found = self._find_pose(deskewed, time_ns)
         if found is None:
             return None
-        covariance = motion.velocity(time_ns, found.T_world_middle)[1]
+        of_pose = independent_covariance(found.fit, found.blend)
+        covariance = motion.velocity(time_ns, found.T_world_middle, of_pose)[1]
         if sweep is not None:
             accelerated = motion.acceleration(time_ns, found.T_world_middle, sweep.twist)
             bent = accelerated * observation.half_s / 3.0
@@ -190,6 +194,7 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
             time_ns,
             found.T_world_middle,
             is_certain=fits and found.is_measured,
+            pose_covariance=noise.independent,
             measured=None if placed.twist is None else (placed.twist, placed.velocity_covariance),
         )
         T_world_body = found.T_world_middle @ self._motion.twist.over(-observation.middle_s)

@@ -37,6 +37,10 @@ _OFF_VOXELS = 1.0  # nearer to the keyframe rings lie on the same places, and so
 _FEW_PAIRS, _ENOUGH_PAIRS = 8, 24
 """Pairs that face a motion and agree: a bare tunnel has up to 11 by chance, a field with two trees 13 to 60.
 They measure it to σ/√pairs, with the 0.1 m that a point agrees within to 0.02 m."""
+_PAIR_VOXELS = 0.6
+"""Error of such a pair: a point agrees within 0.33 voxels, a standard deviation of 0.19, and the normals of
+ten neighbours err alike. 0.45 and 0.8 serve as well."""
+_LEAST_WEIGHT = 1e-6  # keeps the error of a motion that no pair shows finite
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,6 +95,8 @@ class ScanFit:
         points: (M, 3) the paired points, scan's frame.
         degeneracy: Of what the normals of both scans show.
         observability: (6,) of the degeneracy's motions: 1 if measured, 0 if not, and between.
+        shown_m: (6,) standard deviation of each of these motions where few pairs show it, 0 where many do, as
+            its displacement of the points, metres.
         unobservable: Names of the motions that are rather not measured, as in "translation along x".
     """
 
@@ -103,6 +109,7 @@ class ScanFit:
     points: Array
     degeneracy: Degeneracy
     observability: Array
+    shown_m: Array
     unobservable: str
 
 
@@ -178,7 +185,8 @@ def fit_of(
     agreement, _ = weakest_direction(source.normals, agree)
     counts = FreeSpaceCheck(_MARGIN_M).count(keyframe.description, _checked(deskewed), T_key_scan)
     degeneracy = degeneracy_of(0.5 * (shown + shown.T), points=source.points, min_share=_SMALL_SHARE)
-    observability = _observability(degeneracy, points, rows, own_rows, agree[near])
+    observability, weights = _observability(degeneracy, points, rows, own_rows, agree[near])
+    shown_m = _PAIR_VOXELS * source.voxel_m / np.sqrt(weights)
     if np.linalg.norm(T_key_scan[:3, 3]) < _OFF_VOXELS * source.voxel_m:
         observability[: degeneracy.unobservable_count] = 0.0
     unobservable = ""
@@ -197,26 +205,30 @@ def fit_of(
         points=points,
         degeneracy=degeneracy,
         observability=observability,
+        shown_m=np.minimum(shown_m, degeneracy.extent_m),
         unobservable=unobservable,
     )
 
 
 def _observability(
     degeneracy: Degeneracy, points: Array, rows: Array, own_rows: Array, agree: NDArray[np.bool_]
-) -> Array:
+) -> tuple[Array, Array]:
     """Return (6,) whether enough pairs show a motion (as Tuna et al. 2024, §III, count contributions).
 
-    Shares do not tell: normals off by a few degrees, a thousand times, make as large a share as one tree.
+    With it comes (6,) how much these pairs weigh; infinite where many pairs show the motion. Shares do not
+    tell: normals off by a few degrees, a thousand times, make as large a share as one tree. A pair weighs as
+    much as the square of its displacement by the motion, whose mean over all points is 1, and at most 1:
+    however many pairs lie on one tree, they hardly measure a rotation about it.
     """
-    observability = np.ones(6)
+    observability, weights = np.ones(6), np.full(6, np.inf)
     for k in range(degeneracy.unobservable_count):
         motion = degeneracy.motions[k]
         displacements = np.cross(motion[:3], points) + motion[3:]
-        along = (rows @ motion) * (own_rows @ motion)
-        facing = along > _FACING * np.einsum("ni,ni->n", displacements, displacements)
-        pairs = int((facing & agree).sum())
-        observability[k] = np.clip((pairs - _FEW_PAIRS) / (_ENOUGH_PAIRS - _FEW_PAIRS), 0.0, 1.0)
-    return observability
+        squared = np.einsum("ni,ni->n", displacements, displacements)
+        facing = ((rows @ motion) * (own_rows @ motion) > _FACING * squared) & agree
+        observability[k] = np.clip((facing.sum() - _FEW_PAIRS) / (_ENOUGH_PAIRS - _FEW_PAIRS), 0.0, 1.0)
+        weights[k] = max(float(np.minimum(squared[facing], 1.0).sum()), _LEAST_WEIGHT)
+    return observability, weights
 
 
 def contradiction(keyframe: ScanKeyframe, description: ScanDescription, T_key_scan: Transform) -> float:

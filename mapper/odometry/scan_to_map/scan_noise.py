@@ -68,6 +68,20 @@ def surface_covariance(fit: ScanFit) -> Array:
     return np.asarray(along_axes @ to_tangent.T, np.float64)
 
 
+def independent_covariance(fit: ScanFit, blend: Blend) -> Array:
+    """Return the (6, 6) covariance of a pose without the errors that the last pose has alike.
+
+    That is of the distances, and of what these leave open; what few pairs show, the same ones show both.
+    """
+    return surface_covariance(fit) + _along(fit, blend.open_m)
+
+
+def _along(fit: ScanFit, sigmas_m: Array) -> Array:
+    """Return the (6, 6) covariance of the fit's motions with (6,) standard deviations."""
+    motions = fit.degeneracy.motions
+    return np.asarray(np.einsum("ki,k,kj->ij", motions, sigmas_m**2, motions), np.float64)
+
+
 def _design_effect(residuals_m: Array, sectors: NDArray[np.intp], points: NDArray[np.intp]) -> float:
     """Return how many times the variance exceeds that of independent distances; 1 with too few points."""
     sums, squares = (np.bincount(sectors, weights) for weights in (residuals_m, residuals_m**2))
@@ -86,9 +100,16 @@ def _sectors(points: Array) -> NDArray[np.intp]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseNoise:
-    """Covariance (6, 6) of a scan's pose in its tangent, and why it may be more than it says."""
+    """Noise of a scan's pose, in its tangent.
+
+    Attributes:
+        covariance: (6, 6) relative to the keyframe.
+        independent: (6, 6) of what the last pose does not have alike.
+        doubts: Why it may be more than that.
+    """
 
     covariance: Array
+    independent: Array
     doubts: tuple[str, ...] = ()
 
     def inflated(self, jump: Jump) -> Array:
@@ -130,20 +151,20 @@ class ScanNoise:
             elapsed_s: Since the scan before.
             at_stamps: (6, 6) covariance of the motion from the stamps to the middles of both sweeps.
         """
-        covariance = surface_covariance(fit)
+        surface = surface_covariance(fit)
+        independent = surface + _along(fit, blend.open_m)
         off_m, moved_m = float(np.median(np.abs(fit.residuals_m))), float(np.linalg.norm(T_key_scan[:3, 3]))
         least_rad = _LEAST_RAD + _MODEL_RAD_M * off_m
         least_m = np.hypot(_LEAST_M + _MODEL_M_M * off_m, _MODEL_SHARE_M * off_m * moved_m)
-        covariance = covariance + np.diag(np.square([least_rad] * 3 + [least_m] * 3)) + at_stamps
+        covariance = surface + np.diag(np.square([least_rad] * 3 + [least_m] * 3)) + at_stamps
+        covariance += _along(fit, fit.observability * fit.shown_m)
         unseen, step = self._since_seen.add(blend, T_last_scan, elapsed_s)
         if fit.observability.min() >= 1.0:
             self._unseen = 0
-            return PoseNoise(covariance)
+            return PoseNoise(covariance, independent)
         self._unseen += 1
         self._steps += self._unseen
-        motions = fit.degeneracy.motions
-        added_m = np.minimum(blend.open_m * self._steps, fit.degeneracy.extent_m)
-        predicted = np.einsum("ki,k,kj->ij", motions, added_m**2, motions)
+        predicted = _along(fit, np.minimum(blend.open_m * self._steps, fit.degeneracy.extent_m))
         rates = _largest(step) / max(elapsed_s, _SHORTEST_S)
         (sigma_rad, sigma_m), (rate_radps, rate_mps) = _largest(unseen), rates
         doubts: tuple[str, ...] = ()
@@ -152,7 +173,7 @@ class ScanNoise:
             name = fit.unobservable or "a motion"
             known = f"±{rate_mps:.2f} m and {np.degrees(rate_radps):.1f}° a second"
             doubts = (f"{name} is not seen but predicted, to {known}",)
-        return PoseNoise(covariance + predicted, doubts)
+        return PoseNoise(covariance + predicted, independent, doubts)
 
 
 class PredictedPart:
