@@ -6,7 +6,7 @@ from mapper.sources.chained import sessions_of
 from mapper.sources.depth_distortion import distortion_of
 
 _DOUBTFUL_SHARE = 0.007
-"""Of the median depth. White rooms by sensors of 0.9 % were wrong by metres; a Kinect at desks has 0.55 %."""
+"""Of the median depth. White rooms by simulated sensors of 0.9 % were wrong by metres."""
 
 
 def distortion_warnings(source: Log) -> list[RunWarning]:

@@ -19,7 +19,7 @@ SETTINGS = ("odometry.kind=given", "loops.kind=none", "octree.resolution_m=0.1")
 
 @pytest.fixture(scope="module")
 def bent():
-    return bent_log(error_per_m=smooth_error(0.0022))
+    return bent_log(error_per_m=smooth_error(0.0022), sigma_per_m=0.001)
 
 
 @pytest.fixture(scope="module")

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from mapper.core.frames import ray_table
+from mapper.sensing import depth_distortion
 from mapper.sensing.depth_distortion import measure_distortion
 from mapper.simulation.config import SensorConfig, SynthConfig
 from mapper.simulation.sensor import BASELINE_M, DISPARITY_FOCAL_PX, warp_of
@@ -69,6 +70,27 @@ def test_an_exact_camera_has_none():
 
 def test_a_camera_that_stands_still_before_relief_has_none(truth):
     assert measured(images(error_per_m=truth, moves=False)) is None
+
+
+def relief_seen(sway_m, *, frames=40):
+    """Return (H, W) depths of uneven ground 1.2 m ahead, from up to (3,) metres right, down and ahead."""
+    x, y = np.moveaxis(ray_table(CAMERA).astype(np.float64), 2, 0)
+    seen = []
+    for k in range(frames):
+        right_m, down_m, ahead_m = np.array(sway_m) * np.sin(np.array([0.9, 0.7, 0.4]) * k)
+        height_m = 1.2 - ahead_m
+        across_m, along_m = right_m + x * height_m, down_m + y * height_m
+        relief_m = 0.012 * (np.sin(7.0 * across_m + 1.0) * np.cos(6.0 * along_m) + np.cos(9.0 * across_m))
+        seen.append((height_m - relief_m).astype(np.float32))
+    return seen
+
+
+@pytest.mark.parametrize("sway_m", [(0.15, 0.15, 0.3), (0.2, 0.2, 0.3)])
+def test_relief_that_stays_in_view_is_none(monkeypatch, sway_m):
+    seen = relief_seen(sway_m)
+    assert measured(seen) is None
+    monkeypatch.setattr(depth_distortion, "_MIN_EXPLAINED", -1.0)
+    assert measured(seen) is not None, "without the cross-validation it would be taken for distortion"
 
 
 def test_an_error_that_changes_is_none(truth):

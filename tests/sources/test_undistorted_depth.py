@@ -16,6 +16,7 @@ from mapper.sources.selection import selected
 from mapper.sources.writers import write_log
 from tests.support.bent_depth import bent_log, images, smooth_error
 from tests.support.logs import CountedReads, MemoryEntry, log_in_memory
+from tests.support.paths import FR1_XYZ
 
 ON, OFF = SourceConfig(), SourceConfig(undistort_depth=False)
 ERROR_PER_M = smooth_error()
@@ -86,6 +87,12 @@ def test_scans_have_no_depth_images():
     log = log_in_memory([MemoryEntry(0, Scan(0, np.ones((3, 3), np.float32)))], sensor="lidar")
     assert selected(log, ON) is log
     assert distortion_of(log) is None
+
+
+@pytest.mark.skipif(not FR1_XYZ.is_dir(), reason=f"no {FR1_XYZ}")
+def test_clutter_on_a_real_desk_is_no_distortion():
+    log = open_source(FR1_XYZ, OFF)
+    assert distortion_of(log) is None, "its removal made the map thicker, also by the true poses"
 
 
 def test_a_log_without_readable_frames_has_none():
