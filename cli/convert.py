@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from mapper.cli.answer import Answer, Output
-from mapper.cli.options import First, Last, Overrides, RequireTruth, Stride, merged, selection
+from mapper.cli.options import AS_RECORDED, First, Last, Overrides, RequireTruth, Stride, merged, selection
 from mapper.core.errors import ConfigError
 from mapper.runtime.result_paths import LOGS, name_of, place_of
 
@@ -60,9 +60,8 @@ def convert(
         raise ConfigError(
             f"--as: want one of {', '.join(LogFormat)}; an --out that ends in .mcap or .bag says it, too"
         )
-    source = open_source(
-        log, load_source_config(None, merged(selection(first, last, stride, require_truth), set_))
-    )
+    selected = [*AS_RECORDED, *selection(first, last, stride, require_truth)]
+    source = open_source(log, load_source_config(None, merged(selected, set_)))
     ending = f".{as_}" if as_ in _FILES else ""
     out = place_of(out, LOGS / f"{name_of(log)}{ending}")
     progress = output.progress()

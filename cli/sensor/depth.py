@@ -9,14 +9,13 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from mapper.cli.answer import Answer, Output
-from mapper.cli.options import First, Last, Overrides, Stride, merged, selection
+from mapper.cli.options import AS_RECORDED, First, Last, Overrides, Stride, merged, selection
 from mapper.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from mapper.evaluators.depth_camera.accuracy import Patch
 
 _FITTED_FRAMES = 100
-_AS_RECORDED = ("source.undistort_depth=false",)
 
 
 def depth(
@@ -73,7 +72,7 @@ def depth(
 
     distances_m = _distances(logs, plane_at, fit_plane=fit_plane, keep_tilt=keep_tilt)
     where = None if patch is None else _patch(patch)
-    config = load_config(None, merged([*_AS_RECORDED, *selection(first, last, stride, None)], set_)).source
+    config = load_config(None, merged([*AS_RECORDED, *selection(first, last, stride, None)], set_)).source
     sources = [open_source(log, config) for log in logs]
     with nullcontext() if out is None else atomic_folder(out, FOLDER, overwrite=overwrite) as folder:
         study = study_depth(

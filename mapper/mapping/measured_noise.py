@@ -5,13 +5,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.core.errors import FrameError
-from mapper.core.frames import RgbdFrame, ray_table
+from mapper.core.frames import ray_table
 from mapper.core.geometry import Array
 from mapper.runtime.ordered_map import ordered_map
 from mapper.sensing.config import KINECT_NOISE, DepthNoiseConfig
 from mapper.sensing.planes import cut_tiles, fit_planes
-from mapper.sources.base import FrameRef, Log
+from mapper.sources.base import FrameRef, Log, read_depth
 
 _FRAMES = 24
 _TILES_ACROSS = 16
@@ -63,8 +62,7 @@ def measure_noise(source: Log, *, given: DepthNoiseConfig | None = None, workers
         given: The noise, where the user knows it; then only depths are collected.
         workers: Threads that decode frames.
     """
-    chosen = np.unique(np.linspace(0, len(source) - 1, min(_FRAMES, len(source))).round().astype(int))
-    entries = (source.entry_at(int(index)) for index in chosen)
+    entries = source.spread_entries(_FRAMES)
     seen = [one for one in ordered_map(_seen, entries, workers=workers) if one is not None]
     depths_m = np.concatenate([np.empty(0), *(depths for depths, _, _ in seen)])
     if given is not None:
@@ -86,11 +84,8 @@ def measure_noise(source: Log, *, given: DepthNoiseConfig | None = None, workers
 
 def _seen(entry: FrameRef) -> tuple[Array, Array, Array] | None:
     """Return some depths of a frame, and the distances and standard deviations of tiles that are planes."""
-    try:
-        frame = entry.load(colour=False)
-    except FrameError:
-        return None
-    if not isinstance(frame, RgbdFrame):
+    frame = read_depth(entry)
+    if frame is None:
         return None
     depth_m = frame.depth_m[::_STRIDE_PX, ::_STRIDE_PX]
     some_m = depth_m[::4, ::4][depth_m[::4, ::4] > 0.0].astype(np.float64)

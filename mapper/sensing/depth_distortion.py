@@ -109,7 +109,7 @@ def measure_distortion(images_m: Iterable[DepthImage], rays: NDArray[np.floating
     error = grid.error(coefficients)
     if np.sqrt((error**2).mean()) < _MIN_RMS_PER_M:
         return None
-    if _explained_share(inverses, planes, equations, grid) < _MIN_EXPLAINED:
+    if not _explained_share(inverses, planes, equations, grid) >= _MIN_EXPLAINED:
         return None
     for _ in range(_REPETITIONS):
         left = np.where(inverses > 0.0, inverses - error, 0.0)

@@ -8,8 +8,8 @@ from typing import Protocol, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.core.errors import DataError
-from mapper.core.frames import Frame, Scan, Sensor
+from mapper.core.errors import DataError, FrameError
+from mapper.core.frames import Frame, RgbdFrame, Scan, Sensor
 from mapper.core.geometry import Array
 from mapper.core.timebase import Stamps
 from mapper.core.trajectory import Trajectory
@@ -195,6 +195,11 @@ class Log:
         """Yield every frame's entry in time order; nothing is decoded yet."""
         return map(self.entry_at, range(len(self)))
 
+    def spread_entries(self, most: int) -> Iterator[FrameRef]:
+        """Yield the entries of at most so many frames, evenly spread over the log."""
+        indices = np.unique(np.linspace(0, len(self) - 1, min(most, len(self))).round().astype(int))
+        return map(self.entry_at, indices.tolist())
+
     def subset(self, indices: NDArray[np.intp]) -> "Log":
         """Return the log with only the frames of some increasing indices; all else stays as it is."""
         return replace(
@@ -202,6 +207,15 @@ class Log:
             stamps_ns=self.stamps_ns[indices],
             entry_at=lambda index: self.entry_at(int(indices[index])),
         )
+
+
+def read_depth(entry: FrameRef) -> RgbdFrame | None:
+    """Return a frame with its depth and without colour; None if it cannot be read or is a scan."""
+    try:
+        frame = entry.load(colour=False)
+    except FrameError:
+        return None
+    return frame if isinstance(frame, RgbdFrame) else None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

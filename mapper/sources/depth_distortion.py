@@ -1,22 +1,20 @@
 """Depth distortion of a log's camera: measured in some of its frames, and removed from all of them."""
 
 import threading
-from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
-import numpy as np
-
-from mapper.core.errors import FrameError
 from mapper.core.frames import Frame, RgbdFrame, Scan, ray_table
 from mapper.sensing.depth_distortion import DepthDistortion, measure_distortion
-from mapper.sources.base import Log, WrappedEntry
+from mapper.sources.base import Log, WrappedEntry, read_depth
 
 _FRAMES = 60
 
 
 def distortion_of(log: Log) -> DepthDistortion | None:
     """Measure the depth distortion in frames spread over a log; None if there is none, or no depth images."""
-    frames = _spread(log)
+    if log.sensor != "rgbd":
+        return None
+    frames = (frame for entry in log.spread_entries(_FRAMES) if (frame := read_depth(entry)) is not None)
     first = next(frames, None)
     if first is None:
         return None
@@ -38,19 +36,6 @@ def undistorted(log: Log) -> Log:
         entry_at=lambda index: _UndistortedEntry(log.entry_at(index), measured),
         removed_distortion=measured.distortion,
     )
-
-
-def _spread(log: Log) -> Iterator[RgbdFrame]:
-    """Yield frames spread over a log, without those that cannot be read."""
-    if log.sensor != "rgbd":
-        return
-    for index in np.unique(np.linspace(0, len(log) - 1, min(_FRAMES, len(log))).round().astype(int)):
-        try:
-            frame = log.entry_at(int(index)).load(colour=False)
-        except FrameError:
-            continue
-        if isinstance(frame, RgbdFrame):
-            yield frame
 
 
 @dataclass(slots=True, eq=False)

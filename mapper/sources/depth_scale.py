@@ -6,13 +6,12 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from mapper.core.errors import FrameError
 from mapper.core.frames import RgbdFrame
 from mapper.core.geometry import Array, Transform, angle_between, apply, inverse
 from mapper.core.timebase import NS_PER_S
 from mapper.core.trajectory import Trajectory
 from mapper.sensing.wheel_kinematics import pose_at
-from mapper.sources.base import Log
+from mapper.sources.base import Log, read_depth
 
 _FRAMES = 8
 """Frames, spread over the log, whose depth is looked at, and from which pairs begin."""
@@ -61,7 +60,7 @@ def depth_warnings(log: Log) -> list[str]:
     if log.sensor != "rgbd":
         return []
     spread = np.unique(np.linspace(0, len(log) - 1, _FRAMES).astype(int)).tolist()
-    frames = {index: frame for index in spread if (frame := _read(log, index)) is not None}
+    frames = {index: frame for index in spread if (frame := read_depth(log.entry_at(index))) is not None}
     if not frames:
         return []
     measured = float(np.median([(frame.depth_m > 0.0).mean() for frame in frames.values()]))
@@ -108,7 +107,7 @@ def _scale_of_log(log: Log, frames: Mapping[int, RgbdFrame]) -> float | None:
         return None
     scales = []
     for first, second, T_first_second in _pairs(log, motion, frames.keys()):
-        frame = _read(log, second)
+        frame = read_depth(log.entry_at(second))
         if frame is not None and (scale := _scale(frames[first], frame, T_first_second)) is not None:
             scales.append(scale)
     median = float(np.median(scales)) if scales else 1.0
@@ -194,14 +193,6 @@ def _matched(one: _Features, other: _Features) -> Array:
         and back.get(best.queryIdx) == best.trainIdx
     ]
     return np.array(found, dtype=int).reshape(-1, 2)
-
-
-def _read(log: Log, index: int) -> RgbdFrame | None:
-    try:
-        frame = log.entry_at(index).load(colour=False)
-    except FrameError:
-        return None  # it is counted when the log is read
-    return frame if isinstance(frame, RgbdFrame) else None
 
 
 def _units_per_m(log: Log) -> float | None:

@@ -87,9 +87,9 @@ def vehicle_box(log: Log) -> Box | None:
 def _clouds(log: Log, scale: _Scale) -> list[Points]:
     """Return the points around the sensor of some frames, without the ground."""
     clouds: list[Points] = []
-    for index in np.unique(np.linspace(0, len(log) - 1, min(_FRAMES, len(log))).round().astype(int)):
+    for entry in log.spread_entries(_FRAMES):
         try:
-            points = log.entry_at(int(index)).scan().points_body
+            points = entry.scan().points_body
         except FrameError:
             continue
         points = points[:: max(1, len(points) // _POINTS)].astype(np.float64)

@@ -7,7 +7,7 @@ import pytest
 
 from mapper.core.errors import FrameError
 from mapper.core.frames import Scan
-from mapper.sources import open_source
+from mapper.sources import depth_distortion, open_source
 from mapper.sources.chained import chained, sessions_of
 from mapper.sources.config import BodyConfig, SourceConfig
 from mapper.sources.depth_distortion import distortion_of
@@ -15,6 +15,7 @@ from mapper.sources.inspection import inspect_log
 from mapper.sources.selection import selected
 from mapper.sources.writers import write_log
 from tests.support.bent_depth import bent_log, images, smooth_error
+from tests.support.command_line import mapper
 from tests.support.logs import CountedReads, MemoryEntry, log_in_memory
 from tests.support.paths import FR1_XYZ
 
@@ -74,6 +75,12 @@ def test_logs_of_a_chain_are_corrected_each_by_its_own(bent):
     first, second = (session.log.removed_distortion() for session in sessions_of(both))
     assert first is not None
     assert second is None
+
+
+def test_a_conversion_measures_no_distortion(bent, tmp_path, monkeypatch):
+    write_log(bent, tmp_path / "log.mcap", kind="mcap")
+    monkeypatch.setattr(depth_distortion, "measure_distortion", lambda *_: pytest.fail("it is not needed"))
+    mapper("convert", tmp_path / "log.mcap", "--out", tmp_path / "log", "--as", "tum")
 
 
 def test_an_inspection_tells_how_large_it_is(bent, tmp_path):

@@ -36,9 +36,10 @@ _MIN_SHARE, _NOISE_SHARES = 0.004, 2.5
 depth image gives 0.002, and the normals' noise gives their variance."""
 _FEW = 0.02  # of all surface; a direction that less faces is left to the degeneracy check
 _LEAST_SCALE = 0.5  # of the assumed noise, however well the surfaces fit
-_UNSEEN_PER_M, _UNSEEN_SHARE = 0.0004, 1.0
+_UNSEEN_PER_M = 0.0004
 """Distortion of inverse depth that no plane shows, each of its three parts (root mean square): half of the
-largest that passes for none, and as much as was measured. Simulated sensors have 0.4 of that, at most 0.9."""
+largest that passes for none, added to as much as was measured. Simulated sensors have 0.4 of that, at most
+0.9."""
 _LINKS_ALIKE = 2.0
 """Links of four keyframes in a row have the same error, while the graph takes them as independent."""
 _LEAST_OBSERVED = 1e-4
@@ -300,7 +301,7 @@ def _systematic(
     share = information @ np.linalg.pinv(information + others)
     moved: Array = np.linalg.pinv(H, rcond=_LEAST_OBSERVED) @ B
     spread = np.append(cells.rays.reshape(-1, 2).std(axis=0), 1.0)
-    sigma = (_UNSEEN_PER_M + _UNSEEN_SHARE * cells.distortion_per_m) / spread
+    sigma = (_UNSEEN_PER_M + cells.distortion_per_m) / spread
     moved = share.T @ (moved * (_LINKS_ALIKE * sigma))
     return moved @ moved.T
 
