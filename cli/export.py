@@ -7,6 +7,7 @@ import typer
 
 from mapper.cli.answer import Answer, Output, made
 from mapper.cli.completion import export_kinds
+from mapper.cli.option_rules import refuse_with
 from mapper.cli.options import MovedLogs, Overrides, RunFolder, assignments, merged
 from mapper.export.exporters import EXPORTERS
 
@@ -44,6 +45,8 @@ def export(
     from mapper.run.manifest import is_merged_map
     from mapper.run.map_folder import MapFolder
 
+    if as_ != "octomap":
+        refuse_with(f"--as {as_}", {"--level": level})
     built: MapFolder
     if is_merged_map(run):
         from mapper.merging.merged_map import open_map

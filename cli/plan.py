@@ -11,6 +11,7 @@ import typer
 from mapper.cli.answer import Answer, Output
 from mapper.cli.completion import run_folders
 from mapper.cli.groups import Verb
+from mapper.cli.option_rules import refuse_with
 from mapper.cli.options import assignments
 from mapper.core.errors import ConfigError
 
@@ -96,6 +97,8 @@ def plan(
     from mapper.run.folder import Run, open_run
     from mapper.run.manifest import is_merged_map
 
+    if in_3d:
+        refuse_with("--3d", {"--layer": layer})
     has_storeys = not in_3d and layer == Layer.TRAVERSABLE and (run / f"{files.storey(0)}.yaml").exists()
     counts = (3,) if in_3d else (2, 3) if has_storeys else (2,)
     start, goal = (_point(text, name, counts) for text, name in zip((from_, to), _POINT_OPTIONS, strict=True))
