@@ -352,6 +352,12 @@ def test_images_are_placed_by_the_wheels(folder):
     wall_m = ahead_m(THESIS, np.array([200.0]))[0]
     assert state_at(driven.grid, 0.45 + wall_m, 0.0) == OCCUPIED
 
+    encoders.write_text("".join(f"{1001 + 0.4 * k:.1f} {0.2 * k:.2f} 0\n" for k in range(8)))
+    assert len(drive(scans, sensor_poses(encoders, calibration)[0], CONFIG.map).trajectory) == 3
+    strict = CONFIG.map.model_copy(update={"max_wheel_gap_s": 0.3})
+    with pytest.raises(DataError, match="no image was taken between two of their readings"):
+        drive(scans, sensor_poses(encoders, calibration)[0], strict)
+
     with pytest.raises(SourceError, match=r"readings.txt: the wheelbase is unknown"):
         sensor_poses(encoders, THESIS)
     encoders.write_text("5.0 0 0\n6.0 0.1 0\n")
