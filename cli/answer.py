@@ -57,9 +57,9 @@ class Answer:
     """Answer of a verb: what it made or found.
 
     Attributes:
-        document: For ``--json``; keys are stable and end in the unit: ``total_s``, ``path_length_m``.
+        document: Document of ``--json``; keys are stable and end in the unit: ``total_s``, ``path_length_m``.
         text: Lines for people.
-        details: What ``--verbose`` prints instead; empty if that is the text.
+        details: Text of ``--verbose``; empty if that is ``text``.
         error: Raised after printing: the answer is whole, but the exit status is 1.
     """
 

@@ -53,7 +53,7 @@ def placing_of(
         default: Source if neither is given.
         jointly: Whether shared places bend the runs, or place each as a rigid body.
         known: A map of the first of them, to which the others are added.
-        workers: Where places are compared.
+        workers: Workers that compare places.
         progress: Receives stages and notes.
 
     Raises:

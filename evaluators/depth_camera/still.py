@@ -84,7 +84,7 @@ def depth_at(
     Args:
         source: RGB-D log.
         distance_m: Depth of the plane where the optical axis meets it.
-        patch: What shows nothing but the plane; None is the middle third of the image, each way.
+        patch: Part of the image that shows only the plane; None is the middle third of the image, each way.
         keep_tilt: Compare with a plane across the axis, as the thesis does.
         progress: Receives notes of frames that show no plane.
 

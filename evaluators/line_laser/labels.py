@@ -41,7 +41,7 @@ class LabelScores:
     """Detections and ranges of a sensor in labelled images.
 
     Attributes:
-        images: How many.
+        images: Number of images.
         counts: Counts of every method's detections.
         true_m: (N,) ranges in all columns in which a stripe was and was found.
         found_m: (N,) what was measured there.
@@ -79,7 +79,7 @@ def score(
     Args:
         scans: Scans by the names of their images.
         labels: Labels from :func:`read_labels`.
-        config: How a stripe is found.
+        config: Settings of the stripe detection.
 
     Raises:
         FrameError: An image can no longer be read.

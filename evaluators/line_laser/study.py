@@ -80,7 +80,7 @@ def study(config: LineLaserConfig, seeds: Sequence[int], *, progress: Progress =
     """Render every scene, and a wall at every range of Table 2.1, with every seed; shots calibrate.
 
     Args:
-        config: How the stripe is found.
+        config: Settings of the stripe detection.
         seeds: Each another room, other things on its walls and other noise.
         progress: Receives the count of scenes and seeds, and of Table 2.1.
     """

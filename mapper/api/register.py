@@ -34,10 +34,10 @@ def register(
     """Register two clouds: find the pose of the source in the target.
 
     Args:
-        source: What is aligned: (N, 3) points in metres, a file (.bin .pcd .ply .xyz .npy .las .laz),
+        source: Cloud that is aligned: (N, 3) points in metres, a file (.bin .pcd .ply .xyz .npy .las .laz),
             ``LOG@N`` for the n-th frame of a log, or a frame. Points are kept as float32, so they lie within
             a kilometre of their origin.
-        target: What it is aligned to: the same.
+        target: Cloud that it is aligned to, given likewise.
         method: "hough-gicp" or "hough-ndt", which search all motions of clouds with z up; "kiss-matcher",
             which searches any; "icp", "plane-icp", "gicp" or "ndt", which refine the guess; "isvd" for
             RGB-D frames.

@@ -81,7 +81,7 @@ def drop_unknown(model: type[Config], tree: Any) -> list[str]:
     """Delete the names that a model does not have from what an older version wrote; return them, dotted.
 
     Args:
-        model: What the tree is to be.
+        model: Class of the settings.
         tree: Parsed JSON; changed in place. What else is wrong with it is left to the model.
     """
     try:

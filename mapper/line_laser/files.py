@@ -55,7 +55,7 @@ def read_shots(
     Args:
         path: Lines ``image,range_m[,width_m]``, or the folder with such a ``shots.csv``: images of a board
             that faces the sensor, in the middle of the image, and how far and how wide it is.
-        config: How its stripe is found.
+        config: Settings of the stripe detection.
         progress: Receives the count of images.
 
     Raises:

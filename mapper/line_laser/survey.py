@@ -29,7 +29,7 @@ class Drive:
         scans: Scans whose pose is known.
         trajectory: T_world_sensor of each.
         grid: The map.
-        notes: What was left out.
+        notes: Sentences on what was left out.
     """
 
     scans: Sequence[LineScan]

@@ -98,7 +98,7 @@ def fuse_changed(
     Args:
         source: The log that the run was built from.
         run: A finished run, with the configuration to fuse by.
-        changed: What replaces the run's own; None keeps that.
+        changed: Tracking that replaces the run's own; None keeps that.
         solve: Record of the solve that changed it, for the manifest; None keeps the old one.
         edits: Text to replace the run's ``edits.toml``; None keeps that.
         progress: Receives stages, counts and notes.
@@ -184,7 +184,7 @@ def fuse_into(
     """Fuse the trajectory of an unfinished run and write everything that is made from the maps.
 
     Args:
-        writer: Of the run, with its trajectory, graph and frame records.
+        writer: Writer of the run, which has its trajectory, graph and frame records.
         source: The log that was tracked.
         config: All settings.
         progress: Receives stages, counts and notes.

@@ -23,7 +23,7 @@ Distances = Annotated[tuple[PositiveFloat, ...], Field(min_length=1)]
 
 
 class AcceptanceConfig(Config):
-    """When a motion is accepted."""
+    """Acceptance of a motion."""
 
     near_voxels: PositiveFloat = 3.5
     surface_voxels: PositiveFloat = 0.33

@@ -46,7 +46,7 @@ def write_log(
     RGB-D logs become TUM or mbag folders, LiDAR logs KITTI folders, and both MCAP files or ROS 1 bags.
 
     Args:
-        source: What to write.
+        source: Log that is written.
         out: File or folder to make; it must not exist or be empty.
         kind: The format.
         on_progress: Told how many frames are done, after each.

@@ -77,7 +77,7 @@ class ObjectsConfig(Config):
 
 
 class ConstellationConfig(Config):
-    """From one scan to the centres that vote."""
+    """Constellation: the centres of a scan that vote."""
 
     levelling: LevellingConfig = LevellingConfig()
     """Level frame of a scan."""
@@ -133,7 +133,7 @@ class OverlapConfig(Config):
 
 
 class HoughAcceptanceConfig(Config):
-    """When the answer is accepted; otherwise there is none."""
+    """Acceptance of the answer; otherwise there is none."""
 
     min_agreeing_ratio: Ratio = 0.1
     """Share of each scan's obstacles that the other measured, too. Right results had 0.12 or more."""

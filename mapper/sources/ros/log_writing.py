@@ -42,7 +42,7 @@ def write_recording(
     poses of the sensor's own frame, on /wheel_odometry, and accelerations are on /imu.
 
     Args:
-        source: What to write.
+        source: Log that is written.
         out: File to make; its name ends as its kind does, by which it is recognised.
         kind: "mcap" (ROS 2) or "bag" (ROS 1).
         on_progress: Called with the number of frames done, after each.
