@@ -22,7 +22,7 @@ from mapper.line_laser.detection import Method
 from mapper.line_laser.products import DETECTIONS, RANGE_ERRORS
 from mapper.line_laser.ranging import LineScan
 from mapper.runtime.atomic import write_text
-from mapper.sources.images import read_colour
+from mapper.sources.image_files.reading import read_colour
 from mapper.sources.text import parse_numbers, rows
 
 _NEAR_M = 0.1

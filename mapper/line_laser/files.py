@@ -11,7 +11,7 @@ from mapper.core.timebase import Stamps
 from mapper.line_laser.calibration import CalibrationShot, find_board
 from mapper.line_laser.config import StripeConfig
 from mapper.runtime.progress import SILENT, Progress
-from mapper.sources.images import read_colour
+from mapper.sources.image_files.reading import read_colour
 from mapper.sources.scan_stamps import Wording, in_order, scan_stamps
 from mapper.sources.text import parse_numbers, rows, time_order
 

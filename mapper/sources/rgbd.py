@@ -15,7 +15,7 @@ from mapper.sources.base import Accelerations, ImageFiles, Log
 from mapper.sources.calibration import Calibration, configured
 from mapper.sources.calibration_file import calibration_file, read_calibration
 from mapper.sources.config import CameraConfig
-from mapper.sources.images import check_size, read_colour, read_depth_m, read_grey, scan_of
+from mapper.sources.image_files.reading import check_size, read_colour, read_depth_m, read_grey, scan_of
 from mapper.sources.listed_files import refuse_links_out
 from mapper.sources.text import parse_numbers, parse_stamp, table, time_order
 

@@ -6,7 +6,7 @@ import json
 import pytest
 
 from mapper.config.loading import load_config
-from mapper.sources.images import read_grey
+from mapper.sources.image_files.reading import read_grey
 from tests.support.command_line import mapper
 
 SMALL = ["--seconds", "0.1", "--set", "width_px=160", "--set", "height_px=120", "--set", "texture_px_per_m=8"]

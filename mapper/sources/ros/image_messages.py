@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mapper.core.errors import FrameError
 from mapper.core.frames import DepthImage, Image
-from mapper.sources.images import decode_colour, decode_depth_units, decode_grey, depth_m_from
+from mapper.sources.image_files.reading import decode_colour, decode_depth_units, decode_grey, depth_m_from
 from mapper.sources.ros.messages import FileMessage, ImageMessage, PixelsMessage
 
 MILLIMETRES_PER_M = 1000.0

@@ -7,7 +7,7 @@ from pathlib import Path
 from mapper.core.errors import FrameError, SourceError
 from mapper.core.frames import RgbdFrame, Scan
 from mapper.sources.base import FrameRef, ImageFiles, Log, Skipped
-from mapper.sources.images import image_bytes, read_colour, read_depth_m
+from mapper.sources.image_files.reading import image_bytes, read_colour, read_depth_m
 from mapper.sources.ros.encode_ros import (
     SerializedMessage,
     camera_info_message,
