@@ -115,11 +115,9 @@ class OverlapConfig(Config):
     obstacles: PositiveInt = 1000
     """Number of obstacle voxels, and of ground columns, that are compared, evenly chosen."""
     step_m: PositiveFloat = 0.4
-    """First step in which the overlap is maximised from each peak, along each axis."""
+    """First step in which the overlap is maximised from each peak, along each axis; it is halved twice."""
     step_rad: PositiveFloat = 0.0175
-    """First step of the heading."""
-    halvings: NonNegativeInt = 2
-    """Number of times that both steps are halved."""
+    """First step of the heading, likewise."""
     candidates: PositiveInt = 6
     """Number of peaks, those with most overlap, that get the free-space check."""
     distinct_m: PositiveFloat = 1.0
