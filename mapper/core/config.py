@@ -59,6 +59,19 @@ def _elements(text: str) -> Any:
         return text
 
 
+def members_of(annotation: Any) -> list[type[Config]]:
+    """Return the classes of settings that a field may hold, whatever union its annotation is."""
+    if isinstance(annotation, type) and issubclass(annotation, Config):
+        return [annotation]
+    return [member for inner in get_args(annotation) for member in members_of(inner)]
+
+
+def kind_of(member: type[Config]) -> str:
+    """Return the ``kind`` by which a member of a union is chosen; empty without one."""
+    field = member.model_fields.get("kind")
+    return "" if field is None else str(field.default)
+
+
 def flattened(tree: Mapping[str, Any], before: str = "") -> dict[str, Any]:
     """Return nested settings by dotted name."""
     flat: dict[str, Any] = {}

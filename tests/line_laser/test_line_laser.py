@@ -25,6 +25,7 @@ from mapper.line_laser.mapping import map_scans
 from mapper.line_laser.ranging import line_scan, local_grid, scan_image
 from mapper.line_laser.survey import drive, scan_images, sensor_poses
 from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN
+from tests.support.grids import state_at
 
 CONFIG = LineLaserConfig()
 GREY = np.full((360, 640, 3), 90, np.uint8)
@@ -243,11 +244,6 @@ def test_the_local_grid_has_the_vehicle_at_the_middle_of_row_zero():
     )
     assert D.shape == (190, 240)
     assert np.argwhere(D).tolist() == [[50, 120 + 10], [100, 120 - 100]]
-
-
-def state_at(grid, x, y):
-    column, row = np.floor((np.array([x, y]) - grid.origin_world_m) / grid.resolution_m).astype(int)
-    return grid.cells[row, column]
 
 
 WALL = [(1.01, y) for y in np.linspace(0.4, -0.4, 81)]
