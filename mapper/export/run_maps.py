@@ -96,8 +96,8 @@ def read_snapshots(path: Path) -> Iterator[Snapshot]:
             continue
         message = decode(topic, data)
         if isinstance(message, list):
-            T_told = FrameTree(message).find(BODY, CAMERA)
-            T_body_camera = T_body_camera if T_told is None else T_told
+            T_found = FrameTree(message).find(BODY, CAMERA)
+            T_body_camera = T_body_camera if T_found is None else T_found
         elif isinstance(message, CameraMessage):
             camera = _camera(message)
         elif isinstance(message, FileMessage):
