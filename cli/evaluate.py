@@ -127,6 +127,7 @@ def evaluate(
     mapper eval runs/flat --map logs/flat --sharpness
     """
     from mapper.evaluators.metrics.inputs import estimate_and_truth
+    from mapper.evaluators.metrics.loops import loop_metrics_of_run
     from mapper.run.manifest import is_merged_map
 
     is_merged = is_merged_map(estimate)
@@ -159,7 +160,7 @@ def evaluate(
     )
     metrics = list(found.metrics)
     if run is not None and known is not None:
-        metrics += _loops_of(run, known)
+        metrics += loop_metrics_of_run(run, known)
     moved_log = _log_of(_needed(run, estimate, "--sharpness"), log) if sharpness else None
     if map_ is None:
         quality = None
@@ -299,15 +300,6 @@ def _numbers(text: str) -> list[float]:
         return [float(word) for word in text.split(",")]
     except ValueError:
         raise DataError(f"--lengths {text}: want metres with commas between, as in 1,2,5") from None
-
-
-def _loops_of(run: "Run", truth: "Trajectory") -> "list[Metric]":
-    from mapper.evaluators.metrics.loops import loop_metrics
-
-    loops = run.config.loops
-    looked_every_m = loops.min_motion_m if loops.kind == "scans" else 0.0
-    keyframes_ns = run.keyframes.stamps_ns
-    return loop_metrics(run.loops, keyframes_ns, truth, looked_every_m=looked_every_m)
 
 
 def _every_metric(metrics: "list[Metric]", found: "Assessment") -> "list[Metric]":
