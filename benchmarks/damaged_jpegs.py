@@ -22,8 +22,8 @@ from mapper.core.errors import DataError
 from mapper.core.frames import Image
 from mapper.simulation.config import SynthConfig
 from mapper.simulation.source import CameraSimulator
-from mapper.sources.images import read_colour
-from mapper.sources.jpeg_entropy import check_entropy
+from mapper.sources.image_files.jpeg_entropy import check_entropy
+from mapper.sources.image_files.reading import read_colour
 
 _IMAGES = 12
 _ENCODINGS = {

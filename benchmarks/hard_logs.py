@@ -16,8 +16,8 @@ class HardLog:
     """One log.
 
     Attributes:
-        why: What is hard about it.
-        arguments: What ``mapper synth`` is given besides the folder and the seed.
+        why: Difficulty of the log.
+        arguments: Arguments of ``mapper synth`` besides the folder and the seed.
     """
 
     why: str

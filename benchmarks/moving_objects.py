@@ -68,7 +68,7 @@ class Labelled:
     """A log whose points are labelled.
 
     Attributes:
-        name: What it is called.
+        name: Name.
         octree: Its octree's settings.
         scans: (N, 3) float32 points of each scan, body frame.
         T_world_body: (S, 4, 4) poses with errors.

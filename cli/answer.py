@@ -15,6 +15,7 @@ from typing import Annotated, Any
 import typer
 
 from mapper.cli.console import progress_for
+from mapper.cli.option_rules import refuse_several
 from mapper.cli.terminal import print_text
 from mapper.core.errors import MapperError
 from mapper.runtime.atomic import MANIFEST_NAME
@@ -56,9 +57,9 @@ class Answer:
     """Answer of a verb: what it made or found.
 
     Attributes:
-        document: For ``--json``; keys are stable and end in the unit: ``total_s``, ``path_length_m``.
+        document: Document of ``--json``; keys are stable and end in the unit: ``total_s``, ``path_length_m``.
         text: Lines for people.
-        details: What ``--verbose`` prints instead; empty if that is the text.
+        details: Text of ``--verbose``; empty if that is ``text``.
         error: Raised after printing: the answer is whole, but the exit status is 1.
     """
 
@@ -86,8 +87,7 @@ def verb(function: Callable[..., Answer]) -> Callable[..., None]:
 
     @functools.wraps(function)
     def command(*, json: bool, verbose: bool, quiet: bool, **given: Any) -> None:
-        if verbose and quiet:
-            raise MapperError("--verbose and --quiet: choose one")
+        refuse_several({"--verbose": verbose, "--quiet": quiet})
         output = Output(json=json, quiet=quiet, verbose=verbose)
         answer = function(**given, output=output)
         _show(answer, output)

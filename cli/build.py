@@ -12,6 +12,7 @@ import typer
 from mapper.cli.answer import Answer, Output
 from mapper.cli.completion import run_folders
 from mapper.cli.environment import has_compiled_code
+from mapper.cli.option_rules import refuse_with, refuse_without
 from mapper.cli.options import (
     ConfigFile,
     First,
@@ -23,7 +24,7 @@ from mapper.cli.options import (
     selection,
 )
 from mapper.cli.stepping import Stepping
-from mapper.core.errors import ConfigError, UntrustedError, ViewerError
+from mapper.core.errors import UntrustedError, ViewerError
 from mapper.runtime.result_paths import RUNS, name_of, place_of
 
 if TYPE_CHECKING:
@@ -104,7 +105,9 @@ def build(
             make_observer=make_observer,
         )
     else:
-        _refuse_both(config, onto, rerun)
+        refuse_with("--onto", {"--config": config}, remedy="give single settings by --set")
+        refuse_with("--onto", {"--rerun": rerun}, remedy="look at the new run with mapper view")
+        refuse_with("--onto", {"--fresh": fresh})
         run, metrics = appended(log, onto, overrides, out, overwrite=overwrite, output=output)
     from mapper.cli.summary import summary_of  # a build begins without what its end needs
 
@@ -167,8 +170,7 @@ def _preview(source: "Log", out: Path, progress: "Progress") -> "Observer":
 def _observer_factory(rerun: str | None, *, step: bool, overwrite: bool) -> "ObserverFactory | None":
     """Return the observer of a build, refusing at once what would fail at its end."""
     if rerun is None:
-        if step:
-            raise ConfigError("--step: there is nothing to see without --rerun")
+        refuse_without("--rerun", {"--step": step})
         return None
     from mapper.export.rerun.target import check_target
     from mapper.runtime.atomic import refuse_existing
@@ -211,12 +213,3 @@ def appended(
     preview = _preview(source, out, progress)
     run = append(source, first, config, out, progress=progress, observer=preview, overwrite=overwrite)
     return run, evaluate(run.trajectory, run.truth).metrics
-
-
-def _refuse_both(config: Path | None, onto: Path, rerun: str | None) -> None:
-    if rerun is not None:
-        raise ConfigError(f"--rerun {rerun}: not with --onto; look at the new run with mapper view")
-    if config is not None:
-        raise ConfigError(
-            f"--config {config}: with --onto the settings of {onto} hold; turn single ones by --set"
-        )

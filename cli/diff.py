@@ -32,12 +32,12 @@ def diff(
         typer.Option(metavar="FOLDER", help="Folder to create.  [default: diffs/RUN_A+RUN_B]"),
     ] = None,
     place: Annotated[
-        Place,
+        Place | None,
         typer.Option(
             help="built: both runs have one world, as sessions of a chain have. "
-            "truth: the runs' truths share a frame. auto: by places that both have seen."
+            "truth: the runs' truths share a frame. auto: by places that both have seen.  [default: auto]"
         ),
-    ] = Place.AUTO,
+    ] = None,
     poses: PosesFile = None,
     tolerance_m: Annotated[
         float | None,
@@ -62,7 +62,15 @@ def diff(
     earlier, later = open_run(before), open_run(after)
     progress = output.progress()
     out = place_of(out, DIFFS / joined_names([before, after]), overwrite=overwrite)
-    placing = placing_of([earlier, later], place, poses, jointly=False, workers=IN_PROCESS, progress=progress)
+    placing = placing_of(
+        [earlier, later],
+        place,
+        poses,
+        default=Place.AUTO,
+        jointly=False,
+        workers=IN_PROCESS,
+        progress=progress,
+    )
     found = differences_of(*placing.placed, tolerance_m=tolerance_m, min_voxels=min_voxels)
     placed = placing.placed[-1].how
     write_differences(out, found, earlier, later, placed=placed, overwrite=overwrite)

@@ -8,6 +8,7 @@ import typer
 
 from mapper.cli.answer import Answer, Output
 from mapper.cli.completion import run_folders
+from mapper.cli.option_rules import refuse_with
 from mapper.core.errors import ConfigError, MapperError
 from mapper.runtime.progress import SILENT
 
@@ -54,11 +55,15 @@ def doctor(
 
     Example: mapper doctor --json, or: mapper doctor runs/xyz, or after pip install: mapper doctor --warm
     """
+    if warm:
+        refuse_with(
+            "--warm", {"RUN": run, "--accept": accept}, remedy="it compiles the kernels of all builds"
+        )
     if accept:
         _accept(run, accept)
     progress = output.progress() if warm or sys.stderr.isatty() else SILENT
     if warm:
-        findings = _warmed(run, progress)
+        findings = _warmed(progress)
     elif run is None:
         from mapper.doctor.examination import examine
 
@@ -74,12 +79,10 @@ def doctor(
     return Answer({"findings": findings}, _table(findings), error=error)
 
 
-def _warmed(run: Path | None, progress: "Progress") -> "list[Finding]":
+def _warmed(progress: "Progress") -> "list[Finding]":
     from mapper.doctor.machine import check_kernels
     from mapper.pipeline.warm_up import compile_kernels
 
-    if run is not None:
-        raise ConfigError(f"--warm: compiles kernels for all builds, so it takes no run; got {run}")
     compile_kernels(progress=progress)
     return [check_kernels()]
 

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from mapper.cli.answer import Answer, Output
+from mapper.cli.option_rules import refuse_several, refuse_without
 from mapper.cli.options import MovedLogs, RunFolder
 from mapper.core.errors import ConfigError
 
@@ -58,16 +59,12 @@ def edit(
     from mapper.pipeline.edit_map import add_region, undo_region
     from mapper.run.folder import moved_log, open_run
 
-    kinds: list[EditKind] = []
-    if erase:
-        kinds.append("erase")
-    if keep:
-        kinds.append("keep")
-    if keepout:
-        kinds.append("keepout")
+    given: dict[EditKind, bool] = {"erase": erase, "keep": keep, "keepout": keepout}
+    kinds = [kind for kind, is_given in given.items() if is_given]
     region = _region(box, height, radius, polygon)
-    if len(kinds) + undo > 1:
-        raise ConfigError("--erase, --keep, --keepout and --undo: want one at a time")
+    refuse_several({"--erase": erase, "--keep": keep, "--keepout": keepout, "--undo": undo})
+    if not (kinds or undo):
+        refuse_without("--erase, --keep, --keepout or --undo", {"--log": log})
     if kinds and region is None:
         raise ConfigError(f"--{kinds[0]}: want a region: --box, --height, --radius or --polygon")
     if region is not None and not kinds:

@@ -1,6 +1,5 @@
 """``mapper eval``: errors of a trajectory, and the quality of a map."""
 
-from collections.abc import Mapping
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -9,6 +8,7 @@ import typer
 
 from mapper.cli.answer import Answer, Output
 from mapper.cli.completion import run_folders
+from mapper.cli.option_rules import refuse_with, refuse_without
 from mapper.core.errors import DataError
 
 if TYPE_CHECKING:
@@ -96,14 +96,14 @@ def evaluate(
         bool, typer.Option("--register", help="Register REFERENCE to the run's cloud before it is compared.")
     ] = False,
     tolerance: Annotated[
-        int,
+        int | None,
         typer.Option(
             metavar="VOXELS",
             min=0,
             max=10,
-            help="Largest distance between matching surfaces of the two maps.",
+            help="Largest distance between matching surfaces of the two maps.  [default: 1]",
         ),
-    ] = _TOLERANCE,
+    ] = None,
     sharpness: Annotated[
         bool, typer.Option("--sharpness", help="Measure how thick walls are where the log's scans overlap.")
     ] = False,
@@ -127,23 +127,28 @@ def evaluate(
     mapper eval runs/flat --map logs/flat --sharpness
     """
     from mapper.evaluators.metrics.inputs import estimate_and_truth
+    from mapper.evaluators.metrics.loops import loop_metrics_of_run
     from mapper.run.manifest import is_merged_map
 
-    if is_merged_map(estimate):
-        _refuse_for_merged_map(
-            estimate,
-            {
-                "--truth": truth,
-                "--times": times,
-                "--log": log,
-                "--lengths": lengths,
-                "--map-world": map_world,
-                "--register": register,
-                "--sharpness": sharpness,
-                "--plot": plot,
-            },
-        )
-        return _of_merged_map(estimate, align, map_, tolerance, format_)
+    is_merged = is_merged_map(estimate)
+    if is_merged:
+        only_of_runs = {
+            "--truth": truth,
+            "--times": times,
+            "--log": log,
+            "--lengths": lengths,
+            "--map-world": map_world,
+            "--register": register,
+            "--sharpness": sharpness,
+            "--plot": plot,
+        }
+        refuse_with(f"{estimate}, a merged map", only_of_runs, remedy="evaluate its runs one by one")
+    if map_ is None:
+        of_map = {"--map-world": map_world, "--register": register, "--tolerance": tolerance}
+        refuse_without("--map", of_map)
+    voxels = _TOLERANCE if tolerance is None else tolerance
+    if is_merged:
+        return _of_merged_map(estimate, align, map_, voxels, format_)
     run, trajectory, known = estimate_and_truth(estimate, truth, times)
     found = _path_errors(
         trajectory,
@@ -155,14 +160,13 @@ def evaluate(
     )
     metrics = list(found.metrics)
     if run is not None and known is not None:
-        metrics += _loops_of(run, known)
+        metrics += loop_metrics_of_run(run, known)
     moved_log = _log_of(_needed(run, estimate, "--sharpness"), log) if sharpness else None
     if map_ is None:
-        _refuse_without_map(map_world, register=register, tolerance=tolerance)
         quality = None
     else:
         built = _needed(run, estimate, "--map")
-        quality = _map_quality(built, map_, world=map_world, register=register, tolerance=tolerance)
+        quality = _map_quality(built, map_, world=map_world, register=register, voxels=voxels)
         metrics += quality.metrics
     if moved_log is not None:
         path = run.tracked_trajectory if run else trajectory
@@ -230,20 +234,8 @@ def _plot(
         write_map_errors(folder, quality.check, title=f"{name} against {map_.resolve().name}")
 
 
-def _refuse_for_merged_map(folder: Path, options: Mapping[str, object]) -> None:
-    for option in (name for name, value in options.items() if value):
-        raise DataError(f"{folder}: is a merged map; {option} is for a run: evaluate the runs one by one")
-
-
-def _refuse_without_map(world: World | None, *, register: bool, tolerance: int) -> None:
-    if world or register or tolerance != _TOLERANCE:
-        raise DataError(
-            "--map-world, --register and --tolerance are for the comparison with --map, which is missing"
-        )
-
-
 def _of_merged_map(
-    folder: Path, align: Align, reference: Path | None, tolerance: int, format_: Format
+    folder: Path, align: Align, reference: Path | None, voxels: int, format_: Format
 ) -> Answer:
     from mapper.cli.report import distinct_names
     from mapper.evaluators.metrics.evaluate import Assessment
@@ -256,7 +248,7 @@ def _of_merged_map(
     metrics, notes = merged_map_metrics(merged, names, alignment=align.value)
     if reference is not None:
         found = read_reference(reference, voxel_m=merged.config.octree.resolution_m)
-        metrics += merged_map_quality(merged, found, voxels=tolerance)
+        metrics += merged_map_quality(merged, found, voxels=voxels)
     text = _text(metrics, Assessment(tuple(metrics)), format_)
     if notes and format_ in (Format.TEXT, Format.MARKDOWN):
         text = "\n".join([text, "", *notes])
@@ -269,16 +261,12 @@ def _needed(run: "Run | None", path: Path, option: str) -> "Run":
     return run
 
 
-def _map_quality(
-    run: "Run", path: Path, *, world: World | None, register: bool, tolerance: int
-) -> "MapQuality":
+def _map_quality(run: "Run", path: Path, *, world: World | None, register: bool, voxels: int) -> "MapQuality":
     from mapper.evaluators.metrics.map_quality import map_quality
     from mapper.evaluators.metrics.map_reference import read_reference
 
     reference = read_reference(path, voxel_m=run.config.octree.resolution_m)
-    return map_quality(
-        run, reference, world=world.value if world else None, voxels=tolerance, register=register
-    )
+    return map_quality(run, reference, world=world.value if world else None, voxels=voxels, register=register)
 
 
 def _log_of(run: "Run", log: Path | None) -> "Log":
@@ -312,15 +300,6 @@ def _numbers(text: str) -> list[float]:
         return [float(word) for word in text.split(",")]
     except ValueError:
         raise DataError(f"--lengths {text}: want metres with commas between, as in 1,2,5") from None
-
-
-def _loops_of(run: "Run", truth: "Trajectory") -> "list[Metric]":
-    from mapper.evaluators.metrics.loops import loop_metrics
-
-    loops = run.config.loops
-    looked_every_m = loops.min_motion_m if loops.kind == "scans" else 0.0
-    keyframes_ns = run.keyframes.stamps_ns
-    return loop_metrics(run.loops, keyframes_ns, truth, looked_every_m=looked_every_m)
 
 
 def _every_metric(metrics: "list[Metric]", found: "Assessment") -> "list[Metric]":

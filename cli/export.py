@@ -7,6 +7,7 @@ import typer
 
 from mapper.cli.answer import Answer, Output, made
 from mapper.cli.completion import export_kinds
+from mapper.cli.option_rules import refuse_with
 from mapper.cli.options import MovedLogs, Overrides, RunFolder, assignments, merged
 from mapper.export.exporters import EXPORTERS
 
@@ -40,19 +41,13 @@ def export(
     """
     from mapper.config.loading import overridden
     from mapper.export.exporters import export as export_run
+    from mapper.merging.map_folders import open_map_folder
     from mapper.run.folder import moved_log, open_run
-    from mapper.run.manifest import is_merged_map
     from mapper.run.map_folder import MapFolder
 
-    built: MapFolder
-    if is_merged_map(run):
-        from mapper.merging.merged_map import open_map
-
-        built = open_map(run)
-    else:
-        built = open_run(run)
-    if log:
-        built = moved_log(open_run(run), *log)
+    if as_ != "octomap":
+        refuse_with(f"--as {as_}", {"--level": level})
+    built: MapFolder = moved_log(open_run(run), *log) if log else open_map_folder(run)
     changes = merged(assignments({"octomap.level": level}), set_)
     config = overridden(built.config, changes) if changes else None
     progress = output.progress()

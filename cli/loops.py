@@ -8,6 +8,7 @@ import typer
 
 from mapper.cli.answer import Answer, Output
 from mapper.cli.groups import Verb
+from mapper.cli.option_rules import refuse_without
 from mapper.cli.options import MovedLogs, RunFolder
 from mapper.core.errors import ConfigError
 
@@ -48,6 +49,8 @@ def loops(
     """
     from mapper.run.folder import moved_log, open_run
 
+    if not (add or remove):
+        refuse_without("--add or --remove", {"--log": log})
     built, solved = open_run(run), None
     if add or remove:
         from mapper.cli.summary import summary_of

@@ -30,13 +30,14 @@ def merge(
         typer.Option(metavar="MAP", help="Folder to create.  [default: maps/RUN+RUN…, or the map itself]"),
     ] = None,
     place: Annotated[
-        Place,
+        Place | None,
         typer.Option(
             help="built: every run's world is the map's already. "
             "truth: the runs' truths share a frame. auto: by places that the runs share, in one pose graph; "
-            "those that share none are left out. By truth and auto the first run's world is the map's."
+            "those that share none are left out. By truth and auto the first run's world is the map's.  "
+            "[default: built; auto for a map that was placed so]"
         ),
-    ] = Place.BUILT,
+    ] = None,
     poses: PosesFile = None,
     tile_m: Annotated[
         float, typer.Option(help="Approximate edge of a tile; a power of two in voxels.")
@@ -70,14 +71,17 @@ def merge(
     workers = workers_for(processes, scheduler, default=1)
     progress = output.progress()
     known = open_map(runs[0]) if is_merged_map(runs[0]) else None
+    default = Place.BUILT
     if known is None:
         built, out = [open_run(run) for run in runs], out or MAPS / joined_names(runs)
     else:
         built, out = [*runs_of(known), *(open_run(run) for run in runs[1:])], out or known.path
         overwrite |= out.resolve() == known.path.resolve()
-        if place is Place.BUILT and poses is None and known.graph is not None:
-            place = Place.AUTO
-    placing = placing_of(built, place, poses, jointly=True, known=known, workers=workers, progress=progress)
+        if known.graph is not None:
+            default = Place.AUTO
+    placing = placing_of(
+        built, place, poses, default=default, jointly=True, known=known, workers=workers, progress=progress
+    )
     merged = merge_runs(
         placing,
         out,

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from mapper.cli.completion import assignments_to, run_folders, setting_keys
+from mapper.cli.option_rules import refuse_with
 from mapper.core.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -94,7 +95,7 @@ def workers_for(processes: int | None, scheduler: str | None, *, default: int) -
     if processes is None:
         return Workers(default, scheduler)
     if scheduler is not None:
-        raise ConfigError(f"--processes {processes}: has no meaning with --scheduler; leave it out")
+        refuse_with("--scheduler", {"--processes": processes})
     if processes < 1:
         raise ConfigError(f"--processes {processes}: want at least 1")
     return Workers(processes)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, assert_never
 
 import typer
 
-from mapper.core.errors import ConfigError
+from mapper.cli.option_rules import refuse_several
 
 if TYPE_CHECKING:
     from mapper.merging.merged_map import MergedMap
@@ -35,9 +35,10 @@ PosesFile = Annotated[
 
 def placing_of(
     runs: "Sequence[Run]",
-    place: Place,
+    place: Place | None,
     poses: Path | None,
     *,
+    default: Place,
     jointly: bool,
     known: "MergedMap | None" = None,
     workers: "Workers",
@@ -46,26 +47,26 @@ def placing_of(
     """Return the runs with the poses of their worlds.
 
     Args:
-        runs: To be placed.
+        runs: Runs to be placed.
         place: Source of the poses.
-        poses: File of them.
+        poses: File of the poses.
+        default: Source if neither is given.
         jointly: Whether shared places bend the runs, or place each as a rigid body.
         known: A map of the first of them, to which the others are added.
-        workers: Where places are compared.
+        workers: Workers that compare places.
         progress: Receives stages and notes.
 
     Raises:
-        ConfigError: Two sources of the poses are given.
+        ConfigError: Both are given.
         MapperError: A pose is missing; see :mod:`mapper.merging.placing` and
             :mod:`mapper.pipeline.place_runs`.
     """
     from mapper.merging.placing import Placing, as_built, by_poses, by_truth
 
+    refuse_several({"--place": place, "--poses": poses})
     if poses is not None:
-        if place is not Place.BUILT:
-            raise ConfigError(f"--place {place} and --poses {poses}: both say where the runs lie; give one")
         return Placing(by_poses(runs, poses))
-    match place:
+    match place or default:
         case Place.BUILT:
             return Placing(as_built(runs))
         case Place.TRUTH:
@@ -77,5 +78,5 @@ def placing_of(
                 return place_by_shared_places(runs, workers=workers, progress=progress)
             known = known if known is not None and known.graph is not None else None
             return place_jointly(runs, known=known, workers=workers, progress=progress)
-        case _:
-            assert_never(place)
+        case unreachable:
+            assert_never(unreachable)

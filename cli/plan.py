@@ -11,18 +11,12 @@ import typer
 from mapper.cli.answer import Answer, Output
 from mapper.cli.completion import run_folders
 from mapper.cli.groups import Verb
+from mapper.cli.option_rules import refuse_with
 from mapper.cli.options import assignments
 from mapper.core.errors import ConfigError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from mapper.core.geometry import Array, Points
-    from mapper.merging.merged_map import MergedMap
-    from mapper.run.folder import Run
+    from mapper.core.geometry import Array
 
 _POINT_OPTIONS = ("--from", "--to")
 
@@ -84,31 +78,30 @@ def plan(
     """
     from mapper.config.loading import overridden
     from mapper.export.plan import draw_plan, plan_json, write_plan
-    from mapper.export.run_maps import storeys_of_run
-    from mapper.merging.floors import storeys_of_map
-    from mapper.merging.merged_map import open_map
+    from mapper.merging.floors import keep_out_of, storeys_of
+    from mapper.merging.map_folders import open_map_folder
     from mapper.navigation.config import PlanConfig
     from mapper.navigation.planner import plan_2d, plan_3d
     from mapper.navigation.storey_planner import plan_storeys
     from mapper.octree.grid import with_obstacles
     from mapper.octree.reading import read_octree
     from mapper.run import files
-    from mapper.run.folder import Run, open_run
-    from mapper.run.manifest import is_merged_map
+    from mapper.run.folder import Run
 
+    if in_3d:
+        refuse_with("--3d", {"--layer": layer})
     has_storeys = not in_3d and layer == Layer.TRAVERSABLE and (run / f"{files.storey(0)}.yaml").exists()
     counts = (3,) if in_3d else (2, 3) if has_storeys else (2,)
     start, goal = (_point(text, name, counts) for text, name in zip((from_, to), _POINT_OPTIONS, strict=True))
     config = overridden(PlanConfig(), assignments({"radius_m": radius, "unknown": unknown, "layer": layer}))
-    built = open_map(run) if is_merged_map(run) else open_run(run)
+    built = open_map_folder(run)
     on_floor = config.layer == "traversable"
     grid = built.traversable if on_floor else with_obstacles(built.slice, built.keepout)
     if in_3d:
         octree = read_octree(built.file(files.OCTREE_OT))
-        found = plan_3d(octree, start, goal, config=config, keep_out=_keep_out(built))
+        found = plan_3d(octree, start, goal, config=config, keep_out=keep_out_of(built))
     elif has_storeys:
-        storeys = storeys_of_run(built) if isinstance(built, Run) else storeys_of_map(built)
-        found = plan_storeys(storeys, start, goal, config=config)
+        found = plan_storeys(storeys_of(built), start, goal, config=config)
     else:
         found = plan_2d(grid, start, goal, config=config)
     if isinstance(built, Run):
@@ -120,20 +113,6 @@ def plan(
         {"picture": run / files.PLAN_VIEW, **json.loads(plan_json(found))},
         "\n".join([found.summary, *points, str(run / files.PLAN_VIEW)]),
     )
-
-
-def _keep_out(built: "Run | MergedMap") -> "Callable[[Points], NDArray[np.bool_]] | None":
-    """Return the function that marks points in keep-out regions; None if there are no regions."""
-    import numpy as np
-
-    from mapper.export.run_maps import editor_of
-    from mapper.merging.floors import editors_of_map
-    from mapper.run.folder import Run
-
-    editors = [editor_of(built)] if isinstance(built, Run) else editors_of_map(built)
-    if not any(editor.edits.keepout for editor in editors):
-        return None
-    return lambda points: np.any([editor.keep_out(points) for editor in editors], axis=0)
 
 
 def _point(text: str, name: str, counts: tuple[int, ...]) -> "Array":

@@ -55,7 +55,7 @@ def register(
     Example: mapper register scan_10.bin scan_00.bin --method hough-gicp --out registered
     """
     from mapper.api.logs import read_frame
-    from mapper.config.loading import overridden
+    from mapper.config.loading import load_source_config, overridden
     from mapper.config.register import check_method, register_config
     from mapper.evaluators.register.files import (
         FOLDER,
@@ -74,11 +74,10 @@ def register(
     check_method(method, guess=guess)
     T_target_source = parse_guess(guess)
     overrides = set_ or []
-    opening = overridden(register_config(method, "lidar"), [o for o in overrides if o.startswith("source.")])
-    target_frame, target_sensor = read_frame(target, opening.source)
-    source_frame, source_sensor = read_frame(source, opening.source)
-    seen_by: Sensor = "rgbd" if "rgbd" in (target_sensor, source_sensor) else "lidar"
-    config = overridden(register_config(method, seen_by), overrides)
+    opening = load_source_config(None, overrides)
+    target_frame, target_sensor = read_frame(target, opening)
+    source_frame, source_sensor = read_frame(source, opening)
+    config = overridden(register_config(method, target_sensor, source_sensor), overrides)
     registered = register_frames(target_frame, source_frame, config.registration, T_target_source)
     text = registration_text(registered)
     if out is not None:

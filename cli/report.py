@@ -67,7 +67,7 @@ def _figures(run: "Run") -> "list[Figure]":
     import numpy as np
 
     from mapper.evaluators.metrics.evaluate import assess
-    from mapper.evaluators.metrics.loops import loop_metrics
+    from mapper.evaluators.metrics.loops import loop_metrics_of_run
     from mapper.evaluators.metrics.metric import shown
     from mapper.export.path_band import SIGMAS
     from mapper.export.report.data import Figure
@@ -76,7 +76,7 @@ def _figures(run: "Run") -> "list[Figure]":
     frames_ns = run.frames_ns
     metrics = list(assess(run.trajectory, truth, frames_ns=frames_ns).metrics)
     if truth is not None:
-        metrics += loop_metrics(run.loops, run.keyframes.stamps_ns, truth)
+        metrics += loop_metrics_of_run(run, truth)
     right: list[tuple[str, str]] = [("verdict", run.verdict.state)]
     if poses is not None and np.isfinite(poses.position_sigmas_m).any():
         widest_m = SIGMAS * float(np.nanmax(poses.position_sigmas_m))

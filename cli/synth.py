@@ -1,6 +1,6 @@
 """``mapper synth``: a synthetic log with exact truth."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, TypeVar
@@ -8,6 +8,7 @@ from typing import Annotated, TypeVar
 import typer
 
 from mapper.cli.answer import Answer, Output
+from mapper.cli.option_rules import refuse_with
 from mapper.cli.options import assignments, merged
 from mapper.core.errors import ConfigError
 from mapper.runtime.result_paths import LOGS, place_of
@@ -116,16 +117,16 @@ def synth(
         "--plane-at": plane_at,
         "--scene": scene,
         "--rings": rings,
-        "--wheels": wheels or None,
-        "--moving": moving or None,
-        "--uncalibrated": uncalibrated or None,
+        "--wheels": wheels,
+        "--moving": moving,
+        "--uncalibrated": uncalibrated,
     }
-    _refuse(options, _NOT_OF[sensor], f"--sensor {sensor}")
+    refuse_with(f"--sensor {sensor}", {name: options[name] for name in _NOT_OF[sensor]})
     given: dict[str, object] = {"duration_s": seconds, "seed": seed}
     if sensor is SensorKind.LINE_LASER:
         return _line_laser(place_of(out, LOGS / sensor), assignments(given), noise, set_, output)
     if plane_at is not None:
-        _refuse(options, ("--path", "--scene"), "--plane-at")
+        refuse_with("--plane-at", {"--path": path, "--scene": scene})
     if sensor is SensorKind.RGBD:
         name, kind, write = scene or SceneName.FLAT, "TUM", _write_camera_log
         given |= {"path": path, "rooms": rooms} | _at_wall(plane_at) | _camera_noise(noise)
@@ -146,7 +147,7 @@ def _write_camera_log(
 
     start = _scene(CAMERA_SCENES, name, SensorKind.RGBD)
     if start.scene != "flat":
-        _refuse(options, ("--rooms",), f"--scene {name}")
+        refuse_with(f"--scene {name}", {"--rooms": options["--rooms"]})
     changed: dict[str, object] = dict(MOVING_INDOORS) if options["--moving"] else {}
     if options["--wheels"]:
         changed["wheels"] = SynthWheelsConfig()
@@ -202,13 +203,6 @@ def _scene(known: Mapping[str, Settings], name: SceneName, sensor: SensorKind) -
             f"--scene {name}: has no meaning with --sensor {sensor}; want one of {', '.join(known)}"
         )
     return known[name]
-
-
-def _refuse(options: Mapping[str, object], names: Iterable[str], beside: str) -> None:
-    """Refuse the first of some options that is given beside another with which it has no meaning."""
-    for name in names:
-        if options[name] is not None:
-            raise ConfigError(f"{name} {options[name]}: has no meaning with {beside}; leave it out")
 
 
 def _at_wall(distance_m: float | None) -> dict[str, object]:

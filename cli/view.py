@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from mapper.cli.answer import Answer, Output, made
+from mapper.cli.option_rules import refuse_several, refuse_without
 from mapper.cli.options import RunFolders
 from mapper.cli.report import distinct_names
 from mapper.core.errors import ConfigError
@@ -62,13 +63,11 @@ def view(
     from mapper.run.files import RERUN
     from mapper.run.folder import open_run
 
-    if (rrd is not None) + spawn + (connect is not None) + html > 1:
-        raise ConfigError("--rrd, --spawn, --connect and --html: choose one")
+    refuse_several({"--rrd": rrd, "--spawn": spawn, "--connect": connect, "--html": html})
     if html:
         page = write_page(runs, out or Path(f"{runs[0].resolve().name}.html"), overwrite=overwrite)
         return made(page)
-    if out is not None:
-        raise ConfigError(f"--out {out}: needs --html")
+    refuse_without("--html", {"--out": out})
     if len(runs) > 1:
         raise ConfigError(f"{len(runs)} runs: Rerun shows one; --html shows several")
     (run,) = runs

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from mapper.cli.answer import Answer, Output
+from mapper.cli.option_rules import refuse_with
 from mapper.cli.options import AS_RECORDED, First, Last, Overrides, Stride, merged, selection
 from mapper.core.errors import ConfigError
 
@@ -92,12 +93,13 @@ def depth(
 
 
 def _distances(
-    logs: Sequence[Path], plane_at: Sequence[float] | None, *, fit_plane: bool, keep_tilt: bool
+    logs: Sequence[Path], plane_at: list[float] | None, *, fit_plane: bool, keep_tilt: bool
 ) -> Sequence[float] | None:
     """Return the distance of each log's plane, or None where planes are to be fitted."""
     if fit_plane:
-        if plane_at or keep_tilt:
-            raise ConfigError("--fit-plane: finds the distances itself; leave --plane-at and --keep-tilt out")
+        refuse_with(
+            "--fit-plane, which finds distance and tilt", {"--plane-at": plane_at, "--keep-tilt": keep_tilt}
+        )
         return None
     if not plane_at:
         raise ConfigError(

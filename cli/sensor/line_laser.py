@@ -201,7 +201,7 @@ def _draw(
 ) -> None:
     """Draw the detections in the first image, in the last, and between."""
     from mapper.evaluators.pictures.line_laser import write_detections
-    from mapper.sources.images import read_colour
+    from mapper.sources.image_files.reading import read_colour
 
     for place in sorted({k * (len(paths) - 1) // (_SHOWN - 1) for k in range(_SHOWN)}):
         path = paths[place]

@@ -38,8 +38,8 @@ class Comparison:
     Attributes:
         path: Path of the log.
         log: Its name.
-        sensor: What took it.
-        config: How the methods were compared.
+        sensor: Sensor that took it.
+        config: Settings of the comparison.
         truth: True poses of the body while the log was taken, if it has them.
         runs: Each method over the whole log.
         step: Step of the runs' relative errors.
@@ -47,7 +47,7 @@ class Comparison:
         read_ms: CPU time of reading a frame, for all methods alike and not counted as theirs.
         scan_ms: CPU time of making its scan, likewise.
         skipped: Frames that could not be read.
-        notes: What had to be left out, a sentence each.
+        notes: Sentences on what was left out.
     """
 
     path: Path
@@ -151,7 +151,7 @@ class MethodJob:
 
     Attributes:
         source: The log.
-        config: How methods are compared.
+        config: Settings of the comparison.
         method: Its name.
         progress: Receives stages, counts and notes.
     """

@@ -41,14 +41,14 @@ class FrameReader:
 
     Attributes:
         read_s: Seconds of the CPU for reading and decoding.
-        scan_s: The same for making scans of depth images.
+        scan_s: Seconds of the CPU for making scans of depth images.
     """
 
     def __init__(self, config: RgbdCompareConfig) -> None:
         """Begin at zero.
 
         Args:
-            config: How depth images become scans.
+            config: Settings by which depth images become scans.
         """
         self._config = config
         self.read_s = self.scan_s = 0.0

@@ -43,7 +43,7 @@ def pairs_of(stamps_ns: Stamps, truth: Trajectory, *, count: int, frames_apart: 
     Args:
         stamps_ns: (N,) stamps of all frames.
         truth: Frames that it does not cover are left out.
-        count: How many pairs; all that there are, where the log has fewer.
+        count: Number of pairs; all that there are, where the log has fewer.
         frames_apart: The distances; those of which the log has too few pairs leave their share to others.
     """
     index, gap_ns = nearest(truth.stamps_ns, stamps_ns)
@@ -65,7 +65,7 @@ def guesses_for(pair: Pair, guesses: Sequence[GuessConfig], *, level: bool, seed
 
     Args:
         pair: Pair with its true motion; its number and the seed decide what is drawn.
-        guesses: How far off.
+        guesses: Sizes of the guesses' errors.
         level: Off in x, y and heading only, as for a robot on level ground.
         seed: Seed of all that is random.
     """

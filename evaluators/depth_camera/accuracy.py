@@ -106,7 +106,7 @@ class SeenPlane:
     """One plane in one frame.
 
     Attributes:
-        distance_m: How far away it was measured.
+        distance_m: Distance at which it was measured.
         tilt_rad: Between its normal and the optical axis.
         measured_ratio: Share of its pixels that had a depth.
         raw: Errors of the depth image as it is.
@@ -129,9 +129,9 @@ def seen_plane(
 
     Args:
         depth_m: Measured depths, 0 where there is none.
-        filtered_m: The same after DIF.
+        filtered_m: Measured depths after DIF.
         reference_m: True depth of each, or of all.
-        distance_m: How far away the plane was measured.
+        distance_m: Distance at which the plane was measured.
         tilt_rad: Between its normal and the optical axis.
 
     Raises:

@@ -84,7 +84,7 @@ def depth_at(
     Args:
         source: RGB-D log.
         distance_m: Depth of the plane where the optical axis meets it.
-        patch: What shows nothing but the plane; None is the middle third of the image, each way.
+        patch: Part of the image that shows only the plane; None is the middle third of the image, each way.
         keep_tilt: Compare with a plane across the axis, as the thesis does.
         progress: Receives notes of frames that show no plane.
 
@@ -139,7 +139,10 @@ def _see(frame: RgbdFrame, distance_m: float, patch: Patch, *, keep_tilt: bool) 
     depth_m = frame.depth_m[patch.slices].astype(np.float64)
     measured = depth_m > 0.0
     if measured.mean() < _MIN_MEASURED_RATIO:
-        raise DataError(f"frame {frame.stamp_ns}: {measured.mean():.0%} of the patch {patch} has depth")
+        raise DataError(
+            f"frame {frame.stamp_ns}: {measured.mean():.0%} of the patch {patch} has depth, "
+            f"want at least {_MIN_MEASURED_RATIO:.0%}"
+        )
     rays = ray_table(frame.camera)[patch.slices].astype(np.float64)
     plane = fit_planes(depth_m.reshape(1, -1), rays.reshape(1, -1, 2))
     sigma_ratio = float(plane.sigma_m[0] / abs(plane.distance_m[0]))

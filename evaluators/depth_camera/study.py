@@ -23,9 +23,9 @@ class DepthStudy:
     """Accuracy and noise of a depth camera by its logs.
 
     Attributes:
-        logs: What was measured.
+        logs: Logs that were measured.
         is_known: Whether the planes' distances were given, rather than fitted.
-        levels: From near to far.
+        levels: Distances from near to far.
         fit: The noise before DIF.
         maps: Errors by position in the image.
     """
@@ -53,8 +53,8 @@ def study_depth(
         distances_m: Distance of the plane before which the camera stands in each log; None searches for
             planes.
         patch: Part of the image that is used; None is the usual one.
-        keep_tilt: As :func:`mapper.evaluators.depth_camera.still.depth_at`.
-        most_frames: As :func:`mapper.evaluators.depth_camera.tiles.depth_of_planes`.
+        keep_tilt: Whether tilt counts as error, as of :func:`mapper.evaluators.depth_camera.still.depth_at`.
+        most_frames: Limit of frames, as of :func:`mapper.evaluators.depth_camera.tiles.depth_of_planes`.
         progress: Receives stages, counts and notes.
 
     Raises:

@@ -22,7 +22,7 @@ from mapper.line_laser.detection import Method
 from mapper.line_laser.products import DETECTIONS, RANGE_ERRORS
 from mapper.line_laser.ranging import LineScan
 from mapper.runtime.atomic import write_text
-from mapper.sources.images import read_colour
+from mapper.sources.image_files.reading import read_colour
 from mapper.sources.text import parse_numbers, rows
 
 _NEAR_M = 0.1
@@ -41,7 +41,7 @@ class LabelScores:
     """Detections and ranges of a sensor in labelled images.
 
     Attributes:
-        images: How many.
+        images: Number of images.
         counts: Counts of every method's detections.
         true_m: (N,) ranges in all columns in which a stripe was and was found.
         found_m: (N,) what was measured there.
@@ -79,7 +79,7 @@ def score(
     Args:
         scans: Scans by the names of their images.
         labels: Labels from :func:`read_labels`.
-        config: How a stripe is found.
+        config: Settings of the stripe detection.
 
     Raises:
         FrameError: An image can no longer be read.

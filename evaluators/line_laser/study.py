@@ -24,7 +24,7 @@ from mapper.line_laser.simulation.render import take
 from mapper.line_laser.simulation.room import Room, make_board, make_room
 from mapper.runtime.progress import SILENT, Progress
 from mapper.simulation.streams import Stream, rng_of
-from mapper.sources.images import decode_colour
+from mapper.sources.image_files.reading import decode_colour
 
 SCENES: Mapping[str, Mapping[str, float]] = {
     "bare": {"lamps": 0.0, "red_things": 0.0, "dull_things": 0.0},
@@ -80,7 +80,7 @@ def study(config: LineLaserConfig, seeds: Sequence[int], *, progress: Progress =
     """Render every scene, and a wall at every range of Table 2.1, with every seed; shots calibrate.
 
     Args:
-        config: How the stripe is found.
+        config: Settings of the stripe detection.
         seeds: Each another room, other things on its walls and other noise.
         progress: Receives the count of scenes and seeds, and of Table 2.1.
     """

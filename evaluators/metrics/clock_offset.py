@@ -24,7 +24,7 @@ class ClockOffset:
     """Clock offset that explains most of a position error.
 
     Attributes:
-        offset_s: How much later the truth's stamps are, seconds.
+        offset_s: Delay of the truth's stamps, seconds.
         rmse_m: RMSE of the positions without it, metres, after the alignment.
     """
 

@@ -15,6 +15,8 @@ from mapper.sensing.wheel_kinematics import pose_at
 
 _NEXT_TO_NOTHING = 1e-6 * np.eye(6)
 """Information of factors that only ask for the covariance of two nodes relative to each other."""
+_WINDOW_NS = NS_PER_S
+_MOST_WINDOWS = 300  # spread over the log: the covariance of each takes a while
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,19 +39,14 @@ def window_nees(
     graph: PoseGraph,
     records: Sequence[FrameRecord],
     truth: Trajectory,
-    *,
-    window_s: float = 1.0,
-    most: int = 300,
 ) -> Nees:
-    """Return the NEES of tracked poses relative to those a window before (Bar-Shalom, Li & Kirubarajan 2001).
+    """Return the NEES of tracked poses relative to those a second before (Bar-Shalom, Li & Kirubarajan 2001).
 
     Args:
         trajectory: Solved poses of the body.
         graph: Solved, with the factors that hold.
         records: Outcome of every frame; frames without sigmas are left out.
         truth: True poses of the body, interpolated to the frames' stamps.
-        window_s: Length of a window.
-        most: Windows to compare, spread over the log.
     """
     pose_of = dict(trajectory.items())
     known = [
@@ -61,9 +58,9 @@ def window_nees(
         and (T_true := _true_pose(truth, record.stamp_ns)) is not None
     ]
     stamps_ns = stamps_of(record for record, _ in known)
-    ends = np.searchsorted(stamps_ns, stamps_ns + round(window_s * NS_PER_S))
+    ends = np.searchsorted(stamps_ns, stamps_ns + _WINDOW_NS)
     begins = np.flatnonzero(ends < len(known))
-    begins = begins[:: max(1, len(begins) // most)]
+    begins = begins[:: max(1, len(begins) // _MOST_WINDOWS)]
     windows = [(known[a], known[int(ends[a])]) for a in begins]
     relative = _relative_covariances(graph, [(a.node, b.node) for (a, _), (b, _) in windows])
     errors = []

@@ -100,7 +100,7 @@ def evaluate(
     Args:
         estimate: A run or its folder, a trajectory, or a file of TUM or KITTI text.
         truth: True poses of the body: the same but a run; None takes a run's own, if its log has any.
-        alignment: How the estimate is laid over the truth first: "none", "yaw" (for worlds with z up), "se3"
+        alignment: Alignment of the estimate with the truth: "none", "yaw" (for worlds with z up), "se3"
             or "sim3".
         times: File of seconds, one a line, for poses in KITTI text; else these pair by line.
         max_gap_s: Largest time between an estimated pose and its true one.
@@ -155,13 +155,13 @@ def assess(
     Args:
         estimate: The trajectory.
         truth: True poses of the body, or None if they are not known.
-        alignment: How the estimate is aligned with the truth first.
+        alignment: Alignment of the estimate with the truth.
         frames_ns: Stamps of all frames of the log, of which the estimate should have poses; None takes the
             time that the truth covers instead.
         lengths_m: Lengths of the segments of the relative errors; None chooses them by the length of the true
             path.
         max_gap_s: Largest time between an estimated pose and its true one.
-        names: What to call the two in an error, for instance their file names.
+        names: Names of the two in an error, such as their file names.
 
     Raises:
         DataError: The estimate is empty, no stamps match, too few do, or a length is not > 0.

@@ -19,8 +19,8 @@ def estimate_and_truth(
     """Return the run if it is one, the estimated poses, and the true ones, which may be its own.
 
     Args:
-        estimate: What is evaluated.
-        truth: What it is compared with.
+        estimate: Run folder or trajectory that is evaluated.
+        truth: Trajectory that it is compared with.
         times: Seconds, one a line, of poses in KITTI text.
 
     Raises:

@@ -10,6 +10,8 @@ from mapper.core.timebase import MAX_TRUTH_GAP_NS, NS_PER_S, Stamps, nearest
 from mapper.core.trajectory import Trajectory
 from mapper.evaluators.metrics.metric import Metric
 from mapper.loops.closure import LoopClosure, accepted_loops, discrepancy
+from mapper.loops.config import ScanLoopsConfig
+from mapper.run.folder import Run
 
 MAX_ERROR_M, MAX_ERROR_RAD = 0.2, 0.1
 """A loop that is farther from the truth is wrong."""
@@ -17,8 +19,15 @@ REVISIT_M, REVISIT_RAD, REVISIT_S = 0.5, np.deg2rad(20.0), 5.0
 """A keyframe revisits a place if an earlier one was so near, turned so nearly alike, so long ago."""
 
 
+def loop_metrics_of_run(run: Run, truth: Trajectory) -> list[Metric]:
+    """Return the loop metrics of a run, whose scans are searched for loops once in some metres."""
+    loops = run.config.loops
+    searched_every_m = loops.min_motion_m if isinstance(loops, ScanLoopsConfig) else 0.0
+    return loop_metrics(run.loops, run.keyframes.stamps_ns, truth, searched_every_m=searched_every_m)
+
+
 def loop_metrics(
-    loops: Sequence[LoopClosure], keyframes_ns: Stamps, truth: Trajectory, *, looked_every_m: float = 0.0
+    loops: Sequence[LoopClosure], keyframes_ns: Stamps, truth: Trajectory, *, searched_every_m: float = 0.0
 ) -> list[Metric]:
     """Return how many loops hold, how many of them are wrong, and how many true revisits have one.
 
@@ -26,14 +35,14 @@ def loop_metrics(
         loops: Every candidate with its verdict.
         keyframes_ns: (N,) int64 stamps of all nodes, in time order.
         truth: True poses of the body; loops that it does not cover are left out.
-        looked_every_m: Distance that a run went between two searches for loops: a loop found from so near
+        searched_every_m: Distance that a run went between two searches for loops: a loop found from so near
             counts for a keyframe too.
     """
     accepted = accepted_loops(loops)
     revisits = revisits_of(keyframes_ns, truth)
     along_m = _along(keyframes_ns, truth)
     found_m = along_m[np.isin(keyframes_ns, [loop.stamp_j_ns for loop in accepted])]
-    found = (np.abs(along_m[:, np.newaxis] - found_m) <= looked_every_m).any(axis=1)
+    found = (np.abs(along_m[:, np.newaxis] - found_m) <= searched_every_m).any(axis=1)
     return [
         Metric("loops", len(accepted), "loops"),
         Metric("loops wrongly accepted", sum(wrong_loops(accepted, truth)), "loops"),

@@ -46,10 +46,10 @@ def map_quality(
 
     Args:
         run: A finished run.
-        reference: What to compare it with.
+        reference: Reference that it is compared with.
         world: World of the reference; None is the truth's for the world of a synthetic log, else the
             run's own.
-        voxels: How far apart the surfaces may be, in voxels.
+        voxels: Largest distance between matching surfaces, in voxels.
         register: Refine the alignment of the reference by point-to-plane ICP with the run's cloud.
 
     Raises:

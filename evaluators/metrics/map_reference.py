@@ -34,7 +34,7 @@ class Reference:
     """A reference in its own frame.
 
     Attributes:
-        name: What it is, for a reader.
+        name: Description for a reader.
         points: (N, 3) metres on its surfaces, no two in a quarter of the map's voxels; None for a world that
             is known exactly.
         signed_distance_m: Signed distance in a world that is known exactly, else None.

@@ -25,8 +25,8 @@ def merged_map_metrics(
 
     Args:
         merged: A finished merged map.
-        names: What to call its runs, in its order.
-        alignment: How poses are aligned with the truth, as of ``assess``.
+        names: Names of its runs, in its order.
+        alignment: Alignment of poses with the truth, as of ``assess``.
     """
     manifest = merged.manifest
     metrics = [

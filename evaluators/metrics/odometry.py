@@ -42,7 +42,7 @@ class PathErrors:
     Attributes:
         ate_m: Root mean square distance of the positions from the true ones.
         rpe_m: Root mean square error of the translation over a step; None where no two poses are one apart.
-        rpe_rad: The same of the rotation.
+        rpe_rad: Root mean square error of the rotation over a step, likewise.
         drift_ratio: Mean error of the translation over a stretch of the path, as a share of its length. The
             stretches are a tenth to a half of the path (Geiger et al. 2012 take 100 to 800 m); None where
             no two poses are so far apart.

@@ -20,7 +20,7 @@ def summary(run: Run, *, alignment: AlignmentKind = "se3") -> dict[str, Value]:
 
     Args:
         run: A finished run.
-        alignment: How its path is aligned with the truth.
+        alignment: Alignment of its path with the truth.
     """
     counts, trajectory, truth = run.manifest.counts, run.trajectory, run.truth
     matched = None if truth is None else _aligned(trajectory, truth, alignment)

@@ -61,7 +61,7 @@ def segment_errors(matched: Matched, lengths_m: Sequence[float]) -> tuple[Length
     car at 10 Hz there is none, between the keyframes of a walk there may be.
 
     Args:
-        matched: At least one pair; how they are aligned does not matter, their scale does.
+        matched: Pairs of poses, at least one; how they are aligned does not matter, their scale does.
         lengths_m: Each > 0; one that the path does not have has no segments.
 
     Raises:

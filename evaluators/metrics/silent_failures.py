@@ -16,6 +16,7 @@ WRONG_M, WRONG_RAD, WRONG_SIGMAS = 0.2, float(np.deg2rad(5.0)), 5.0
 """A relative pose is wrong if it is farther off than either, and than so many of its standard deviations."""
 RIGHT_M, RIGHT_RAD = 0.25 * WRONG_M, 0.25 * WRONG_RAD
 """A frame is right if it is no farther off than this, seen from the nearest frame that is not doubtful."""
+_WINDOW_NS = NS_PER_S
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,12 +53,10 @@ def check_doubts(
     trajectory: Trajectory,
     records: Sequence[FrameRecord],
     truth: Trajectory,
-    *,
-    window_s: float = 1.0,
 ) -> DoubtCheck:
     """Return how often a path is wrong and nothing is flagged, and how often right frames are flagged.
 
-    A window reaches from a placed frame to the first placed one at least ``window_s`` later, over gaps of the
+    A window reaches from a placed frame to the first placed one at least a second later, over gaps of the
     log too. Where every frame between has a covariance, the window is wrong only if its error is also more
     than ``WRONG_SIGMAS`` by the covariance of the relative pose, propagated from keyframe to keyframe.
 
@@ -65,7 +64,6 @@ def check_doubts(
         trajectory: Solved poses of the body.
         records: Outcome of every frame of the log, in time order.
         truth: True poses of the body.
-        window_s: Length of a window.
     """
     of_stamp = {stamp_ns: i for i, stamp_ns in enumerate(trajectory.stamps_ns.tolist())}
     stamps_ns = stamps_of(records)
@@ -76,7 +74,7 @@ def check_doubts(
     partner, gap_ns = nearest(truth.stamps_ns, stamps_ns)
     T_truth: Array = truth.T_world_body[partner]
     known = np.flatnonzero(placed & (gap_ns <= MAX_TRUTH_GAP_NS))
-    ends = np.searchsorted(stamps_ns[known], stamps_ns[known] + round(window_s * NS_PER_S))
+    ends = np.searchsorted(stamps_ns[known], stamps_ns[known] + _WINDOW_NS)
     has_end = ends < len(known)
     windows = list(zip(known[has_end].tolist(), known[ends[has_end]].tolist(), strict=True))
     wrong = list(_wrong_windows(windows, records, placed, poses, T_truth))

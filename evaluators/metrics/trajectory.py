@@ -88,7 +88,7 @@ class RelativeErrors:
     Attributes:
         translation_m: Errors of the relative translation.
         rotation_rad: Angles of the relative rotation's error.
-        pairs: How many pairs of poses were compared.
+        pairs: Number of pairs of poses that were compared.
     """
 
     translation_m: Statistics

@@ -31,7 +31,7 @@ class VariantResult:
 
     Attributes:
         estimate: Poses of the frames that were placed; None if too few were.
-        frames: How many could be read.
+        frames: Number of frames that could be read.
         failure: Why there is no estimate, or empty.
     """
 

@@ -39,7 +39,7 @@ def write_reproduction(folder: Path, reproduction: Reproduction) -> None:
 
     Args:
         folder: Existing folder.
-        reproduction: What was measured.
+        reproduction: Measured tables.
     """
     write_text(folder / MARKDOWN, _markdown(reproduction))
     if records := everything(reproduction):

@@ -118,8 +118,8 @@ def hough_jobs(logs: Path, *, seeds: int, pictures: Path) -> dict[HoughTrial, Jo
     """Return the trials of a folder's pairs, by both methods and every seed; those of seed 0 draw a picture.
 
     Args:
-        logs: As for :func:`~mapper.evaluators.papers.hough_pairs.find_pairs`.
-        seeds: How often each pair is perturbed.
+        logs: Folder of logs, as of :func:`~mapper.evaluators.papers.hough_pairs.find_pairs`.
+        seeds: Number of perturbations of each pair.
         pictures: Folder for the pictures.
 
     Raises:

@@ -21,9 +21,9 @@ class PaperCell:
     """One cell of a printed table. Every figure in the three papers' tables is the better the smaller it is.
 
     Attributes:
-        row: As printed, e.g. "fr1/xyz".
-        column: As printed, e.g. "7", "MP4", "ISVD+LC".
-        published: As printed; None where the paper has no such cell.
+        row: Name of its row as printed, e.g. "fr1/xyz".
+        column: Name of its column as printed, e.g. "7", "MP4", "ISVD+LC".
+        published: Value as printed; None where the paper has no such cell.
         ours: One per seed, in the table's unit; a method without chance has one. Empty if every try failed.
         failures: Why the other seeds gave nothing, a line each.
         in_part: Ours is of a part of what the printed figure is of, so the two do not compare.
@@ -86,8 +86,8 @@ class PaperTable:
         metric: "ATE RMSE"; what is printed in the cells.
         unit: "m"; empty where it differs by column, whose text then ends in its own, e.g. "x [mm]".
         cells: Row by row.
-        axis: What the columns count, e.g. "iterations" or "MP", if they are numbers that make a curve.
-        notes: What a reader must know to compare, a sentence each: other hardware, another log, a part of it.
+        axis: Quantity of the columns, e.g. "iterations" or "MP", if they are numbers that make a curve.
+        notes: Sentences that a reader must know to compare: other hardware, another log, a part of it.
     """
 
     name: str
@@ -125,11 +125,11 @@ class Reproduction:
 
     Attributes:
         paper: Author, title, year.
-        tables: In the paper's order.
+        tables: Tables in the paper's order.
         paths: Trajectories to draw.
         missing: The paper's sequences that are not at hand.
-        seeds: How many were run where chance plays a part.
-        notes: What holds for all tables, a sentence each, e.g. "first 200 frames only".
+        seeds: Number of seeds where chance plays a part.
+        notes: Sentences that hold for all tables, e.g. "first 200 frames only".
         pictures: PNG files that were drawn while the tables were measured.
     """
 

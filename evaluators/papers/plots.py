@@ -38,7 +38,7 @@ def write_plots(folder: Path, reproduction: Reproduction) -> dict[str, Path]:
 
     Args:
         folder: Existing folder.
-        reproduction: What was measured.
+        reproduction: Measured tables.
 
     Returns:
         The files, by the table that they show or by what they are.

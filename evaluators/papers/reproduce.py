@@ -66,9 +66,9 @@ def reproduce(
     """Measure what is not measured yet, and write all tables, ours with the printed figures.
 
     Args:
-        request: What to measure.
+        request: Tables to measure, and their logs.
         out: Folder for tables, pictures, trajectories and finished cells; an unfinished one is completed.
-        workers: Where to measure; a scheduler's workers see the logs and ``out`` under the same paths.
+        workers: Workers that measure; those of a scheduler see the logs and ``out`` under the same paths.
         progress: Receives stages, counts and notes.
 
     Raises:

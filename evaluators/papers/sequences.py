@@ -23,7 +23,7 @@ class Found:
     Attributes:
         logs: The log of each, in the paper's order.
         missing: The others, in the paper's order.
-        notes: What was ambiguous, a sentence each.
+        notes: Sentences on what was ambiguous.
     """
 
     logs: Mapping[str, Path]

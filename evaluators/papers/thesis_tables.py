@@ -49,7 +49,7 @@ class Ablation:
         sequences: And how many of their first frames are used; None is all.
         settings: Settings by their names in the table.
         places: Places of the figures.
-        measure: How they are worked out.
+        measure: Function that works them out.
         alone: It shares too little work with the others to be measured with them.
     """
 

@@ -38,7 +38,7 @@ class Printed:
     """A table of the paper.
 
     Attributes:
-        key: In ``published.json``.
+        key: Key in ``published.json``.
         table: Without its cells.
         columns: Columns that our method fills; the others are other systems.
     """

@@ -91,7 +91,7 @@ def write_registration_errors(
     Args:
         path: PNG file to write.
         errors_m: Kind of guess to name to the (N,) distances.
-        max_error_m: What counts as right.
+        max_error_m: Largest error that counts as right.
         title: Headline.
     """
     names = list(dict.fromkeys(name for kind in errors_m.values() for name in kind))

@@ -77,7 +77,7 @@ def write_accuracy(path: Path, levels: Sequence[DepthLevel], fit: NoiseFit, *, t
 
     Args:
         path: PNG file to write.
-        levels: From near to far.
+        levels: Distances from near to far.
         fit: The noise before DIF as a curve.
         title: Headline.
     """

@@ -37,7 +37,7 @@ def write_detections(
     Args:
         path: PNG file to write.
         image: (H, W, 3) RGB.
-        config: How the stripe is found.
+        config: Settings of the stripe detection.
         title: Headline.
         true_rows: (W,) where the stripe is, NaN where there is none, if that is known.
     """
@@ -80,7 +80,7 @@ def write_calibration_picture(path: Path, fit: Fit, shots: Sequence[CalibrationS
     Args:
         path: PNG file to write.
         fit: The laws and their errors.
-        shots: What they were fitted to, in the same order.
+        shots: Shots that they were fitted to, in the same order.
     """
     calibration = fit.calibration
     figure = new_figure(11.0, 4.6)

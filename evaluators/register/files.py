@@ -62,7 +62,7 @@ def write_registration(
         target: Scan that stayed.
         source: Scan that was aligned to it.
         names: The user's names of target and source.
-        sensor: What took them, which decides the direction up.
+        sensor: Sensor that took them, which decides the direction up.
         config: Its settings.
     """
     last = registered.stages[-1]

@@ -41,7 +41,7 @@ class Registered:
     Attributes:
         method: Its name in the configuration.
         alignment: The answer.
-        stages: From the beginning on; without "refined" where there was no answer at all.
+        stages: Stages from the beginning on; without "refined" where there was no answer at all.
         seconds: Wall time of each step, in order.
         cpu_s: CPU time of all steps: a wall clock sees other programs, too.
     """

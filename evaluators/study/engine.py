@@ -33,8 +33,8 @@ def run_study(
     Args:
         jobs: Jobs by the place in a table that they fill.
         folder: Folder of the results; with a scheduler, a place that all of its workers see.
-        workers: Where the jobs run.
-        attempts: How often a job is begun before it has failed.
+        workers: Workers that run the jobs.
+        attempts: Number of times that a job is begun before it has failed.
         progress: Receives the count of the jobs that are left, so that the expected end holds, and failures.
 
     Raises:

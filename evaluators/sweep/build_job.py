@@ -32,7 +32,7 @@ class BuildJob:
         config: Every setting.
         scratch: Folder for the run while it is built.
         kept: Folder that the run is kept in, or None.
-        keep: How much of it.
+        keep: Files of it that are kept.
     """
 
     log: Path

@@ -19,7 +19,7 @@ class Line:
         label: Text at its left.
         colour: Number of its colour.
         values: Sorted; none if there is nothing to draw.
-        text: The same in words.
+        text: Value in words.
     """
 
     label: str

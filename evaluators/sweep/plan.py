@@ -61,7 +61,7 @@ class Plan:
     """Every build of a sweep, and what cannot be built.
 
     Attributes:
-        config: What was asked for.
+        config: Settings of the sweep.
         out: Absolute folder of the results.
         entries: A job for every build, log by log, or the reason why its method does not apply to the log.
     """
@@ -114,7 +114,7 @@ def run_sweep(
 
     Args:
         plan: The builds.
-        workers: Where the builds run; each keeps to one core.
+        workers: Workers that run the builds; each keeps to one core.
         progress: Receives stages, counts and notes.
 
     Raises:

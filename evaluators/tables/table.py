@@ -48,7 +48,7 @@ class Column:
 
     Attributes:
         key: Key in the records.
-        title: What stands above it, with the unit.
+        title: Heading with the unit.
         shown: Turns a value into text.
     """
 
@@ -62,7 +62,7 @@ class Table:
     """Records as they are shown, with what must be known to read them.
 
     Attributes:
-        columns: What is shown of each record.
+        columns: Columns that are shown of each record.
         records: A row each.
         title: Headline in a document.
         notes: A sentence each.

@@ -48,7 +48,7 @@ def read_frame(name: AnyPath, config: SourceConfig) -> tuple[Frame, Sensor]:
 
     Args:
         name: A cloud, or ``LOG@N``: the n-th frame of a log, from 0.
-        config: How logs are opened.
+        config: Settings by which logs are opened.
 
     Raises:
         SourceError: It is a folder, or the log has no such frame.

@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mapper.api.logs import read_frame
-from mapper.config.loading import Settings, overridden
-from mapper.config.register import RegisterConfig, check_method, register_config
+from mapper.config.loading import Settings, load_source_config, overridden
+from mapper.config.register import check_method, register_config
 from mapper.core.errors import ConfigError
 from mapper.core.frames import Frame, RgbdFrame, Scan, Sensor
 from mapper.core.geometry import Transform, is_rigid, point_rows
@@ -18,6 +18,7 @@ from mapper.registration.base import Alignment
 from mapper.registration.factory import build_registration
 from mapper.registration.guess import parse_guess
 from mapper.run.cloud import Cloud
+from mapper.sources.config import SourceConfig
 
 Registrable = ArrayLike | Cloud | Frame | AnyPath
 """(N, 3) points in metres, a cloud, a frame, a cloud's file, or ``LOG@N``."""
@@ -34,10 +35,10 @@ def register(
     """Register two clouds: find the pose of the source in the target.
 
     Args:
-        source: What is aligned: (N, 3) points in metres, a file (.bin .pcd .ply .xyz .npy .las .laz),
+        source: Cloud that is aligned: (N, 3) points in metres, a file (.bin .pcd .ply .xyz .npy .las .laz),
             ``LOG@N`` for the n-th frame of a log, or a frame. Points are kept as float32, so they lie within
             a kilometre of their origin.
-        target: What it is aligned to: the same.
+        target: Cloud that it is aligned to, given likewise.
         method: "hough-gicp" or "hough-ndt", which search all motions of clouds with z up; "kiss-matcher",
             which searches any; "icp", "plane-icp", "gicp" or "ndt", which refine the guess; "isvd" for
             RGB-D frames.
@@ -65,13 +66,11 @@ def register(
     check_method(method, guess=None if guess is None else "given")
     T_target_source = _guess(guess)
     settings = settings or {}
-    of_logs = {name: value for name, value in settings.items() if name.split(".")[0] == "source"}
-    opening = overridden(register_config(method, "lidar"), settings=of_logs)
+    opening = load_source_config(settings=settings)
     (target_frame, target_sensor), (source_frame, source_sensor) = (
         _frame(cloud, name, opening) for cloud, name in ((target, "target"), (source, "source"))
     )
-    seen_by: Sensor = "rgbd" if "rgbd" in (target_sensor, source_sensor) else "lidar"
-    config = overridden(register_config(method, seen_by), settings=settings).registration
+    config = overridden(register_config(method, target_sensor, source_sensor), settings=settings).registration
     if isinstance(config, IsvdOdometryConfig):
         from mapper.odometry.isvd_pair import align_images
 
@@ -79,14 +78,14 @@ def register(
     return build_registration(config).prepare(target_frame.scan()).align(source_frame.scan(), T_target_source)
 
 
-def _frame(cloud: Registrable, name: str, config: RegisterConfig) -> tuple[Frame, Sensor]:
+def _frame(cloud: Registrable, name: str, config: SourceConfig) -> tuple[Frame, Sensor]:
     match cloud:
         case RgbdFrame():
             return cloud, "rgbd"
         case Scan():
             return cloud, "lidar"
         case str() | os.PathLike():
-            return read_frame(cloud, config.source)
+            return read_frame(cloud, config)
         case _:
             _, rows = point_rows(cloud, f"register: {name}")
             return Scan(0, rows.astype(np.float32)), "lidar"

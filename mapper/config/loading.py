@@ -6,14 +6,14 @@ import tomllib
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar, get_args
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from pydantic import ValidationError
 
 from mapper.config.build import BuildConfig
 from mapper.config.refusals import refusal
 from mapper.config.sensors import DEFAULTS
-from mapper.core.config import Config, drop_unknown
+from mapper.core.config import Config, drop_unknown, kind_of, members_of
 from mapper.core.errors import ConfigError, MapperWarning
 from mapper.core.paths import AnyPath
 from mapper.runtime.atomic import MANIFEST_NAME
@@ -224,15 +224,11 @@ def _with_kinds(tree: dict[str, Any], default: Config) -> dict[str, Any]:
         if not isinstance(value, dict) or not isinstance(member, Config):
             continue
         if "kind" in type(member).model_fields:
-            value = {"kind": _kind(type(member)), **value}
-            members = get_args(type(default).model_fields[name].annotation)
-            member = next((m() for m in members if _kind(m) == value["kind"]), member)
+            value = {"kind": kind_of(type(member)), **value}
+            members = members_of(type(default).model_fields[name].annotation)
+            member = next((m() for m in members if kind_of(m) == value["kind"]), member)
         filled[name] = member.model_dump(include=member.model_fields_set) | _with_kinds(value, member)
     return filled
-
-
-def _kind(member: type[Config]) -> str:
-    return str(member.model_fields["kind"].default)
 
 
 def _validated(model: type[AnyConfig], tree: dict[str, Any], where: str | None) -> AnyConfig:

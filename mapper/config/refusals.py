@@ -2,9 +2,9 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from difflib import get_close_matches
-from typing import Any, get_args
+from typing import Any
 
-from mapper.core.config import Config
+from mapper.core.config import Config, kind_of, members_of
 
 _Location = Sequence[int | str]
 
@@ -37,7 +37,7 @@ def _hint(model: type[Config], loc: _Location) -> str:
     """Return what was perhaps meant by an unknown name, or else which names are known."""
     *parents, name = loc
     alternatives = _members_at(model, parents[:-1])
-    if len(alternatives) > 1 and (kinds := [_kind(m) for m in alternatives if name in m.model_fields]):
+    if len(alternatives) > 1 and (kinds := [kind_of(m) for m in alternatives if name in m.model_fields]):
         return f"{'.'.join(map(str, parents[:-1]))}.kind={' or '.join(kinds)} has it"
     known = [field for member in _members_at(model, parents)[:1] for field in member.model_fields]
     if close := get_close_matches(str(name), known, n=1):
@@ -54,21 +54,10 @@ def _members_at(model: type[Config], loc: _Location) -> list[type[Config]]:
         if isinstance(part, int):  # an element of a list
             continue
         if len(members) > 1:
-            members = [member for member in members if _kind(member) == part]
+            members = [member for member in members if kind_of(member) == part]
         elif members and part in members[0].model_fields:
-            members = _members(members[0].model_fields[part].annotation)
+            members = members_of(members[0].model_fields[part].annotation)
     return members
-
-
-def _members(annotation: Any) -> list[type[Config]]:
-    if isinstance(annotation, type) and issubclass(annotation, Config):
-        return [annotation]
-    return [member for inner in get_args(annotation) for member in _members(inner)]
-
-
-def _kind(member: type[Config]) -> str:
-    field = member.model_fields.get("kind")
-    return "" if field is None else str(field.default)
 
 
 def _paths(model: type[Config]) -> Iterator[str]:

@@ -37,13 +37,14 @@ def check_method(method: str, *, guess: str | None) -> None:
         raise ConfigError(f"guess: {method} has no use for one; leave it out, or choose {', '.join(others)}")
 
 
-def register_config(method: str, sensor: Sensor) -> RegisterConfig:
-    """Return a known method's configuration, scaled to a sensor's range.
+def register_config(method: str, *sensors: Sensor) -> RegisterConfig:
+    """Return a known method's configuration, scaled to the range of the sensors that took the two frames.
 
     Raises:
         ConfigError: The method searches the ground, and a camera's frame has its z ahead.
     """
     member: Any = _METHODS[method]
+    sensor: Sensor = "rgbd" if "rgbd" in sensors else "lidar"
     if sensor == "lidar" or member is IsvdOdometryConfig:
         return RegisterConfig(registration=member())
     if issubclass(member, HoughConfig):

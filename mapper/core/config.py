@@ -59,6 +59,19 @@ def _elements(text: str) -> Any:
         return text
 
 
+def members_of(annotation: Any) -> list[type[Config]]:
+    """Return the classes of settings that a field may hold, whatever union its annotation is."""
+    if isinstance(annotation, type) and issubclass(annotation, Config):
+        return [annotation]
+    return [member for inner in get_args(annotation) for member in members_of(inner)]
+
+
+def kind_of(member: type[Config]) -> str:
+    """Return the ``kind`` by which a member of a union is chosen; empty without one."""
+    field = member.model_fields.get("kind")
+    return "" if field is None else str(field.default)
+
+
 def flattened(tree: Mapping[str, Any], before: str = "") -> dict[str, Any]:
     """Return nested settings by dotted name."""
     flat: dict[str, Any] = {}
@@ -81,7 +94,7 @@ def drop_unknown(model: type[Config], tree: Any) -> list[str]:
     """Delete the names that a model does not have from what an older version wrote; return them, dotted.
 
     Args:
-        model: What the tree is to be.
+        model: Class of the settings.
         tree: Parsed JSON; changed in place. What else is wrong with it is left to the model.
     """
     try:

@@ -117,7 +117,7 @@ class Scan:
         origin_body: (3,) float64, metres, body frame: origin of the rays.
         colors: (N, 3) uint8 RGB of each point, where the sensor has colour.
         times_s: (N,) float32 seconds after ``stamp_ns`` of each point, where the file has them.
-        far_returns: How many more were left out, for no sensor reaches as far.
+        far_returns: Number of returns that were left out as farther than any sensor reaches.
     """
 
     stamp_ns: int

@@ -43,7 +43,7 @@ def point_rows(points: ArrayLike, owner: str) -> tuple[tuple[int, ...], Points]:
 
     Args:
         points: Anything that numpy takes for an array.
-        owner: What they are given to, for the error.
+        owner: Name of what they are given to, for the error.
 
     Raises:
         DataError: They are not numbers, or the last axis is not 3.

@@ -16,7 +16,7 @@ class Finding:
         name: Name of the check.
         verdict: "warning" is worth knowing; "failed" keeps some verb from working.
         detail: Result in one line.
-        remedy: What to do about it; empty when all is well.
+        remedy: Instruction to the user; empty when all is well.
     """
 
     name: str

@@ -84,7 +84,7 @@ def tried(
         name: Name of the library.
         version: Version of the library.
         command: Ends with status 0 if the library works.
-        again: How to install the library afresh.
+        again: Command that installs the library afresh.
         patience_s: Longer is a failure; None: a minute, and more where processes wait for processors.
     """
     if patience_s is None:

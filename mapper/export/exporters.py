@@ -24,11 +24,11 @@ class Exporter:
     """One kind of file.
 
     Attributes:
-        summary: What it is, in a few words.
+        summary: Description of the file, in a few words.
         function: ``module:name`` of the ``Write``, below :mod:`mapper.export`; imported at the first use.
         file_name: Its name inside the run; some are there since the build. Empty for a folder, which is
             never in the run.
-        endings: What another name may end with.
+        endings: Endings that another name may have.
         sidecars: Endings of the files that are written with it.
         settings: The part of the configuration that it reads, if any.
         of_merged: Whether a merged map has it, too.

@@ -68,7 +68,7 @@ def scale_bar(axes: "Axes", low: Array, high: Array, *, color: str) -> None:
     """Draw a bar of a round length in the lower left corner.
 
     Args:
-        axes: In metres.
+        axes: Axes in metres.
         low: (2,) lower left corner of the map, metres.
         high: (2,) upper right corner.
         color: Colour of the bar and its length.

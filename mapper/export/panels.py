@@ -67,7 +67,7 @@ def panel(
     """Return the axes of a panel; panels are numbered from the upper left.
 
     Args:
-        figure: What ``page`` returned for so many columns and rows.
+        figure: Page of as many columns and rows, from ``page``.
         number: Number of the panel.
         columns: Number of columns of panels.
         rows: Number of rows of panels.

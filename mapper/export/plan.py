@@ -23,7 +23,7 @@ def write_plan(run: Run, plan: Plan, *, grid: OccupancyGrid) -> None:
     Args:
         run: A finished run.
         plan: The path.
-        grid: What it is drawn over.
+        grid: Background of the drawing.
 
     Raises:
         RunError: The run has no MCAP log.
@@ -46,7 +46,7 @@ def draw_plan(folder: Path, plan: Plan, *, grid: OccupancyGrid) -> None:
     Args:
         folder: Folder of a run, or of a merged map.
         plan: The path.
-        grid: What it is drawn over.
+        grid: Background of the drawing.
     """
     write_text(folder / files.PLAN, plan_json(plan))
     write_path(

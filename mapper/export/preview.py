@@ -142,7 +142,7 @@ def drawn(path: Array, points: Array, *, text: str) -> NDArray[np.uint8]:
     Args:
         path: (N, 2) metres, to the right and upwards; at least one.
         points: (M, 2) the same.
-        text: What stands below.
+        text: Caption.
     """
     picture = np.full((_HEIGHT_PX, _WIDTH_PX, 3), FREE_CELL[::-1], np.uint8)
     low, high = path.min(axis=0), path.max(axis=0)

@@ -15,7 +15,7 @@ from mapper.mapping.fusion import Maps, Snapshot
 from mapper.navigation.floor import reachable_floor
 from mapper.navigation.traversable import Storey, traversable
 from mapper.octree.grid import OccupancyGrid
-from mapper.octree.grid_file import stored_grid
+from mapper.octree.grid_file import stored_grid_if_any
 from mapper.run import files
 from mapper.run.cloud import Cloud, read_cloud
 from mapper.run.folder import Run
@@ -69,9 +69,10 @@ def storeys_of_run(run: Run) -> tuple[Storey, ...]:
 
 def _storeys(run: Run) -> Iterator[OccupancyGrid]:
     for stem in map(files.storey, count()):
-        if not (run.path / f"{stem}.yaml").exists():
+        grid = stored_grid_if_any(run, stem)
+        if grid is None:
             return
-        yield stored_grid(run, stem)
+        yield grid
 
 
 def snapshots_of(run: Run) -> Iterator[Snapshot]:
@@ -95,8 +96,8 @@ def read_snapshots(path: Path) -> Iterator[Snapshot]:
             continue
         message = decode(topic, data)
         if isinstance(message, list):
-            T_told = FrameTree(message).find(BODY, CAMERA)
-            T_body_camera = T_body_camera if T_told is None else T_told
+            T_found = FrameTree(message).find(BODY, CAMERA)
+            T_body_camera = T_body_camera if T_found is None else T_found
         elif isinstance(message, CameraMessage):
             camera = _camera(message)
         elif isinstance(message, FileMessage):

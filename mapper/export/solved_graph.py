@@ -29,8 +29,8 @@ class SolvedGraph:
         path: The file that the graph came from.
         graph: Nodes at their first estimates.
         solution: Solution of that graph.
-        config: What it was solved with.
-        seconds: What reading and solving took, by name.
+        config: Settings of the solver.
+        seconds: Durations of reading and solving, by name.
     """
 
     path: Path

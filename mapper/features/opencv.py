@@ -103,7 +103,7 @@ def until_enough(
         attempt: Returns the features at a given threshold; a lower one gives more.
         threshold: First threshold.
         floor: Last threshold.
-        want: How many features are enough.
+        want: Number of features that is enough.
     """
     features = attempt(threshold)
     while len(features) < want and threshold > floor:

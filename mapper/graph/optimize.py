@@ -33,7 +33,7 @@ def optimize(graph: PoseGraph, config: GraphConfig, *, progress: Progress = SILE
     all estimates are returned as they are; the errors show how well they fit.
 
     Args:
-        graph: At least one node; it is not changed.
+        graph: Graph of at least one node; it is not changed.
         config: Solver, and when it stops.
         progress: Receives the iterations of each component, and how many there may be.
 

@@ -31,7 +31,7 @@ class Board:
 
     Attributes:
         row_px: Its mean row, 0 the middle of the top one.
-        width_px: How many columns it spans; None if it leaves the image.
+        width_px: Number of columns that it spans; None if it leaves the image.
     """
 
     row_px: float
@@ -44,8 +44,8 @@ class CalibrationShot:
 
     Attributes:
         board: Its stripe.
-        range_m: How far ahead it stood.
-        width_m: How wide it is; None if that was not measured or cannot be seen.
+        range_m: Distance of the board ahead.
+        width_m: Width of the board; None if it was not measured or cannot be seen.
     """
 
     board: Board
@@ -124,10 +124,10 @@ def calibrate(
     """Return the laws that suit shots best: by least squares in ln υ, and in px per cm.
 
     Args:
-        shots: At three ranges at least, two of them with widths.
+        shots: Shots at three ranges at least, two of them with widths.
         size_px: Width and height of the images.
         reach_m: Distance at which the laser meets the floor.
-        vehicle: What carries the sensor.
+        vehicle: Vehicle that carries the sensor.
 
     Raises:
         DataError: Too few shots, one beyond the reach, or no law of this kind suits them.

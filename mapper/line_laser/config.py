@@ -4,7 +4,7 @@ from typing import Annotated, Self
 
 from pydantic import Field, NegativeFloat, NonNegativeFloat, PositiveFloat, PositiveInt, model_validator
 
-from mapper.core.config import Config, Ratio
+from mapper.core.config import Config
 
 Covariance = tuple[tuple[float, float], tuple[float, float]]
 Level = Annotated[int, Field(ge=1, le=255)]
@@ -137,23 +137,12 @@ class LineLaserSynthConfig(Config):
     speed_mps: PositiveFloat = 0.3
     wheelbase_m: PositiveFloat = 0.26
     sensor_x_m: float = 0.2
-    tick_m: NonNegativeFloat = 0.002
-    """Path between two ticks of the encoder."""
-    steering_noise_rad: NonNegativeFloat = 0.003
 
     width_px: PositiveInt = 640
     height_px: PositiveInt = 360
     focal_px: PositiveFloat = 550.0
-    camera_height_m: PositiveFloat = 0.324
-    laser_height_m: PositiveFloat = 0.615
     reach_m: PositiveFloat = 1.9
-    """The defaults of these four put the stripe within 0.3 % of where eq. 2.44 has it."""
-
-    laser_levels: PositiveFloat = 600.0
-    """Brightness the laser adds to a white wall 1 m away; 255 is the most a pixel can show. The default lets
-    the stripe be seen on the floor at its reach, where the thesis measured its farthest point."""
-    stripe_m: PositiveFloat = 0.004
-    """Width of the stripe, four standard deviations."""
+    """Distance at which the laser meets the floor."""
     ambient: PositiveFloat = 0.55
     """Brightness of the room; from 1 on, white walls are as bright as a pixel can be."""
     lamps: NonNegativeFloat = 0.3
@@ -162,7 +151,4 @@ class LineLaserSynthConfig(Config):
     """Red things per metre of wall."""
     dull_things: NonNegativeFloat = 0.3
     """Things that return no laser light, per metre of wall."""
-    gloss: Ratio = 0.15
-    """Share of light that the floor reflects like a mirror."""
     noise_levels: NonNegativeFloat = 3.0
-    jpeg_quality: Annotated[int, Field(ge=1, le=100)] = 85

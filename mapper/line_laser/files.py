@@ -11,7 +11,7 @@ from mapper.core.timebase import Stamps
 from mapper.line_laser.calibration import CalibrationShot, find_board
 from mapper.line_laser.config import StripeConfig
 from mapper.runtime.progress import SILENT, Progress
-from mapper.sources.images import read_colour
+from mapper.sources.image_files.reading import read_colour
 from mapper.sources.scan_stamps import Wording, in_order, scan_stamps
 from mapper.sources.text import parse_numbers, rows, time_order
 
@@ -55,7 +55,7 @@ def read_shots(
     Args:
         path: Lines ``image,range_m[,width_m]``, or the folder with such a ``shots.csv``: images of a board
             that faces the sensor, in the middle of the image, and how far and how wide it is.
-        config: How its stripe is found.
+        config: Settings of the stripe detection.
         progress: Receives the count of images.
 
     Raises:

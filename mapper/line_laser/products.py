@@ -54,7 +54,7 @@ def write_scans(
         scans: Scans by the names of their images.
         calibration: Calibration that was used.
         config: Likewise.
-        notes: What was left out or assumed.
+        notes: Sentences on what was left out or assumed.
     """
     (folder / LOCAL).mkdir()
     with atomic_file(folder / RANGES) as partial, partial.open("w", encoding="utf-8") as ranges:

@@ -15,7 +15,7 @@ from mapper.runtime.ordered_map import ordered_map
 from mapper.runtime.progress import SILENT, Progress
 from mapper.sensing.wheel_kinematics import pose_at
 from mapper.sources.config import WheelsConfig
-from mapper.sources.images import read_colour
+from mapper.sources.image_files.reading import read_colour
 from mapper.sources.wheel_files import read_wheels_file
 
 _WORKERS = 2
@@ -29,7 +29,7 @@ class Drive:
         scans: Scans whose pose is known.
         trajectory: T_world_sensor of each.
         grid: The map.
-        notes: What was left out.
+        notes: Sentences on what was left out.
     """
 
     scans: Sequence[LineScan]

@@ -15,7 +15,7 @@ from mapper.registration.hough.config import ConstellationConfig, GroundConfig, 
 
 
 class ImageVerificationConfig(Config):
-    """When two images show one place."""
+    """Verification that two images show one place."""
 
     match: MatchConfig = MatchConfig(filter="none", max_ratio=0.85)
     """How descriptors are paired."""
@@ -98,7 +98,7 @@ class PlaceLoopsConfig(KeyframeLoopsConfig):
 
 
 class ScanVerificationConfig(Config):
-    """When two scans are of one place."""
+    """Verification that two scans are of one place."""
 
     voxel_m: PositiveFloat = 0.5
     """One point is kept per voxel."""

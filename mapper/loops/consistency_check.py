@@ -39,7 +39,7 @@ class ConsistencyCheck:
             estimator: Poses of the nodes.
             gate: Drift of the odometry between neighbours.
             min_agreeing: Number of others that must agree.
-            within_m: How far along the path the ends of two loops may lie apart to be compared.
+            within_m: Largest distance along the path between ends of two loops that are compared.
         """
         self._chain = chain
         self._estimator = estimator

@@ -38,7 +38,7 @@ def build_loop_detector(
 
     Args:
         config: Settings.
-        correction: How the graph is solved in the end; the detector's estimate of the poses is corrected
+        correction: Solver of the graph in the end; the detector's estimate of the poses is corrected
             alike.
         verifier: Compares places; None makes the one that the settings choose.
     """

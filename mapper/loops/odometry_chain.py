@@ -51,7 +51,7 @@ class _Edge:
         covariance: (6, 6) of its j.
         path_m: Its distance.
         turned_rad: Its angle.
-        cost: What shortest paths minimise: distance, angle, and their standard deviations.
+        cost: Cost that shortest paths minimise: distance, angle, and their standard deviations.
     """
 
     factor: BetweenFactor

@@ -33,7 +33,7 @@ def write_places(path: Path, places: Mapping[int, AnyPlace], nodes: Iterable[int
 
     Args:
         path: The file.
-        places: What the nodes are recognised by.
+        places: Features or scans by which the nodes are recognised.
         nodes: Nodes to write; None is all.
     """
     with ExitStack() as stack:

@@ -63,7 +63,7 @@ def shared_place(
     Args:
         first: Number of the earlier run.
         second: Number of the run whose keyframe was recognised.
-        loop: From a node i of the earlier run to a node j of the other.
+        loop: Loop from a node i of the earlier run to a node j of the other.
         T_first_node: (4, 4) poses of the earlier run's nodes in its world.
         T_second_node: (4, 4) poses of the other's.
     """
@@ -88,9 +88,9 @@ def find_shared_places(
 
     Args:
         runs: Their places, each in its own world; one run may have none.
-        config: How places are proposed and verified.
+        config: Settings by which places are proposed and verified.
         searched: So many of the first runs are not searched in each other: what they share is known.
-        workers: Where pairs are verified, a job for any two runs.
+        workers: Workers that verify pairs, a job for any two runs.
         progress: Receives how many runs are searched, and how many pairs of runs verified.
 
     Raises:

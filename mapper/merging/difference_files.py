@@ -33,7 +33,7 @@ def write_differences(
         found: The differences.
         before: The earlier run, whose slice lies below the picture.
         after: The later run.
-        placed: How the later run was placed, in a few words.
+        placed: Source of the later run's pose, in a few words.
         overwrite: Replace a folder of such files.
 
     Raises:

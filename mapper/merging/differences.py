@@ -55,8 +55,8 @@ class Differences:
     """Differences of a later map from an earlier one, in the earlier one's world.
 
     Attributes:
-        appeared: What stands in space that was free before, the largest first.
-        vanished: What stood in space that is free now, the largest first.
+        appeared: Clusters of voxels that stand in space that was free before, the largest first.
+        vanished: Clusters of voxels that stood in space that is free now, the largest first.
         not_seen_again: (N, 3) centres of occupied voxels of the earlier map that the later run did not look
             at, metres.
         newly_seen: (N, 3) the same of the later map, where the earlier run did not look.

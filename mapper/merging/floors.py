@@ -1,11 +1,12 @@
-"""Floor of a merged map, found over all its tiles from where all its runs drove."""
+"""Floor of a merged map, found over all its tiles from where all its runs drove; and that of any map."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.geometry import Points, apply, inverse
+from mapper.export.run_maps import editor_of, storeys_of_run
 from mapper.mapping.config import Edits
 from mapper.mapping.edits import MapEditor
 from mapper.merging.merged_map import MapManifest, MergedMap
@@ -14,6 +15,7 @@ from mapper.navigation.floor import Floor, floor_of, margin_for
 from mapper.navigation.traversable import Storey, traversable
 from mapper.octree.columns import block_extent, columns_of, occupied_voxels
 from mapper.octree.reading import read_octree
+from mapper.run.folder import Run
 
 MOST_COLUMNS = 1 << 25
 """More columns in the map's bounding box, and its floor would take more than about 2 GB."""
@@ -114,3 +116,25 @@ def with_keepout(storeys: tuple[Storey, ...], editors: Sequence[MapEditor]) -> t
     for editor in editors:
         storeys, _ = editor.edit_storeys(storeys)
     return storeys
+
+
+def storeys_of(folder: Run | MergedMap) -> tuple[Storey, ...]:
+    """Return the storeys of the floor of a run or of a merged map, as ``storeys_of_map`` does.
+
+    Raises:
+        MapFileError: The octree, or a tile, cannot be read.
+        RunError: A merged run's trajectory is missing.
+    """
+    return storeys_of_run(folder) if isinstance(folder, Run) else storeys_of_map(folder)
+
+
+def keep_out_of(folder: Run | MergedMap) -> Callable[[Points], NDArray[np.bool_]] | None:
+    """Return the function that marks points in keep-out regions; None if there are no regions.
+
+    Raises:
+        RunError: A merged run's trajectory is missing.
+    """
+    editors = [editor_of(folder)] if isinstance(folder, Run) else editors_of_map(folder)
+    if not any(editor.edits.keepout for editor in editors):
+        return None
+    return lambda points: np.any([editor.keep_out(points) for editor in editors], axis=0)

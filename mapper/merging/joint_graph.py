@@ -105,7 +105,7 @@ def solve_jointly(
         T_map_worlds: (4, 4) first estimates of their worlds' poses.
         used: Shared places that agree on these poses.
         others: Shared places that do not, which are recorded as rejected.
-        config: How the first run solved its graph.
+        config: Settings by which the first run solved its graph.
 
     Raises:
         GraphError: The graph cannot be solved.

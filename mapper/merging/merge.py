@@ -98,7 +98,7 @@ def merge(
         placing: The runs, and the poses of their worlds.
         out: Folder to create; until it is whole it is called ``OUT.partial``.
         tile_m: About how long the edge of a tile is.
-        workers: Where the jobs run; those of a Dask cluster must see the same files.
+        workers: Workers that run the jobs; those of a Dask cluster must see the same files.
         progress: Receives stages, counts and notes.
         overwrite: Replace a map that is there, once the new one is whole.
         known: A map of the first of these runs, to which the others are added. What has not moved in it by

@@ -23,7 +23,7 @@ from mapper.merging.joint_graph import Tie
 from mapper.navigation.config import CostmapConfig, TraversableConfig
 from mapper.octree.config import OctreeConfig, SliceConfig
 from mapper.octree.grid import OccupancyGrid
-from mapper.octree.grid_file import stored_grid
+from mapper.octree.grid_file import stored_grid, stored_grid_if_any
 from mapper.octree.map import OctreeMap
 from mapper.octree.reading import read_octree
 from mapper.run import files
@@ -192,17 +192,18 @@ class MergedMap:
         Raises:
             RunError: There is none; the manifest's notes say why, unless the map was made before 2026-11-22.
         """
-        if not (self.path / f"{files.TRAVERSABLE}.yaml").is_file():
+        grid = stored_grid_if_any(self, files.TRAVERSABLE)
+        if grid is None:
             why = next(
                 (note for note in self.manifest.notes if "no traversable floor" in note), "merge again"
             )
             raise RunError(f"{self.path}: has no {files.TRAVERSABLE}.yaml; {why}")
-        return stored_grid(self, files.TRAVERSABLE)
+        return grid
 
     @property
     def keepout(self) -> OccupancyGrid | None:
         """Keep-out regions of its runs in the slice's cells; None if there are none."""
-        return stored_grid(self, files.KEEPOUT) if (self.path / f"{files.KEEPOUT}.yaml").exists() else None
+        return stored_grid_if_any(self, files.KEEPOUT)
 
     @property
     def graph(self) -> PoseGraph | None:

@@ -50,9 +50,9 @@ class Placed:
     Attributes:
         run: The run.
         T_map_world: (4, 4) pose of its world in the map.
-        how: Where the pose comes from, in a few words.
+        how: Source of the pose, in a few words.
         bent: Its frames' poses in its own world by a joint graph; None keeps those of the run.
-        kept: How it lies in the map that runs are added to, where that still holds.
+        kept: Its pose in the map that runs are added to, where that still holds.
     """
 
     run: Run
@@ -96,9 +96,9 @@ class Placing:
     """Runs in the map, and those whose pose is not known.
 
     Attributes:
-        placed: In the order they were given.
+        placed: Runs in the order in which they were given.
         left_out: Why each of the others is not in the map, by the run's path.
-        doubts: What is suspicious about the poses, a line each.
+        doubts: Warnings about the poses, a line each.
         joint: The pose graph of all of them; None if they are placed as rigid bodies.
     """
 

@@ -66,7 +66,7 @@ def solve_worlds(shared: Sequence[SharedPlace], gate: GateConfig) -> SolvedWorld
 
     Args:
         shared: Shared places as measured; some may be false.
-        gate: How far two places may disagree, by the distance between them: the drift within a run.
+        gate: Largest disagreement of two places, by the distance between them: the drift within a run.
     """
     pairs = defaultdict[tuple[int, int], list[SharedPlace]](list)
     for place in shared:

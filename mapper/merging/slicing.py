@@ -75,7 +75,7 @@ def slice_map(
     """Find the floor under the runs' paths, and cut the slice above it.
 
     Args:
-        workspace: With the tiles and their pieces.
+        workspace: Workspace with the tiles and their pieces.
         stages: Runs the jobs, one for each column of tiles.
         joined: The tiles.
         manifest: Manifest of the map, without what is found here.

@@ -50,7 +50,7 @@ class Stages:
         """Yield the name and the result of every job, those known from an earlier session first.
 
         Args:
-            stage: What the jobs are called together.
+            stage: Name of the jobs together.
             work: Functions by job name; a merge that is started again recognises its jobs by these names.
             kind: Type of the results.
 

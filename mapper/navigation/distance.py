@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from mapper.core.errors import DataError
 from mapper.core.geometry import Array, Points
 from mapper.navigation.distance_transform import NONE, squares_to_boxes
-from mapper.navigation.voxels import LIMIT_BYTES, Box, VoxelGrid, cut_box, layer
+from mapper.navigation.voxels import Box, VoxelGrid, cut_box, layer
 from mapper.octree.grid import OccupancyGrid
 from mapper.octree.map import OctreeMap
 
@@ -73,21 +73,18 @@ def distance_2d(grid: OccupancyGrid, *, unknown_blocks: bool) -> Distances:
     return np.ascontiguousarray(distances_m[0, 1:-1, 1:-1])
 
 
-def distance_3d(
-    octree: OctreeMap, box: Box, *, unknown_blocks: bool, limit_bytes: int = LIMIT_BYTES
-) -> DistanceField:
+def distance_3d(octree: OctreeMap, box: Box, *, unknown_blocks: bool) -> DistanceField:
     """Return the distance field of a box of the map; obstacles outside the box do not count.
 
     Args:
         octree: The map.
         box: Part of the map; larger than the wanted part by the distance of interest.
         unknown_blocks: Whether unknown voxels count as obstacles.
-        limit_bytes: Limit of the working space.
 
     Raises:
         MapSizeError: More space is needed; nothing has been allocated then.
     """
-    voxels = cut_box(octree, box, bytes_per_voxel=_BYTES_PER_VOXEL, limit_bytes=limit_bytes)
+    voxels = cut_box(octree, box, bytes_per_voxel=_BYTES_PER_VOXEL)
     return distance_field(voxels, unknown_blocks=unknown_blocks)
 
 

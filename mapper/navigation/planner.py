@@ -13,7 +13,7 @@ from mapper.navigation.config import PlanConfig
 from mapper.navigation.distance import DistanceField, distance_field
 from mapper.navigation.line_of_sight import in_sight, path_length, shortened
 from mapper.navigation.search import Cell, shortest_path
-from mapper.navigation.voxels import LIMIT_BYTES, VoxelGrid, cut_box, known_box, layer
+from mapper.navigation.voxels import VoxelGrid, cut_box, known_box, layer
 from mapper.octree.grid import OCCUPIED, UNKNOWN, OccupancyGrid
 from mapper.octree.map import OctreeMap
 
@@ -91,7 +91,6 @@ def plan_3d(
     *,
     config: PlanConfig,
     keep_out: Callable[[Points], NDArray[np.bool_]] | None = None,
-    limit_bytes: int = LIMIT_BYTES,
 ) -> Plan:
     """Return a shortest path for a ball through the known part of the octree, as :func:`plan_2d` does.
 
@@ -101,13 +100,12 @@ def plan_3d(
         goal_world: (3,) metres.
         config: Radius, and whether unknown voxels are blocked.
         keep_out: Returns which of (N, 3) points, metres, are blocked in addition.
-        limit_bytes: Limit of the working space.
 
     Raises:
         PlanError: As :func:`plan_2d`.
         MapSizeError: The known part of the map is too large.
     """
-    voxels = cut_box(octree, known_box(octree), bytes_per_voxel=_BYTES_PER_VOXEL, limit_bytes=limit_bytes)
+    voxels = cut_box(octree, known_box(octree), bytes_per_voxel=_BYTES_PER_VOXEL)
     if keep_out is not None:
         _block(voxels, keep_out)
     return _planned(voxels, np.asarray(start_world, np.float64), np.asarray(goal_world, np.float64), config)

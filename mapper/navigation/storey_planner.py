@@ -29,7 +29,7 @@ def plan_storeys(
     with floor there.
 
     Args:
-        storeys: From :func:`mapper.navigation.traversable.traversable`, with links.
+        storeys: Storeys from :func:`mapper.navigation.traversable.traversable`, with links.
         start_world: (2,) or (3,) metres.
         goal_world: (2,) or (3,) metres.
         config: Radius, and whether unknown cells are blocked.

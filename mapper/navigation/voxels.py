@@ -14,7 +14,7 @@ from mapper.octree.keys import BLOCK_BITS, BLOCK_VOXELS, KEY_COUNT, KEY_ZERO, bl
 from mapper.octree.map import OctreeMap
 
 LIMIT_BYTES = 2 << 30
-"""Default limit of the working space of a distance field or a plan."""
+"""Limit of the working space of a distance field or a plan."""
 
 _BLOCK_EDGE = 1 << BLOCK_BITS
 
@@ -80,16 +80,13 @@ def known_box(octree: OctreeMap) -> Box:
     return Box(low * octree.resolution_m, high * octree.resolution_m)
 
 
-def cut_box(
-    octree: OctreeMap, box: Box, *, bytes_per_voxel: int, limit_bytes: int = LIMIT_BYTES
-) -> VoxelGrid:
+def cut_box(octree: OctreeMap, box: Box, *, bytes_per_voxel: int) -> VoxelGrid:
     """Return the states of all voxels that a box touches.
 
     Args:
         octree: The map.
         box: Part of the map; it may reach beyond known voxels, but not beyond the key range.
         bytes_per_voxel: Working space of the caller per voxel, these states included.
-        limit_bytes: Limit of the working space.
 
     Raises:
         MapSizeError: More space is needed; nothing has been allocated then.
@@ -105,10 +102,10 @@ def cut_box(
         )
     counts = [int(n) for n in last - first + 1]
     needed_bytes = bytes_per_voxel * prod(counts)
-    if needed_bytes > limit_bytes:
+    if needed_bytes > LIMIT_BYTES:
         raise MapSizeError(
             f"a box of {'×'.join(str(n) for n in counts)} voxels needs {needed_bytes / 2**30:.1f} GiB of "
-            f"working space, the limit is {limit_bytes / 2**30:.1f}; choose a smaller box or a coarser map"
+            f"working space, the limit is {LIMIT_BYTES / 2**30:.1f}; choose a smaller box or a coarser map"
         )
     states = np.full(counts[::-1], UNKNOWN, dtype=np.int8)
     codes = octree.blocks.codes

@@ -105,7 +105,7 @@ def columns_of(
 
     Args:
         voxels: (N,) from ``occupied_voxels``, those of all parts of the map; they are sorted in place.
-        extent: From ``block_extent``, of all parts.
+        extent: Extent of all parts, from ``block_extent``.
         margin: So many columns are added around it.
         resolution_m: Edge of a voxel.
 

@@ -47,13 +47,16 @@ def read_grid(path: Path) -> OccupancyGrid:
 
 
 class _Folder(Protocol):
-    """A run or a merged map."""
+    """Run or merged map."""
+
+    @property
+    def path(self) -> Path: ...
 
     def file(self, name: str, /) -> Path: ...
 
 
 def stored_grid(folder: _Folder, stem: str) -> OccupancyGrid:
-    """Return a grid of a run or of a merged map: its slice, or its traversable floor.
+    """Return a grid of a run or of a merged map, such as its slice.
 
     Raises:
         RunError: A file is not as it was written.
@@ -61,6 +64,11 @@ def stored_grid(folder: _Folder, stem: str) -> OccupancyGrid:
     """
     folder.file(f"{stem}.pgm")
     return read_grid(folder.file(f"{stem}.yaml"))
+
+
+def stored_grid_if_any(folder: _Folder, stem: str) -> OccupancyGrid | None:
+    """Return a grid as :func:`stored_grid` does; None if there is none of this name."""
+    return stored_grid(folder, stem) if (folder.path / f"{stem}.yaml").exists() else None
 
 
 def _read_settings(path: Path) -> dict[str, str]:

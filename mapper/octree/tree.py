@@ -86,7 +86,7 @@ def preorder_of(store: BlockStore, *, root_depth: int = 0) -> Preorder:
     """Return the nodes of a map, in memory that is a tenth of the map's and 100 MB.
 
     Args:
-        store: At least one block.
+        store: Store of at least one block.
         root_depth: Depth of a node above all blocks that serves as root; it is listed first.
     """
     slots = store.sorted_slots()
@@ -120,7 +120,7 @@ def words_in_preorder(
     """Return (W,) uint16, the words of a ``.bt`` file, one for each inner node, and the root's NODE.
 
     Args:
-        store: At least one block.
+        store: Store of at least one block.
         threshold: Log-odds from which a voxel is occupied.
         root_depth: Depth of a node above all blocks that serves as root.
     """

@@ -14,7 +14,7 @@ def add_region(source: Log, run: Run, kind: EditKind, region: Region, *, progres
     Args:
         source: The log that the run was built from.
         run: A finished run.
-        kind: What to do in the region.
+        kind: Kind of the edit.
         region: The region.
         progress: Receives stages, counts and notes.
 

@@ -28,7 +28,7 @@ from mapper.octree.scan_update_file import ScanUpdateWriter, open_scan_updates
 from mapper.pipeline.checkpoints import Checkpoints
 from mapper.pipeline.distortion_warnings import distortion_warnings
 from mapper.pipeline.fuse_checkpoints import MarkedUpdates, known_updates
-from mapper.pipeline.judge import judge
+from mapper.pipeline.settings_trial import try_settings
 from mapper.run import files
 from mapper.run.edits_file import edits_text, parse_edits, write_edits
 from mapper.run.folder import Run, moved_log, open_run
@@ -38,7 +38,8 @@ from mapper.run.manifest import DepthReach, Solve, Status, Timing
 from mapper.run.observers import NULL_OBSERVER, Observer
 from mapper.run.results import RunResults
 from mapper.run.stored_tracking import StoredTracking, load_tracking, save_solved
-from mapper.run.warnings import FLOOR, floor_warnings
+from mapper.run.verdict import TRACKING_KINDS, verdict_of
+from mapper.run.warnings import FLOOR, find_warnings, floor_warnings
 from mapper.run.writer import RunWriter, write_run
 from mapper.runtime.atomic import is_temporary
 from mapper.runtime.progress import SILENT, Progress
@@ -97,7 +98,7 @@ def fuse_changed(
     Args:
         source: The log that the run was built from.
         run: A finished run, with the configuration to fuse by.
-        changed: What replaces the run's own; None keeps that.
+        changed: Tracking that replaces the run's own; None keeps that.
         solve: Record of the solve that changed it, for the manifest; None keeps the old one.
         edits: Text to replace the run's ``edits.toml``; None keeps that.
         progress: Receives stages, counts and notes.
@@ -183,7 +184,7 @@ def fuse_into(
     """Fuse the trajectory of an unfinished run and write everything that is made from the maps.
 
     Args:
-        writer: Of the run, with its trajectory, graph and frame records.
+        writer: Writer of the run, which has its trajectory, graph and frame records.
         source: The log that was tracked.
         config: All settings.
         progress: Receives stages, counts and notes.
@@ -229,7 +230,7 @@ def fuse_into(
     others = [warning for warning in writer.manifest.warnings if warning.kind != FLOOR]
     found = floor_warnings(config.traversable, config.octree.resolution_m, has_path=maps.has_path)
     writer.update(warnings=(*others, *found), edits=maps.edits)
-    judge(writer, source, config, results, progress=progress)
+    _write_verdict(writer, source, config, results, progress)
     counts = writer.manifest.counts.model_copy(
         update={
             "leaves": len(maps.octree),
@@ -242,6 +243,22 @@ def fuse_into(
     log_s = _duration_s(trajectory, [log.begins_ns for log in writer.manifest.input.appended])
     writer.record_timing(log_s=log_s, frames=counts.read)
     observer.on_mapped(Run(writer.folder, config, writer.manifest), results, maps)
+
+
+def _write_verdict(
+    writer: RunWriter, source: Log, config: BuildConfig, results: RunResults, progress: Progress
+) -> None:
+    """Write all warnings and the verdict into a run's manifest.
+
+    Where frames were lost or doubtful, other settings are tried, unless the manifest has a trial already.
+    """
+    warnings = find_warnings(results, writer.manifest)
+    trial = writer.manifest.trial
+    is_poor = any(warning.kind in TRACKING_KINDS and warning.weight != "note" for warning in warnings)
+    if is_poor and trial is None:
+        with writer.clock.stage("track"):
+            trial = try_settings(source, config, results, progress=progress)
+    writer.update(warnings=tuple(warnings), trial=trial, verdict=verdict_of(warnings, trial))
 
 
 def _warn_of_distortion(writer: RunWriter, source: Log, progress: Progress) -> None:

@@ -18,11 +18,12 @@ from mapper.loops.factory import LOOPS_OF, build_verifier
 from mapper.loops.map_constraints import KnownPlaces
 from mapper.loops.place_file import AnyPlace, read_places
 from mapper.merging.extending import runs_of
-from mapper.merging.merged_map import open_map
+from mapper.merging.map_folders import open_map_folder
+from mapper.merging.merged_map import MergedMap
+from mapper.octree.grid import OccupancyGrid
 from mapper.pipeline.reobserve import reobserve
 from mapper.run import files
-from mapper.run.folder import Run, open_run
-from mapper.run.manifest import is_merged_map
+from mapper.run.folder import Run
 from mapper.runtime.progress import SILENT, Progress
 
 _MAX_MOVED_RATIO = 0.14
@@ -35,11 +36,13 @@ class KnownMap:
 
     Attributes:
         path: Folder of the run or of the merged map.
+        slice: Its 2D navigation map.
         config: Settings by which its places were observed: those of its first run.
         places: Places of all of its runs, in the map's frame.
     """
 
     path: Path
+    slice: OccupancyGrid
     config: BuildConfig
     places: KnownPlaces[Any]
 
@@ -58,11 +61,8 @@ def load_known_map(path: Path, *, progress: Progress = SILENT) -> KnownMap:
         RunError: There is no such map, it has no places, its runs have changed or were observed by other
             settings, or the log of an old run is no longer there.
     """
-    if not is_merged_map(path):
-        run = open_run(path)
-        members = [(run, run.graph.T_world_node)]
-    else:
-        members = _members(path)
+    folder = open_map_folder(path)
+    members = [(folder, folder.graph.T_world_node)] if isinstance(folder, Run) else _members(folder)
     first, _ = members[0]
     places: dict[int, AnyPlace] = {}
     T_map_node: dict[int, Transform] = {}
@@ -79,12 +79,12 @@ def load_known_map(path: Path, *, progress: Progress = SILENT) -> KnownMap:
         raise RunError(
             f"{path}: no keyframe of it can be recognised; build it with loops.kind=places or scans"
         )
-    return KnownMap(path, first.config, KnownPlaces(places, T_map_node))
+    return KnownMap(path, folder.slice, first.config, KnownPlaces(places, T_map_node))
 
 
-def _members(path: Path) -> list[tuple[Run, dict[int, Transform]]]:
+def _members(merged: MergedMap) -> list[tuple[Run, dict[int, Transform]]]:
     """Return the runs of a merged map, with the poses of their nodes in it."""
-    merged, members = open_map(path), []
+    members = []
     graph = merged.graph
     for member, run in zip(merged.manifest.runs, runs_of(merged), strict=True):
         if graph is None or member.first_node is None:

@@ -21,7 +21,6 @@ from mapper.graph.optimize import optimize
 from mapper.loops.closure import Discrepancy, accepted_loops, exceeds, why_none_accepted
 from mapper.loops.config import PlaceLoopsConfig, ScanLoopsConfig
 from mapper.loops.map_constraints import build_map_constraint_detector
-from mapper.octree.grid_file import read_grid
 from mapper.odometry.factory import odometry_for
 from mapper.odometry.node_offset import NodeOffset
 from mapper.pipeline.components import component_of
@@ -254,7 +253,7 @@ def _write(writer: RunWriter, source: Log, known: KnownMap, tracking: TrackingRe
     writer.update(warnings=tuple(warnings), verdict=verdict_of(warnings))
     write_localised(
         folder / files.SUMMARY,
-        grid=read_grid(known.path / f"{files.SLICE}.yaml"),
+        grid=known.slice,
         poses=poses,
         begins_ns=[record.stamp_ns for record in stored.records if record.node is None],
         recognised_world=np.array([stored.graph.T_world_node[loop.j][:3, 3] for loop in held]),

@@ -38,9 +38,9 @@ def place_by_shared_places(
     they are, and each run is placed as a rigid body. Places of all runs are held in memory.
 
     Args:
-        runs: At least one; the first must have places. A run made before places were stored has them observed
-            again from its log.
-        workers: Where places are compared.
+        runs: Runs, at least one; the first must have places. A run made before places were stored has them
+            observed again from its log.
+        workers: Workers that compare places.
         progress: Receives stages and notes.
 
     Returns:
@@ -77,9 +77,9 @@ def place_jointly(
     keyframes are nearest to where they were in it; what is left is the bend.
 
     Args:
-        runs: At least one; the first must have places.
+        runs: Runs, at least one; the first must have places.
         known: A map of the first of these runs by a joint graph: they are not searched in each other again.
-        workers: Where places are compared.
+        workers: Workers that compare places.
         progress: Receives stages and notes.
 
     Returns:

@@ -40,7 +40,7 @@ class FrameCheckpoint:
         result: Its result, or why there is none.
         search: The search for loops from it.
         frame_ms: Milliseconds that it took.
-        reading: What ``ReadingChecks`` keep of it.
+        reading: Its part in ``ReadingChecks``.
     """
 
     result: FrameResult | Skipped

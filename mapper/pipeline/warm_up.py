@@ -46,7 +46,7 @@ def _build_rgbd(folder: Path) -> None:
     from mapper.registration.isvd import Isvd
     from mapper.simulation import write_tum_log
     from mapper.simulation.config import SynthConfig
-    from mapper.sources.jpeg_entropy import check_entropy
+    from mapper.sources.image_files.jpeg_entropy import check_entropy
 
     check_entropy(encode_jpeg(np.zeros((8, 8, 3), np.uint8), width_px=8, quality=90))  # the log has PNGs
     bits = pack(np.zeros((2, 32), np.uint8))  # matching and ISVD of loop closures, which a second has none of

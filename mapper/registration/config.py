@@ -23,7 +23,7 @@ Distances = Annotated[tuple[PositiveFloat, ...], Field(min_length=1)]
 
 
 class AcceptanceConfig(Config):
-    """When a motion is accepted."""
+    """Acceptance of a motion."""
 
     near_voxels: PositiveFloat = 3.5
     surface_voxels: PositiveFloat = 0.33
@@ -75,8 +75,6 @@ class NdtConfig(Config):
     """Number of nearest points for each normal, with which the result is assessed."""
     cells_voxels: Distances = (7.0, 3.5)
     """Edges of the target's cells, each with one Gaussian, from coarse to fine."""
-    min_points: Annotated[int, Field(ge=4)] = 6
-    """Cells with fewer points have none."""
     max_iterations: PositiveInt = 30
     """Largest number of iterations at each of these cell sizes."""
     acceptance: AcceptanceConfig = AcceptanceConfig()

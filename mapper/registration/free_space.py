@@ -49,8 +49,8 @@ class FreeSpaceCounts:
 
     Attributes:
         points: Number of points.
-        agreeing: How many lie on a surface that the other scan measured.
-        contradicting: How many lie in space that the other scan's rays passed. The remaining points are
+        agreeing: Number of points on a surface that the other scan measured.
+        contradicting: Number of points in space that the other scan's rays passed. The remaining points are
             hidden behind surfaces, or in directions without returns.
     """
 

@@ -50,7 +50,7 @@ def refined(
         source: Cloud that moves.
         T_target_source: (4, 4) guess.
         config: Pair distances, from coarse to fine, iterations and acceptance.
-        kind: What is minimised.
+        kind: Error that is minimised.
     """
     alignment = refine(
         target,

@@ -13,6 +13,9 @@ from mapper.registration.config import NdtConfig
 from mapper.registration.surfaces import Prepared, prepared
 from mapper.runtime.extras import extra
 
+_MIN_POINTS = 6
+"""Cells with fewer points have no Gaussian: twice as many as span a plane."""
+
 
 class Ndt:
     """NDT: scans are registered by the Gaussians of the target's cells."""
@@ -44,7 +47,6 @@ class NdtAligner:
             cloud.points,
             T_target_source,
             cells_m=[cell_voxels * config.voxel_m for cell_voxels in config.cells_voxels],
-            min_points=config.min_points,
             max_iterations=config.max_iterations,
         )
         if isinstance(found, str):
@@ -58,7 +60,6 @@ def refine_by_cells(
     T_target_source: Transform,
     *,
     cells_m: Sequence[float],
-    min_points: int = 6,
     max_iterations: int = 30,
 ) -> Transform | str:
     """Return the motion refined from a guess, or why there is none.
@@ -71,13 +72,12 @@ def refine_by_cells(
         source: (M, 3) points that are placed in them, metres.
         T_target_source: (4, 4) guess.
         cells_m: Edges of the cells, from coarse to fine.
-        min_points: Cells with fewer points have no Gaussian.
         max_iterations: Largest number of steps at each cell size.
     """
     if len(source) == 0:
         return "no points in the source"
     for cell_m in cells_m:
-        found = _by_cells(target, source, T_target_source, cell_m, min_points, max_iterations)
+        found = _by_cells(target, source, T_target_source, cell_m, max_iterations)
         if isinstance(found, str):
             return found
         T_target_source = found
@@ -85,20 +85,20 @@ def refine_by_cells(
 
 
 def _by_cells(
-    target: Points, source: Points, T: Transform, cell_m: float, min_points: int, max_iterations: int
+    target: Points, source: Points, T: Transform, cell_m: float, max_iterations: int
 ) -> Transform | str:
     with extra("peers", "NDT"):
         import open3d
 
     registration = open3d.pipelines.registration
     option = registration.NormalDistributionsTransformOption(
-        voxel_size=cell_m, min_points_per_voxel=min_points, max_iteration=max_iterations
+        voxel_size=cell_m, min_points_per_voxel=_MIN_POINTS, max_iteration=max_iterations
     )
     with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
         try:
             result = registration.registration_ndt(_open3d_cloud(source), _open3d_cloud(target), option, T)
         except RuntimeError:
-            return f"no cell of {cell_m:g} m has {min_points} points of the target in it"
+            return f"no cell of {cell_m:g} m has {_MIN_POINTS} points of the target in it"
     if result.fitness == 0.0:
         return f"no point of the source lies in a cell of {cell_m:g} m that has a Gaussian: no overlap"
     # Open3D sums in the order its threads finish, so the last digits vary from run to run.

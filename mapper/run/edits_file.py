@@ -27,7 +27,7 @@ def parse_edits(text: str, folder: Path) -> Edits:
     """Return the edits of a text.
 
     Args:
-        text: In TOML.
+        text: Content of the file, TOML.
         folder: The run, for messages.
 
     Raises:

@@ -50,7 +50,7 @@ class RunFiles:
     """Files of a run that are written together.
 
     Attributes:
-        names: What they are called.
+        names: Names of the files.
         content: Their content, as docs/formats.md describes it.
         depends_on: "tracking": written once the log is tracked and its graph is solved; "maps": written by
             every fuse; "poses" and "exported maps": written on request, and outdated when the poses, or the

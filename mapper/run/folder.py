@@ -53,7 +53,7 @@ class Run:
 
     Attributes:
         path: Its folder.
-        config: What it was built with, every default spelled out.
+        config: Settings by which it was built, every default spelled out.
         manifest: Its ``manifest.json``.
     """
 
@@ -178,9 +178,9 @@ class Run:
     @cached_property
     def keepout(self) -> "OccupancyGrid | None":
         """Keep-out regions in the slice's cells; None if there are none."""
-        from mapper.octree.grid_file import stored_grid
+        from mapper.octree.grid_file import stored_grid_if_any
 
-        return stored_grid(self, files.KEEPOUT) if (self.path / f"{files.KEEPOUT}.yaml").exists() else None
+        return stored_grid_if_any(self, files.KEEPOUT)
 
     def plot(self, axes: "Axes | None" = None) -> "Axes":
         """Draw the path over the slice, seen from above, with loops, uncertainty and the truth if known.

@@ -113,7 +113,7 @@ def save_frames(writer: RunWriter, tracked: StoredTracking, *, nodes: int) -> No
 
     Args:
         writer: Writer of the run, or of a localised log.
-        tracked: What to write.
+        tracked: Tracking that is written.
         nodes: Number of the graph's nodes that are of the log.
     """
     folder = writer.folder

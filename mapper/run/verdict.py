@@ -13,7 +13,7 @@ def verdict_of(warnings: Sequence[RunWarning], trial: Trial | None = None) -> Ve
 
     Args:
         warnings: Warnings from ``find_warnings``.
-        trial: What a trial of other settings found, which is the suggestion for frames lost and doubtful.
+        trial: Result of the trial of other settings, which is the suggestion for frames lost and doubtful.
     """
     heavy = [with_trial(warning, trial) for warning in warnings if warning.weight != "note"]
     weights = {warning.weight for warning in heavy}

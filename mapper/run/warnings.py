@@ -70,7 +70,7 @@ def merge_warnings(name: str, *, agreement: float | None, shared_voxels: int) ->
 
     Args:
         name: Name of the run.
-        agreement: Of the shared voxels that are occupied in either, the share that is occupied in both.
+        agreement: Share occupied in both, of the shared voxels that are occupied in either.
         shared_voxels: Number of voxels that are known in both.
     """
     if agreement is None or shared_voxels < _LEAST_SHARED_VOXELS or agreement >= _LEAST_AGREEMENT:

@@ -31,7 +31,7 @@ class RunWriter:
     Attributes:
         folder: Folder of the files.
         clock: Times the stages.
-        manifest: What will be written at the end; ``update`` replaces parts of it.
+        manifest: Manifest that is written at the end; ``update`` replaces parts of it.
     """
 
     def __init__(self, folder: Path, manifest: Manifest) -> None:
@@ -61,7 +61,7 @@ class RunWriter:
 
         Args:
             log_s: Duration of the log that was worked on.
-            frames: How many of its frames were read.
+            frames: Number of its frames that were read.
         """
         seconds = {stage: round(value, 3) for stage, value in self.clock.seconds.items()}
         total_s = max(sum(seconds.values()), 1e-9)
@@ -101,7 +101,7 @@ def write_run(
 
     Args:
         out: Run folder to create.
-        manifest: What to begin with.
+        manifest: Manifest to begin with.
         config: Every setting.
         overwrite: Replace a run that is there; one that holds a user's own files only with ``takes_over``.
         takes_over: The caller copies a user's own files from the run that is replaced.

@@ -30,9 +30,9 @@ class FolderKind:
     """Kind of folder that a verb writes, by which one that may be replaced is known.
 
     Attributes:
-        name: What messages call it, as in "a run".
+        name: Name in messages, as in "a run".
         manifest_keys: Keys that its ``manifest.json`` has.
-        files: What may be in it: names, or patterns of names.
+        files: Names, or patterns of names, that may be in it.
         kind: Value of the manifest's ``kind``; None if it has none.
     """
 
@@ -173,7 +173,7 @@ def atomic_folder(
 
     Args:
         out: Folder to create.
-        kind: What it will be; only such a folder is replaced, and only if nothing else is in it.
+        kind: Kind of the folder; only such a folder is replaced, and only if nothing else is in it.
         overwrite: Replace a folder that is there; it stays untouched until the new one is whole.
         takes_over: The caller copies what else is in the folder that is replaced.
         keeps: Returns the names of what an earlier process left in ``OUT.partial`` that stays; what else is

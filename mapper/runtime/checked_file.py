@@ -23,7 +23,7 @@ class CheckedFormat:
     Attributes:
         magic: First bytes of a file: not text, and damaged by whatever takes it for text.
         version: The only one that can be read.
-        remedy: What to do with a file of another version.
+        remedy: Instruction for a file of another version.
         error: Raised for a file that cannot be read.
     """
 

@@ -71,8 +71,8 @@ def make_executor(workers: Workers, *, jobs: int | None = None) -> Executor:
     """Return an executor for one or several lists of jobs, one after the other.
 
     Args:
-        workers: Where the jobs run.
-        jobs: How many there will be, if that is known: no more processes are started.
+        workers: Workers that run the jobs.
+        jobs: Number of jobs, if that is known: no more processes are started.
 
     Raises:
         ConfigError: The scheduler does not answer, or has no workers.
@@ -95,8 +95,8 @@ def run_jobs(
         jobs: Callables that can be pickled: a ``functools.partial`` of a module's function, or a frozen
             dataclass with ``__call__``. Their results travel through a pipe, so big ones belong in files.
         executor: Leaving it, as Ctrl-C does, ends local workers at once; a Dask worker finishes its job.
-        attempts: How often a job is begun before it is given up. Dask itself begins a job whose worker ended
-            again on others, as its ``allowed-failures`` says.
+        attempts: Number of times that a job is begun before it is given up. Dask itself begins a job whose
+            worker ended again on others, as its ``allowed-failures`` says.
 
     Raises:
         ConfigError: ``attempts`` is not positive, or the scheduler went away.

@@ -16,7 +16,7 @@ def extra(name: str, purpose: str) -> Iterator[None]:
 
     Args:
         name: Name of the extra, as in pyproject.toml.
-        purpose: What they are needed for, as a message begins.
+        purpose: Use of the libraries, as a message begins.
 
     Raises:
         DependencyError: One of them is not installed.
@@ -33,7 +33,7 @@ def require(library: str, name: str, purpose: str) -> None:
     Args:
         library: Name by which the library is imported.
         name: Name of the extra.
-        purpose: What it is needed for, as a message begins.
+        purpose: Use of the library, as a message begins.
 
     Raises:
         DependencyError: It is not installed.

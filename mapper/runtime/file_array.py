@@ -21,7 +21,7 @@ class FileArray:
         """Start without rows.
 
         Args:
-            folder: On the disk that takes the file.
+            folder: Folder on the disk that takes the file.
             columns: Numbers in a row.
             kind: Type of the numbers.
 

@@ -28,7 +28,7 @@ def call_isolated(job: Callable[[], R], *, memory_bytes: int) -> R:
 
     Args:
         job: A callable that can be pickled, as its result and exceptions can.
-        memory_bytes: How much it may allocate (Linux).
+        memory_bytes: Limit of what it may allocate (Linux).
 
     Raises:
         DataError: The process ended; the message says how.

@@ -124,7 +124,7 @@ class StateFile:
 
     Attributes:
         folder: Folder of the two files.
-        name: What both names begin with.
+        name: Beginning of both names.
     """
 
     folder: Path

@@ -22,7 +22,7 @@ def ordered_map(
         work: Thread-safe function; gains from threads if it releases the GIL, as OpenCV and numba do.
         items: Read in the caller's thread, a few at a time.
         workers: Threads; 0 works in the caller's thread.
-        ahead: How many results may be pending.
+        ahead: Number of results that may be pending.
     """
     if workers == 0:
         yield from map(work, items)

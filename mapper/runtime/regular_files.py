@@ -48,10 +48,10 @@ def read_text(
     """Return the text of a file.
 
     Args:
-        path: As of :func:`read_regular`.
-        error: What is raised.
+        path: File, as of :func:`read_regular`.
+        error: Class of the error.
         encoding: Encoding of the text.
-        may_be_pipe: As of :func:`read_regular`.
+        may_be_pipe: Whether it may be a pipe, as of :func:`read_regular`.
 
     Raises:
         MapperError: ``error``: it cannot be read, is no regular file, too large or no text; the message says

@@ -29,7 +29,7 @@ class Job:
     Attributes:
         key: Name of the result's file. The same key stands for the same result, in other sessions too, so it
             is a hash of all that decides the result unless its folder is for one piece of work alone.
-        label: What messages call the job.
+        label: Name of the job in messages.
         run: Does the work, and can be pickled; ``mapper.runtime.executor`` says how.
     """
 
@@ -49,7 +49,7 @@ class JobResult:
     Attributes:
         key: The job's.
         label: The job's.
-        records: What its work returned; empty if it failed.
+        records: Records that its work returned; empty if it failed.
         seconds: Wall time of the work, wherever it ran; 0 if it failed.
         failure: Why it failed, in one line, or empty.
     """
@@ -86,7 +86,7 @@ class JobRunner:
         Args:
             jobs: Jobs with different keys.
             executor: Executor that runs them.
-            attempts: How often a job is begun before it has failed.
+            attempts: Number of times that a job is begun before it has failed.
         """
         folder = self.folder.resolve()
         outcomes = run_jobs([_KeptJob(job, folder) for job in jobs], executor, attempts=attempts)

@@ -43,7 +43,7 @@ def dump(
     """Write a state.
 
     Args:
-        state: What to write.
+        state: Object that is written.
         file: Takes its bytes.
         fixed: Parts that are not written, by name; ``loads`` is given their equals.
         archive: Returns where data is kept that there is an ``Archived`` of; None makes it a part of the

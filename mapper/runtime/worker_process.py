@@ -26,7 +26,7 @@ class Failure:
     Attributes:
         reason: One line: a MapperError's message, another exception's type, message and place, or how the
             worker ended.
-        attempts: How often the job was begun.
+        attempts: Number of times that the job was begun.
     """
 
     reason: str

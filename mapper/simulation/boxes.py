@@ -21,7 +21,7 @@ class Boxes:
     """Solid boxes in the world frame (z up, floor at z = 0).
 
     Attributes:
-        names: What each box is part of, e.g. "wall" or "desk".
+        names: Name of the thing that each box is part of, e.g. "wall" or "desk".
         centers_world: (N, 3) float64 metres.
         half_sizes_m: (N, 3) float64 metres, along the box's own axes.
         yaws_rad: (N,) float64 turn of each box about the vertical.

@@ -21,8 +21,8 @@ class Light:
     """Light from above and a little from one side.
 
     Attributes:
-        yaw_rad: From which side.
-        swing: How much brighter that side of things is than the mean of both.
+        yaw_rad: Direction that it comes from.
+        swing: Relative excess of that side's brightness over the mean of both sides.
         gain: Brightness of all.
     """
 
@@ -111,7 +111,7 @@ class Builder:
         """Add one box.
 
         Args:
-            name: What it is part of.
+            name: Name of the thing that it is part of.
             place: Frame in which ``low`` is given.
             low: The corner with the smallest x, y, z, metres.
             size: Extent along x, y, z, metres.

@@ -42,7 +42,7 @@ class Piece:
     """A kind of furniture.
 
     Attributes:
-        name: What its boxes are called.
+        name: Name of its boxes.
         smallest: Smallest size.
         largest: Largest size.
         build: Adds the boxes of one piece of a given size.

@@ -42,7 +42,7 @@ def write_tum_log(
 
     Args:
         out: Folder to make; it must not exist.
-        config: What to record.
+        config: Settings of the log.
         on_progress: Called with (frames written, frames in all) after every frame.
 
     Raises:

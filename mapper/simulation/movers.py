@@ -27,7 +27,7 @@ class Movers:
 
     Attributes:
         still: The boxes, then all parts of the people, standing on the world's origin.
-        faces: How they look, in the textures of the scene; None if there are no boxes.
+        faces: Faces in the textures of the scene; None if there are no boxes.
         route: (R, 2) control points of the way, as in ``Plan``.
         starts_m: (M,) where along the way each box is at the start.
         speeds_mps: (M,) negative against the walker's direction.

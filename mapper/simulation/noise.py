@@ -19,7 +19,7 @@ def fractal(
         rng: Source of the noise.
         shape: (H, W) in pixels.
         cell_px: Height and width of the largest blobs; each octave halves size and amplitude.
-        octaves: How many sizes are summed.
+        octaves: Number of sizes that are summed.
     """
     total = np.zeros(shape, dtype=np.float32)
     for octave in range(octaves):

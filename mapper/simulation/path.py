@@ -29,7 +29,7 @@ class Motion:
     """Motion of a camera: its pose at any time.
 
     Attributes:
-        duration_s: From the first to the last frame.
+        duration_s: Time from the first to the last frame.
         steady: Maps (N,) seconds to position (N, 3) metres and yaw, pitch, roll (N, 3) radians.
         shake: Maps (N,) seconds to what an unsteady hand adds to each of these six, (N, 6).
     """

@@ -33,7 +33,7 @@ class Walkers:
         positions: (P, 2) where each is at the start, world x and y, metres.
         velocities_mps: (P, 2) while they walk.
         stops_s: (P,) when each stops.
-        stand_s: How long each stands.
+        stand_s: Duration that each stands.
     """
 
     positions: Array

@@ -62,7 +62,7 @@ class Plan:
     """Floor plan: rooms, walls and the walking route.
 
     Attributes:
-        rooms: In the order in which the route visits them.
+        rooms: Rooms in the order in which the route visits them.
         walls: All of them, doors included.
         route: (R, 2) control points of the closed uniform cubic B-spline one walks, world x and y in metres.
         desk_center: (2,) middle of the desk in room 0, which stands against the wall y = y0; only in a flat.

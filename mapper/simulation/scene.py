@@ -41,7 +41,7 @@ class Scene:
 
     Attributes:
         boxes: Every solid; ``boxes.occupied`` and ``boxes.signed_distance_m`` are the ground truth of maps.
-        faces: How the boxes look.
+        faces: Faces of the boxes.
         atlas: The textures.
         plan: Rooms, doors and the free way round.
     """

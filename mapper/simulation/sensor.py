@@ -40,7 +40,7 @@ def observe(
     Args:
         rendering: The exact image.
         focal_px: Focal length of the rendering.
-        sensor: How good the sensor is.
+        sensor: Settings of the sensor.
         rng: This frame's own noise.
         warp_px: (H, W) constant error of the disparity; None is none.
     """

@@ -69,9 +69,9 @@ def synthetic_log(
     """Return the log of a simulated sensor, with wheel odometry where it is configured.
 
     Args:
-        config: What the log is made from.
-        name: What the log is called.
-        sensor: What the frames are.
+        config: Settings of the log.
+        name: Name of the log.
+        sensor: Kind of the frames.
         truth: Exact T_world_body of every frame.
         poses: Maps (N,) seconds after the start to (N, 4, 4) exact T_world_body.
         simulate: Returns a frame by its number; an image is grey where the second argument is false.
@@ -101,9 +101,9 @@ class CameraSimulator:
     """RGB-D camera that moves through a flat.
 
     Attributes:
-        config: What the log is made from.
+        config: Settings of the log.
         scene: The world, without what moves in it.
-        movers: What moves in it.
+        movers: Objects that move in it.
         camera: The camera.
         motion: Its pose at any time.
         truth: Exact T_world_camera of every frame, also of those that the log drops.

@@ -33,7 +33,7 @@ def counted(
         config: Size of the errors, and rate of the readings.
         poses: Maps (N,) seconds after the start to (N, 4, 4) exact T_world_body.
         duration_s: Length of the log.
-        sensor: What the body is.
+        sensor: Sensor whose frame is the body's.
         rng: Source of the errors.
     """
     count = round(duration_s * config.rate_hz) + 2  # the last reading is after the last frame

@@ -130,17 +130,17 @@ class Log:
     """A recorded log: the same frames in time order, however often it is read.
 
     Attributes:
-        path: What was opened.
-        name: What the log calls itself; the folder's name where it does not say.
+        path: File or folder that was opened.
+        name: Name that the log gives itself; the folder's name where it does not say.
         kind: Format that it was recognised as, e.g. "tum".
-        sensor: What its frames are.
+        sensor: Sensor that took its frames.
         stamps_ns: (N,) time of every frame, nanoseconds, strictly increasing.
         entry_at: Returns the entry of frame 0 … N - 1; nothing is decoded yet.
         truth: True T_world_body, if the log has it.
         accelerations: Accelerometer readings, if the log has them.
         wheels: T_odom_body by wheel odometry, in a frame of its own that drifts, if the log has it.
         are_units_assumed: Nothing says how many units of its depth images a metre has.
-        notes: What opening it had to leave out or assume, a sentence each.
+        notes: Sentences on what opening it left out or assumed.
         removed_distortion: Returns the depth distortion that frames are loaded without, or None if none was
             found. None itself where frames are loaded as they were recorded.
         sessions: The logs that a chained log is made of, oldest first; empty for any other.

@@ -41,7 +41,7 @@ class CameraConfig(Config):
 
 
 class TopicsConfig(Config):
-    """Which topics of an MCAP file or a ROS bag are read; None is guessed, and told."""
+    """Topics of an MCAP file or a ROS bag that are read; None is guessed, and reported."""
 
     color: str | None = None
     """Colour or grey images."""
@@ -60,7 +60,7 @@ class TopicsConfig(Config):
 
 
 class WheelsConfig(Config):
-    """How a log's wheels move its body."""
+    """Kinematics of a log's wheels."""
 
     wheelbase_m: PositiveFloat | None = None
     """Distance between the axles; required for a log's encoders.txt, not for its wheels.txt."""

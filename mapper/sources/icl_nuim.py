@@ -18,7 +18,7 @@ from mapper.sources.calibration import ICL_NUIM
 from mapper.sources.config import SourceConfig
 from mapper.sources.listed_files import present
 from mapper.sources.numbered import RATE_HZ, find_images, stamp_at
-from mapper.sources.pairing import pair_anew
+from mapper.sources.pairing import apply_depth_offset
 from mapper.sources.rgbd import FramePair, find_calibration, rgbd_log
 from mapper.sources.text import (
     parse_count,
@@ -60,16 +60,16 @@ def read_log(path: Path, config: SourceConfig) -> Log:
             f"camera assumed to be the {ICL_NUIM.origin}; if not, put a calibration.toml beside the log"
         )
     truth, truth_notes = _read_truth(path, rate_hz)
-    shifted, shift_notes = pair_anew(pairs, config, path=path)
+    pairs_used, offset_notes = apply_depth_offset(pairs, config, path=path)
     return rgbd_log(
-        shifted,
+        pairs_used,
         calibration,
         depth_units_per_m=units_per_m,
         path=path,
         name=path.resolve().name,
         kind="icl-nuim",
         truth=truth,
-        notes=[*notes, *shift_notes, *truth_notes],
+        notes=[*notes, *offset_notes, *truth_notes],
     )
 
 

@@ -36,9 +36,9 @@ class Timing:
     """Rate and gaps of messages or frames.
 
     Attributes:
-        count: How many there are.
+        count: Number of stamps.
         first_ns: Stamp of the first.
-        duration_s: From the first to the last.
+        duration_s: Time from the first to the last.
         rate_hz: One over the median time between two; 0 with fewer than two.
         gaps: Pauses of more than three usual periods.
         longest_gap_s: The longest time between two.
@@ -67,18 +67,18 @@ class LogFacts:
     """Facts of a log that can be mapped.
 
     Attributes:
-        name: What the log calls itself.
+        name: Name that the log gives itself.
         kind: Format of the log.
         sensor: "rgbd" or "lidar".
-        frames: How its frames follow each other.
+        frames: Timing of its frames.
         content: The first frame that can be read, in words, or that none can.
         calibration: The camera, in words; None of a LiDAR.
-        truth: What truth there is, in words; None without.
-        wheels: How the readings of its wheels follow each other; None without.
+        truth: Description of its truth; None without.
+        wheels: Timing of its wheels' readings; None without.
         wheels_path_m: Length of their path, metres.
-        readings: How many accelerations there are.
-        notes: What opening it had to leave out or assume.
-        warnings: What is implausible about its depth.
+        readings: Number of accelerations.
+        notes: Sentences on what opening it left out or assumed.
+        warnings: Sentences on what is implausible about its depth.
         vehicle: Box around the sensor's own vehicle, least x y z and largest, metres, body frame; None where
             none is seen.
     """
@@ -103,7 +103,7 @@ class Inspection:
     """Facts of a log, and of a recording's topics.
 
     Attributes:
-        path: What was opened.
+        path: File or folder that was opened.
         topics: Every topic, of a recording.
         log: Its frames; None if it has none.
         problem: Why nothing can be mapped; None if something can.

@@ -26,7 +26,7 @@ def write_kitti_log(
     within 20 ms, for KITTI's lines bear no stamps. Colours, and intensities, are not kept.
 
     Args:
-        source: What to write.
+        source: Log that is written.
         out: Folder to make.
         on_progress: Told how many scans are done, after each.
 

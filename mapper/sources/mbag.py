@@ -17,7 +17,7 @@ from mapper.sources.base import Log
 from mapper.sources.calibration import freiburg_camera
 from mapper.sources.config import SourceConfig
 from mapper.sources.listed_files import present, within
-from mapper.sources.pairing import pair_anew
+from mapper.sources.pairing import apply_depth_offset
 from mapper.sources.rgbd import FramePair, find_calibration, rgbd_log
 from mapper.sources.text import (
     parse_numbers,
@@ -71,16 +71,16 @@ def read_log(path: Path, config: SourceConfig) -> Log:
         depth_units_per_m=DEPTH_UNITS_PER_M,
     )
     truth, truth_notes = truth_from(poses, what=file.name) if poses else (None, [])
-    shifted, shift_notes = pair_anew(pairs, config, path=file)
+    pairs_used, offset_notes = apply_depth_offset(pairs, config, path=file)
     return rgbd_log(
-        shifted,
+        pairs_used,
         calibration,
         depth_units_per_m=units_per_m,
         path=path,
         name=name,
         kind="mbag",
         truth=truth,
-        notes=[*notes, *shift_notes, *truth_notes],
+        notes=[*notes, *offset_notes, *truth_notes],
     )
 
 

@@ -22,7 +22,7 @@ from mapper.sources.base import Log
 from mapper.sources.calibration import PRIMESENSE, SEVEN_SCENES
 from mapper.sources.calibration_file import calibration_file
 from mapper.sources.config import SourceConfig
-from mapper.sources.pairing import pair_anew
+from mapper.sources.pairing import apply_depth_offset
 from mapper.sources.rgbd import FramePair, find_calibration, rgbd_log
 from mapper.sources.text import parse_count, parse_numbers, rows, time_order, truth_from
 
@@ -113,16 +113,16 @@ def read_log(path: Path, config: SourceConfig) -> Log:
     pairs, stamp_notes = stamped(images.pairs, rate_hz=config.rate_hz or RATE_HZ)
     truth, truth_notes = _read_truth(path, pairs)
     order, order_notes = time_order(np.array([pair.stamp_ns for pair in pairs]), what="image names")
-    shifted, shift_notes = pair_anew([pairs[i] for i in order], config, path=path)
+    pairs_used, offset_notes = apply_depth_offset([pairs[i] for i in order], config, path=path)
     return rgbd_log(
-        shifted,
+        pairs_used,
         calibration,
         depth_units_per_m=units_per_m,
         path=path,
         name=path.resolve().name,
         kind="7-scenes" if is_seven_scenes else "redwood",
         truth=truth,
-        notes=[*notes, *stamp_notes, *order_notes, *shift_notes, *truth_notes],
+        notes=[*notes, *stamp_notes, *order_notes, *offset_notes, *truth_notes],
     )
 
 

@@ -61,10 +61,10 @@ def pair_images(
     return pairs, unpaired_note(len(gap_ns) - len(pairs), len(gap_ns), max_gap_s=max_gap_s)
 
 
-def pair_anew(
+def apply_depth_offset(
     pairs: Sequence[FramePair], config: SourceConfig, *, path: Path
 ) -> tuple[Sequence[FramePair], list[str]]:
-    """Return a format's own pairs, or those of other images if ``source.depth_offset_s`` shifts their depth.
+    """Return a format's own pairs, or those found again if ``source.depth_offset_s`` shifts the depth images.
 
     Raises:
         SourceError: Nothing pairs.

@@ -19,7 +19,7 @@ from mapper.core.trajectory import Trajectory
 from mapper.sources.base import Log
 from mapper.sources.config import SourceConfig
 from mapper.sources.numbered import find_images, stamp_at, stamped
-from mapper.sources.pairing import pair_anew
+from mapper.sources.pairing import apply_depth_offset
 from mapper.sources.rgbd import find_calibration, rgbd_log
 from mapper.sources.text import parse_count, parse_numbers, read_lines, rows, truth_from
 
@@ -51,16 +51,16 @@ def read_log(path: Path, config: SourceConfig) -> Log:
     )
     stamps_ns = {image.number: pair.stamp_ns for image, pair in zip(images.pairs, pairs, strict=True)}
     truth, truth_notes = _read_truth(truth_path, stamps_ns, rate_hz=rate_hz)
-    shifted, shift_notes = pair_anew(pairs, config, path=path)
+    pairs_used, offset_notes = apply_depth_offset(pairs, config, path=path)
     return rgbd_log(
-        shifted,
+        pairs_used,
         calibration,
         depth_units_per_m=units_per_m,
         path=path,
         name=path.resolve().name,
         kind="poznan",
         truth=truth,
-        notes=[*images.notes, *stamp_notes, *shift_notes, *truth_notes],
+        notes=[*images.notes, *stamp_notes, *offset_notes, *truth_notes],
     )
 
 

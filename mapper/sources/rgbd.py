@@ -15,7 +15,7 @@ from mapper.sources.base import Accelerations, ImageFiles, Log
 from mapper.sources.calibration import Calibration, configured
 from mapper.sources.calibration_file import calibration_file, read_calibration
 from mapper.sources.config import CameraConfig
-from mapper.sources.images import check_size, read_colour, read_depth_m, read_grey, scan_of
+from mapper.sources.image_files.reading import check_size, read_colour, read_depth_m, read_grey, scan_of
 from mapper.sources.listed_files import refuse_links_out
 from mapper.sources.text import parse_numbers, parse_stamp, table, time_order
 
@@ -94,12 +94,12 @@ def rgbd_log(
         calibration: Intrinsics of all of them; the first colour image that can be read gives their size. With
             fy < 0 the truth is in left-handed frames, whose y points up: both are mirrored, not the images.
         depth_units_per_m: Depth image units per metre.
-        path: What was opened: a folder, or a file in the folder of the log.
-        name: As of :class:`Log`.
-        kind: As of :class:`Log`.
-        truth: As of :class:`Log`.
-        notes: What finding all these had to leave out or assume.
-        are_units_assumed: As of :class:`Log`.
+        path: Folder that was opened, or a file in the folder of the log.
+        name: Name, as of :class:`Log`.
+        kind: Format, as of :class:`Log`.
+        truth: True poses, as of :class:`Log`.
+        notes: Sentences on what finding all these left out or assumed.
+        are_units_assumed: Whether the units of depth are a guess, as of :class:`Log`.
 
     Raises:
         SourceError: No colour image can be read, they are not of the calibration's size, an image is a link
@@ -148,7 +148,7 @@ def find_calibration(
 
     Args:
         folder: Folder that may hold a calibration file.
-        config: What the user set.
+        config: The user's settings of the camera.
         known: The camera that the log's format or name implies.
         depth_units_per_m: The format's own depth image units per metre, where nothing else states them.
 

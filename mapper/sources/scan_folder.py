@@ -86,14 +86,14 @@ def scan_log(
     """Return the log of some clouds, in time order.
 
     Args:
-        path: What was opened.
+        path: Folder that was opened.
         files: The clouds, one or more, in the order of the lines of the two text files.
-        kind: What it was recognised as.
+        kind: Format of the log.
         stamps_file: A stamp a line, for names that carry none.
         truth_file: TUM's lines with stamps, or KITTI's, one a cloud.
         config: Rate, scale, and the text files that the user names instead.
         T_posed_lidar: Pose of the LiDAR in what KITTI's lines are the poses of; None is the LiDAR itself.
-        notes: What finding the clouds had to leave out or assume.
+        notes: Sentences on what finding the clouds left out or assumed.
 
     Raises:
         SourceError: A text file is missing or malformed, or has not one stamp for every cloud.

@@ -56,7 +56,7 @@ def scan_stamps(
         chosen: List of stamps that the user named; it goes before the stamps in names.
         beside: List of stamps found by its own name; it comes after them.
         rate_hz: Scans a second without any stamps; None is 10.
-        wording: For files that are no clouds.
+        wording: Words of the message, for files that are no clouds.
 
     Raises:
         SourceError: The list is malformed, or has not one stamp for every cloud.

@@ -132,7 +132,7 @@ def truth_from(
     """Return the truth of (stamp_ns, T_world_body) rows, and notes on rows that had to go.
 
     Args:
-        poses: In any order; a pose that is None or not a finite rigid motion is dropped.
+        poses: Stamps and poses in any order; a pose that is None or not a finite rigid motion is dropped.
         what: The file's name, for the notes.
     """
     usable = [(stamp_ns, T) for stamp_ns, T in poses if T is not None and is_rigid(T)]

@@ -79,8 +79,8 @@ def log_of_images(
         depth: Depth images.
         config: Pairing and camera.
         depth_units_per_m: Depth image units per metre, where nothing states them.
-        name: As of :class:`Log`.
-        notes: What finding the images had to leave out.
+        name: Name, as of :class:`Log`.
+        notes: Sentences on what finding the images left out.
 
     Raises:
         SourceError: As :func:`read_log`.

@@ -19,7 +19,7 @@ class ValidReturns(NamedTuple):
     Attributes:
         points: (M, 3) float32 metres.
         rows: (M,) their rows; None where all are valid.
-        far: How many others are finite, but farther than ``FARTHEST_M``.
+        far: Number of others that are finite, but farther than ``FARTHEST_M``.
     """
 
     points: Points32

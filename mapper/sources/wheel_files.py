@@ -46,7 +46,7 @@ def read_wheels(folder: Path, config: WheelsConfig, *, sensor: Sensor) -> tuple[
         folder: Folder that may hold ``wheels.txt`` (``stamp tx ty tz qx qy qz qw`` of the base) or
             ``encoders.txt`` (``stamp path_m steering_rad``).
         config: The wheelbase, and where the body is.
-        sensor: What the body is.
+        sensor: Sensor whose frame is the body's.
 
     Raises:
         SourceError: A file is malformed, or there are readings but no wheelbase.
@@ -66,9 +66,9 @@ def read_wheels_file(
 
     Args:
         path: The file.
-        config: As above.
-        sensor: As above.
-        wheelbase_by: How a user sets the wheelbase, for the message.
+        config: Settings of the wheels.
+        sensor: Sensor whose frame is the body's.
+        wheelbase_by: Setting of the wheelbase, for the message.
 
     Raises:
         SourceError: As above.

@@ -16,7 +16,7 @@ from mapper.core.trajectory import Trajectory
 from mapper.runtime.atomic import new_folder, write_bytes, write_text
 from mapper.sources.base import Accelerations, FrameRef, Log, Skipped
 from mapper.sources.calibration_file import calibration_text
-from mapper.sources.images import FINE_UNITS_PER_M, encode_colour, encode_depth, image_bytes
+from mapper.sources.image_files.reading import FINE_UNITS_PER_M, encode_colour, encode_depth, image_bytes
 from mapper.sources.kitti_writing import write_kitti_log
 from mapper.sources.mbag import HEADER
 from mapper.sources.trajectory_files import write_tum
@@ -46,7 +46,7 @@ def write_log(
     RGB-D logs become TUM or mbag folders, LiDAR logs KITTI folders, and both MCAP files or ROS 1 bags.
 
     Args:
-        source: What to write.
+        source: Log that is written.
         out: File or folder to make; it must not exist or be empty.
         kind: The format.
         on_progress: Told how many frames are done, after each.

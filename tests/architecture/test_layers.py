@@ -66,7 +66,7 @@ TRIES_THEM_ALL = "mapper/doctor/self_tests.py"
 HOMES = {
     "gtsam": ("mapper/graph/",),
     "mcap": ("mapper/export/mcap_log.py", "mapper/sources/ros/"),
-    "simplejpeg": ("mapper/sources/jpeg.py",),
+    "simplejpeg": ("mapper/sources/image_files/jpeg.py",),
     "rosbags": ("mapper/sources/ros/",),
     "foxglove": ("mapper/export/", "mapper/sources/ros/decode_foxglove.py"),
     "google": ("mapper/sources/ros/decode_foxglove.py",),

@@ -164,7 +164,7 @@ def test_spelled_out_overrides_win(desk_log, tmp_path):
         ),
         (["eval", "nowhere"], "mapper: nowhere: no such run folder"),
         (["eval", "RUN", "--map", "nowhere"], "mapper: nowhere: no such reference for a map"),
-        (["eval", "RUN", "--tolerance", "2"], "mapper: --map-world, --register and --tolerance are for"),
+        (["eval", "RUN", "--tolerance", "2"], "mapper: --tolerance 2: has no meaning without --map"),
         (["eval", "RUN", "--lengths", "1;2"], "mapper: --lengths 1;2: want metres with commas"),
         (["eval", "RUN", "--lengths", "99"], "mapper: --lengths 99: the true path, where there are poses"),
         (["eval", "RUN", "--log", "nowhere"], "mapper: nowhere: --log is for bare trajectories"),

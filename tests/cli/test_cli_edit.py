@@ -115,8 +115,8 @@ def test_a_keepout_blocks_the_traversable_floor_and_plans_but_not_the_slice(run_
     [
         (["--erase"], "--erase: want a region: --box, --height, --radius or --polygon"),
         (["--height", 0, 1], "a region alone changes nothing: want --erase, --keep or --keepout"),
-        (["--erase", "--keep", "--radius", 1], "want one at a time"),
-        (["--undo", "--keep", "--radius", 1], "want one at a time"),
+        (["--erase", "--keep", "--radius", 1], "choose one"),
+        (["--undo", "--keep", "--radius", 1], "choose one"),
         (["--undo", "--radius", 1], "a region alone changes nothing"),
         (["--undo"], "has no edits to undo"),
         (

@@ -6,7 +6,7 @@ import json
 import pytest
 
 from mapper.config.loading import load_config
-from mapper.sources.images import read_grey
+from mapper.sources.image_files.reading import read_grey
 from tests.support.command_line import mapper
 
 SMALL = ["--seconds", "0.1", "--set", "width_px=160", "--set", "height_px=120", "--set", "texture_px_per_m=8"]
@@ -92,7 +92,7 @@ def test_without_a_folder_nothing_is_written_and_planes_need_no_distance(walls, 
         (["--plane-at", "0.7", "--plane-at", "1"], "1 logs and 2 --plane-at; want one for each log"),
         (["--plane-at", "-1"], "--plane-at -1: want metres before the camera"),
         (["--plane-at", "nan"], "--plane-at nan: want metres before the camera"),
-        (["--plane-at", "1", "--fit-plane"], "--fit-plane: finds the distances itself"),
+        (["--plane-at", "1", "--fit-plane"], "--plane-at 1.0: has no meaning with --fit-plane"),
         (["--plane-at", "1.5"], "shows a plane at 0.7 m, not at 1.5 m"),
         (["--plane-at", "0.7", "--patch", "1,2,3"], "--patch 1,2,3: want four whole numbers"),
         (["--plane-at", "0.7", "--patch", "100,0,90,9"], "reaches beyond the image of 160×120 px"),

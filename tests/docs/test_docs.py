@@ -6,12 +6,11 @@ from collections.abc import Iterator
 from functools import cache
 from itertools import chain
 from pathlib import Path
-from typing import get_args
 
 import pytest
-from pydantic import BaseModel
 
 from mapper.config.build import BuildConfig
+from mapper.core.config import Config, members_of
 from mapper.run.files import RUN_FILES
 from tests.support.pages import PAGES
 from tests.support.paths import ROOT
@@ -84,19 +83,11 @@ def resolves(dotted: str) -> bool:
     return False
 
 
-def models_in(annotation: object) -> list[type[BaseModel]]:
-    """The classes of settings that a field may hold, whatever unions they stand in."""
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return [annotation]
-    return [model for part in get_args(annotation) for model in models_in(part)]
-
-
-def is_setting(names: list[str], models: list[type[BaseModel]]) -> bool:
+def is_setting(names: list[str], models: list[type[Config]]) -> bool:
     """Tell whether any of some classes has a setting of this path."""
     fields = [model.model_fields[names[0]] for model in models if names[0] in model.model_fields]
-    return bool(fields) and (
-        len(names) == 1 or is_setting(names[1:], [m for field in fields for m in models_in(field.annotation)])
-    )
+    members = [member for field in fields for member in members_of(field.annotation)]
+    return bool(fields) and (len(names) == 1 or is_setting(names[1:], members))
 
 
 @pytest.mark.parametrize("path", PAGES, ids=IDS)

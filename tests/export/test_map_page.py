@@ -162,7 +162,7 @@ def test_the_page_fetches_nothing_and_is_the_same_each_time(page, desk_run, tmp_
 def test_options_that_do_not_go_together_are_refused(page, desk_run, tmp_path):
     for arguments, said in (
         (("--html", "--spawn"), "choose one"),
-        (("--out", tmp_path / "x.html"), "needs --html"),
+        (("--out", tmp_path / "x.html"), "has no meaning without --html"),
         (("--html", "--out", page), "pass --overwrite"),
         ((desk_run.path,), "--html shows several"),
     ):

@@ -8,15 +8,9 @@ from mapper.graph.incremental import IncrementalSolver
 from mapper.graph.marginals import marginals_of
 from mapper.graph.model import BetweenFactor, PoseGraph, PoseSigmas
 from mapper.graph.optimize import optimize
+from tests.support.planar import on_a_circle
 
 SIGMAS = PoseSigmas(rotation_rad=0.005, translation_m=0.01)
-
-
-def ring(n):
-    angles = np.linspace(0.0, 4.0 * np.pi, n, endpoint=False)
-    return [
-        exp(np.array([0.0, 0.0, a]), np.zeros(3)) @ transform(np.eye(3), [3.0, 0.0, 0.1 * a]) for a in angles
-    ]
 
 
 def measured(truth, i, j, rng, origin="odometry"):
@@ -27,7 +21,7 @@ def measured(truth, i, j, rng, origin="odometry"):
 def grown(n=80, *, seed=0):
     """Two rounds, every node hung on the believed pose of the last, and loops to the first round."""
     rng = np.random.default_rng(seed)
-    truth = ring(n)
+    truth = on_a_circle(n, radius_m=3.0, rounds=2)
     solver, graph = IncrementalSolver(), PoseGraph()
     solver.add_node(0, truth[0])
     graph.add_node(0, 0, truth[0])
@@ -104,7 +98,7 @@ def test_a_false_loop_pulls_less_than_a_believed_measurement():
 def test_components_are_anchored_apart_until_a_loop_joins_them():
     """After a loss the map goes on elsewhere; the loop takes the younger part to the older."""
     rng = np.random.default_rng(2)
-    truth = ring(30)
+    truth = on_a_circle(30, radius_m=3.0, rounds=2)
     T_wrong_world = exp(np.array([0.1, 0.2, 1.5]), np.array([5.0, -3.0, 1.0]))
     solver = IncrementalSolver()
     for k in range(30):
@@ -126,7 +120,7 @@ def test_components_are_anchored_apart_until_a_loop_joins_them():
 def test_a_loop_takes_along_a_component_that_still_waits():
     """A later session, none of whose factors was ever solved, begins where its first loop wants it."""
     rng = np.random.default_rng(4)
-    truth = ring(30)
+    truth = on_a_circle(30, radius_m=3.0, rounds=2)
     T_wrong_world = exp(np.array([0.1, 0.2, 3.0]), np.array([5.0, -3.0, 1.0]))
     solver = IncrementalSolver()
     for k in range(30):

@@ -12,22 +12,16 @@ from mapper.graph.model import BetweenFactor, PoseGraph, PoseSigmas
 from mapper.graph.optimize import optimize
 from tests.support.noisy_graphs import noisy_measure, odometry_chain, wrong_alignment
 from tests.support.paths import POSE_GRAPHS
+from tests.support.planar import on_a_circle
 
 needs_posegraphs = pytest.mark.skipif(not POSE_GRAPHS.is_dir(), reason=f"{POSE_GRAPHS} is not here")
 
 INFORMATION = PoseSigmas(rotation_rad=0.01, translation_m=0.02).information
 
 
-def on_a_circle(n):
-    angles = np.linspace(0.0, 2.0 * np.pi, n, endpoint=False)
-    return [
-        exp(np.array([0.0, 0.0, a]), np.zeros(3)) @ transform(np.eye(3), [2.0, 0.0, 0.1 * a]) for a in angles
-    ]
-
-
 def loop(n=12, *, first=0, rng=None):
     """A closed loop of exact measurements; with rng, estimates off by some 5 cm and 3°."""
-    truth = on_a_circle(n)
+    truth = on_a_circle(n, radius_m=2.0)
     graph = PoseGraph()
     for k, T in enumerate(truth):
         error = exp(rng.normal(0, 0.05, 3), rng.normal(0, 0.05, 3)) if rng and k else np.eye(4)
@@ -148,7 +142,7 @@ def laps(lap=80, *, seed=0, false=0, too_confident=1.0):
     """Three rounds with drift and loops to the first; then false ones: clusters of four, each consistent."""
     rng = np.random.default_rng(seed)
     sigmas, loop_sigmas = PoseSigmas(0.002, 0.005), PoseSigmas(0.005, 0.01)
-    truth = 3 * on_a_circle(lap)
+    truth = 3 * on_a_circle(lap, radius_m=2.0)
     n = len(truth)
 
     measured = noisy_measure(truth, rng, too_confident=too_confident)

@@ -25,6 +25,7 @@ from mapper.line_laser.mapping import map_scans
 from mapper.line_laser.ranging import line_scan, local_grid, scan_image
 from mapper.line_laser.survey import drive, scan_images, sensor_poses
 from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN
+from tests.support.grids import state_at
 
 CONFIG = LineLaserConfig()
 GREY = np.full((360, 640, 3), 90, np.uint8)
@@ -245,11 +246,6 @@ def test_the_local_grid_has_the_vehicle_at_the_middle_of_row_zero():
     assert np.argwhere(D).tolist() == [[50, 120 + 10], [100, 120 - 100]]
 
 
-def state_at(grid, x, y):
-    column, row = np.floor((np.array([x, y]) - grid.origin_world_m) / grid.resolution_m).astype(int)
-    return grid.cells[row, column]
-
-
 WALL = [(1.01, y) for y in np.linspace(0.4, -0.4, 81)]
 
 
@@ -351,6 +347,12 @@ def test_images_are_placed_by_the_wheels(folder):
     assert any("no wheel pose for 1 images" in note for note in driven.notes)
     wall_m = ahead_m(THESIS, np.array([200.0]))[0]
     assert state_at(driven.grid, 0.45 + wall_m, 0.0) == OCCUPIED
+
+    encoders.write_text("".join(f"{1001 + 0.4 * k:.1f} {0.2 * k:.2f} 0\n" for k in range(8)))
+    assert len(drive(scans, sensor_poses(encoders, calibration)[0], CONFIG.map).trajectory) == 3
+    strict = CONFIG.map.model_copy(update={"max_wheel_gap_s": 0.3})
+    with pytest.raises(DataError, match="no image was taken between two of their readings"):
+        drive(scans, sensor_poses(encoders, calibration)[0], strict)
 
     with pytest.raises(SourceError, match=r"readings.txt: the wheelbase is unknown"):
         sensor_poses(encoders, THESIS)

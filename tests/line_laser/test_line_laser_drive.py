@@ -20,7 +20,7 @@ from mapper.line_laser.survey import drive, scan_images
 from mapper.line_laser.survey import sensor_poses as drive_poses
 from mapper.octree.grid import OCCUPIED
 from mapper.octree.grid_file import read_grid
-from mapper.sources.images import decode_colour
+from mapper.sources.image_files.reading import decode_colour
 from tests.support.command_line import invoke
 
 SYNTH = LineLaserSynthConfig(seed=2)

@@ -74,6 +74,17 @@ def test_reprojection_refuses_what_isvd_alone_would_take():
     assert found.rmse_m is not None
 
 
+def test_a_loop_needs_a_share_of_pairs_that_agree():
+    room = Room(1)
+    i, j = room.view(at(0.0), 0), room.view(at(0.1), 1)
+    pixels = j.pixels.copy()
+    pixels[::3] += 40.0  # a third of the view moves
+    moved = replace(j, pixels=pixels)
+    assert ImageVerifier(ImageVerificationConfig()).verify(i, moved).reason == ""
+    strict = ImageVerifier(ImageVerificationConfig(min_inlier_ratio=0.8)).verify(i, moved)
+    assert strict.reason.startswith("reprojection: ")
+
+
 def test_a_homography_filters_the_pairs_when_asked():
     config = ImageVerificationConfig(match=MatchConfig(filter="homography"), min_matches=45)
     room = Room(1)

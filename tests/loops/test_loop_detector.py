@@ -113,6 +113,13 @@ def test_a_loop_that_no_other_confirms_is_rejected():
     assert any(loop.reason.startswith("alone: ") for loop in detector.closures())
 
 
+def test_loops_confirm_each_other_only_nearby_along_the_path():
+    detector = build_loop_detector(PlaceLoopsConfig(places=PLACES, agreement_path_m=0.01), "batch")
+    walk(detector, Room(1))
+    assert not accepted(detector)
+    assert any(loop.reason.startswith("alone: ") for loop in detector.closures())
+
+
 def test_a_look_needs_motion():
     detector = build_loop_detector(
         PlaceLoopsConfig(places=PLACES, min_motion_m=10.0, min_motion_rad=10.0), "batch"
@@ -144,6 +151,17 @@ def test_the_thesis_looks_only_from_sharp_frames():
     assert detector.closures()
     assert {loop.j % 10 for loop in detector.closures()} == {5}
     assert worst_m(accepted(detector)) < 0.05
+
+
+def test_sharpness_is_relative_to_the_last_frames():
+    features = [500 if k < 30 else 800 for k in range(NODES)]  # the texture changes for good
+    of_frames = {}
+    for median_frames in (5, 100):
+        config = ThesisLoopsConfig(keyframe_interval=5, median_frames=median_frames)
+        detector = build_loop_detector(config, "proportional")
+        walk(detector, Room(1), features=features)
+        of_frames[median_frames] = {loop.j for loop in detector.closures()}
+    assert max(of_frames[5], default=0) < 33 < max(of_frames[100])
 
 
 def test_the_thesis_finds_nothing_when_no_frame_is_sharp():

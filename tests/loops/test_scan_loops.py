@@ -263,11 +263,13 @@ def test_a_street_whose_cars_have_left_is_one_place_where_that_is_allowed():
         there = on_street(elsewhere, along_m)
         views = view(here, T), view(street(seed, day=1), T, seed=1), view(elsewhere, there, seed=2)
         places.append([ScanVerifier(ScanVerificationConfig()).describe(seen) for seen in views])
-    strict, lenient = (ScanVerifier(ScanVerificationConfig(max_moved_ratio=ratio)) for ratio in (0.0, 0.14))
+    changes = ({}, {"max_moved_ratio": 0.14}, {"max_contradicting_ratio": 0.2})
+    strict, lenient, loose = (ScanVerifier(ScanVerificationConfig(**change)) for change in changes)
     held = {
         verifier: sum(not verifier.verify(a, b).reason for a, b, _ in places)
-        for verifier in (strict, lenient)
+        for verifier in (strict, lenient, loose)
     }
     assert held[lenient] >= 7
     assert held[strict] < held[lenient]
+    assert held[strict] < held[loose]
     assert all(lenient.verify(a, c).reason for a, _, c in places)

@@ -1,4 +1,5 @@
 import json
+import shutil
 
 import cv2
 import numpy as np
@@ -102,3 +103,12 @@ def test_the_verb_compares_runs_and_writes_what_it_found(desk_run, tmp_path):
     assert cv2.imread(str(out / "diff.png")) is not None
     assert {path.name for path in out.glob("*.ply")} == {"appeared.ply", "vanished.ply", "not_seen_again.ply"}
     assert "exists already" in mapper("diff", desk_run.path, desk_run.path, "--out", out, status=1).output
+
+
+def test_runs_are_compared_where_a_file_of_poses_has_them(desk_run, tmp_path):
+    again = shutil.copytree(desk_run.path, tmp_path / "again")
+    poses = tmp_path / "poses.txt"
+    poses.write_text(f"{desk_run.path.name} 0 0 0 0 0 0 1\nagain 0 0 0 0 0 0 1\n")
+    text = mapper("diff", desk_run.path, again, "--poses", poses, "--out", tmp_path / "diff").stdout
+    assert "placed by poses.txt" in text
+    assert "0 appeared, 0 vanished" in text

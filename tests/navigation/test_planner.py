@@ -241,6 +241,7 @@ def test_in_space_a_ball_keeps_out_of_regions(chamber):
         )
 
 
-def test_a_map_too_large_is_refused(chamber):
+def test_a_map_too_large_is_refused(chamber, monkeypatch):
+    monkeypatch.setattr("mapper.navigation.voxels.LIMIT_BYTES", 1000)
     with pytest.raises(MapSizeError, match=r"needs .* GiB of working space"):
-        plan_3d(chamber, np.zeros(3), np.ones(3), config=POINT, limit_bytes=1000)
+        plan_3d(chamber, np.zeros(3), np.ones(3), config=POINT)

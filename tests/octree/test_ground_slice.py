@@ -11,6 +11,7 @@ from mapper.octree.ground_height import DrivenGround, ground_heights
 from mapper.octree.keys import KEY_ZERO
 from mapper.octree.map import OctreeMap
 from mapper.octree.slice import cut_slice
+from tests.support.grids import state_at
 
 SLOPE = 0.1
 
@@ -37,11 +38,6 @@ def at(position):
     return pose
 
 
-def cell(grid, x_m, y_m):
-    column, row = np.floor((np.array([x_m, y_m]) - grid.origin_world_m) / grid.resolution_m).astype(int)
-    return grid.cells[row, column]
-
-
 def test_the_ground_is_found_under_every_column(hill):
     first = np.array([KEY_ZERO - 100, KEY_ZERO - 40])
 
@@ -58,9 +54,9 @@ def test_a_slice_that_follows_the_ground_shows_the_wall_and_no_road(hill):
     following = cut_slice(hill, SliceConfig(**band, above="ground"))
 
     for x_m in (-15.0, -5.0, 5.0, 15.0):
-        assert cell(following, x_m, 0.0) == FREE
-        assert cell(following, x_m, 8.1) == OCCUPIED
-    assert cell(level, 10.0, 0.0) == OCCUPIED  # the road itself is a metre above the floor there
+        assert state_at(following, x_m, 0.0) == FREE
+        assert state_at(following, x_m, 8.1) == OCCUPIED
+    assert state_at(level, 10.0, 0.0) == OCCUPIED  # the road itself is a metre above the floor there
 
 
 def test_where_no_floor_is_seen_the_band_is_level(hill):

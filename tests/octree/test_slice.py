@@ -8,6 +8,7 @@ from mapper.octree.config import OctreeConfig, SliceConfig
 from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, shrunk
 from mapper.octree.map import OctreeMap
 from mapper.octree.slice import cut_slice
+from tests.support.grids import state_at
 
 CELL = 0.05
 
@@ -26,11 +27,6 @@ def wall(start, end, *, z=(0.525,)):
     return np.vstack([np.column_stack([line, np.full(n, height)]) for height in z])
 
 
-def code_at(grid, x, y):
-    column, row = np.floor((np.array([x, y]) - grid.origin_world_m) / grid.resolution_m).astype(int)
-    return grid.cells[row, column]
-
-
 def test_an_l_shaped_room_lies_the_right_way_round():
     # The L is 4 m × 3 m without its corner of high x and high y.
     corners = [(-1.0, -1.0), (3.0, -1.0), (3.0, 0.5), (1.0, 0.5), (1.0, 2.0), (-1.0, 2.0), (-1.0, -1.0)]
@@ -42,10 +38,10 @@ def test_an_l_shaped_room_lies_the_right_way_round():
     np.testing.assert_allclose(grid.origin_world_m, [-1.0, -1.0], atol=1e-9)
     assert grid.cells.shape == (61, 81)  # rows are y, columns are x
     for x, y in corners:
-        assert code_at(grid, x + 0.025, y + 0.025) == OCCUPIED
-    assert code_at(grid, 2.5, -0.5) == FREE  # along x
-    assert code_at(grid, -0.5, 1.5) == FREE  # along y
-    assert code_at(grid, 2.5, 1.5) == UNKNOWN  # the missing corner
+        assert state_at(grid, x + 0.025, y + 0.025) == OCCUPIED
+    assert state_at(grid, 2.5, -0.5) == FREE  # along x
+    assert state_at(grid, -0.5, 1.5) == FREE  # along y
+    assert state_at(grid, 2.5, 1.5) == UNKNOWN  # the missing corner
     assert (grid.cells[0] == OCCUPIED).all()  # row 0 is the wall of lowest y
     assert (grid.cells[:, 0] == OCCUPIED).all()
     assert (grid.cells[-1, 50:] == UNKNOWN).all()
@@ -58,8 +54,8 @@ def test_occupied_beats_free_beats_unknown():
 
     grid = cut_slice(octree, SliceConfig())
 
-    assert code_at(grid, 1.025, 0.025) == OCCUPIED
-    assert code_at(grid, 1.525, 0.025) == FREE
+    assert state_at(grid, 1.025, 0.025) == OCCUPIED
+    assert state_at(grid, 1.525, 0.025) == FREE
     assert grid.cells.tolist() == [[FREE] * 20 + [OCCUPIED] + [FREE] * 19 + [OCCUPIED]]
 
 
@@ -95,10 +91,10 @@ def test_without_speckles_their_columns_other_voxels_count():
     every = cut_slice(octree, SliceConfig())
     clean = cut_slice(octree, SliceConfig(min_cluster_cells=2))
 
-    assert code_at(every, 0.525, 0.025) == code_at(every, 1.525, 1.525) == OCCUPIED
-    assert code_at(clean, 0.525, 0.025) == FREE
-    assert code_at(clean, 1.525, 1.525) == UNKNOWN
-    assert code_at(clean, 1.025, 0.025) == OCCUPIED
+    assert state_at(every, 0.525, 0.025) == state_at(every, 1.525, 1.525) == OCCUPIED
+    assert state_at(clean, 0.525, 0.025) == FREE
+    assert state_at(clean, 1.525, 1.525) == UNKNOWN
+    assert state_at(clean, 1.025, 0.025) == OCCUPIED
     assert (clean.cells == OCCUPIED).sum() == (every.cells == OCCUPIED).sum() - 2
 
 

@@ -200,4 +200,4 @@ def test_a_configuration_file_and_a_run_to_append_to_exclude_each_other(first, d
     out = tmp_path / "out"
     config = first.path / "config.json"
     result = mapper("build", desk_log, "--onto", first.path, "--config", config, "--out", out, status=1)
-    assert "with --onto the settings of" in result.stderr
+    assert "has no meaning with --onto; give single settings by --set" in result.stderr

@@ -132,6 +132,14 @@ def test_a_merged_map_has_the_places_of_its_runs(first, desk_log, localised, tmp
     )
 
 
+def test_a_map_whose_slice_was_changed_is_refused_before_tracking(first, tmp_path):
+    changed = shutil.copytree(first.path, tmp_path / "changed")
+    with (changed / "slice.pgm").open("ab") as file:
+        file.write(b"0")
+    with pytest.raises(RunError, match=r"slice\.pgm: .*mapper doctor .* --accept slice"):
+        load_known_map(changed)
+
+
 def test_another_place_is_refused_in_a_line(first, elsewhere, tmp_path):
     result = mapper("localise", elsewhere, "--in", first.path, "--out", tmp_path / "out", "--quiet", status=1)
     assert f"mapper: {elsewhere}: cannot be placed in {first.path}" in result.stderr

@@ -84,5 +84,5 @@ def test_the_verb_compiles_and_says_how_many_there_are(monkeypatch):
     refused = invoke("doctor", "run", "--warm")
     assert (refused.exit_code, refused.stderr) == (
         1,
-        "mapper: --warm: compiles kernels for all builds, so it takes no run; got run\n",
+        "mapper: RUN run: has no meaning with --warm; it compiles the kernels of all builds\n",
     )

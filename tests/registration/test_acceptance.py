@@ -41,6 +41,13 @@ def test_the_right_motion_is_accepted(clouds):
     assert alignment.inlier_ratio > 0.9
 
 
+@pytest.mark.parametrize("limit", ["near_voxels", "surface_voxels"])
+def test_points_agree_within_limits_of_distance_and_surface(clouds, limit):
+    nearly = exp(np.zeros(3), np.array([0.0, 0.0, 0.03]))
+    assert assess(*clouds, nearly, AcceptanceConfig()).converged
+    assert not assess(*clouds, nearly, AcceptanceConfig(**{limit: 0.01})).converged
+
+
 @pytest.mark.parametrize("turn_rad", [0.0, 1.0])
 def test_a_wrong_motion_over_the_same_floor_is_not(clouds, turn_rad):
     wrong = exp(np.array([0.0, 0.0, turn_rad]), np.array([3.0, -2.0, 0.0]))

@@ -92,6 +92,33 @@ def test_a_slope_is_ground_and_a_box_is_not(rng):
     assert heights_m.max() <= 2.1
 
 
+def test_what_is_ground_depends_on_how_far_it_rises_and_how_rough_it_is(rng):
+    points = field(rng, count=150_000)
+    is_raised = (np.abs(points[:, :2] - [7.0, 7.0]) < 2.0).all(axis=1)
+    points[is_raised, 2] += 0.8
+    is_rough = (np.abs(points[:, :2] + [7.0, 7.0]) < 2.0).all(axis=1)
+    points[is_rough, 2] += rng.uniform(-0.4, 0.4, np.count_nonzero(is_rough))
+    T = transform(np.eye(3), np.array([0.0, 0.0, HEIGHT_M]))
+    raised, rough = np.array([7.2, -7.2]), np.array([7.2, -7.2])
+
+    def is_ground(**limits):
+        return find_ground(as_scan(points), T, GroundConfig(**limits)).at(raised, rough)[0].tolist()
+
+    assert is_ground() == [False, False]
+    assert is_ground(max_rise_m=1.0) == [True, False]
+    assert is_ground(max_thickness_m=1.0) == [False, True]
+
+
+def test_obstacles_lie_between_two_heights(rng):
+    points = np.concatenate([field(rng, count=60_000), box(rng, 0.0, 7.0, count=4000)])
+    T, limits = transform(np.eye(3), np.array([0.0, 0.0, HEIGHT_M])), GroundConfig(min_obstacle_m=1.0)
+    limits = limits.model_copy(update={"max_obstacle_m": 1.6, "voxel_m": 0.1})
+    ground = find_ground(as_scan(points), T, limits)
+    _, heights_m = find_obstacles(as_scan(points), T, ground, limits)
+    assert 0.9 <= heights_m.min() < 1.1
+    assert 1.5 < heights_m.max() <= 1.7
+
+
 def test_obstacles_weigh_alike_in_sparse_and_dense_clouds(rng):
     scene = [box(rng, 10.0, 0.0, size=4.0, count=40_000), box(rng, -8.0, 3.0, size=4.0, count=40_000)]
     dense = np.concatenate([field(rng, count=200_000), *scene])
@@ -121,6 +148,8 @@ def test_objects_are_the_parts_of_a_group(rng):
     assert len(found) == 3
     gaps = np.linalg.norm(places[:, None] - found[None], axis=2).min(axis=1)
     assert gaps.max() < 0.2
+    assert len(centres_in(scan, ObjectsConfig(fine_m=2.0))) == 2
+    assert len(centres_in(scan[len(scan) - 400 :], ObjectsConfig(coarse_m=0.1, fine_m=0.1))) > 10
 
 
 def test_a_group_without_a_large_part_is_one_object():

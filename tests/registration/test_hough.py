@@ -2,12 +2,14 @@ import numpy as np
 import pytest
 
 from mapper.core.frames import Scan
-from mapper.core.geometry import angle_between, apply, inverse, rotation_exp, transform
+from mapper.core.geometry import inverse, rotation_exp, transform
+from mapper.evaluators.papers.scan_pairs import moved
 from mapper.registration.factory import build_registration
 from mapper.registration.hough.aligner import Hough
 from mapper.registration.hough.config import HoughAcceptanceConfig, HoughGicpConfig, HoughNdtConfig
 from mapper.simulation.config import COURTYARD, STREET
 from mapper.simulation.lidar import LidarSimulator
+from tests.support.alignments import miss
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -17,24 +19,11 @@ def source_of(config, seed):
     return LidarSimulator(config.model_copy(update={"seed": seed, "sensor": sensor}))
 
 
-def moved(scan, T_new_body):
-    return Scan(
-        stamp_ns=scan.stamp_ns,
-        points_body=apply(T_new_body, scan.points_body.astype(np.float64)).astype(np.float32),
-        origin_body=apply(T_new_body, scan.origin_body[np.newaxis])[0],
-    )
-
-
 def pair_of(log, i, j, *, yaw_rad, shift_m):
     """Return two scans, the second in a frame turned and set off, and the motion between them."""
     T_source_new = transform(rotation_exp(yaw_rad * UP), np.array(shift_m))
     T_i_j = inverse(log.truth.T_world_body[i]) @ log.truth.T_world_body[j]
     return log.observe(i), moved(log.observe(j), inverse(T_source_new)), T_i_j @ T_source_new
-
-
-def miss(alignment, T_target_source):
-    gap = inverse(T_target_source) @ alignment.T_target_source
-    return np.linalg.norm(gap[:3, 3]), np.degrees(angle_between(gap[:3, :3], np.eye(3)))
 
 
 @pytest.fixture(scope="module")

@@ -113,6 +113,16 @@ def test_thresholds_are_those_of_equation_4_2():
     assert 1 not in kept_by_three
 
 
+def test_the_halving_threshold_begins_at_its_start_error():
+    source = room(np.random.default_rng(2), 4000)
+    target = source.copy()
+    target[0, 0] += 0.300
+    for start_error_mm, is_kept in ((1000.0, True), (250.0, False)):
+        config = IsvdConfig(threshold="halving", start_error_mm=start_error_mm, max_iterations=2)
+        _, kept = Isvd(config)._trim(target, source)
+        assert (0 in kept) == is_kept
+
+
 def test_auto_stops_before_too_few_pairs_remain():
     target, source, _ = pairs_with_outliers(3, wrong=0, noise_m=0.01)
 

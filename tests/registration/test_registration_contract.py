@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 
 from mapper.core.frames import Scan
-from mapper.core.geometry import angle_between, apply, exp, inverse
+from mapper.core.geometry import exp, inverse
+from mapper.evaluators.papers.scan_pairs import moved
 from mapper.registration.config import RegistrationConfig
 from mapper.registration.factory import build_registration
 from mapper.simulation.config import STREET, LidarSensorConfig
 from mapper.simulation.lidar import LidarSimulator
+from tests.support.alignments import miss
 
 EVERY_METHOD = [member() for member in get_args(get_args(RegistrationConfig)[0])]
 NEEDS_NO_GUESS = [
@@ -39,16 +41,6 @@ def pair():
 def elsewhere():
     """A scan of another street."""
     return street(2).observe(3)
-
-
-def moved(scan, T_new_body):
-    points = apply(T_new_body, scan.points_body.astype(np.float64)).astype(np.float32)
-    return Scan(scan.stamp_ns, points, origin_body=T_new_body[:3, 3])
-
-
-def miss(alignment, T_target_source):
-    error = inverse(T_target_source) @ alignment.T_target_source
-    return np.linalg.norm(error[:3, 3]), np.degrees(angle_between(error[:3, :3], np.eye(3)))
 
 
 @every_method

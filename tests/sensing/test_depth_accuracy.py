@@ -144,6 +144,14 @@ def test_the_patch_decides_what_is_seen():
         depth_at(log, 1.0, patch=Patch(150, 0, 80, 240))
 
 
+def test_a_patch_with_little_depth_is_refused():
+    log = wall(1.0)
+    for entry in log.entries():
+        entry.frame.depth_m[:, 20:] = 0.0
+    with pytest.raises(DataError, match=r"10% of the patch .* has depth, want at least 50%"):
+        depth_at(log, 1.0, patch=Patch(0, 0, 200, 240))
+
+
 def test_a_wall_seen_at_a_slant_is_refused():
     with pytest.raises(DataError, match=r"is 40° from lying across the camera's axis, want at most 30°"):
         depth_at(wall(1.0, tilt_rad=np.radians(40.0)), 1.0)

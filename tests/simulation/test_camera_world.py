@@ -56,6 +56,11 @@ def points_world_of(rendering, camera, T_world_camera):
 # Geometry
 
 
+def test_the_focal_length_follows_from_the_view():
+    camera = camera_of(SynthConfig(width_px=400, horizontal_view_rad=np.pi / 2.0))
+    assert (camera.fx_px, camera.fy_px) == pytest.approx((200.0, 200.0))
+
+
 def test_distances_to_a_turned_box_are_exact():
     boxes = Boxes(("box",), np.array([[1.0, 2.0, 3.0]]), np.array([[2.0, 1.0, 0.5]]), np.array([np.pi / 2]))
     points = np.array([[1, 2, 3], [1, 2, 4], [1, 5, 3], [3, 2, 3], [3, 5, 3], [1, 2, 3.4]], dtype=float)

@@ -174,11 +174,25 @@ def test_a_lens_moves_points_as_brown_says():
     assert abs(lens.columns[row, column] - (column + lens.wide.cx_px - camera.cx_px)) > 0.5
 
 
-def test_a_lens_bends_image_and_depth(source):
-    bent, straight = seen_by(source, radial_k1=-0.1).render(20), seen_by(source).render(20)
+@pytest.mark.parametrize("distortion", [{"radial_k1": -0.1}, {"radial_k2": -0.3}], ids=["k1", "k2"])
+def test_a_lens_bends_image_and_depth(source, distortion):
+    bent, straight = seen_by(source, **distortion).render(20), seen_by(source).render(20)
     middle = (slice(58, 62), slice(78, 82))
     np.testing.assert_allclose(bent.depth_m[middle], straight.depth_m[middle], atol=0.02)
     assert (np.abs(bent.rgb.astype(int) - straight.rgb)[:20] > 10).mean() > 0.1
+
+
+def test_depth_ends_where_it_is_too_near_and_fades_far_away(source):
+    exact = seen_by(source).observe(20).depth_m
+    low_m, middle_m, high_m = np.quantile(exact, [0.2, 0.6, 1.0])
+    near = seen_by(source, min_depth_m=middle_m).observe(20).depth_m
+    np.testing.assert_array_equal(near, np.where(exact < np.float32(middle_m), np.float32(0.0), exact))
+
+    faded = seen_by(source, fade_depth_m=low_m, max_depth_m=high_m).observe(20).depth_m == 0.0
+    parts = (exact < low_m, (exact > low_m) & (exact < middle_m), exact > middle_m)
+    near_lost, middle_lost, far_lost = (faded[part].mean() for part in parts)
+    assert near_lost < 0.05
+    assert near_lost < middle_lost < far_lost
 
 
 def test_depth_is_scaled_and_its_disparity_warped_alike_in_all_frames(source):

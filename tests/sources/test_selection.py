@@ -45,6 +45,8 @@ def test_drops_frames_without_truth_and_counts_them(tiny_tum_log):
     assert source.notes == ["2 frames have no ground truth within 20 ms; left out", "3 of 6 frames selected"]
     with pytest.raises(SourceError, match="no selected frame has ground truth within 20 ms"):
         open_source(log, SourceConfig(first_frame=5, require_truth=True))
+    lenient = SourceConfig(first_frame=1, require_truth=True, max_truth_gap_s=60.0)
+    assert indices_of(open_source(log, lenient), open_source(log)) == [1, 2, 3, 4, 5]
 
 
 def test_cannot_require_truth_of_a_log_without(tiny_tum_log):

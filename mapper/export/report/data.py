@@ -37,7 +37,7 @@ class Figure:
     """One number about a run, as it is to be shown.
 
     Attributes:
-        name: What it is.
+        name: Name of the quantity.
         value: Value with its unit.
         question: What it answers first of all; empty if it is only one of all numbers.
     """

@@ -49,7 +49,7 @@ def map_page(
     """Return a page that shows maps in 3D, each with its path and its loops.
 
     Args:
-        title: What is shown.
+        title: Title of the page.
         curves: Name, path, truth and loops that belong to each map, see :func:`~.data.drawn`.
         maps: Points, voxels and layers, see :func:`~.map_data.map_of`.
         pictures: HTML that takes the maps' place where they cannot be shown.

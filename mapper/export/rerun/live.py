@@ -178,7 +178,7 @@ def live_recording(target: str, source: Log, config: RerunConfig) -> Iterator[Li
     Args:
         target: FILE.rrd, "spawn", "connect" or "connect:URL".
         source: The log that is mapped.
-        config: What is shown.
+        config: Settings of what is shown.
 
     Raises:
         ConfigError: The target is none.

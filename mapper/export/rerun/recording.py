@@ -253,7 +253,7 @@ def recorded(
 
     Args:
         target: FILE.rrd, "spawn", "connect" or "connect:URL".
-        name: What the viewer calls it.
+        name: Name in the viewer.
         has_images: Leave room for images.
         body: The entity that is to move with the body.
         looking_at: (2, 3) lower and upper corner of what to look at first, metres; None leaves it to Rerun.

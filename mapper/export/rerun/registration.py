@@ -34,7 +34,7 @@ def record_registration(
         points_source: (M, 3) metres, source frame.
         stages: A line of text on each, and T_target_source after it.
         sensor: Decides which axis is up.
-        name: What the viewer calls the recording.
+        name: Name of the recording in the viewer.
 
     Raises:
         ConfigError: The target is none.

@@ -56,9 +56,9 @@ def streaming(
     """Send a recording to a target while inside; a file appears at the end, whole.
 
     Args:
-        recording: What is sent.
+        recording: Recording that is sent.
         target: FILE.rrd, "spawn", "connect" or "connect:URL".
-        blueprint: How it is arranged.
+        blueprint: Arrangement of the viewer.
         keeps: Whether an error inside leaves the file too, with what was recorded until then.
 
     Raises:

@@ -25,6 +25,8 @@ _BOARD_STEP_M = 0.2  # as in Somlyai (PhD thesis), §2.5.3: every 20 cm nearer
 _NEAREST_M = 0.5
 _START_NS = 1_000 * NS_PER_S
 _READING_NS, _FINE_NS = 50_000_000, 20_000_000
+_TICK_M = 0.002  # of path between two ticks of the encoder
+_STEERING_NOISE_RAD = 0.003
 _WORKERS = 2
 
 
@@ -118,10 +120,9 @@ def _encoders_text(config: LineLaserSynthConfig) -> str:
     last_ns = int(sensor_poses(config).stamps_ns[-1])
     stamps_ns = np.arange(_START_NS, last_ns + _READING_NS, _READING_NS, dtype=np.int64)
     path_m = config.speed_mps * (stamps_ns - _START_NS) / NS_PER_S
-    noise_rad = rng_of(config.seed, Stream.PATH).normal(0.0, config.steering_noise_rad, len(path_m))
+    noise_rad = rng_of(config.seed, Stream.PATH).normal(0.0, _STEERING_NOISE_RAD, len(path_m))
     steering_rad = _steering(config, path_m) + noise_rad
-    if config.tick_m:
-        path_m = np.floor(path_m / config.tick_m) * config.tick_m
+    path_m = np.floor(path_m / _TICK_M) * _TICK_M
     lines = [
         f"{seconds_text_from_ns(int(stamp_ns))} {path:.6f} {angle:.6f}"
         for stamp_ns, path, angle in zip(stamps_ns, path_m, steering_rad, strict=True)

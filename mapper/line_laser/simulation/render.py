@@ -19,6 +19,15 @@ from mapper.line_laser.config import LineLaserSynthConfig
 from mapper.line_laser.simulation.room import Patch, Room
 from mapper.simulation.noise import Field32, fractal
 
+_CAMERA_M, _LASER_M = 0.324, 0.615
+"""Heights above the floor; with the default focal length and reach they put the stripe within 0.3 % of where
+eq. 2.44 has it."""
+_LASER_LEVELS = 600.0
+"""Brightness that the laser adds to a white wall 1 m away, where 255 is the most a pixel can show: the stripe
+is seen on the floor at its reach, where the thesis measured its farthest point."""
+_STRIPE_M = 0.004  # four standard deviations
+_GLOSS = 0.15  # share of light that the floor reflects like a mirror
+_JPEG_QUALITY = 85
 _LENS_PX = 0.9
 _TEXTURE_PX_PER_M = 150.0
 _TEXTURE_GAIN = 0.08
@@ -79,12 +88,12 @@ def take(
     rows, ranges_m, levels = _stripe(room, config, view)
     laser = _stripe_light(config, rows, ranges_m, levels, rng=rng)
     light += laser[:, :, None] * np.array([1.0, _CROSSTALK, _CROSSTALK], np.float32)
-    ghost_rows = (config.height_px - 1) - rows + 2.0 * config.focal_px * config.camera_height_m / ranges_m
-    mirrored = _stripe_light(config, ghost_rows, ranges_m, config.gloss * levels, rng=rng)
+    ghost_rows = (config.height_px - 1) - rows + 2.0 * config.focal_px * _CAMERA_M / ranges_m
+    mirrored = _stripe_light(config, ghost_rows, ranges_m, _GLOSS * levels, rng=rng)
     light[:, :, 0] += np.where(view.up_m < 0.0, mirrored, np.float32(0.0))
     visible = (levels > 0.0) & (rows >= 0.0) & (rows <= config.height_px - 1)
     return Shot(
-        _encoded(_developed(light, config, rng=rng), config),
+        _encoded(_developed(light, config, rng=rng)),
         np.where(visible, rows, np.nan),
         np.where(visible, ranges_m, np.nan),
     )
@@ -109,7 +118,7 @@ def _looked(room: Room, config: LineLaserSynthConfig, T_world_sensor: Transform)
     slant = np.abs(across[column, wall]) / length_m[wall] / np.linalg.norm(sight_world, axis=1)
     nearest_m, wall = np.minimum(nearest_m, _FAR_M), np.where(np.isfinite(nearest_m), wall, -1)
     below = np.arange(config.height_px)[:, None] - 0.5 * (config.height_px - 1)
-    up_m = config.camera_height_m - below * nearest_m / config.focal_px
+    up_m = _CAMERA_M - below * nearest_m / config.focal_px
     return _View(sight_world, nearest_m, wall, share[column, wall] * length_m[wall], slant, up_m)
 
 
@@ -124,7 +133,7 @@ def _lit_by_room(
     """Return (H, W, 3) levels of bare walls and floor."""
     height = config.height_px
     below = np.maximum(np.arange(height) - 0.5 * (height - 1), 0.5)[:, None]
-    floor_m = config.focal_px * config.camera_height_m / below
+    floor_m = config.focal_px * _CAMERA_M / below
     floor_world = position + floor_m[:, :, None] * view.sight_world
     is_floor = view.up_m < 0.0
     s = np.where(is_floor, floor_world[:, :, 0], view.along_m + 1.7 * view.wall)
@@ -150,7 +159,7 @@ def _paint(light: Field32, patch: Patch, view: _View, config: LineLaserSynthConf
     bright = 255.0 * (1.0 if patch.kind == "lamp" else config.ambient) * np.array(patch.color)
     part[(up_m >= patch.up_m[0]) & (up_m <= patch.up_m[1])] = bright
     if patch.kind == "lamp":
-        part[(-up_m >= patch.up_m[0]) & (-up_m <= patch.up_m[1])] += config.gloss * bright
+        part[(-up_m >= patch.up_m[0]) & (-up_m <= patch.up_m[1])] += _GLOSS * bright
     light[:, columns] = part
 
 
@@ -163,23 +172,23 @@ def _stripe(room: Room, config: LineLaserSynthConfig, view: _View) -> tuple[Arra
     """Return row, range and brightness of the stripe in each column: on the wall, or else on the floor."""
     on_floor = view.depth_m >= config.reach_m
     ranges_m = np.where(on_floor, config.reach_m, view.depth_m)
-    height_m = config.laser_height_m * (1.0 - ranges_m / config.reach_m)
-    rows = 0.5 * (config.height_px - 1) + config.focal_px * (config.camera_height_m - height_m) / ranges_m
+    height_m = _LASER_M * (1.0 - ranges_m / config.reach_m)
+    rows = 0.5 * (config.height_px - 1) + config.focal_px * (_CAMERA_M - height_m) / ranges_m
     returned = room.colors[view.wall, 0]
     for patch in room.patches:
         columns = _columns_of(patch, view)
         lit = columns[(height_m[columns] >= patch.up_m[0]) & (height_m[columns] <= patch.up_m[1])]
         returned[lit] = 0.0 if patch.kind == "dull" else min(patch.color[0], 1.0)
-    grazing = config.laser_height_m / np.hypot(config.laser_height_m, config.reach_m)
+    grazing = _LASER_M / np.hypot(_LASER_M, config.reach_m)
     share = np.where(on_floor, room.floor[0] * grazing, returned * view.slant)
-    return rows, ranges_m, config.laser_levels * share / ranges_m
+    return rows, ranges_m, _LASER_LEVELS * share / ranges_m
 
 
 def _stripe_light(
     config: LineLaserSynthConfig, rows: Array, ranges_m: Array, levels: Array, *, rng: np.random.Generator
 ) -> Field32:
     """Return (H, W) levels that the laser adds."""
-    sigma_px = np.hypot(_LENS_PX, 0.25 * config.focal_px * config.stripe_m / ranges_m)
+    sigma_px = np.hypot(_LENS_PX, 0.25 * config.focal_px * _STRIPE_M / ranges_m)
     noise = cv2.GaussianBlur(rng.standard_normal((1, config.width_px)), (0, 0), 1.0)[0]
     speckle = np.exp(_SPECKLE * noise / noise.std())
     offset = np.arange(config.height_px)[:, None] - rows
@@ -198,7 +207,7 @@ def _developed(light: Field32, config: LineLaserSynthConfig, *, rng: np.random.G
     return np.clip(np.rint(seen), 0, 255).astype(np.uint8)
 
 
-def _encoded(image: Image, config: LineLaserSynthConfig) -> bytes:
+def _encoded(image: Image) -> bytes:
     bgr = np.ascontiguousarray(image[:, :, ::-1])
-    _, jpeg = cv2.imencode(".jpg", bgr, (cv2.IMWRITE_JPEG_QUALITY, config.jpeg_quality))
+    _, jpeg = cv2.imencode(".jpg", bgr, (cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY))
     return jpeg.tobytes()

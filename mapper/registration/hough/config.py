@@ -77,7 +77,7 @@ class ObjectsConfig(Config):
 
 
 class ConstellationConfig(Config):
-    """From one scan to the centres that vote."""
+    """Constellation: the centres of a scan that vote."""
 
     levelling: LevellingConfig = LevellingConfig()
     """Level frame of a scan."""
@@ -115,11 +115,9 @@ class OverlapConfig(Config):
     obstacles: PositiveInt = 1000
     """Number of obstacle voxels, and of ground columns, that are compared, evenly chosen."""
     step_m: PositiveFloat = 0.4
-    """First step in which the overlap is maximised from each peak, along each axis."""
+    """First step in which the overlap is maximised from each peak, along each axis; it is halved twice."""
     step_rad: PositiveFloat = 0.0175
-    """First step of the heading."""
-    halvings: NonNegativeInt = 2
-    """Number of times that both steps are halved."""
+    """First step of the heading, likewise."""
     candidates: PositiveInt = 6
     """Number of peaks, those with most overlap, that get the free-space check."""
     distinct_m: PositiveFloat = 1.0
@@ -133,7 +131,7 @@ class OverlapConfig(Config):
 
 
 class HoughAcceptanceConfig(Config):
-    """When the answer is accepted; otherwise there is none."""
+    """Acceptance of the answer; otherwise there is none."""
 
     min_agreeing_ratio: Ratio = 0.1
     """Share of each scan's obstacles that the other measured, too. Right results had 0.12 or more."""

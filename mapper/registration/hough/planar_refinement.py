@@ -11,6 +11,8 @@ from mapper.registration.hough.ground_removal import Ground
 from mapper.registration.hough.planar_kernels import FULL_OVERLAP, hill_climb
 from mapper.registration.hough.voting import planar_motion
 
+_HALVINGS = 2
+"""Number of times that the steps are halved: to a quarter of a voxel; the points are then refined."""
 _FITS = 3
 _FIT_WIDTH_M = 0.5
 _MIN_FIT_CELLS = 30
@@ -60,7 +62,7 @@ def refine_planar(
         config.constellation.ground.min_obstacle_m,
         overlap.step_m,
         overlap.step_rad,
-        overlap.halvings,
+        _HALVINGS,
     )
     share = total / (FULL_OVERLAP * max(len(source.heights_m), 1))
     return PlanarFit(float(dx_m), float(dy_m), float(alpha_rad), float(share))

@@ -21,7 +21,7 @@ def row(
         start: Their first corner; x runs along the row, and the houses face −y.
         length_m: Length of the row; under 7 m nothing fits.
         depth_m: Depth of the houses.
-        behind_m: How far behind the houses a gap ends at another house; 0 leaves it open.
+        behind_m: Depth of a gap, which ends at another house; 0 leaves it open.
         rng: Source of the row.
     """
     at_m = 0.0

@@ -26,7 +26,7 @@ def write_lidar_log(
 
     Args:
         out: Folder to make; it must not exist.
-        config: What to record.
+        config: Settings of the log.
         on_progress: Called with (scans written, scans in all) after every scan.
 
     Raises:

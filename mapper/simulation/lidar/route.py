@@ -151,11 +151,11 @@ class Drive:
     """Motion of a sensor: its pose at any time.
 
     Attributes:
-        config: How it moves.
+        config: Settings of the motion.
         route: Along which way.
         ground: Over which ground.
         phases_rad: (3,) of its swings.
-        aside_m: How far to the left of the way it keeps.
+        aside_m: Distance that it keeps to the left of the route.
     """
 
     config: LidarSynthConfig

@@ -59,7 +59,7 @@ def measure(
         sensor: The LiDAR.
         T_world_lidar: (A, 4, 4) its pose when each column is fired.
         rng: This scan's own noise.
-        traffic: What moves; None is nothing.
+        traffic: Moving objects; None is none.
         start_s: When the sweep begins, seconds after the log does.
 
     Returns:

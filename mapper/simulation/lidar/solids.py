@@ -59,7 +59,7 @@ class Site:
     """Builder of the outdoor world.
 
     Attributes:
-        ground: What everything stands on.
+        ground: Ground on which everything stands.
     """
 
     ground: Ground
@@ -79,11 +79,11 @@ class Site:
         """Add one solid.
 
         Args:
-            name: What it is part of.
+            name: Name of the thing that it is part of.
             place: Frame in which ``center`` is given; its origin lies on the ground.
             center: Middle of the solid's box, metres.
             size: Extent of the box along x, y, z, metres.
-            shape: What fills the box.
+            shape: Shape that fills the box.
         """
         x, y = place.world(center[0], center[1])
         base_m = float(self.ground.height_m(np.array([[place.x_m, place.y_m]]))[0])

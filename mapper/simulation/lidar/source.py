@@ -20,9 +20,9 @@ class LidarSimulator:
     """LiDAR that moves through a street or a yard.
 
     Attributes:
-        config: What the log is made from.
+        config: Settings of the log.
         scene: The world, without what moves in it.
-        traffic: What moves in it.
+        traffic: Objects that move in it.
         drive: The sensor's pose at any time.
         truth: Exact T_world_lidar where each sweep begins.
     """

@@ -97,11 +97,11 @@ class Kind:
 
     Attributes:
         build: Adds one at a place.
-        offset_m: How far from the middle of the road, lowest and highest.
+        offset_m: Distance from the middle of the road, lowest and highest.
         along_m: Space it needs along the kerb.
         across_m: Half its width.
-        share: How often it comes, relative to others.
-        is_movable: On another day it may be gone or elsewhere.
+        share: Frequency relative to other kinds.
+        is_movable: Whether it may be gone or elsewhere on another day.
     """
 
     build: Callable[[Site, Place, np.random.Generator], None]

@@ -31,11 +31,11 @@ class _Mover:
     Attributes:
         solids: Its parts, standing on the world's origin, facing along x.
         start_m: Position along the route at the start.
-        offset_m: How far to the left of the route it keeps.
+        offset_m: Distance that it keeps to the left of the route.
         speed_mps: Its speed while it goes; negative against the sensor's direction.
-        go_s: How long it goes.
-        stop_s: How long it then stands.
-        phase_s: How long before the start it last set out.
+        go_s: Duration of motion.
+        stop_s: Duration of the stop after it.
+        phase_s: Time from its last departure to the start of the log.
     """
 
     solids: Solids
@@ -60,8 +60,8 @@ class Traffic:
 
     Attributes:
         movers: Each of them.
-        route: What they follow.
-        ground: What they stand on.
+        route: Route that they follow.
+        ground: Ground on which they stand.
     """
 
     movers: tuple[_Mover, ...]

@@ -36,7 +36,7 @@ def cloud_from(columns: Columns, *, path: Path, scale: float | None) -> RawCloud
     """Return the cloud of a file's columns; not a number, infinity and 0 0 0 are missing returns.
 
     Args:
-        columns: What was read; x, y and z are needed.
+        columns: Columns that were read; x, y and z are needed.
         path: The file, for messages.
         scale: Metres per unit; None is 1, and checked.
 

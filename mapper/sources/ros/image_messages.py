@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mapper.core.errors import FrameError
 from mapper.core.frames import DepthImage, Image
-from mapper.sources.images import decode_colour, decode_depth_units, decode_grey, depth_m_from
+from mapper.sources.image_files.reading import decode_colour, decode_depth_units, decode_grey, depth_m_from
 from mapper.sources.ros.messages import FileMessage, ImageMessage, PixelsMessage
 
 MILLIMETRES_PER_M = 1000.0
@@ -98,8 +98,8 @@ def depth_m_of(
     Args:
         message: 16-bit units, 32-bit numbers, or a file of either.
         units_per_m: 16-bit units of a metre; ROS says 1000.
-        float_units_per_m: The same of 32-bit numbers; ROS says 1.
-        where: What to name in an error.
+        float_units_per_m: Units of 32-bit numbers; ROS says 1.
+        where: Name of the image in an error.
 
     Raises:
         FrameError: The image is damaged, or in an encoding that is not read.

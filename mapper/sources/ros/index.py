@@ -27,11 +27,11 @@ class Series:
     """Messages of one topic, in the order of the recording.
 
     Attributes:
-        topic: What they are.
+        topic: Topic of the messages.
         stamps_ns: (N,) when they were measured, by their headers; ``log_ns`` where their type has none.
         log_ns: (N,) when they were recorded.
         places: (N, 3) block, offset and length of each.
-        undated: How many more have no header that can be read; they are left out.
+        undated: Number of others without a header that can be read; they are left out.
         kept: Bytes of small messages by their number: to read them again would unpack the whole file again.
     """
 

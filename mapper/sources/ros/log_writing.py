@@ -7,7 +7,7 @@ from pathlib import Path
 from mapper.core.errors import FrameError, SourceError
 from mapper.core.frames import RgbdFrame, Scan
 from mapper.sources.base import FrameRef, ImageFiles, Log, Skipped
-from mapper.sources.images import image_bytes, read_colour, read_depth_m
+from mapper.sources.image_files.reading import image_bytes, read_colour, read_depth_m
 from mapper.sources.ros.encode_ros import (
     SerializedMessage,
     camera_info_message,
@@ -42,7 +42,7 @@ def write_recording(
     poses of the sensor's own frame, on /wheel_odometry, and accelerations are on /imu.
 
     Args:
-        source: What to write.
+        source: Log that is written.
         out: File to make; its name ends as its kind does, by which it is recognised.
         kind: "mcap" (ROS 2) or "bag" (ROS 1).
         on_progress: Called with the number of frames done, after each.

@@ -20,7 +20,7 @@ class PixelsMessage:
         width_px: Pixels of a row.
         height_px: Rows.
         row_bytes: Bytes of a row, padding included.
-        is_big_endian: How pixels of several bytes are stored.
+        is_big_endian: Whether pixels of several bytes are stored highest byte first.
         data: The rows.
     """
 

@@ -26,8 +26,8 @@ class Topic:
 
     Attributes:
         name: E.g. "/camera/color/image_raw".
-        type: What a message is, as ROS 2 or Foxglove call it, e.g. "sensor_msgs/msg/Image".
-        encoding: How a message is written: "cdr", "ros1", "protobuf", "json" or another that is not read.
+        type: Type of its messages, as ROS 2 or Foxglove call it, e.g. "sensor_msgs/msg/Image".
+        encoding: Encoding of its messages: "cdr", "ros1", "protobuf", "json" or another that is not read.
     """
 
     name: str
@@ -110,8 +110,8 @@ class Contents(ABC):
 
     Attributes:
         blocks: Places of the blocks, in the order of the file.
-        expected: How many messages the file says that it holds, if it says so.
-        notes: What is lost already, a sentence each.
+        expected: Number of messages that the file says it holds, if it says so.
+        notes: Sentences on what is lost already.
     """
 
     def __init__(self) -> None:
@@ -149,7 +149,7 @@ class BlockRecording:
 
         Args:
             path: The file.
-            kind: As of :class:`Recording`.
+            kind: Format, as of :class:`Recording`.
             contents: Its blocks.
             unpack: Returns the bytes of a stored block; DataError if they are damaged.
         """
@@ -247,11 +247,11 @@ def open_blocks(
 
     Args:
         path: The file.
-        kind: As of :class:`Recording`.
+        kind: Format, as of :class:`Recording`.
         magic: Bytes that every file of the format begins with.
         called: The format's files, for messages.
         read_contents: Finds the blocks of an open file.
-        unpack: As of :class:`BlockRecording`.
+        unpack: Function as of :class:`BlockRecording`.
 
     Raises:
         SourceError: The file does not begin as it should, or cannot be read.

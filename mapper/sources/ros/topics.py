@@ -73,8 +73,8 @@ def choose(
     Args:
         series: Every topic.
         firsts: The first message of those that can be read.
-        config: What the user set.
-        path: What to name in an error.
+        config: The user's choice of topics.
+        path: Recording, for errors.
 
     Raises:
         SourceError: A chosen topic is not there or of another type, or nothing can be mapped.

@@ -1,12 +1,15 @@
 """Precision and recall of loop closures against the truth."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from mapper.core.timebase import NS_PER_S
 from mapper.core.trajectory import Trajectory
-from mapper.evaluators.metrics.loops import loop_metrics, revisits_of
+from mapper.evaluators.metrics.loops import loop_metrics, loop_metrics_of_run, revisits_of
 from mapper.loops.closure import LoopClosure
+from mapper.loops.config import PlaceLoopsConfig, ScanLoopsConfig
 from tests.support.planar import at
 
 
@@ -75,5 +78,13 @@ def test_what_the_truth_does_not_cover_is_not_judged(truth):
 
 
 def test_where_looks_are_rare_a_loop_counts_for_the_keyframes_around(truth):
-    told = values(loop_metrics([closure(2, 18, 0.0)], truth.stamps_ns, truth, looked_every_m=1.0))
+    told = values(loop_metrics([closure(2, 18, 0.0)], truth.stamps_ns, truth, searched_every_m=1.0))
     assert told["true revisits with a loop"] == 5  # 16 to 20 s, half a metre apart
+
+
+@pytest.mark.parametrize(
+    ("loops", "found"), [(ScanLoopsConfig(min_motion_m=1.0), 5), (PlaceLoopsConfig(min_motion_m=1.0), 1)]
+)
+def test_scans_are_searched_for_loops_once_in_some_metres(truth, loops, found):
+    run = SimpleNamespace(config=SimpleNamespace(loops=loops), loops=[closure(2, 18, 0.0)], keyframes=truth)
+    assert values(loop_metrics_of_run(run, truth))["true revisits with a loop"] == found

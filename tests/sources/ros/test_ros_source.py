@@ -10,7 +10,7 @@ from mapper.core.geometry import exp
 from mapper.core.rotations import quaternion_from_rotation
 from mapper.sources import open_source
 from mapper.sources.config import CameraConfig, SourceConfig, TopicsConfig
-from mapper.sources.images import decode_depth_units
+from mapper.sources.image_files.reading import decode_depth_units
 from mapper.sources.ros.encode_ros import (
     SerializedMessage,
     cloud_message,

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from mapper.core.errors import DataError, FrameError
-from mapper.sources.image_size import MOST_MEGAPIXELS, _size
-from mapper.sources.images import decode_colour, decode_depth_units, decode_grey
+from mapper.sources.image_files.reading import decode_colour, decode_depth_units, decode_grey
+from mapper.sources.image_files.size import MOST_MEGAPIXELS, _size
 
 DECODERS = {
     "colour": lambda data: decode_colour(data, "x"),

@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from mapper.core.errors import DataError, FrameError
-from mapper.sources import jpeg, open_source
-from mapper.sources.jpeg_entropy import _STANDARD_TABLES, check_entropy
+from mapper.sources import open_source
+from mapper.sources.image_files import jpeg
+from mapper.sources.image_files.jpeg_entropy import _STANDARD_TABLES, check_entropy
 from tests.support.jpeg_writing import (
     SIXTEEN_ZEROS,
     coder,

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from mapper.core.errors import DataError, FrameError
-from mapper.sources import jpeg, png
-from mapper.sources.images import read_colour, read_depth_m, read_grey
+from mapper.sources.image_files import jpeg, png
+from mapper.sources.image_files.reading import read_colour, read_depth_m, read_grey
 from tests.support.tum_logs import picture
 
 FILTERS = {

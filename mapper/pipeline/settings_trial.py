@@ -1,4 +1,4 @@
-"""Judging a run: its warnings, a short trial of other settings where tracking was poor, and the verdict."""
+"""Trial of other settings of the odometry, on the stretch of a log with most lost and doubtful frames."""
 
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -18,18 +18,14 @@ from mapper.pipeline.track import track_log
 from mapper.run.manifest import Trial
 from mapper.run.results import RunResults
 from mapper.run.timeline import span_text
-from mapper.run.verdict import TRACKING_KINDS, verdict_of
-from mapper.run.warnings import find_warnings
-from mapper.run.writer import RunWriter
 from mapper.runtime.progress import SILENT, Progress
 from mapper.sources.base import Log
 
 _FRAMES: Mapping[Sensor, int] = {"rgbd": 40, "lidar": 15}
-"""Length of a trial: some seconds of work for all settings together."""
+"""Length of a trial by sensor: some seconds of work for all settings together."""
 _LEAD = 4
 """A trial begins 1 / ``_LEAD`` of its frames before the stretch in question, to have a map there."""
 
-# By kind of odometry: settings of which one other value is tried: this factor times the run's own.
 _FACTORS: Mapping[str, Mapping[str, float]] = {
     "local-map": {"detector.max_features": 2, "search_px": 2, "max_depth_m": 2},
     "pnp": {"detector.max_features": 2, "max_depth_m": 2},
@@ -39,35 +35,13 @@ _FACTORS: Mapping[str, Mapping[str, float]] = {
     "kiss-icp": {"map_voxel_m": 0.5, "keyframe_distance_m": 0.5},
     "hough-ndt": {"voxel_m": 0.5},
 }
+"""Settings that are tried, by kind of odometry, with the factor from the run's own value to the other."""
 _OTHERS: Mapping[str, PnpConfig | HoughOdometryConfig] = {
     "local-map": PnpConfig(),
     "gicp": HoughOdometryConfig(),
     "icp": HoughOdometryConfig(),
 }
-
-
-def judge(
-    writer: RunWriter, source: Log, config: BuildConfig, results: RunResults, *, progress: Progress = SILENT
-) -> None:
-    """Write a run's warnings and the verdict on it into its manifest.
-
-    Where frames were lost or doubtful, other settings are tried on the stretch with most of them, unless the
-    manifest has a trial already.
-
-    Args:
-        writer: Writer of the run; its manifest has the warnings of tracking and fusing.
-        source: The log.
-        config: Settings by which the run was built.
-        results: Results of the solved run.
-        progress: Receives the stage of the trial.
-    """
-    warnings = find_warnings(results, writer.manifest)
-    trial = writer.manifest.trial
-    poor = any(warning.kind in TRACKING_KINDS and warning.weight != "note" for warning in warnings)
-    if poor and trial is None:
-        with writer.clock.stage("track"):
-            trial = try_settings(source, config, results, progress=progress)
-    writer.update(warnings=tuple(warnings), trial=trial, verdict=verdict_of(warnings, trial))
+"""Other odometry that is tried, by kind of the run's own."""
 
 
 def try_settings(
@@ -75,14 +49,14 @@ def try_settings(
 ) -> Trial | None:
     """Track the stretch in which most frames were lost or doubtful again, with a few other settings.
 
-    Without loops, and from the stretch's first frame on, with the run's own settings too: only so do the
-    numbers compare. The stretch is chosen by counting frames, so the same log gives the same trial.
+    The run's own settings are tried too, from the stretch's first frame on and without loops, so that the
+    numbers can be compared. The stretch is chosen by counting frames, so the same log gives the same trial.
 
     Returns:
-        How many frames each lost or doubted; None if no frame of the log was, or no other setting applies.
+        Number of frames that each setting lost or doubted; None if no frame was, or no other setting applies.
     """
     unplaced_ns = [record.stamp_ns for record in results.records if record.outcome in ("lost", "doubtful")]
-    candidates = dict(candidates_for(config))
+    candidates = dict(candidate_settings(config))
     is_unplaced = np.isin(source.stamps_ns, unplaced_ns)
     if not is_unplaced.any() or not candidates:
         return None
@@ -98,7 +72,7 @@ def try_settings(
     return Trial(where=span_text(begin_s, end_s), frames=len(frames), unplaced=own, tried=tried)
 
 
-def candidates_for(config: BuildConfig) -> Iterator[tuple[str, BuildConfig]]:
+def candidate_settings(config: BuildConfig) -> Iterator[tuple[str, BuildConfig]]:
     """Yield the settings to try instead of a configuration's own, as ``--set`` takes them."""
     odometry = config.odometry
     for name, factor in _FACTORS.get(odometry.kind, {}).items():

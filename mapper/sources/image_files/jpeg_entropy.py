@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mapper.core.errors import DataError
-from mapper.sources.jpeg_kernels import (
+from mapper.sources.image_files.jpeg_kernels import (
     ENDS_EARLY,
     LONG_RUN,
     NO_RESTART,

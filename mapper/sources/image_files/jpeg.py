@@ -2,14 +2,14 @@
 
 OpenCV decodes whatever it can make of a file and prints libjpeg's warnings to stderr, out of any program's
 reach. libjpeg-turbo's own interface reports them; its pixels are the same, and it takes less time. What it
-decodes without a warning is checked by its codes (``mapper.sources.jpeg_entropy``).
+decodes without a warning is checked by its codes (``mapper.sources.image_files.jpeg_entropy``).
 """
 
 import simplejpeg
 
 from mapper.core.errors import DataError
 from mapper.core.frames import Image
-from mapper.sources.jpeg_entropy import check_entropy
+from mapper.sources.image_files.jpeg_entropy import check_entropy
 
 START = b"\xff\xd8\xff"
 

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from mapper.core.errors import DataError, FrameError
 from mapper.core.frames import DepthImage, Image, PinholeCamera, RgbdFrame, Scan
 from mapper.runtime.regular_files import read_regular
-from mapper.sources import jpeg, png
 from mapper.sources.base import ImageFile
-from mapper.sources.image_size import check_pixels
+from mapper.sources.image_files import jpeg, png
+from mapper.sources.image_files.size import check_pixels
 
 SATURATED = 65535
 """The largest 16-bit depth is a sensor's way to say "nothing" (7-Scenes) or "too far": no measurement."""

@@ -9,7 +9,7 @@ import pytest
 from mapper.config.loading import load_config
 from mapper.evaluators.metrics.evaluate import evaluate
 from mapper.odometry.factory import odometry_for
-from mapper.pipeline import judge, track
+from mapper.pipeline import settings_trial, track
 from mapper.pipeline.build import build
 from mapper.pipeline.fuse import fuse
 from mapper.run.folder import open_run
@@ -50,7 +50,7 @@ def test_a_build_tells_what_helped_in_a_trial(desk_log, tmp_path, monkeypatch):
     def fails(*_, **__):
         raise AssertionError("the trial of the build is still good")
 
-    monkeypatch.setattr(judge, "try_settings", fails)
+    monkeypatch.setattr("mapper.pipeline.fuse.try_settings", fails)
     again = fuse(run.open_log(), run, run.config)
     assert again.manifest.verdict == manifest.verdict
     assert again.manifest.warnings == manifest.warnings
@@ -58,7 +58,7 @@ def test_a_build_tells_what_helped_in_a_trial(desk_log, tmp_path, monkeypatch):
 
 def test_strict_builds_end_with_status_1_and_are_whole(desk_log, tmp_path, monkeypatch):
     doubt_frames(monkeypatch, DOUBTED)
-    monkeypatch.setattr(judge, "_FACTORS", {})
+    monkeypatch.setattr(settings_trial, "_FACTORS", {})
     arguments = ["build", desk_log, "--out", tmp_path / "run", "--set", SETTINGS[1], "--strict"]
     result = mapper(*arguments, status=1)
     run = open_run(tmp_path / "run")
@@ -92,10 +92,10 @@ def test_a_trusted_run_passes_strictly(desk_run):
 def test_a_trial_looks_where_most_went_wrong():
     is_unplaced = np.zeros(1000, np.bool_)
     is_unplaced[[100, 103, 500, 501, 505, 507]] = True
-    frames = judge._worst_stretch(is_unplaced, 40)
+    frames = settings_trial._worst_stretch(is_unplaced, 40)
     assert len(frames) == 40
     assert frames[0] + 10 <= 500 < 507 < frames[-1] + 1
-    assert judge._worst_stretch(is_unplaced[:30], 40).tolist() == list(range(30))
+    assert settings_trial._worst_stretch(is_unplaced[:30], 40).tolist() == list(range(30))
 
 
 @pytest.mark.parametrize(
@@ -108,7 +108,7 @@ def test_a_trial_looks_where_most_went_wrong():
     ],
 )
 def test_settings_to_try_are_settings(overrides, expected):
-    found = dict(judge.candidates_for(load_config(None, overrides)))
+    found = dict(settings_trial.candidate_settings(load_config(None, overrides)))
     assert expected <= found.keys()
     assert bool(found) == bool(expected)
     for setting, config in found.items():

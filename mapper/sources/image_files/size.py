@@ -4,7 +4,7 @@ import re
 import struct
 
 from mapper.core.errors import DataError
-from mapper.sources import jpeg, png
+from mapper.sources.image_files import jpeg, png
 
 MOST_MEGAPIXELS = 100
 """Size of the largest image that is decoded: depth cameras have a megapixel, industrial cameras up to fifty,

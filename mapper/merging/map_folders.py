@@ -1,0 +1,23 @@
+"""Folders with maps, runs and merged maps, opened by one function."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from mapper.run.folder import Run, open_run
+from mapper.run.manifest import is_merged_map
+
+if TYPE_CHECKING:
+    from mapper.merging.merged_map import MergedMap
+
+
+def open_map_folder(path: Path) -> "Run | MergedMap":
+    """Return a finished run or a finished merged map.
+
+    Raises:
+        RunError: The folder is missing, is neither, or is not finished.
+    """
+    if not is_merged_map(path):
+        return open_run(path)
+    from mapper.merging.merged_map import open_map  # compiled code, which runs do not need
+
+    return open_map(path)

@@ -1,0 +1,1 @@
+"""Readers of image files: PNG and JPEG as arrays, with every pixel checked."""
