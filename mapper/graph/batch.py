@@ -86,6 +86,8 @@ def solve(
         if not quick.rose:
             return quick.values, quick.iterations
         parameters = gtsam.LevenbergMarquardtParams()
+        # A step that would raise the error by less than this share ends GTSAM's search for a damping.
+        parameters.setRelativeErrorTol(min(effort.relative_error, parameters.getRelativeErrorTol()))
         damped = _descend(gtsam.LevenbergMarquardtOptimizer(problem, quick.values, parameters), effort)
     except RuntimeError as error:  # how GTSAM's C++ exceptions arrive, several lines long
         reason = " ".join(str(error).split())
