@@ -44,12 +44,14 @@ class Part:
         loops: Its factors that may be outliers.
         held: GTSAM's terms of ``known``, and the anchor.
         start: Poses at which the solver starts.
+        fixed: Node that keeps its pose.
     """
 
     known: Sequence[BetweenFactor]
     loops: Sequence[BetweenFactor]
     held: Sequence[gtsam.NonlinearFactor]
     start: gtsam.Values
+    fixed: int
 
 
 def solve(
