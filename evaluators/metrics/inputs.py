@@ -39,7 +39,13 @@ def estimate_and_truth(
         return None, estimate, known
     if isinstance(estimate, str | os.PathLike):
         if Path(estimate).is_file():
-            return None, _poses(estimate, times), known
+            poses = _poses(estimate, times)
+            if times is None and len(untimed) == 2 and known is not None and len(poses) != len(known):
+                raise DataError(
+                    f"{estimate} has {len(poses)} poses and {truth} {len(known)}: poses in KITTI text are "
+                    "paired by line; cut the longer to the same frames"
+                )
+            return None, poses, known
         estimate = open_run(estimate)
     return estimate, estimate.trajectory, known or estimate.truth
 

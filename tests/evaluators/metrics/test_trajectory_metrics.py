@@ -10,7 +10,7 @@ from mapper.core.geometry import exp, inverse, rotation_exp, transform
 from mapper.core.trajectory import Trajectory
 from mapper.evaluators.metrics.evaluate import evaluate
 from mapper.evaluators.metrics.trajectory import Matched, align, associate, ate, rpe, start_end_offset
-from mapper.sources.trajectory_files import read_kitti, read_tum, write_tum
+from mapper.sources.trajectory_files import read_kitti, read_tum, write_kitti, write_tum
 from tests.support.paths import SHARED
 
 TRAJECTORIES = SHARED / "data/trajectories"
@@ -250,3 +250,14 @@ def test_an_aligned_estimate_lies_on_the_truth(tmp_path):
     np.testing.assert_allclose(
         truth.moved(inverse(similarity.T_truth_map)).T_world_body, seen_elsewhere.T_world_body, atol=1e-9
     )
+
+
+def test_two_kitti_texts_of_different_lengths_are_refused(tmp_path):
+    """Lines are all that pairs them: without the first five poses of one, all pairs would be wrong."""
+    truth = walk(40, seed=3)
+    write_kitti(tmp_path / "truth.txt", truth)
+    write_kitti(tmp_path / "same.txt", truth)
+    write_kitti(tmp_path / "late.txt", truth[5:])
+    assert evaluate(tmp_path / "same.txt", tmp_path / "truth.txt").ate_m < 1e-6
+    with pytest.raises(DataError, match=r"late\.txt has 35 poses and .*truth\.txt 40: .* paired by line"):
+        evaluate(tmp_path / "late.txt", tmp_path / "truth.txt")
