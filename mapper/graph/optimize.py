@@ -16,7 +16,7 @@ from mapper.graph.model import PoseGraph, Solution
 from mapper.graph.proportional_correction import distribute
 from mapper.graph.robust import solve_part
 from mapper.graph.terms import anchor, between, poses_of, values_of
-from mapper.runtime.progress import SILENT, Progress
+from mapper.runtime.progress import SILENT, Progress, Report
 
 if TYPE_CHECKING:
     import gtsam
@@ -70,13 +70,31 @@ def optimize(graph: PoseGraph, config: GraphConfig, *, progress: Progress = SILE
                 )
                 part = replace(part, start=start_of(part, config))
                 with progress.stage("solve") as report:
-                    solved, loop_weights, more = solve_part(part, config, report=report)
+                    watched = _Watched(report)
+                    solved, loop_weights, more = solve_part(part, config, report=watched)
+                if watched.done >= config.max_iterations:
+                    progress.note(
+                        f"the solve of {len(nodes)} nodes was ended by max_iterations="
+                        f"{config.max_iterations}, not by convergence; raise it"
+                    )
                 T_world_node |= poses_of(solved)
                 iterations += more
                 for k, weight in zip(loops, loop_weights, strict=True):
                     weights[k] = float(weight)
     after = _errors(terms, values_of(T_world_node, T_world_node))
     return Solution(T_world_node, iterations, before, after, tuple(weights))
+
+
+class _Watched:
+    """Receiver of the iterations, which remembers how many there were."""
+
+    def __init__(self, report: Report) -> None:
+        self._report = report
+        self.done = 0
+
+    def __call__(self, done: int, total: int) -> None:
+        self.done = done
+        self._report(done, total)
 
 
 def _errors(terms: Sequence["gtsam.NonlinearFactor"], values: "gtsam.Values") -> tuple[float, ...]:

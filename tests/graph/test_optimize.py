@@ -299,6 +299,19 @@ def test_damped_steps_go_on_until_the_error_is_least():
     assert solution.error_after == pytest.approx(further.error_after, rel=1e-6)
 
 
+@pytest.mark.parametrize(("limit", "noted"), [(2, 1), (100, 0)])
+def test_a_solve_that_did_not_converge_says_so(limit, noted):
+    notes = []
+
+    class Noting(Silent):
+        note = staticmethod(notes.append)
+
+    graph, _ = loop(rng=np.random.default_rng(8))
+    optimize(graph, GraphConfig(initial="given", max_iterations=limit), progress=Noting())
+    sentence = "the solve of 12 nodes was ended by max_iterations=2, not by convergence; raise it"
+    assert notes == [sentence] * noted
+
+
 @needs_posegraphs
 @pytest.mark.parametrize(
     ("name", "best"),
