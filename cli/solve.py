@@ -60,7 +60,12 @@ def solve(
     import time
 
     from mapper.config.loading import overridden
-    from mapper.export.solved_graph import SolvedGraph, solve_report, write_solved_graph
+    from mapper.export.solved_graph import (
+        SolvedGraph,
+        refuse_existing_result,
+        solve_report,
+        write_solved_graph,
+    )
     from mapper.graph.config import GraphConfig
     from mapper.graph.g2o import read_g2o
     from mapper.graph.optimize import optimize
@@ -70,6 +75,7 @@ def solve(
     config = overridden(GraphConfig(), overrides)
     doubts = config.robust != "none" and any(override.startswith("robust=") for override in overrides)
     out = place_of(out, RUNS / name_of(graph))
+    refuse_existing_result(out)
     progress = output.progress()
     began = time.perf_counter()
     given = read_g2o(graph, guess_loops=doubts, progress=progress)

@@ -28,6 +28,9 @@ def estimate_and_truth(
         SourceError: A file cannot be read.
         DataError: It is malformed, or KITTI text and times do not belong together.
     """
+    for name, one in (("estimate", estimate), ("truth", "" if truth is None else truth)):
+        if not isinstance(one, Run | Trajectory | str | os.PathLike):
+            raise DataError(f"{name}: {type(one).__name__}, want a Trajectory or the path of a file or run")
     paths = [Path(one) if isinstance(one, str | os.PathLike) else None for one in (estimate, truth)]
     untimed = [path for path in paths if path is not None and path.is_file() and is_kitti(path)]
     if times is not None and not untimed:
@@ -39,7 +42,13 @@ def estimate_and_truth(
         return None, estimate, known
     if isinstance(estimate, str | os.PathLike):
         if Path(estimate).is_file():
-            return None, _poses(estimate, times), known
+            poses = _poses(estimate, times)
+            if times is None and len(untimed) == 2 and known is not None and len(poses) != len(known):
+                raise DataError(
+                    f"{estimate} has {len(poses)} poses and {truth} {len(known)}: poses in KITTI text are "
+                    "paired by line; cut the longer to the same frames"
+                )
+            return None, poses, known
         estimate = open_run(estimate)
     return estimate, estimate.trajectory, known or estimate.truth
 

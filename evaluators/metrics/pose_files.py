@@ -1,4 +1,4 @@
-"""Reading of trajectories: TUM text, or KITTI's with or without a list of times."""
+"""Reading of trajectories: TUM text, MulRan's, or KITTI's with or without a list of times."""
 
 from pathlib import Path
 
@@ -7,7 +7,7 @@ import numpy as np
 from mapper.core.errors import SourceError
 from mapper.core.trajectory import Trajectory
 from mapper.sources.text import parse_stamp, rows
-from mapper.sources.trajectory_files import read_kitti, read_tum
+from mapper.sources.trajectory_files import is_mulran, read_kitti, read_mulran, read_tum
 
 _KITTI_COLUMNS = 12
 
@@ -26,7 +26,7 @@ def is_kitti(path: Path) -> bool:
 
 
 def read_poses(path: Path, *, times: Path | None = None) -> Trajectory:
-    """Return a trajectory from TUM or KITTI text, whichever it is.
+    """Return a trajectory from TUM, EuRoC, MulRan or KITTI text, whichever it is.
 
     Args:
         path: The poses.
@@ -38,7 +38,7 @@ def read_poses(path: Path, *, times: Path | None = None) -> Trajectory:
         DataError: A line is malformed, or there are more or fewer times than poses.
     """
     if not is_kitti(path):
-        return read_tum(path)
+        return read_mulran(path) if is_mulran(path) else read_tum(path)
     if times is None:
         return read_kitti(path)
     stamps = [parse_stamp(words[0], where=f"{times}:{number}") for number, words in rows(times)]

@@ -11,6 +11,7 @@ from mapper.core.errors import DataError
 
 NS_PER_S = 1_000_000_000
 _LARGEST_S = (2**63 - 1) // NS_PER_S
+_LAST_SECOND = 2**31  # builtin_interfaces/Time counts seconds in an int32
 _DATE = re.compile(r"(\d{4}-\d\d-\d\d)[ T](\d\d:\d\d:\d\d)(?:\.(\d{1,9}))?Z?")
 
 MAX_TRUTH_GAP_NS = 20_000_000
@@ -18,6 +19,27 @@ MAX_TRUTH_GAP_NS = 20_000_000
 
 Stamps = NDArray[np.int64]
 """(N,) int64 nanoseconds since the Unix epoch (or the log's own zero)."""
+
+
+def check_stamp(stamp_ns: int) -> None:
+    """Raise for a stamp that a message of a run's MCAP log cannot hold.
+
+    Raises:
+        DataError: It is before 1970 or after 2038.
+    """
+    if not 0 <= stamp_ns < _LAST_SECOND * NS_PER_S:
+        raise DataError(f"stamp {stamp_ns} ns: MCAP messages hold 0 … 2³¹ s (1970 to 2038); shift the log")
+
+
+def check_stamps(stamps_ns: Stamps) -> None:
+    """Raise for the first or last of a log's stamps, as :func:`check_stamp` does.
+
+    Raises:
+        DataError: As :func:`check_stamp`.
+    """
+    if len(stamps_ns):
+        check_stamp(int(stamps_ns.min()))
+        check_stamp(int(stamps_ns.max()))
 
 
 def ns_from_seconds_text(text: str) -> int:

@@ -3,15 +3,13 @@
 import numpy as np
 from foxglove import messages
 
-from mapper.core.errors import DataError
 from mapper.core.geometry import Points, Transform
 from mapper.core.rotations import quaternion_from_rotation
-from mapper.core.timebase import NS_PER_S
+from mapper.core.timebase import NS_PER_S, check_stamp
 from mapper.export.palette import Rgb
 
 _DOT_SPACING_M = 0.01
 _MAX_DOTS = 100_000
-_LAST_SECOND = 2**31  # builtin_interfaces/Time counts seconds in an int32
 _LINE_WIDTH_PX = 2.0
 WORLD = "world"
 
@@ -26,16 +24,6 @@ def sample_segments(starts: Points, ends: Points) -> Points:
     share = (step / np.maximum(counts[segment] - 1, 1))[:, None]
     points: Points = starts[segment] * (1.0 - share) + ends[segment] * share
     return points
-
-
-def check_stamp(stamp_ns: int) -> None:
-    """Raise for a stamp that a message cannot hold.
-
-    Raises:
-        DataError: It is before 1970 or after 2038.
-    """
-    if not 0 <= stamp_ns < _LAST_SECOND * NS_PER_S:
-        raise DataError(f"stamp {stamp_ns} ns: MCAP messages hold 0 … 2³¹ s (1970 to 2038); shift the log")
 
 
 def timestamp_of(stamp_ns: int) -> messages.Timestamp:

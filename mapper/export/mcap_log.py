@@ -59,10 +59,10 @@ from zstandard import ZstdError
 from mapper.core.errors import DataError
 from mapper.core.frames import PinholeCamera
 from mapper.core.geometry import Array, Points, Transform
+from mapper.core.timebase import check_stamp
 from mapper.core.trajectory import Trajectory
 from mapper.export.foxglove_messages import (
     WORLD,
-    check_stamp,
     lines_of,
     pose_of,
     quaternion_of,

@@ -62,16 +62,15 @@ class SolvedGraph:
 
 
 def write_solved_graph(out: Path, solved: SolvedGraph) -> None:
-    """Write the solved graph to a ``.g2o`` file, or to a new folder with everything else.
+    """Write the solved graph to a new ``.g2o`` file, or to a new folder with everything else.
 
     Raises:
-        RunError: The folder exists already, or cannot be made.
+        RunError: The file or folder exists already, or cannot be made.
     """
+    refuse_existing_result(out)
     if out.suffix == ".g2o":
         write_g2o(out, solved.solved)
         return
-    if out.exists():
-        raise RunError(f"{out}: exists already; choose another --out, or a file that ends in .g2o")
     with atomic_folder(out, _FOLDER) as folder:
         write_g2o(folder / GRAPH, solved.solved)
         by_time = sorted((stamp, node) for node, stamp in solved.graph.stamps_ns.items())
@@ -79,6 +78,16 @@ def write_solved_graph(out: Path, solved: SolvedGraph) -> None:
         write_tum(folder / KEYFRAMES, trajectory_from(poses))
         write_graph_views(folder / PICTURE, solved.graph, solved.solution, title=solved.path.name)
         write_json(folder / REPORT, solve_report(solved))
+
+
+def refuse_existing_result(out: Path) -> None:
+    """Refuse to write where something is already, such as the graph that is to be solved.
+
+    Raises:
+        RunError: It is there.
+    """
+    if out.exists():
+        raise RunError(f"{out}: exists already; choose another --out")
 
 
 def solve_report(solved: SolvedGraph) -> dict[str, object]:

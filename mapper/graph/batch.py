@@ -44,12 +44,14 @@ class Part:
         loops: Its factors that may be outliers.
         held: GTSAM's terms of ``known``, and the anchor.
         start: Poses at which the solver starts.
+        fixed: Node that keeps its pose.
     """
 
     known: Sequence[BetweenFactor]
     loops: Sequence[BetweenFactor]
     held: Sequence[gtsam.NonlinearFactor]
     start: gtsam.Values
+    fixed: int
 
 
 def solve(
@@ -86,6 +88,8 @@ def solve(
         if not quick.rose:
             return quick.values, quick.iterations
         parameters = gtsam.LevenbergMarquardtParams()
+        # A step that would raise the error by less than this share ends GTSAM's search for a damping.
+        parameters.setRelativeErrorTol(min(effort.relative_error, parameters.getRelativeErrorTol()))
         damped = _descend(gtsam.LevenbergMarquardtOptimizer(problem, quick.values, parameters), effort)
     except RuntimeError as error:  # how GTSAM's C++ exceptions arrive, several lines long
         reason = " ".join(str(error).split())

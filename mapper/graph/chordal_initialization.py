@@ -49,7 +49,7 @@ def start_of(part: Part, config: GraphConfig) -> gtsam.Values:
 
 
 def chordal_start(part: Part) -> gtsam.Values:
-    """Return poses of one connected component from its factors and its first node's estimate.
+    """Return poses of one connected component from its factors and its fixed node's estimate.
 
     Rotations are relaxed to any (3, 3) matrices that fit R_j = R_i · R_i_j best, which binds every row of
     them alike, and projected back. With them fixed, positions are fitted to the measured translations.
@@ -63,32 +63,32 @@ def chordal_start(part: Part) -> gtsam.Values:
     factors = (*part.known, *part.loops)
     nodes = part.start.keys()
     place = {node: k for k, node in enumerate(nodes)}
-    first = part.start.atPose3(nodes[0])
+    kept = part.start.atPose3(part.fixed)
     turns, steps = gtsam.GaussianFactorGraph(), gtsam.GaussianFactorGraph()
     one, zero = np.eye(3), np.zeros(3)
     for factor in factors:
         turns.add(factor.i, -factor.T_i_j[:3, :3].T, factor.j, one, zero)
     try:
-        rows = [_solved(turns, nodes, row) for row in first.rotation().matrix()]
+        rows = [_solved(turns, nodes, part.fixed, row) for row in kept.rotation().matrix()]
         R_world_node = nearest_rotation(np.stack(rows, axis=1))
         for factor in factors:
             steps.add(factor.i, -one, factor.j, one, R_world_node[place[factor.i]] @ factor.T_i_j[:3, 3])
-        positions = _solved(steps, nodes, first.translation())
+        positions = _solved(steps, nodes, part.fixed, kept.translation())
     except RuntimeError as error:  # how GTSAM's C++ exceptions arrive, several lines long
-        raise GraphError(f"no chordal start from node {nodes[0]}: {' '.join(str(error).split())}") from None
+        raise GraphError(f"no chordal start from node {part.fixed}: {' '.join(str(error).split())}") from None
     values = gtsam.Values()
     for node, R, position in zip(nodes, R_world_node, positions, strict=True):
         values.insert(node, gtsam.Pose3(gtsam.Rot3(R), position))
     return values
 
 
-def _solved(problem: gtsam.GaussianFactorGraph, nodes: list[int], first: Array) -> Array:
-    """Return the (N, 3) vectors that solve a linear problem in which the first node's is known."""
+def _solved(problem: gtsam.GaussianFactorGraph, nodes: list[int], fixed: int, known: Array) -> Array:
+    """Return the (N, 3) vectors that solve a linear problem in which the fixed node's is known."""
     import gtsam
 
     held = gtsam.GaussianFactorGraph()
     held.push_back(problem)
-    held.add(nodes[0], np.eye(3), first)
+    held.add(fixed, np.eye(3), known)
     solution = held.optimize()
     return np.array([solution.at(node) for node in nodes])
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path
 from typing import get_args
 
@@ -25,7 +26,7 @@ _SHORTEST = 1e-9
 
 
 def write_g2o(path: Path, graph: PoseGraph) -> None:
-    """Write ``VERTEX_SE3:QUAT``, ``FIX`` of the first node, and ``EDGE_SE3:QUAT`` with every digit.
+    """Write ``VERTEX_SE3:QUAT``, ``FIX`` (the first node unless others are fixed), ``EDGE_SE3:QUAT``.
 
     Data without a g2o tag stand behind a ``#`` at the line's end, which other readers ignore:
     ``# stamp_ns 1305031102175304000`` of a node, ``# origin loop`` of a factor. The information is that of
@@ -41,7 +42,7 @@ def write_g2o(path: Path, graph: PoseGraph) -> None:
         f"VERTEX_SE3:QUAT {node} {pose} # stamp_ns {graph.stamps_ns[node]}"
         for node, pose in zip(graph.T_world_node, poses, strict=True)
     ]
-    lines.append(f"FIX {next(iter(graph.T_world_node))}")
+    lines += [f"FIX {node}" for node in graph.fixed or list(graph.T_world_node)[:1]]
     if graph.factors:
         information = np.array([factor.information for factor in graph.factors])
         information = 0.5 * (information + np.swapaxes(information, 1, 2))
@@ -81,6 +82,7 @@ def read_g2o(path: Path, *, guess_loops: bool = False, progress: Progress = SILE
             raise GraphError(f"{path}:{line}: {error}") from None
     if not graph.T_world_node:
         raise GraphError(f"{path}: no vertices; want g2o text with {' or '.join(_VERTICES)} lines")
+    graph.fixed = _fixed(path, tables.get(_FIX, _Table()), graph)
     informations = _informations(path, tables, progress)
     for line, (i, j), note, T_i_j in _in_order(path, tables, _EDGES):
         unnamed: Origin = "loop" if guess_loops and abs(i - j) != 1 else "odometry"
@@ -128,6 +130,10 @@ class _Table:
             raise GraphError(f"{path}:{self.lines[int(np.argmax(lines))]}: {why}")
 
 
+def _no_poses(numbers: Array) -> Array:
+    return np.empty((len(numbers), 0))
+
+
 def _poses_2d(numbers: Array) -> Array:
     poses = np.tile(np.eye(4), (len(numbers), 1, 1))
     cosine, sine = np.cos(numbers[:, 2]), np.sin(numbers[:, 2])
@@ -139,6 +145,7 @@ def _poses_2d(numbers: Array) -> Array:
 _VERTICES = {"VERTEX_SE3:QUAT": _Form(1, 7, pose_of_row), "VERTEX_SE2": _Form(1, 3, _poses_2d)}
 _EDGES = {"EDGE_SE3:QUAT": _Form(2, 7, pose_of_row, 6), "EDGE_SE2": _Form(2, 3, _poses_2d, 3)}
 _FORMS = _VERTICES | _EDGES
+_FIX = "FIX"
 
 
 def _tables(path: Path) -> dict[str, _Table]:
@@ -148,11 +155,11 @@ def _tables(path: Path) -> dict[str, _Table]:
     for line, text in enumerate(lines, start=1):
         body, _, note = text.partition("#")
         tag, *words = body.split() or [""]
-        if tag in ("", "FIX") or tag.startswith(_PARAMETERS):
+        if tag == "" or tag.startswith(_PARAMETERS):
             continue
-        form = _FORMS.get(tag)
+        form = _Form(len(words), 0, _no_poses) if tag == _FIX else _FORMS.get(tag)
         if form is None:
-            known = ", ".join((*_FORMS, "FIX"))
+            known = ", ".join((*_FORMS, _FIX))
             raise GraphError(f"{path}:{line}: unknown tag {tag!r}; want one of {known}")
         if len(words) != form.columns:
             raise GraphError(f"{path}:{line}: {len(words)} columns after the tag, want {form.columns}")
@@ -165,7 +172,7 @@ def _tables(path: Path) -> dict[str, _Table]:
         table.lines.append(line)
         table.notes.append(note)
     for table in tables.values():
-        table.refuse(path, np.array(table.ids) < 0, "an id is negative")
+        table.refuse(path, np.array([min(ids, default=0) < 0 for ids in table.ids]), "an id is negative")
     return tables
 
 
@@ -186,6 +193,15 @@ def _in_order(
             table.refuse(path, lengths < _SHORTEST, "its quaternion is zero and has no direction")
         rows += zip(table.lines, table.ids, table.notes, form.poses(pose), strict=True)
     return sorted(rows, key=lambda row: row[0])
+
+
+def _fixed(path: Path, table: _Table, graph: PoseGraph) -> tuple[int, ...]:
+    """Return the nodes that the file says to keep."""
+    for line, ids in zip(table.lines, table.ids, strict=True):
+        for node in ids:
+            if node not in graph.T_world_node:
+                raise GraphError(f"{path}:{line}: FIX of node {node}, which is not in the graph")
+    return tuple(dict.fromkeys(chain.from_iterable(table.ids)))
 
 
 def _informations(path: Path, tables: dict[str, _Table], progress: Progress) -> dict[int, Array]:

@@ -69,11 +69,19 @@ class BetweenFactor:
 
 @dataclass(slots=True)
 class PoseGraph:
-    """Nodes with their estimates, and the factors between them. Grows while a log is tracked."""
+    """Nodes with their estimates, and the factors between them. Grows while a log is tracked.
+
+    Attributes:
+        T_world_node: Pose of every node.
+        stamps_ns: Time of every node.
+        factors: Measurements between nodes.
+        fixed: Nodes that a solve leaves where they are, in place of each component's first.
+    """
 
     T_world_node: dict[int, Transform] = field(default_factory=dict)
     stamps_ns: dict[int, int] = field(default_factory=dict)
     factors: list[BetweenFactor] = field(default_factory=list)
+    fixed: tuple[int, ...] = ()
 
     def __repr__(self) -> str:
         loops = sum(factor.origin == "loop" for factor in self.factors)
@@ -106,7 +114,7 @@ class PoseGraph:
         return np.array(ends).reshape(-1, 2, 3)
 
     def to_gtsam(self) -> "tuple[gtsam.NonlinearFactorGraph, gtsam.Values]":
-        """Return the factors and the estimates as GTSAM's, keyed by node; a prior holds the first node.
+        """Return the factors and the estimates as GTSAM's, keyed by node; a prior holds one node.
 
         Every factor is a ``BetweenFactorPose3`` with Gaussian noise; its tangent is ordered (rotation,
         translation), as here.
@@ -114,8 +122,8 @@ class PoseGraph:
         from mapper.graph.batch import problem_of
         from mapper.graph.terms import anchor, between, values_of
 
-        first = next(iter(self.T_world_node.items()), None)
-        priors = [] if first is None else [anchor(*first)]
+        first = next(iter((*self.fixed, *self.T_world_node)), None)
+        priors = [] if first is None else [anchor(first, self.T_world_node[first])]
         terms = [*priors, *(between(factor) for factor in self.factors)]
         return problem_of(terms), values_of(self.T_world_node, self.T_world_node)
 
@@ -135,11 +143,11 @@ class PoseGraph:
 
     def with_poses(self, T_world_node: dict[int, Transform]) -> "PoseGraph":
         """Return the graph with other poses of the same nodes."""
-        return PoseGraph(T_world_node, self.stamps_ns, self.factors)
+        return PoseGraph(T_world_node, self.stamps_ns, self.factors, self.fixed)
 
     def with_factors(self, factors: Iterable[BetweenFactor]) -> "PoseGraph":
         """Return the graph with these factors in place of its own."""
-        return PoseGraph(self.T_world_node, self.stamps_ns, list(factors))
+        return PoseGraph(self.T_world_node, self.stamps_ns, list(factors), self.fixed)
 
     def without_loops(self) -> "PoseGraph":
         """Return the graph with the factors of odometry and wheels alone."""
@@ -151,6 +159,7 @@ class PoseGraph:
             {node: T for node, T in self.T_world_node.items() if node in nodes},
             {node: stamp_ns for node, stamp_ns in self.stamps_ns.items() if node in nodes},
             [factor for factor in self.factors if factor.i in nodes and factor.j in nodes],
+            tuple(node for node in self.fixed if node in nodes),
         )
 
     def add_factors(self, factors: Iterable[BetweenFactor]) -> None:

@@ -16,7 +16,7 @@ from mapper.graph.model import PoseGraph, Solution
 from mapper.graph.proportional_correction import distribute
 from mapper.graph.robust import solve_part
 from mapper.graph.terms import anchor, between, poses_of, values_of
-from mapper.runtime.progress import SILENT, Progress
+from mapper.runtime.progress import SILENT, Progress, Report
 
 if TYPE_CHECKING:
     import gtsam
@@ -27,7 +27,8 @@ def optimize(graph: PoseGraph, config: GraphConfig, *, progress: Progress = SILE
 
     Least squares on ½ Σ w ‖log(T_i_j⁻¹ · T_i⁻¹ · T_j)‖², each in its factor's metric; w is 1 but for loops,
     which ``config.robust`` weighs. Every connected component is solved on its own and
-    keeps its first node where it was; a node without factors keeps its estimate.
+    keeps its first node where it was, or of ``graph.fixed`` the first that is in it; a node without
+    factors keeps its estimate.
 
     With ``config.solve == "proportional"`` the loops are spread along the path instead, and with "none"
     all estimates are returned as they are; the errors show how well they fit.
@@ -59,21 +60,41 @@ def optimize(graph: PoseGraph, config: GraphConfig, *, progress: Progress = SILE
             for nodes, factors in _connected_components(graph):
                 loops = [k for k in factors if graph.factors[k].origin == "loop"]
                 known = [k for k in factors if graph.factors[k].origin != "loop"]
+                fixed = _fixed_node(graph, nodes, progress)
                 part = Part(
                     known=[graph.factors[k] for k in known],
                     loops=[graph.factors[k] for k in loops],
-                    held=[*(terms[k] for k in known), anchor(nodes[0], graph.T_world_node[nodes[0]])],
+                    held=[*(terms[k] for k in known), anchor(fixed, graph.T_world_node[fixed])],
                     start=given if len(nodes) == given.size() else values_of(graph.T_world_node, nodes),
+                    fixed=fixed,
                 )
                 part = replace(part, start=start_of(part, config))
                 with progress.stage("solve") as report:
-                    solved, loop_weights, more = solve_part(part, config, report=report)
+                    watched = _Watched(report)
+                    solved, loop_weights, more = solve_part(part, config, report=watched)
+                if watched.done >= config.max_iterations:
+                    progress.note(
+                        f"the solve of {len(nodes)} nodes was ended by max_iterations="
+                        f"{config.max_iterations}, not by convergence; raise it"
+                    )
                 T_world_node |= poses_of(solved)
                 iterations += more
                 for k, weight in zip(loops, loop_weights, strict=True):
                     weights[k] = float(weight)
     after = _errors(terms, values_of(T_world_node, T_world_node))
     return Solution(T_world_node, iterations, before, after, tuple(weights))
+
+
+class _Watched:
+    """Receiver of the iterations, which remembers how many there were."""
+
+    def __init__(self, report: Report) -> None:
+        self._report = report
+        self.done = 0
+
+    def __call__(self, done: int, total: int) -> None:
+        self.done = done
+        self._report(done, total)
 
 
 def _errors(terms: Sequence["gtsam.NonlinearFactor"], values: "gtsam.Values") -> tuple[float, ...]:
@@ -88,6 +109,15 @@ def _connected_components(graph: PoseGraph) -> list[tuple[list[int], list[int]]]
     for k, factor in enumerate(graph.factors):
         factors[component_of[factor.i]].append(k)
     return [(nodes, indices) for nodes, indices in zip(parts, factors, strict=True) if indices]
+
+
+def _fixed_node(graph: PoseGraph, nodes: Sequence[int], progress: Progress) -> int:
+    """Return the node of a component that keeps its pose."""
+    among = set(nodes)
+    fixed = [node for node in graph.fixed if node in among]
+    if len(fixed) > 1:
+        progress.note(f"of {len(fixed)} connected nodes that are fixed only node {fixed[0]} keeps its pose")
+    return fixed[0] if fixed else nodes[0]
 
 
 def _refuse_unusable(graph: PoseGraph) -> None:

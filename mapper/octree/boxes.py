@@ -13,6 +13,8 @@ from mapper.octree.blocks import BlockStore, slot_of
 from mapper.octree.keys import BLOCK_BITS, KEY_ZERO, gather, morton
 
 _EDGE = 1 << BLOCK_BITS
+_ROUNDING = 1e-6
+"""Share of a voxel; keeps rounding from adding a layer where a face lies on a voxel's border."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,8 +66,8 @@ def count_boxes(
         raise DataError(f"octree: boxes from {lower.shape} to {upper.shape}, want two (N, 3)")
     if not (np.isfinite(lower).all() and np.isfinite(upper).all() and (lower <= upper).all()):
         raise DataError("octree: every box needs finite corners, the lower one first")
-    first = np.floor(lower / resolution_m)
-    last = np.maximum(np.ceil(upper / resolution_m) - 1.0, first)
+    first = np.floor(lower / resolution_m + _ROUNDING)
+    last = np.maximum(np.ceil(upper / resolution_m - _ROUNDING) - 1.0, first)
     reach = -KEY_ZERO, KEY_ZERO - 1
     outside = ((last < reach[0]) | (first > reach[1])).any(axis=1)
     first_key, last_key = (np.clip(keys, *reach).astype(np.int64) + KEY_ZERO for keys in (first, last))

@@ -44,10 +44,17 @@ def floor_below(
 
 
 def cut_between(octree: "OctreeMap", z_min: float, z_max: float | None) -> OccupancyGrid:
-    """Return the band between two heights of the world; without the upper one, the voxels at the lower."""
-    if z_max is None:
-        z_min = octree.resolution_m * (z_min // octree.resolution_m)
-        z_max = z_min + octree.resolution_m
+    """Return the band between two heights of the world; without the upper one, the voxels at the lower.
+
+    Raises:
+        DataError: A height is not finite, or the upper one is not the higher.
+    """
+    heights = (z_min,) if z_max is None else (z_min, z_max)
+    if not np.isfinite(heights).all() or (z_max is not None and z_max <= z_min):
+        raise DataError(f"slice: from {z_min} to {z_max} m; want finite heights, the lower one first")
+    if z_max is None:  # a height on a border belongs to the voxel above it, as in a query
+        layer = np.floor((1.0 / octree.resolution_m) * z_min)
+        z_min, z_max = layer * octree.resolution_m, (layer + 1.0) * octree.resolution_m
     return cut_slice(octree, SliceConfig(min_height_m=z_min, max_height_m=z_max))
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from mapper.config.build import BuildConfig
 from mapper.core.deskew import deskewed, twist_at
 from mapper.core.errors import FrameError
+from mapper.core.timebase import check_stamps
 from mapper.core.trajectory import Trajectory
 from mapper.mapping.levelling import AXES, Level, find_level
 from mapper.odometry.base import Odometry
@@ -72,9 +73,11 @@ def build(
 
     Raises:
         TrackingError: Too few frames could be tracked; what there is stays in ``OUT.partial``.
+        DataError: Some frames are from before 1970 or after 2038, which the run's MCAP log cannot hold.
         RunError: OUT is there already, or cannot be made; or a build of another log, with other settings or
             by another version was not finished there.
     """
+    check_stamps(source.stamps_ns)
     warnings = depth_cautions(source)
     for warning in warnings:
         progress.note(warning.sentence)

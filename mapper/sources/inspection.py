@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from mapper.core.errors import FrameError, SourceError
+from mapper.core.errors import DataError, FrameError, SourceError
 from mapper.core.frames import Frame, PinholeCamera, RgbdFrame, Scan, Sensor
-from mapper.core.timebase import MAX_TRUTH_GAP_NS, NS_PER_S, Stamps, nearest
+from mapper.core.timebase import MAX_TRUTH_GAP_NS, NS_PER_S, Stamps, check_stamps, nearest
 from mapper.core.trajectory import Trajectory
 from mapper.runtime.ordered_map import ordered_map
 from mapper.sources import open_source
@@ -171,7 +171,16 @@ def _inspected(path: Path, topics: Sequence[TopicFacts], source: Log) -> Inspect
         warnings=depth_warnings(source),
         vehicle=vehicle_box(source),
     )
-    return Inspection(path, topics, log, problem or None)
+    return Inspection(path, topics, log, problem or _unwritable(source))
+
+
+def _unwritable(source: Log) -> str | None:
+    """Return why no run can have the log's stamps; None if it can."""
+    try:
+        check_stamps(source.stamps_ns)
+    except DataError as error:
+        return str(error)
+    return None
 
 
 def _first_frame(source: Log) -> tuple[Frame | None, str]:

@@ -1,4 +1,4 @@
-"""Trajectories as TUM and KITTI text."""
+"""Trajectories as TUM, EuRoC, KITTI and MulRan text."""
 
 import math
 import re
@@ -18,6 +18,9 @@ from mapper.sources.text import poses_from_numbers
 
 _EUROC = re.compile(r"\s*\d{16,19}\s*,")
 _W_FIRST = re.compile(r"\bq\w*w\b.*\bq\w*x\b")
+_QUATERNION_ERROR = 0.01
+"""Deviation from the length 1 beyond which four numbers are no quaternion: text has three digits or more."""
+_MULRAN_COLUMNS = 13
 _NUMBER = re.compile(r"[-+.]?\d|nan|inf", re.IGNORECASE)
 
 
@@ -81,8 +84,13 @@ def read_kitti(path: Path, stamps_ns: Stamps | None = None) -> Trajectory:
     Raises:
         DataError: A line that is not twelve finite numbers, or another number of stamps than poses.
     """
+    return _matrices(path, _rows(path), stamps_ns)
+
+
+def _matrices(path: Path, lines: Iterable[tuple[int, list[str]]], stamps_ns: Stamps | None) -> Trajectory:
+    """Return the poses of numbered lines of twelve numbers."""
     numbers: list[list[float]] = []
-    for number, words in _rows(path):
+    for number, words in lines:
         try:
             row = [float(word) for word in words]
         except ValueError as error:
@@ -105,6 +113,32 @@ def read_kitti(path: Path, stamps_ns: Stamps | None = None) -> Trajectory:
     return Trajectory(stamps, pose_of_row(row_of_pose(T)))  # text of few digits is slightly off SO(3)
 
 
+def is_mulran(path: Path) -> bool:
+    """Return whether a file begins as MulRan's ``global_pose.csv``: whole nanoseconds and a 3×4 pose."""
+    _, words = next(iter(_rows(path)), (0, []))
+    return len(words) == _MULRAN_COLUMNS and words[0].isdigit()
+
+
+def read_mulran(path: Path) -> Trajectory:
+    """Read lines of nanoseconds and a row-major 3×4 matrix (Kim et al. 2020). Equal stamps count once.
+
+    Raises:
+        DataError: A line that is not a stamp and twelve finite numbers, or stamps that decrease.
+    """
+    stamps_ns: list[int] = []
+    poses: list[tuple[int, list[str]]] = []
+    for number, words in _rows(path):
+        if len(words) != _MULRAN_COLUMNS or not words[0].isdigit():
+            raise DataError(f"{path}:{number}: want whole nanoseconds and 12 numbers, a row-major 3×4 pose")
+        stamp_ns = int(words[0])
+        if stamps_ns and stamp_ns < stamps_ns[-1]:
+            raise DataError(f"{path}:{number}: stamp {words[0]} comes before the line above; sort the file")
+        if not stamps_ns or stamp_ns > stamps_ns[-1]:
+            stamps_ns.append(stamp_ns)
+            poses.append((number, words[1:]))
+    return _matrices(path, poses, np.array(stamps_ns, dtype=np.int64))
+
+
 def write_kitti(path: Path, trajectory: Trajectory) -> None:
     """Write one row-major 3×4 matrix a line, with every digit; KITTI text has no stamps."""
     rows = (" ".join(repr(float(v)) for v in T[:3].ravel()) for T in trajectory.T_world_body)
@@ -122,11 +156,28 @@ def _tum_rows(path: Path) -> Iterable[tuple[int, list[str]]]:
         elif words and not is_comment:
             is_euroc = len(words) >= 8 and _EUROC.match(line) is not None
             if is_euroc:
+                _refuse_another_csv(f"{path}:{number}", words)
                 words = [f"{words[0]}e-9", *words[1:8]]
             if (is_euroc or is_w_first) and len(words) == 8:
                 words = [*words[:4], *words[5:], words[4]]
             yield number, words
         has_begun = has_begun or (bool(words) and not is_comment)
+
+
+def _refuse_another_csv(place: str, words: list[str]) -> None:
+    """Refuse a line that begins as EuRoC's does, but has no unit quaternion where that has one.
+
+    Raises:
+        DataError: It is such a line.
+    """
+    try:
+        length = math.hypot(*map(float, words[4:8]))
+    except ValueError:
+        return  # the caller names the word that is no number
+    if abs(length - 1.0) > _QUATERNION_ERROR:
+        raise DataError(
+            f"{place}: columns 5 to 8 have length {length:.4g}; want EuRoC's unit quaternion, w first"
+        )
 
 
 def _rows(path: Path) -> Iterable[tuple[int, list[str]]]:

@@ -70,7 +70,12 @@ def left_out(source: Log, kind: LogKind) -> list[str]:
     """Return the parts of a log that a format has no place for, a sentence each."""
     has = {"wheel odometry": source.wheels is not None, "accelerations": source.accelerations is not None}
     no_place: dict[LogKind, list[str]] = {"mbag": ["wheel odometry"], "kitti": ["accelerations"]}
-    return [f"{kind} has no place for {what}; left out" for what in no_place.get(kind, []) if has[what]]
+    missing = [what for what in no_place.get(kind, []) if has[what]]
+    if kind == "mcap" or kind == "bag":
+        from mapper.sources.ros.log_writing import early_readings  # loads rosbags
+
+        missing = [f"{count} {what} before the time 0" for what, count in early_readings(source).items()]
+    return [f"{kind} has no place for {what}; left out" for what in missing]
 
 
 def _write_images_log(

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import mapper
+from mapper.core.trajectory import trajectory_from
 
 POINTS = np.random.default_rng(0).uniform(-3.0, 3.0, (500, 3))
 WRONG = {
@@ -29,6 +30,9 @@ WRONG = {
     "a guess of no motion": lambda _: mapper.register(POINTS, POINTS, method="icp", guess=np.zeros((4, 4))),
     "a guess without use": lambda _: mapper.register(POINTS, POINTS, guess=np.eye(4)),
     "nothing to evaluate": lambda folder: mapper.evaluate(f"{folder}/nothing"),
+    "an array of poses": lambda _: mapper.evaluate(np.zeros((3, 8))),
+    "no estimate": lambda _: mapper.evaluate(None),
+    "a number as the truth": lambda _: mapper.evaluate(trajectory_from([(0, np.eye(4))]), 5),
     "no truth": lambda folder: mapper.evaluate(f"{folder}/a.tum", f"{folder}/b.tum"),
 }
 

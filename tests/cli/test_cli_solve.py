@@ -143,3 +143,13 @@ def test_a_folder_that_is_there_is_not_written_into(tmp_path):
     assert result.exit_code == 1
     assert "exists already" in result.stderr
     assert not any((tmp_path / "out").iterdir())
+
+
+def test_a_file_that_is_there_is_not_replaced(tmp_path):
+    path = tmp_path / "ring.g2o"
+    write_g2o(path, ring()[0])
+    before = path.read_bytes()
+    result = invoke("solve", path, "--out", path)
+    assert result.exit_code == 1
+    assert "ring.g2o: exists already; choose another --out" in result.stderr
+    assert path.read_bytes() == before

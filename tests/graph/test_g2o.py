@@ -48,6 +48,21 @@ def test_a_graph_survives_the_file(tmp_path):
         assert (theirs.information == 0.5 * (ours.information + ours.information.T)).all()
 
 
+def test_fixed_nodes_are_read_and_written(tmp_path):
+    path = tmp_path / "graph.g2o"
+    path.write_text(f"{VERTICES}{EDGE}FIX 1\n")
+    graph = read_g2o(path)
+    assert graph.fixed == (1,)
+    write_g2o(path, graph.with_poses(graph.T_world_node))
+    assert "\nFIX 1\n" in path.read_text()
+    assert read_g2o(path).fixed == (1,)
+    path.write_text(f"{VERTICES}{EDGE}FIX 0 1\n")
+    assert read_g2o(path).fixed == (0, 1)
+    path.write_text(f"{VERTICES}{EDGE}FIX 5\n")
+    with pytest.raises(GraphError, match=r"graph\.g2o:4: FIX of node 5, which is not in the graph"):
+        read_g2o(path)
+
+
 def test_gtsam_reads_the_same_problem(tmp_path):
     graph = random_graph(seed=1)
     path = tmp_path / "graph.g2o"

@@ -10,7 +10,8 @@ from mapper.graph.config import GraphConfig
 from mapper.graph.g2o import read_g2o
 from mapper.graph.model import BetweenFactor, PoseGraph, PoseSigmas
 from mapper.graph.optimize import optimize
-from tests.support.noisy_graphs import noisy_measure, odometry_chain, wrong_alignment
+from mapper.runtime.progress import Silent
+from tests.support.noisy_graphs import noisy_measure, odometry_chain, winding_street, wrong_alignment
 from tests.support.paths import POSE_GRAPHS
 from tests.support.planar import on_a_circle
 
@@ -99,6 +100,28 @@ def test_components_are_solved_apart_and_each_keeps_its_first_node():
     assert optimize(a, GraphConfig()).error_before + optimize(b, GraphConfig()).error_before == pytest.approx(
         solution.error_before
     )
+
+
+@pytest.mark.parametrize("initial", ["given", "chordal"])
+def test_a_fixed_node_keeps_its_pose_in_place_of_the_first(initial):
+    graph, truth = loop(rng=np.random.default_rng(1))
+    graph.fixed = (7,)
+    solution = optimize(graph, GraphConfig(initial=initial))
+    T_new_old = graph.T_world_node[7] @ inverse(truth[7])
+    for node, T in enumerate(truth):
+        np.testing.assert_allclose(solution.T_world_node[node], T_new_old @ T, atol=1e-7)
+
+
+def test_further_fixed_nodes_of_a_component_are_noted():
+    notes = []
+
+    class Noting(Silent):
+        note = staticmethod(notes.append)
+
+    graph, _ = loop(rng=np.random.default_rng(1))
+    graph.fixed = (7, 3)
+    optimize(graph, GraphConfig(), progress=Noting())
+    assert notes == ["of 2 connected nodes that are fixed only node 7 keeps its pose"]
 
 
 def test_one_node_without_factors_is_its_own_solution():
@@ -260,6 +283,27 @@ def test_the_iterations_are_reported():
     graph, _ = loop(rng=np.random.default_rng(8))
     solution = optimize(graph, GraphConfig(initial="given"), progress=Watching())
     assert seen[-1] == ("solve", solution.iterations, solution.iterations)
+
+
+def test_damped_steps_go_on_until_the_error_is_least():
+    """GTSAM's own limit ends its search for a damping where a step raises the error by up to 1e-5 of it."""
+    graph = winding_street(900, seed=8)
+    solution = optimize(graph, GraphConfig())
+    further = optimize(graph.with_poses(solution.T_world_node), GraphConfig())
+    assert solution.error_after == pytest.approx(further.error_after, rel=1e-6)
+
+
+@pytest.mark.parametrize(("limit", "noted"), [(2, 1), (100, 0)])
+def test_a_solve_that_did_not_converge_says_so(limit, noted):
+    notes = []
+
+    class Noting(Silent):
+        note = staticmethod(notes.append)
+
+    graph, _ = loop(rng=np.random.default_rng(8))
+    optimize(graph, GraphConfig(initial="given", max_iterations=limit), progress=Noting())
+    sentence = "the solve of 12 nodes was ended by max_iterations=2, not by convergence; raise it"
+    assert notes == [sentence] * noted
 
 
 @needs_posegraphs

@@ -70,6 +70,21 @@ def test_a_slice_is_the_band_between_two_heights(octree):
         octree.slice(50.0, 51.0)
 
 
+@pytest.mark.parametrize("height_m", [-0.35, 0.0, 0.15, 0.3, 0.5, 0.6])
+def test_a_height_on_a_border_is_in_the_voxels_above_it_as_in_a_query(octree, height_m):
+    """0.5 // 0.05 is 9."""
+    at, within = octree.slice(height_m), octree.slice(height_m + 0.02)
+    np.testing.assert_array_equal(at.cells, within.cells)
+    x, y = at.origin_world_m + at.resolution_m * (np.argwhere((at.cells == OCCUPIED).T)[0] + 0.5)
+    assert octree.query([x, y, height_m]) == OCCUPIED
+
+
+@pytest.mark.parametrize("heights_m", [(1.2, 0.1), (0.3, 0.3), (np.nan,), (0.0, np.inf)])
+def test_heights_that_are_no_band_are_refused_in_one_line(octree, heights_m):
+    with pytest.raises(DataError, match=r"^slice: from .*; want finite heights, the lower one first$"):
+        octree.slice(*heights_m)
+
+
 @pytest.mark.parametrize("write", [write_bt, write_ot])
 def test_a_file_is_named_by_text_or_path(octree, tmp_path, write):
     path = tmp_path / "map"

@@ -138,6 +138,18 @@ def test_boxes_count_obstacles_and_free_space():
     assert counts.unknown.tolist()[2:] == [0, 12]
 
 
+def test_boxes_whose_faces_lie_on_borders_have_no_layer_more():
+    """0.15 / 0.05 is below 3."""
+    octree = OctreeMap(0.05)
+    lower = np.array([[0.15, 0.3, 0.35], [-0.35, -0.3, -0.15]])
+    counts = octree.count_boxes(lower, lower + 0.3)
+    assert counts.unknown.tolist() == [6**3, 6**3]
+    at = np.array([[0.15, 0.3, 0.35]])
+    octree.insert_points((at + 0.01).astype(np.float32), np.array([0.0, 0.0, 0.0]))
+    assert octree.query(at).tolist() == [100]
+    assert octree.count_boxes(at, at).occupied.tolist() == [1]
+
+
 def test_boxes_beyond_the_key_range_hold_nothing(octree):
     counts = octree.count_boxes(np.full((1, 3), 1e8), np.full((1, 3), 2e8))
 

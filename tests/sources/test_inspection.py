@@ -137,3 +137,16 @@ def test_the_box_of_the_vehicle_is_printed_as_the_setting_that_clears_it(tmp_pat
     setting = re.search(r"--set (source\.body\.box=\[[-0-9.,]+\])", told).group(1)
     assert "own vehicle" not in invoke("inspect", tmp_path, "--set", setting).stdout
     assert len(json.loads(invoke("inspect", tmp_path, "--json").stdout)["log"]["vehicle"]) == 6
+
+
+def test_stamps_that_no_run_can_have_are_said_before_anything_is_tracked(tiny_tum_log, tmp_path):
+    log = tiny_tum_log(12)
+    for name in ("rgb", "depth"):
+        lines = (log / f"{name}.txt").read_text().splitlines()[1:]
+        (log / f"{name}.txt").write_text("".join(f"-{line[9:]}\n" for line in reversed(lines)))
+    reason = "MCAP messages hold 0 … 2³¹ s (1970 to 2038); shift the log"
+    assert reason in inspect_log(log, SourceConfig()).problem
+    result = invoke("build", log, "--out", tmp_path / "run")
+    assert result.exit_code == 1
+    assert reason in result.stderr
+    assert not list(tmp_path.glob("run*"))

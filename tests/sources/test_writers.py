@@ -3,8 +3,9 @@ import pytest
 
 from mapper.core.errors import FrameError, SourceError
 from mapper.core.frames import PinholeCamera, RgbdFrame, Scan
+from mapper.core.trajectory import trajectory_from
 from mapper.sources import open_source
-from mapper.sources.writers import write_log
+from mapper.sources.writers import left_out, write_log
 from tests.support.logs import MemoryEntry, log_in_memory
 from tests.support.tum_logs import FIRST_NS, PERIOD_NS, picture
 
@@ -133,3 +134,16 @@ def test_a_lidars_log_is_refused_before_its_scans_are_read(tmp_path):
     source = log_in_memory([MemoryEntry(5, FrameError("was read"))], sensor="lidar")
     with pytest.raises(SourceError, match=r"memory: scans without images; .* --as kitti"):
         write_log(source, tmp_path / "out", kind="tum")
+
+
+@pytest.mark.parametrize("kind", ["mcap", "bag"])
+def test_recordings_leave_out_what_is_before_time_0_and_say_so(kind, tmp_path):
+    truth = trajectory_from((stamp_ns, np.eye(4)) for stamp_ns in (-20_000_000, -10_000_000, 0, 40_000_000))
+    frames = [MemoryEntry(stamp_ns, frame_at(stamp_ns, 0)) for stamp_ns in (-5_000_000, 30_000_000)]
+    log = log_in_memory(frames, truth=truth)
+    assert left_out(log, kind) == [f"{kind} has no place for 2 true poses before the time 0; left out"]
+    (skipped,) = write_log(log, tmp_path / f"log.{kind}", kind=kind)
+    assert skipped.reason == "stamp -0.005 s: no recording can be before the time 0"
+    again = open_source(tmp_path / f"log.{kind}")
+    assert [entry.stamp_ns for entry in again.entries()] == [30_000_000]
+    assert again.truth.stamps_ns.tolist() == [0, 40_000_000]

@@ -89,9 +89,9 @@ def _frames(
     for done, entry in enumerate(source.entries(), start=1):
         try:
             if isinstance(first, Scan):
-                yield _cloud(entry)
+                yield _not_early(_cloud(entry))
             else:
-                colour, depth = _images(entry)
+                colour, depth = map(_not_early, _images(entry))
                 if depth.stamp_ns != depth_stamp_ns:  # the nearest to two colour images is written once
                     depth_stamp_ns = depth.stamp_ns
                     yield depth
@@ -106,6 +106,12 @@ def _frames(
             skipped.append(Skipped(entry.stamp_ns, str(error)))
         if on_progress is not None:
             on_progress(done)
+
+
+def _not_early(message: SerializedMessage) -> SerializedMessage:
+    if message.stamp_ns < 0:
+        raise FrameError(f"stamp {message.stamp_ns / 1e9:.3f} s: no recording can be before the time 0")
+    return message
 
 
 def _cloud(entry: FrameRef) -> SerializedMessage:
@@ -157,18 +163,30 @@ def _depth_of_files(files: ImageFiles) -> SerializedMessage:
 
 def _truth(source: Log) -> Iterator[SerializedMessage]:
     if source.truth is not None:
-        for stamp_ns, T in source.truth.items():
+        for stamp_ns, T in source.truth[source.truth.stamps_ns >= 0].items():
             yield pose_message(stamp_ns, TRUTH, T, frame=_WORLD)
 
 
 def _wheels(source: Log) -> Iterator[SerializedMessage]:
     if source.wheels is not None:
         body = _LIDAR_FRAME if source.sensor == "lidar" else _CAMERA_FRAME
-        for stamp_ns, T in source.wheels.items():
+        for stamp_ns, T in source.wheels[source.wheels.stamps_ns >= 0].items():
             yield odometry_message(stamp_ns, WHEELS, T, frame=_ODOM, child=body)
 
 
 def _accelerations(source: Log) -> Iterator[SerializedMessage]:
     if (readings := source.accelerations) is not None:
         for stamp_ns, reading in zip(readings.stamps_ns.tolist(), readings.acceleration_mps2, strict=True):
-            yield imu_message(stamp_ns, IMU, reading, frame=_IMU_FRAME)
+            if stamp_ns >= 0:
+                yield imu_message(stamp_ns, IMU, reading, frame=_IMU_FRAME)
+
+
+def early_readings(source: Log) -> dict[str, int]:
+    """Return how many readings of each kind are from before the time 0, where no recording can be."""
+    kinds = {
+        "true poses": source.truth,
+        "wheel readings": source.wheels,
+        "accelerations": source.accelerations,
+    }
+    counts = {kind: int((held.stamps_ns < 0).sum()) for kind, held in kinds.items() if held is not None}
+    return {kind: count for kind, count in counts.items() if count}

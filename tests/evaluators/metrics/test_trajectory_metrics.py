@@ -10,7 +10,7 @@ from mapper.core.geometry import exp, inverse, rotation_exp, transform
 from mapper.core.trajectory import Trajectory
 from mapper.evaluators.metrics.evaluate import evaluate
 from mapper.evaluators.metrics.trajectory import Matched, align, associate, ate, rpe, start_end_offset
-from mapper.sources.trajectory_files import read_kitti, read_tum, write_tum
+from mapper.sources.trajectory_files import read_kitti, read_tum, write_kitti, write_tum
 from tests.support.paths import SHARED
 
 TRAJECTORIES = SHARED / "data/trajectories"
@@ -250,3 +250,44 @@ def test_an_aligned_estimate_lies_on_the_truth(tmp_path):
     np.testing.assert_allclose(
         truth.moved(inverse(similarity.T_truth_map)).T_world_body, seen_elsewhere.T_world_body, atol=1e-9
     )
+
+
+def test_two_kitti_texts_of_different_lengths_are_refused(tmp_path):
+    """Lines are all that pairs them: without the first five poses of one, all pairs would be wrong."""
+    truth = walk(40, seed=3)
+    write_kitti(tmp_path / "truth.txt", truth)
+    write_kitti(tmp_path / "same.txt", truth)
+    write_kitti(tmp_path / "late.txt", truth[5:])
+    assert evaluate(tmp_path / "same.txt", tmp_path / "truth.txt").ate_m < 1e-6
+    with pytest.raises(DataError, match=r"late\.txt has 35 poses and .*truth\.txt 40: .* paired by line"):
+        evaluate(tmp_path / "late.txt", tmp_path / "truth.txt")
+
+
+def mulran_text(trajectory):
+    pairs = zip(trajectory.stamps_ns.tolist(), trajectory.T_world_body, strict=True)
+    return "".join(f"{stamp_ns},{','.join(map(repr, T[:3].ravel().tolist()))}\n" for stamp_ns, T in pairs)
+
+
+def test_mulran_s_poses_are_matrices_and_not_euroc_s(tmp_path):
+    """global_pose.csv has whole nanoseconds, as EuRoC's files have, and twelve numbers in UTM coordinates."""
+    truth = walk(40, seed=4)
+    far = Trajectory(truth.stamps_ns, transform(np.eye(3), [3.5e5, 4.02e6, 20.0]) @ truth.T_world_body)
+    lines = mulran_text(far).splitlines(keepends=True)
+    (tmp_path / "global_pose.csv").write_text("".join([*lines, lines[-1]]))
+    found = evaluate(truth, tmp_path / "global_pose.csv")
+    assert found.ate_m < 1e-6
+
+
+def test_what_only_begins_as_euroc_s_is_refused(tmp_path):
+    (tmp_path / "gps.csv").write_text("".join(f"140363657976355558{k},1,2,3,4,5,6,7\n" for k in range(5)))
+    with pytest.raises(DataError, match=r"gps\.csv:1: columns 5 to 8 have length 11\.22; want EuRoC's unit"):
+        evaluate(walk(5, seed=5), tmp_path / "gps.csv")
+
+
+def test_mulran_s_poses_in_disorder_are_refused(tmp_path):
+    lines = mulran_text(walk(5, seed=6)).splitlines()
+    (tmp_path / "poses.csv").write_text("\n".join([lines[1], lines[0]]) + "\n")
+    with pytest.raises(
+        DataError, match=r"poses\.csv:2: stamp \d+ comes before the line above; sort the file"
+    ):
+        evaluate(walk(5, seed=6), tmp_path / "poses.csv")
