@@ -32,7 +32,7 @@ def floor_plane(scan: Scan, up_body: Array, *, tolerance_m: float) -> Transform 
         scan shows no such plane, or too little of it.
     """
     points = scan.points_body - scan.origin_body
-    points = points[np.linalg.norm(points, axis=1) < _REACH_M]
+    points = points[np.einsum("ij,ij->i", points, points) < _REACH_M**2]
     points = points[:: max(1, -(-len(points) // _POINTS))].astype(np.float64)
     if len(points) < _MIN_PATCHES:
         return None
