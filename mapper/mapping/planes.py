@@ -86,7 +86,7 @@ def patches_of(scans: Sequence[tuple[Scan, Transform]], *, tolerance_m: float) -
         points_body = subsampled(scan) - scan.origin_body
         if len(points_body) < _MIN_PATCH_POINTS:
             continue
-        centres_sensor, normals_sensor = _flat_cells(points_body, tolerance_m)
+        centres_sensor, normals_sensor = flat_cells(points_body, tolerance_m)
         centres.append(apply(T_world_body, centres_sensor + scan.origin_body))
         normals.append(normals_sensor @ T_world_body[:3, :3].T)
     return Patches(np.concatenate(centres), np.concatenate(normals))
@@ -187,7 +187,7 @@ def least_support(patches: int) -> int:
     return max(_MIN_LEVEL_PATCHES, int(_MIN_LEVEL_RATIO * patches))
 
 
-def _flat_cells(points: Points, tolerance_m: float) -> tuple[Points, Array]:
+def flat_cells(points: Points, tolerance_m: float) -> tuple[Points, Array]:
     """Return centres and normals, facing the origin, of the cells whose points lie in a plane."""
     cell_m = float(np.clip(_CELL_RANGE_RATIO * np.median(np.linalg.norm(points, axis=1)), *_CELL_LIMITS_M))
     cells = np.floor(points / cell_m).astype(np.int64)

@@ -12,6 +12,7 @@ from mapper.loops.factory import build_keyframe_loop_detector
 from mapper.odometry.factory import odometry_for
 from mapper.odometry.node_offset import NodeOffset
 from mapper.pipeline.components import component_of
+from mapper.pipeline.floor import UP_LEVEL, above_floor, tracked_stamps
 from mapper.pipeline.fuse import carry_times, fuse_into
 from mapper.pipeline.reobserve import reobserve
 from mapper.pipeline.solve import solve
@@ -86,9 +87,12 @@ def append(
             tracking = component_of(tracking, next(iter(known)), progress=progress)
             solved = solve(tracking.graph, tracking.loops, config.graph)
         _refuse_unconnected(second, run, solved.loops, known)
-        later = from_tracking(replace(tracking, graph=solved.graph, loops=solved.loops), None)
+        trusted_ns = tracked_stamps(before.records) | {track.stamp_ns for track in tracking.tracked}
+        with writer.clock.stage("level"):
+            graph = above_floor(source, solved.graph, config, up_world=UP_LEVEL, trusted_ns=trusted_ns)
+        later = from_tracking(replace(tracking, graph=graph, loops=solved.loops), None)
         save_places(writer, tracking)
-        save_solved(writer, before.solved(solved.graph, solved.loops).then(later, truth=source.truth))
+        save_solved(writer, before.solved(graph, solved.loops).then(later, truth=source.truth))
         writer.update(solve=solved.report)
         write_edits(writer.folder, edits)
         fuse_into(

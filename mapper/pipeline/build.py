@@ -23,6 +23,7 @@ from mapper.pipeline.checkpoints import (
     remove_checkpoints,
 )
 from mapper.pipeline.components import largest_component
+from mapper.pipeline.floor import above_floor
 from mapper.pipeline.solve import solve
 from mapper.pipeline.track import depth_cautions, first_session, track_log
 from mapper.pipeline.tracking_checkpoints import TrackingCheckpoints
@@ -151,7 +152,7 @@ class _Steps:
         tracking = replace(tracking, graph=solved.graph, loops=solved.loops)
         tracking = largest_component(tracking, progress=self.progress)
         with self.writer.clock.stage("level"):
-            level = _level(self.source, tracking.tracked_trajectory(), self.config)
+            tracking, level = levelled(self.source, tracking, self.config)
         tracking = replace(tracking, graph=tracking.graph.moved(level.T_level_world))
         return _Solved(tracking, solved.report, level)
 
@@ -176,6 +177,22 @@ def _height_warning(source: Log, trajectory: Trajectory) -> str:
     if source.sensor != "rgbd" or height_m <= _MAX_CAMERA_HEIGHT_M:
         return ""
     return f"the camera is {height_m:.1f} m above the floor; is source.camera.depth_factor right?"
+
+
+def levelled(source: Log, tracking: TrackingResult, config: BuildConfig) -> tuple[TrackingResult, Level]:
+    """Return a solved log, at the heights and tilts that its floor shows, and its level frame."""
+    level = _level(source, tracking.tracked_trajectory(), config)
+    graph = above_floor(
+        source,
+        tracking.graph,
+        config,
+        up_world=level.T_level_world[2, :3],
+        trusted_ns={track.stamp_ns for track in tracking.tracked},
+    )
+    if graph is tracking.graph:
+        return tracking, level
+    tracking = replace(tracking, graph=graph)
+    return tracking, _level(source, tracking.tracked_trajectory(), config)
 
 
 def _level(source: Log, trajectory: Trajectory, config: BuildConfig) -> Level:

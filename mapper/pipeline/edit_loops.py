@@ -14,6 +14,7 @@ from mapper.loops.base import Proposal, Verifier, verify_proposal
 from mapper.loops.closure import LoopClosure, accepted_loops
 from mapper.loops.config import NoLoopsConfig
 from mapper.loops.factory import LOOPS_OF, build_verifier
+from mapper.pipeline.floor import UP_LEVEL, above_floor, tracked_stamps
 from mapper.pipeline.fuse import fuse_changed
 from mapper.pipeline.reobserve import reobserve
 from mapper.pipeline.solve import solve
@@ -77,8 +78,11 @@ def edit_loops(
         _refuse_rejected(loop)
     if len(components(solved.graph)) > len(components(graph)):
         raise LoopError(f"{run.path}: without these loops the graph falls apart; nothing removed")
+    graph = above_floor(
+        source, solved.graph, run.config, up_world=UP_LEVEL, trusted_ns=tracked_stamps(tracked.records)
+    )
     return fuse_changed(
-        source, run, tracked.solved(solved.graph, solved.loops), solve=solved.report, progress=progress
+        source, run, tracked.solved(graph, solved.loops), solve=solved.report, progress=progress
     )
 
 
