@@ -10,7 +10,7 @@ from mapper.core.geometry import apply, exp, inverse, log
 from mapper.odometry.scan_to_map.keyframe_tree import KeyframeTree
 from mapper.odometry.scan_to_map.observed_part import MEASURED, Blend
 from mapper.odometry.scan_to_map.scan_fit import fit_of
-from mapper.odometry.scan_to_map.scan_noise import PredictedPart, ScanNoise, surface_covariance
+from mapper.odometry.scan_to_map.scan_noise import PredictedPart, ScanNoise
 from mapper.registration.refining import refine
 from tests.support.room_scans import OFF, keyframe, room_scan
 
@@ -25,7 +25,7 @@ def test_the_covariance_covers_what_noise_does():
         ).T_target_source
         fit = fit_of(key, scan, found, max_pair_distance_m=0.5)
         error = np.concatenate(log(inverse(truth) @ found))
-        squares.append(error @ np.linalg.solve(surface_covariance(fit), error) / 6.0)
+        squares.append(error @ np.linalg.solve(fit.surface_covariance, error) / 6.0)
 
     assert 0.4 < np.mean(squares) < 2.5
 
@@ -152,3 +152,11 @@ def test_covariances_of_keyframes_are_those_of_the_factors_between_them():
     for node in range(5, 100):  # by turns on two branches
         covariance = tree.add(node, node - 2, np.eye(4), np.eye(6))
     assert covariance[0, 0] <= 100.0
+
+
+def test_the_covariance_from_surfaces_is_computed_once():
+    key, scan = keyframe(room_scan(0, seed=1)), keyframe(room_scan(1, seed=2)).deskewed
+
+    fit = fit_of(key, scan, np.eye(4), max_pair_distance_m=0.5)
+
+    assert fit.surface_covariance is fit.surface_covariance

@@ -1,6 +1,7 @@
 """Constant-velocity model of the sensor's motion, with the errors that its predictions had in this log."""
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -121,6 +122,10 @@ class MotionModel:
             sigmas = spread.rotation_rad / elapsed_s, spread.translation_m / elapsed_s
         return np.repeat(sigmas, 3)
 
+    def change(self, time_ns: int, T_world_body: Transform) -> Array:
+        """Return (6,) by how much the mean velocity to a pose differs from the one before, rad/s and m/s."""
+        return _lengths(_vector(self.mean_twist(time_ns, T_world_body)) - _vector(self.twist))
+
     def mean_twist(self, time_ns: int, T_world_body: Transform) -> Twist:
         """Return the mean velocity from the last scan to a pose."""
         elapsed_s = self.elapsed_s(time_ns)
@@ -165,9 +170,37 @@ class MotionModel:
         self.pose_covariance = np.zeros((6, 6)) if pose_covariance is None else pose_covariance
 
 
+def velocities_at(
+    T_world_body: Sequence[Transform], elapsed_s: tuple[float, float]
+) -> tuple[Twist, Twist, Array] | None:
+    """Return the velocities of a parabola through three poses; None if two are of nearly one time.
+
+    Args:
+        T_world_body: Three (4, 4) poses, in time order.
+        elapsed_s: Seconds between them.
+
+    Returns:
+        At the first pose, at the second, and (6,) by how much the mean velocity changes there, the same for
+        all three axes of rotation and of translation.
+    """
+    if min(elapsed_s) < _MIN_ELAPSED_S:
+        return None
+    first, second, third = T_world_body
+    before = _vector(twist_between(first, second, duration_s=elapsed_s[0]))
+    after = _vector(twist_between(second, third, duration_s=elapsed_s[1]))
+    step = (after - before) * elapsed_s[0] / sum(elapsed_s)
+    at_first, at_second = before - step, before + step
+    return Twist(at_first[:3], at_first[3:]), Twist(at_second[:3], at_second[3:]), _lengths(after - before)
+
+
 def _time_s2(elapsed_s: float, before_s: float) -> float:
     """Return what an acceleration is multiplied by: from the middle of one interval over the next."""
     return 0.5 * elapsed_s * (elapsed_s + before_s)
+
+
+def _lengths(change: Array) -> Array:
+    """Return (6,) the lengths of a change's rotation and of its translation, for all axes of each."""
+    return np.repeat([float(np.linalg.norm(change[:3])), float(np.linalg.norm(change[3:]))], 3)
 
 
 def _vector(twist: Twist) -> Array:

@@ -1,7 +1,8 @@
 """Scan-to-map odometry by any scan matcher, with checks of each pose against the last keyframe."""
 
 from collections import deque
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -15,13 +16,14 @@ from mapper.odometry.base import Diagnostics, FrameOdometry, FrameResult, lost_f
 from mapper.odometry.keyframe_distance import is_far
 from mapper.odometry.scan_to_map.config import ScanOdometryConfig
 from mapper.odometry.scan_to_map.keyframe_tree import KeyframeTree
-from mapper.odometry.scan_to_map.motion_model import MotionModel
+from mapper.odometry.scan_to_map.motion_model import MotionModel, velocities_at
 from mapper.odometry.scan_to_map.pose_search import PoseCandidate, PoseSearch
 from mapper.odometry.scan_to_map.scan_fit import ScanKeyframe
 from mapper.odometry.scan_to_map.scan_matcher import DeskewedScan, ScanMatcher
 from mapper.odometry.scan_to_map.scan_noise import ScanNoise, independent_covariance
 from mapper.odometry.scan_to_map.scan_observation import ScanObservation, observe_scan
 from mapper.odometry.scan_to_map.sweep_motion import SweepMotion, sweep_motion
+from mapper.odometry.scan_to_map.tracked_scan import PlacedScan, ScanState, TrackedScan
 
 _KEYFRAMES = 5  # so many last ones are compared with
 _NEGLIGIBLE, _SETTLED, _DISPLACED = 0.2, 0.05, 0.5
@@ -42,6 +44,9 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
     inflated covariance, from which tracking goes on once another scan fits it and not the keyframe before.
     Keyframes are the nodes, numbered from 0, each with a factor to an earlier one. Motions that the surfaces
     do not show are predicted, with a covariance that grows until they are seen again.
+
+    Where a sweep may be bent, the next scan's pose tells its velocity better, and it is tracked again with
+    that. Its factor waits for this.
     """
 
     def __init__(self, config: ScanOdometryConfig, matcher: ScanMatcher) -> None:
@@ -55,6 +60,9 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
         self._doubtful: ScanKeyframe | None = None
         self._last: ScanKeyframe | None = None
         self._first: ScanObservation | None = None
+        self._before: TrackedScan | None = None
+        self._waiting: tuple[BetweenFactor, ...] = ()
+        self._again: dict[int, FrameResult] = {}  # of scans that were tracked again, by their stamps
         self._lost_scans = 0
         self._next_node = 0
 
@@ -73,10 +81,32 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
         placed = self._place(observation)
         if placed is not None and self._first is not None and self._first.scan.times_s is not None:
             placed = self._begin_again(self._first, observation, placed.found.T_world_middle)
+        elif placed is not None and self._before is not None:
+            placed = self._after_correction(self._before, observation, placed)
         if placed is None:
             return self._not_found(observation)
-        self._first, self._lost_scans = None, 0
-        return self._placed(observation, placed)
+        state = self._state().copy() if self._may_be_bent(observation) else None
+        first, self._first, self._lost_scans = self._first, None, 0
+        result = self._placed(observation, placed)
+        waiting, self._waiting, self._before = self._waiting, (), None
+        if state is None:
+            return replace(result, factors=(*waiting, *result.factors))
+        self._before = TrackedScan(first, observation, placed, result, state)
+        self._waiting = tuple(result.factors)
+        return replace(result, factors=waiting)
+
+    def finish(self) -> Sequence[BetweenFactor]:
+        """Return the factor of the last scan, if it waits for another scan."""
+        return self._waiting
+
+    def in_hindsight(self, result: FrameResult) -> FrameResult:
+        """Return the result of a scan; if it was tracked again, with the pose and the doubts of that."""
+        again = self._again.get(result.stamp_ns)
+        if again is None:
+            return result
+        return replace(
+            result, T_node_body=again.T_node_body, doubts=again.doubts, covariance=again.covariance
+        )
 
     def view(self, observation: ScanObservation, twist: Twist | None = None, /) -> ScanView:
         """Return the view for place recognition. Pure."""
@@ -85,7 +115,7 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
     def matches(self) -> None:
         """Return None: the pose is not from features."""
 
-    def _place(self, observation: ScanObservation) -> "_PlacedScan | None":
+    def _place(self, observation: ScanObservation, guess: PlacedScan | None = None) -> PlacedScan | None:
         """Return where a scan fits best; None if next to nothing agrees with any pose.
 
         Where the velocity may have changed so much that it displaces the points of the sweep, it is found
@@ -94,15 +124,18 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
         """
         motion, time_ns = self._motion, _time_ns(observation)
         deskewed, sigmas = observation.deskew(motion.twist), motion.velocity_sigmas(time_ns)
-        change_radps = motion.turning_change(time_ns)
-        if change_radps is None or observation.displacement(change_radps) <= _NEGLIGIBLE:
+        if motion.turning_change(time_ns) is None or not self._may_be_bent(observation):
             found = self._find_pose(deskewed, time_ns)
             if found is None:
                 return None
-            return _PlacedScan(deskewed, found, None, np.diag((_CHANGED * sigmas) ** 2))
-        T_world_predicted = motion.predicted(time_ns)
-        matched = self._matcher.match(deskewed, T_world_predicted, reach="near")
-        T_world_middle = T_world_predicted if matched is None else matched
+            changes = np.maximum(sigmas, motion.change(time_ns, found.T_world_middle))
+            return PlacedScan(deskewed, found, None, np.diag((_CHANGED * changes) ** 2))
+        if guess is None:
+            T_world_predicted, start = motion.predicted(time_ns), motion.twist
+            matched = self._matcher.match(deskewed, T_world_predicted, reach="near")
+            T_world_middle = T_world_predicted if matched is None else matched
+        else:
+            T_world_middle, start = guess.found.T_world_middle, guess.twist or motion.twist
         found = None
         sweep: SweepMotion | None = None
         sweep_of_middle, settled = observation.sweep(observation.middle_s), np.zeros(3)
@@ -111,7 +144,7 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
                 motion.pose_covariance if found is None else independent_covariance(found.fit, found.blend)
             )
             expected, covariance = motion.velocity(time_ns, T_world_middle, of_pose)
-            before = motion.twist if sweep is None else sweep.twist
+            before = start if sweep is None else sweep.twist
             measured = sweep_motion(
                 self._keyframes,
                 sweep_of_middle,
@@ -143,7 +176,7 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
             accelerated = motion.acceleration(time_ns, found.T_world_middle, sweep.twist)
             bent = accelerated * observation.half_s / 3.0
             covariance = sweep.covariance + np.diag([*(settled**2 + bent**2), 0.0, 0.0, 0.0])
-        return _PlacedScan(deskewed, found, None if sweep is None else sweep.twist, covariance)
+        return PlacedScan(deskewed, found, None if sweep is None else sweep.twist, covariance)
 
     def _find_pose(
         self, deskewed: DeskewedScan, time_ns: int, T_world_guess: Transform | None = None
@@ -156,18 +189,92 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
 
     def _begin_again(
         self, first: ScanObservation, second: ScanObservation, T_world_second: Transform
-    ) -> "_PlacedScan | None":
+    ) -> PlacedScan | None:
         """Track a map's first two scans again, now that the motion during their sweeps is known."""
         twist = self._motion.mean_twist(_time_ns(second), T_world_second)
-        self._matcher.clear()
-        self._next_node = self._keyframes[0].node
-        T_world_middle = self._keyframes[0].T_world_body @ twist.over(first.middle_s)
-        self._motion = MotionModel(_time_ns(first), T_world_middle)
-        self._motion.twist = twist
-        self._add_keyframe(first, first.deskew(twist), T_world_middle)
+        turning_radps = float(np.linalg.norm(twist.rotation_radps))
+        self._begin(first, twist, turning_radps)  # it may just have begun to turn
         return self._place(second)
 
-    def _placed(self, observation: ScanObservation, placed: "_PlacedScan") -> FrameResult:
+    def _begin(self, first: ScanObservation, twist: Twist, sigma_radps: float) -> None:
+        """Begin a map with its first scan again, by a velocity whose rotation has a standard deviation."""
+        keyframe = self._keyframes[0]
+        self._matcher.clear()
+        self._next_node = keyframe.node
+        T_world_middle = keyframe.T_world_body @ twist.over(first.middle_s)
+        self._motion = MotionModel(_time_ns(first), T_world_middle)
+        self._motion.twist = twist
+        self._add_keyframe(first, first.deskew(twist), T_world_middle, sigma_radps)
+
+    def _may_be_bent(self, observation: ScanObservation) -> bool:
+        """Return whether the velocity may have changed so much that it displaces the points of the sweep."""
+        if observation.scan.times_s is None:
+            return False
+        change_radps = self._motion.turning_change(_time_ns(observation))
+        return change_radps is None or observation.displacement(change_radps) > _NEGLIGIBLE
+
+    def _after_correction(
+        self, before: TrackedScan, observation: ScanObservation, placed: PlacedScan
+    ) -> PlacedScan:
+        """Return a scan's pose after the scan before it was tracked again, if its velocity was off.
+
+        Three poses tell the velocity at the one between better than the sweep does, except at a corner. What
+        it leads to counts if nothing speaks against it and both scans fit no less than before.
+        """
+        state, time_ns = before.state, _time_ns(before.observation)
+        T_world_before = self._motion.T_world_last
+        elapsed_s = state.motion.elapsed_s(time_ns), self._motion.elapsed_s(_time_ns(observation))
+        velocities = velocities_at(
+            (state.motion.T_world_last, T_world_before, placed.found.T_world_middle), elapsed_s
+        )
+        if velocities is None:
+            return placed
+        at_first, twist, change = velocities
+        off_radps = float(np.linalg.norm(twist.rotation_radps - self._motion.twist.rotation_radps))
+        changes = np.maximum(state.motion.velocity_sigmas(time_ns), change)
+        again = replace(before.placed, twist=twist, velocity_covariance=np.diag((_CHANGED * changes) ** 2))
+        is_bent = before.observation.displacement(off_radps) > _NEGLIGIBLE
+        if not is_bent or before.placed.turns_otherwise(again):
+            return placed
+        now = self._state()
+        self._restore(state)
+        if before.first is not None:
+            self._begin(before.first, at_first, float(np.linalg.norm(change[:3])))
+        deskewed = before.observation.deskew(twist)
+        found = self._find_pose(deskewed, time_ns, T_world_before)
+        if found is not None:
+            result = self._placed(before.observation, replace(again, deskewed=deskewed, found=found))
+            is_same = (result.node, result.is_keyframe) == (before.result.node, before.result.is_keyframe)
+            corrected = self._place(observation, placed) if is_same and not result.doubts else None
+            score = before.placed.found.score + placed.found.score
+            if corrected is not None and found.score + corrected.found.score >= score:
+                self._again[result.stamp_ns], self._waiting = result, tuple(result.factors)
+                return corrected
+        self._restore(now)
+        return placed
+
+    def _state(self) -> ScanState:
+        """Return what tracking a scan changes."""
+        return ScanState(
+            self._matcher,
+            self._search.usual,
+            self._noise,
+            self._motion,
+            self._tree,
+            self._keyframes,
+            self._doubtful,
+            self._last,
+            self._next_node,
+        )
+
+    def _restore(self, state: ScanState) -> None:
+        """Go on from a state."""
+        self._matcher, self._noise, self._motion = state.matcher, state.noise, state.motion
+        self._tree, self._keyframes = state.tree, state.keyframes
+        self._doubtful, self._last, self._next_node = state.doubtful, state.last, state.next_node
+        self._search.go_on(state.matcher, state.usual)
+
+    def _placed(self, observation: ScanObservation, placed: PlacedScan) -> FrameResult:
         """Return the result of a scan whose pose was found, and make it a keyframe if it is far."""
         found, deskewed = placed.found, placed.deskewed
         time_ns, keyframe = _time_ns(observation), found.keyframe
@@ -262,16 +369,18 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
         self._matcher.clear()
         self._search.usual.clear()
         self._noise.restart()
-        self._lost_scans, self._first = 0, observation
+        self._lost_scans, self._first, self._before = 0, observation, None
+        waiting, self._waiting = self._waiting, ()
         deskewed = observation.deskew(STILL)
         self._motion = MotionModel(_time_ns(observation), T_world_body)
-        node = self._add_keyframe(observation, deskewed, T_world_body)
+        node = self._add_keyframe(observation, deskewed, T_world_body, 0.0)
         return FrameResult(
             stamp_ns=observation.scan.stamp_ns,
             node=node,
             T_node_body=np.eye(4),
             T_world_body=T_world_body,
             is_keyframe=True,
+            factors=waiting,
             diagnostics=Diagnostics(len(deskewed.prepared.points), 0, 0, 0.0, "m", method),
             is_sharp=observation.scan.times_s is None,
         )
@@ -285,14 +394,17 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
         return lost_frame(scan.stamp_ns, self._motion.T_world_last, features=len(scan.points_body))
 
     def _add_keyframe(
-        self, observation: ScanObservation, deskewed: DeskewedScan, T_world_middle: Transform
+        self,
+        observation: ScanObservation,
+        deskewed: DeskewedScan,
+        T_world_middle: Transform,
+        sigma_radps: float,
     ) -> int:
         """Make a scan a keyframe without a factor; return its node."""
         self._matcher.add(deskewed, T_world_middle, is_keyframe=True)
         twist = self._motion.twist
         T_world_body = T_world_middle @ twist.over(-observation.middle_s)
-        turn_rad = observation.middle_s * float(np.linalg.norm(twist.rotation_radps))
-        covariance = np.diag([turn_rad**2] * 3 + [0.0] * 3)  # it may just have begun to turn
+        covariance = np.diag([(observation.middle_s * sigma_radps) ** 2] * 3 + [0.0] * 3)
         self._keyframes.clear()
         self._keyframes.append(
             ScanKeyframe(self._next_node, deskewed, T_world_middle, T_world_body, covariance)
@@ -301,23 +413,6 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
         self._tree.clear()
         self._next_node += 1
         return self._keyframes[0].node
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _PlacedScan:
-    """A scan with its pose.
-
-    Attributes:
-        deskewed: The scan.
-        found: Its pose in the middle of the sweep.
-        twist: Velocity then, if it was measured; None is the mean one since the scan before.
-        velocity_covariance: (6, 6) of the velocity, (rad/s)² and (m/s)².
-    """
-
-    deskewed: DeskewedScan
-    found: PoseCandidate
-    twist: Twist | None
-    velocity_covariance: Array
 
 
 def _time_ns(observation: ScanObservation) -> int:

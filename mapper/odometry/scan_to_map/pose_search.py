@@ -76,6 +76,10 @@ class PoseSearch:
         self._rescue = build_registration(config.rescue) if config.rescue is not None else None
         self._rescuer: tuple[DeskewedScan, Aligner] | None = None
 
+    def go_on(self, matcher: ScanMatcher, usual: UsualFit) -> None:
+        """Go on with another map and other usual shares."""
+        self._matcher, self.usual = matcher, usual
+
     def find(
         self,
         deskewed: DeskewedScan,

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from mapper.core.frames import Points32
 from mapper.core.geometry import Array, Transform, apply
 from mapper.odometry.scan_to_map.scan_matcher import DeskewedScan
+from mapper.odometry.scan_to_map.surface_covariance import surface_covariance
 from mapper.registration.acceptance import weakest_direction
 from mapper.registration.degeneracy import Degeneracy, degeneracy_of
 from mapper.registration.free_space import FreeSpaceCheck, ScanDescription, range_image
@@ -80,7 +81,7 @@ class ScanKeyframe:
         return min(1.0, self.directions / (_AS_LARGE * directions))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class ScanFit:
     """A scan on a keyframe's surfaces. A pair is a point and the keyframe's point nearest to it.
 
@@ -111,6 +112,11 @@ class ScanFit:
     observability: Array
     shown_m: Array
     unobservable: str
+
+    @cached_property
+    def surface_covariance(self) -> Array:
+        """(6, 6) of the scan's tangent, from its distances to the surfaces."""
+        return surface_covariance(self.rows, self.residuals_m, self.points)
 
 
 def directions_of(deskewed: DeskewedScan) -> int:
