@@ -13,7 +13,8 @@ from mapper.graph.optimize import optimize
 from mapper.mapping.floor_planes import floor_plane
 from mapper.pipeline.tracking_result import BY_POSES
 from mapper.run.frame_outcomes import FrameRecord
-from mapper.sources.base import Log
+from mapper.runtime.ordered_map import ordered_map
+from mapper.sources.base import FrameRef, Log
 
 _ROUNDS = 3
 """The plane is fitted to the poses and the poses to the plane, in turn."""
@@ -69,17 +70,16 @@ def _floors(
     nodes = [node for node, stamp_ns in graph.stamps_ns.items() if stamp_ns in trusted_ns]
     nodes = nodes[:: max(1, -(-len(nodes) // _MAX_KEYFRAMES))]
     node_at = {graph.stamps_ns[node]: node for node in nodes}
-    floors: dict[int, Transform] = {}
-    for entry in source.entries():
-        node = node_at.get(entry.stamp_ns)
-        if node is None:
-            continue
+
+    def seen(entry: FrameRef) -> tuple[int, Transform | None]:
+        node = node_at[entry.stamp_ns]
         try:
             scan = entry.scan()
         except FrameError:
-            continue  # it was readable in the first pass; fusing reports it
+            return node, None  # it was readable in the first pass; fusing reports it
         up_body = graph.T_world_node[node][:3, :3].T @ up_world
-        T_body_floor = floor_plane(scan, up_body, tolerance_m=config.level.plane_tolerance_m)
-        if T_body_floor is not None:
-            floors[node] = T_body_floor
-    return floors
+        return node, floor_plane(scan, up_body, tolerance_m=config.level.plane_tolerance_m)
+
+    entries = (entry for entry in source.entries() if entry.stamp_ns in node_at)
+    floors = ordered_map(seen, entries, workers=config.workers)
+    return {node: T_node_floor for node, T_node_floor in floors if T_node_floor is not None}
