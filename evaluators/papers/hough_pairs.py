@@ -17,10 +17,11 @@ from mapper.core.geometry import Transform, inverse, transform
 from mapper.core.rotations import rotation_from_euler, rotation_from_quaternion
 from mapper.evaluators.papers.scan_pairs import fewer_rings, merged, moved
 from mapper.run.fingerprint import fingerprint
-from mapper.sources import clouds, kitti, open_source
+from mapper.sources import open_source
 from mapper.sources.base import FrameRef
 from mapper.sources.cloud_files import ENDINGS
-from mapper.sources.clouds import read_scan
+from mapper.sources.scan_folders import clouds, kitti
+from mapper.sources.scan_folders.clouds import read_scan
 
 GIVEN = "pairs.toml"
 ALL_RINGS, FEW_RINGS = "all rings", "16 rings"

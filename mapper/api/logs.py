@@ -8,8 +8,8 @@ from mapper.core.frames import Frame, Sensor
 from mapper.core.paths import AnyPath
 from mapper.sources import open_source
 from mapper.sources.base import Log
-from mapper.sources.clouds import read_scan
 from mapper.sources.config import SourceConfig
+from mapper.sources.scan_folders.clouds import read_scan
 
 
 def open_log(path: AnyPath, *, config: AnyPath | None = None, settings: Settings | None = None) -> Log:

@@ -17,7 +17,17 @@ __all__ = ["open_source"]
 
 # The first that recognises a path reads it. Images of ICL-NUIM and Poznań are numbered too, and stamps are
 # numbers, so these come before numbered images; any log's folder may have clouds in it, so clouds come last.
-_FORMATS = ("icl_nuim", "tum", "mbag", "poznan", "stamped_images", "numbered", "kitti", "ros.files", "clouds")
+_FORMATS = (
+    "image_folders.icl_nuim",
+    "image_folders.tum",
+    "image_folders.mbag",
+    "image_folders.poznan",
+    "image_folders.stamped_images",
+    "image_folders.numbered",
+    "scan_folders.kitti",
+    "ros.files",
+    "scan_folders.clouds",
+)
 """Modules, imported one after the other when a log is opened, until one recognises it."""
 _MOST_TRIED = 20
 """Folders within a folder that are looked at, to say which is the log."""
@@ -36,7 +46,7 @@ def open_source(path: Path, config: SourceConfig = _DEFAULTS) -> "Log":
         SourceError: Nothing is there, no format fits, the log is malformed, nothing of it is selected, or it
             has no frame such as is to be its body.
     """
-    from mapper.sources.scan_folder import most_clouds
+    from mapper.sources.scan_folders.scan_folder import most_clouds
     from mapper.sources.selection import selected
     from mapper.sources.wheel_files import read_wheels
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mapper.core.errors import SourceError
 from mapper.core.timebase import NS_PER_S, Stamps, ns_from_seconds_text
-from mapper.sources.numbered import stamp_at
+from mapper.sources.image_folders.numbered import stamp_at
 from mapper.sources.text import parse_date, parse_stamp, rows
 
 RATE_HZ = 10.0

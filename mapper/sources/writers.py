@@ -17,8 +17,8 @@ from mapper.runtime.atomic import new_folder, write_bytes, write_text
 from mapper.sources.base import Accelerations, FrameRef, Log, Skipped
 from mapper.sources.calibration_file import calibration_text
 from mapper.sources.image_files.reading import FINE_UNITS_PER_M, encode_colour, encode_depth, image_bytes
-from mapper.sources.kitti_writing import write_kitti_log
-from mapper.sources.mbag import HEADER
+from mapper.sources.image_folders.mbag import HEADER
+from mapper.sources.scan_folders.kitti_writing import write_kitti_log
 from mapper.sources.trajectory_files import write_tum
 from mapper.sources.wheel_files import write_wheels
 

@@ -18,7 +18,7 @@ from mapper.sources.ros.cloud_messages import scan_from
 from mapper.sources.ros.decode_ros import decode_ros
 from mapper.sources.ros.encode_ros import cloud_message
 from mapper.sources.ros.recording import Topic
-from mapper.sources.scans import ScanEntry
+from mapper.sources.scan_folders.scans import ScanEntry
 from mapper.sources.valid_returns import FARTHEST_M
 from tests.support.clouds import save_cloud
 

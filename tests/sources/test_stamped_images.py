@@ -7,7 +7,7 @@ from mapper.core.errors import SourceError
 from mapper.sources import open_source
 from mapper.sources.config import CameraConfig, SourceConfig
 from mapper.sources.depth_scale import depth_warnings
-from mapper.sources.tum import _MILLIMETRES_NOTE, _UNITS_NOTE
+from mapper.sources.image_folders.tum import _MILLIMETRES_NOTE, _UNITS_NOTE
 from tests.support.tum_logs import CALIBRATION, FIRST_NS, PERIOD_NS, write_picture
 
 N = 4

@@ -8,7 +8,7 @@ from mapper.runtime.atomic import new_folder, write_json
 from mapper.runtime.ordered_map import ordered_map
 from mapper.simulation.config import LidarSynthConfig, set_or_first
 from mapper.simulation.lidar.source import LidarSimulator
-from mapper.sources.kitti_writing import save_scan
+from mapper.sources.scan_folders.kitti_writing import save_scan
 from mapper.sources.trajectory_files import write_kitti
 from mapper.sources.wheel_files import write_wheels
 

@@ -7,7 +7,7 @@ from mapper.core.frames import DepthImage, PinholeCamera, Scan
 from mapper.core.geometry import Transform
 from mapper.sources.base import ImageFiles
 from mapper.sources.image_files.reading import encode_colour, encode_depth
-from mapper.sources.rgbd import RgbdEntry
+from mapper.sources.image_folders.rgbd import RgbdEntry
 from mapper.sources.ros.cloud_messages import scan_from
 from mapper.sources.ros.decode import decode
 from mapper.sources.ros.image_messages import depth_file_of, depth_m_of, image_of

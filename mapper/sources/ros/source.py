@@ -12,7 +12,7 @@ from mapper.sources.base import FrameRef, Log
 from mapper.sources.calibration import Calibration, configured
 from mapper.sources.config import SourceConfig
 from mapper.sources.image_files.reading import FINE_UNITS_PER_M
-from mapper.sources.pairing import depth_offset_ns
+from mapper.sources.image_folders.pairing import depth_offset_ns
 from mapper.sources.ros.entries import CloudEntry, rgbd_entry
 from mapper.sources.ros.image_messages import MILLIMETRES_PER_M, has_float_depth, size_of
 from mapper.sources.ros.index import Series, why_unread

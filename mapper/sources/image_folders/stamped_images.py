@@ -15,10 +15,10 @@ from mapper.core.errors import SourceError
 from mapper.core.timebase import Stamps
 from mapper.sources.base import Log
 from mapper.sources.config import SourceConfig
-from mapper.sources.numbered import image_places
-from mapper.sources.pairing import ImageList
+from mapper.sources.image_folders.numbered import image_places
+from mapper.sources.image_folders.pairing import ImageList
+from mapper.sources.image_folders.tum import DEPTH_UNITS_PER_M, MILLIMETRES_PER_M, log_of_images
 from mapper.sources.scan_stamps import stamps_in
-from mapper.sources.tum import DEPTH_UNITS_PER_M, MILLIMETRES_PER_M, log_of_images
 
 _AFTER = re.compile(r"\D+$")
 

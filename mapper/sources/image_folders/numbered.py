@@ -22,8 +22,8 @@ from mapper.sources.base import Log
 from mapper.sources.calibration import PRIMESENSE, SEVEN_SCENES
 from mapper.sources.calibration_file import calibration_file
 from mapper.sources.config import SourceConfig
-from mapper.sources.pairing import apply_depth_offset
-from mapper.sources.rgbd import FramePair, find_calibration, rgbd_log
+from mapper.sources.image_folders.pairing import apply_depth_offset
+from mapper.sources.image_folders.rgbd import FramePair, find_calibration, rgbd_log
 from mapper.sources.text import parse_count, parse_numbers, rows, time_order, truth_from
 
 DEPTH_UNITS_PER_M = 1000.0

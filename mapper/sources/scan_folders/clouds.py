@@ -6,8 +6,15 @@ from mapper.core.errors import SourceError
 from mapper.core.frames import Scan
 from mapper.sources.base import Log
 from mapper.sources.config import SourceConfig
-from mapper.sources.scan_folder import STAMP_FILES, clouds_in, first_of, is_cloud_name, most_clouds, scan_log
-from mapper.sources.scans import ScanEntry
+from mapper.sources.scan_folders.scan_folder import (
+    STAMP_FILES,
+    clouds_in,
+    first_of,
+    is_cloud_name,
+    most_clouds,
+    scan_log,
+)
+from mapper.sources.scan_folders.scans import ScanEntry
 
 TRUTH_FILES = ("groundtruth.txt", "poses.txt")
 

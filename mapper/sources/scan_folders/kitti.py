@@ -16,7 +16,7 @@ from mapper.core.geometry import Transform, nearest_rotation, transform
 from mapper.core.trajectory import Trajectory
 from mapper.sources.base import Log
 from mapper.sources.config import SourceConfig
-from mapper.sources.scan_folder import STAMP_FILES, clouds_in, first_of, most_clouds, scan_log
+from mapper.sources.scan_folders.scan_folder import STAMP_FILES, clouds_in, first_of, most_clouds, scan_log
 from mapper.sources.text import parse_numbers, rows
 
 _ALONG_Z_RATIO = 0.9

@@ -14,11 +14,11 @@ from mapper.core.trajectory import Trajectory
 from mapper.sources.base import Log
 from mapper.sources.cloud_files import EMPTY, ENDINGS, why_no_points
 from mapper.sources.config import SourceConfig
+from mapper.sources.image_folders.tum import read_truth
+from mapper.sources.scan_folders.scans import ScanEntry
 from mapper.sources.scan_stamps import in_order, line_of_each, scan_stamps
-from mapper.sources.scans import ScanEntry
 from mapper.sources.text import rows, time_order, truth_from
 from mapper.sources.trajectory_files import read_kitti
-from mapper.sources.tum import read_truth
 
 STAMP_FILES = ("times.txt", "stamps.txt", "timestamps.txt")
 

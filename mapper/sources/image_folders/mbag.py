@@ -16,9 +16,9 @@ from mapper.core.timebase import ns_from_seconds_text
 from mapper.sources.base import Log
 from mapper.sources.calibration import freiburg_camera
 from mapper.sources.config import SourceConfig
+from mapper.sources.image_folders.pairing import apply_depth_offset
+from mapper.sources.image_folders.rgbd import FramePair, find_calibration, rgbd_log
 from mapper.sources.listed_files import present, within
-from mapper.sources.pairing import apply_depth_offset
-from mapper.sources.rgbd import FramePair, find_calibration, rgbd_log
 from mapper.sources.text import (
     parse_numbers,
     parse_stamp,

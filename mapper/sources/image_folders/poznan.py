@@ -18,9 +18,9 @@ from mapper.core.rotations import rotation_from_euler
 from mapper.core.trajectory import Trajectory
 from mapper.sources.base import Log
 from mapper.sources.config import SourceConfig
-from mapper.sources.numbered import find_images, stamp_at, stamped
-from mapper.sources.pairing import apply_depth_offset
-from mapper.sources.rgbd import find_calibration, rgbd_log
+from mapper.sources.image_folders.numbered import find_images, stamp_at, stamped
+from mapper.sources.image_folders.pairing import apply_depth_offset
+from mapper.sources.image_folders.rgbd import find_calibration, rgbd_log
 from mapper.sources.text import parse_count, parse_numbers, read_lines, rows, truth_from
 
 DEPTH_UNITS_PER_M = 1000.0

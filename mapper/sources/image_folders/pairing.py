@@ -9,7 +9,7 @@ import numpy as np
 from mapper.core.errors import SourceError
 from mapper.core.timebase import NS_PER_S, Stamps, nearest
 from mapper.sources.config import SourceConfig
-from mapper.sources.rgbd import FramePair, unpaired_note
+from mapper.sources.image_folders.rgbd import FramePair, unpaired_note
 
 
 @dataclass(frozen=True, slots=True, eq=False)

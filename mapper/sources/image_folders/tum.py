@@ -15,9 +15,9 @@ from mapper.core.trajectory import Trajectory
 from mapper.sources.base import Log
 from mapper.sources.calibration import freiburg_camera
 from mapper.sources.config import SourceConfig
+from mapper.sources.image_folders.pairing import ImageList, pair_images
+from mapper.sources.image_folders.rgbd import find_calibration, rgbd_log
 from mapper.sources.listed_files import present, within
-from mapper.sources.pairing import ImageList, pair_images
-from mapper.sources.rgbd import find_calibration, rgbd_log
 from mapper.sources.text import (
     parse_numbers,
     parse_stamp,

@@ -16,10 +16,10 @@ from mapper.core.trajectory import Trajectory
 from mapper.sources.base import Log
 from mapper.sources.calibration import ICL_NUIM
 from mapper.sources.config import SourceConfig
+from mapper.sources.image_folders.numbered import RATE_HZ, find_images, stamp_at
+from mapper.sources.image_folders.pairing import apply_depth_offset
+from mapper.sources.image_folders.rgbd import FramePair, find_calibration, rgbd_log
 from mapper.sources.listed_files import present
-from mapper.sources.numbered import RATE_HZ, find_images, stamp_at
-from mapper.sources.pairing import apply_depth_offset
-from mapper.sources.rgbd import FramePair, find_calibration, rgbd_log
 from mapper.sources.text import (
     parse_count,
     parse_numbers,

@@ -1,0 +1,1 @@
+"""RGB-D logs made of folders of images: one module per layout."""

@@ -1,0 +1,1 @@
+"""LiDAR logs made of folders of clouds: one module per layout."""
