@@ -6,7 +6,8 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from mapper.core.timebase import NS_PER_S, stretches
+from mapper.core.timebase import MAX_TRUTH_GAP_NS, NS_PER_S, nearest, stretches
+from mapper.core.trajectory import Trajectory
 from mapper.navigation.config import TraversableConfig
 from mapper.run.frame_outcomes import DISCONNECTED, FrameRecord
 from mapper.run.graph_warnings import (
@@ -31,6 +32,7 @@ _BROKEN_LOST_S, _BROKEN_LOST_FRAMES = 2.0, 3
 _MAX_DOUBTFUL_SHARE, _FEW_FRAMES = 0.02, 2
 _MIN_COUNTED_DEPTH = 0.5
 _LEAST_AGREEMENT, _LEAST_SHARED_VOXELS = 0.15, 1000
+_MAX_ERROR_SHARE, _LEAST_ERROR_M = 0.03, 0.1
 _REASONS = 3
 
 
@@ -61,6 +63,7 @@ def find_warnings(results: RunResults, manifest: Manifest) -> list[RunWarning]:
         *wheel_warnings(results),
         *uncertainty_warnings(results),
         *step_warnings(results, timeline),
+        *_truth(results),
     ]
     return sorted(found, key=lambda warning: _ORDER.index(warning.weight))
 
@@ -268,4 +271,27 @@ def _depth_reach(manifest: Manifest) -> Iterator[RunWarning]:
             kind="reach",
             sentence=reach.sentence,
             suggestion="raise octree.resolution_m, or set octree.max_range_m if noise in the map is no harm",
+        )
+
+
+def _truth(results: RunResults) -> Iterator[RunWarning]:
+    """Yield a warning if the path is far from the true poses: one of the two is wrong."""
+    tracked, truth = results.tracked, results.truth
+    if truth is None:
+        return
+    index, gap_ns = nearest(truth.stamps_ns, tracked.stamps_ns)
+    near = gap_ns <= MAX_TRUTH_GAP_NS
+    if near.sum() < 3:
+        return
+    seen = Trajectory(tracked.stamps_ns[near], truth.T_world_body[index[near]])
+    off_m = np.linalg.norm(tracked.positions_world[near] - seen.positions_world, axis=1)
+    rmse_m = float(np.sqrt((off_m**2).mean()))
+    path_m = min(tracked.path_length_m, seen.path_length_m)  # errors make a path longer
+    if rmse_m > max(_MAX_ERROR_SHARE * path_m, _LEAST_ERROR_M):
+        yield RunWarning(
+            kind="truth",
+            sentence=f"frames without doubt are {rmse_m:.2f} m (RMSE) from the true poses, on {path_m:.1f} m "
+            f"of path (doubt from {_MAX_ERROR_SHARE:.0%} and {_LEAST_ERROR_M:g} m on): one of both is wrong",
+            suggestion="see where with mapper report; is the truth this log's, and in its clock?",
+            weight="doubt",
         )

@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 
 from mapper.core.geometry import exp, inverse
+from mapper.core.trajectory import Trajectory
 from mapper.graph.model import BetweenFactor, PoseSigmas
 from mapper.loops.closure import Discrepancy, LoopClosure
 from mapper.run.frame_outcomes import DISCONNECTED
 from mapper.run.manifest import AppendedLog, Levelling, RunWarning, SkippedFrame
 from mapper.run.pose_covariances import uncertain_poses
+from mapper.run.results import aligned_truth
 from mapper.run.warnings import find_warnings, merge_warnings
 from mapper.sources.config import SourceConfig
 from tests.support.run_results import MANIFEST, STEP_NS, doubted, lost, results_of
@@ -225,3 +227,12 @@ def test_walls_of_merged_runs():
     (warning,) = merge_warnings("b", agreement=0.11, shared_voxels=200_000)
     assert "b: 11% of its walls" in warning.sentence
     assert "at least 15%" in warning.sentence
+
+
+@pytest.mark.parametrize(("share", "kinds"), [(0.02, []), (0.05, ["truth"])])
+def test_a_path_far_from_the_true_poses(share, kinds):
+    results = results_of()
+    stamps_ns, T_world_body = results.trajectory.stamps_ns, results.trajectory.T_world_body.copy()
+    T_world_body[::2, 1, 3] += 2.0 * share * results.trajectory.path_length_m
+    results = replace(results, truth=aligned_truth(Trajectory(stamps_ns, T_world_body), results.trajectory))
+    assert [warning.kind for warning in found(results)] == kinds
