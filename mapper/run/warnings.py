@@ -292,6 +292,6 @@ def _truth(results: RunResults) -> Iterator[RunWarning]:
             kind="truth",
             sentence=f"frames without doubt are {rmse_m:.2f} m (RMSE) from the true poses, on {path_m:.1f} m "
             f"of path (doubt from {_MAX_ERROR_SHARE:.0%} and {_LEAST_ERROR_M:g} m on): one of both is wrong",
-            suggestion="see where with mapper report; is the truth this log's, and in its clock?",
+            suggestion="mapper report, to see where; check that the truth is of this log and in its clock",
             weight="doubt",
         )
