@@ -94,7 +94,7 @@ def load_source_config(
     _put_all(
         tree,
         [override for override in overrides if override.startswith("source.")],
-        {name: value for name, value in (settings or {}).items() if name.split(".")[0] == "source"},
+        {name: value for name, value in _by_name(settings).items() if name.split(".")[0] == "source"},
     )
     return _validated(
         BuildConfig, {"source": tree.get("source", {})}, None if path is None else str(path)
@@ -191,8 +191,17 @@ def _put_all(tree: dict[str, Any], overrides: Sequence[str], settings: Settings 
         if not equals or not dotted:
             raise ConfigError(f"setting {override!r}: want name=value, such as octree.resolution_m=0.1")
         _put(tree, dotted, value)
-    for dotted, value in (settings or {}).items():
+    for dotted, value in _by_name(settings).items():
         _put(tree, dotted, value)
+
+
+def _by_name(settings: Settings | None) -> Settings:
+    """Return settings as given to a function, {} for None."""
+    if settings is None:
+        return {}
+    if not isinstance(settings, Mapping) or not all(isinstance(name, str) for name in settings):
+        raise ConfigError(f"settings {settings!r}: want values by name, {{'octree.resolution_m': 0.1}}")
+    return settings
 
 
 def _put(tree: dict[str, Any], dotted: str, value: Any) -> None:

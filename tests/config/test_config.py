@@ -4,7 +4,7 @@ import re
 import pytest
 
 from mapper.config.build import BuildConfig
-from mapper.config.loading import load_config, load_run_config, overridden
+from mapper.config.loading import load_config, load_run_config, load_source_config, overridden
 from mapper.core.config import Config
 from mapper.core.errors import ConfigError, MapperWarning
 from mapper.features.config import UniformOrbConfig
@@ -253,3 +253,12 @@ def test_another_kind_leaves_out_the_settings_of_the_former():
         assert changed.odometry.kind == "pnp"
         assert changed.odometry.max_depth_m == 4.0
     assert overridden(isvd, ["odometry.kind=isvd"]) == isvd
+
+
+@pytest.mark.parametrize("load", [load_config, load_source_config])
+@pytest.mark.parametrize("settings", [["octree.resolution_m=0.1"], "octree.resolution_m=0.1", {1: 2}])
+def test_settings_that_are_not_by_name(load, settings):
+    with pytest.raises(
+        ConfigError, match=r"^settings .*: want values by name, \{'octree.resolution_m': 0.1\}$"
+    ):
+        load(settings=settings)
