@@ -1,0 +1,51 @@
+"""Images and scans that fusing hands on for a run's MCAP log."""
+
+import numpy as np
+
+from mapper.config.build import BuildConfig
+from mapper.config.loading import overridden
+from mapper.core.frames import Scan
+from mapper.core.trajectory import Trajectory
+from mapper.mapping.fusion import fuse_log
+from mapper.octree.scan_update_file import ScanUpdateWriter
+from mapper.runtime.progress import SILENT
+from mapper.simulation import CameraSimulator
+from mapper.simulation.config import SynthConfig
+from tests.support.logs import MemoryEntry, log_in_memory
+
+
+def snapshots(log, trajectory, tmp_path, *settings):
+    """Return those of every frame."""
+    config = overridden(BuildConfig(), ["workers=0", "mcap.image_stride=1", "octree.moving=kept", *settings])
+    seen = []
+    with ScanUpdateWriter(tmp_path / "updates.bin", config.octree) as after:
+        fuse_log(log, trajectory, config, progress=SILENT, on_snapshot=seen.append, before=None, after=after)
+    return seen
+
+
+def test_images_have_the_quality_and_width_that_are_set(tmp_path):
+    log = CameraSimulator(
+        SynthConfig(width_px=160, height_px=120, texture_px_per_m=32, frame_rate_hz=2.0, duration_s=1.0)
+    ).log()
+    rough, fine = (
+        snapshots(log, log.truth, tmp_path, f"mcap.image_quality={quality}") for quality in (20, 95)
+    )
+    assert len(rough) == len(fine) == len(log)
+    assert all(2 * len(small.jpeg) < len(large.jpeg) for small, large in zip(rough, fine, strict=True))
+    narrow = snapshots(log, log.truth, tmp_path, "mcap.image_width_px=40")
+    assert narrow[0].camera.width_px == 40
+    assert rough[0].camera.width_px == 160
+
+
+def test_scans_are_thinned_to_a_point_per_voxel(tmp_path):
+    x, y = np.meshgrid(np.arange(-4.0, 4.0, 0.1), np.arange(-4.0, 4.0, 0.1))
+    points = np.stack([x.ravel(), y.ravel(), np.full(x.size, -1.55)], axis=1).astype(np.float32)
+    log = log_in_memory([MemoryEntry(k, Scan(k, points, np.zeros(3))) for k in range(2)], sensor="lidar")
+    still = Trajectory(log.stamps_ns, np.tile(np.eye(4), (2, 1, 1)))
+    few, many = (
+        snapshots(log, still, tmp_path, "slice.min_height_m=-2", f"mcap.scan_voxel_m={size}")
+        for size in (0.8, 0.4)
+    )
+    assert len(few) == len(many) == 2
+    assert 100 <= len(few[0].points_body) <= 121
+    assert 400 <= len(many[0].points_body) <= 441
