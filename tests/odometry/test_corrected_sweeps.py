@@ -103,6 +103,25 @@ def test_corrected_scans_have_their_own_covariance_in_hindsight():
             np.testing.assert_allclose(track.covariance, expected, rtol=1e-6, atol=1e-12)
 
 
+def test_a_sweep_whose_velocity_three_poses_contradict_is_less_certain(monkeypatch):
+    monkeypatch.setattr(PlacedScan, "turns_otherwise", lambda *_: True)
+    odometry = build_frame_odometry(GicpOdometryConfig().scaled(SCALE))
+    tracks = [odometry.track(odometry.observe(entry.load())) for entry in source().entries()]
+    later = [odometry.in_hindsight(track) for track in tracks]
+    factors = {f.j: f for f in [f for track in tracks for f in track.factors] + list(odometry.finish())}
+
+    changed = [
+        k for k, (t, h) in enumerate(zip(tracks, later, strict=True)) if t.covariance is not h.covariance
+    ]
+
+    assert len(changed) >= 2
+    for track, after in ((tracks[k], later[k]) for k in changed):
+        np.testing.assert_array_equal(after.T_node_body, track.T_node_body)
+        assert np.linalg.eigvalsh((after.covariance - track.covariance)[:3, :3]).min() > 0.0
+        if track.is_keyframe:
+            assert np.linalg.det(factors[track.node].information) < np.linalg.det(track.links[0].information)
+
+
 def test_a_later_session_has_its_doubts_and_covariances_in_hindsight_too():
     odometry, tracks = tracked()
     own = [odometry.in_hindsight(track) for track in tracks]
