@@ -7,7 +7,7 @@ from typing import Generic
 from mapper.core.deskew import Twist
 from mapper.features.frame_view import FrameView
 from mapper.graph.model import BetweenFactor
-from mapper.odometry.base import FeatureMatches, FrameResult, Observation, Odometry
+from mapper.odometry.base import FeatureMatches, FrameResult, HindsightOdometry, Observation, Odometry
 from mapper.sources.base import FrameRef
 
 
@@ -24,13 +24,7 @@ class NodeOffset(Generic[Observation]):
 
     def track(self, observation: Observation) -> FrameResult:
         """Track the next frame, in time order."""
-        result = self._odometry.track(observation)
-        return replace(
-            result,
-            node=None if result.node is None else result.node + self._first_node,
-            factors=self._offset(result.factors),
-            links=self._offset(result.links),
-        )
+        return _numbered(self._odometry.track(observation), self._first_node)
 
     def view(self, observation: Observation, twist: Twist | None = None, /) -> FrameView:
         """Return the view for place recognition. Pure."""
@@ -40,12 +34,27 @@ class NodeOffset(Generic[Observation]):
         """Return the matches of the frame tracked last."""
         return self._odometry.matches()
 
+    def in_hindsight(self, result: FrameResult, /) -> FrameResult:
+        """Return the result of a frame with what later ones say against it."""
+        if not isinstance(self._odometry, HindsightOdometry):
+            return result
+        own = _numbered(result, -self._first_node)
+        return _numbered(self._odometry.in_hindsight(own), self._first_node)
+
     def finish(self) -> Sequence[BetweenFactor]:
         """Return the measurements that were still being refined when the log ended."""
-        return self._offset(self._odometry.finish())
+        return _numbered_factors(self._odometry.finish(), self._first_node)
 
-    def _offset(self, factors: Iterable[BetweenFactor]) -> tuple[BetweenFactor, ...]:
-        return tuple(
-            replace(factor, i=factor.i + self._first_node, j=factor.j + self._first_node)
-            for factor in factors
-        )
+
+def _numbered(result: FrameResult, offset: int) -> FrameResult:
+    """Return a result with a constant added to its node numbers."""
+    return replace(
+        result,
+        node=None if result.node is None else result.node + offset,
+        factors=_numbered_factors(result.factors, offset),
+        links=_numbered_factors(result.links, offset),
+    )
+
+
+def _numbered_factors(factors: Iterable[BetweenFactor], offset: int) -> tuple[BetweenFactor, ...]:
+    return tuple(replace(factor, i=factor.i + offset, j=factor.j + offset) for factor in factors)

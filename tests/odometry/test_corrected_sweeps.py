@@ -10,6 +10,7 @@ import pytest
 from mapper.core.deskew import Twist
 from mapper.core.geometry import angle_between, exp, inverse
 from mapper.odometry.factory import build_frame_odometry
+from mapper.odometry.node_offset import NodeOffset
 from mapper.odometry.scan_to_map.config import GicpOdometryConfig
 from mapper.odometry.scan_to_map.motion_model import velocities_at
 from mapper.odometry.scan_to_map.tracked_scan import PlacedScan
@@ -100,6 +101,41 @@ def test_corrected_scans_have_their_own_covariance_in_hindsight():
         if changed[track.node] and track.is_keyframe and track.node == before.node + 1:
             expected = np.linalg.inv(information.get(track.node, odometry.finish()[0].information))
             np.testing.assert_allclose(track.covariance, expected, rtol=1e-6, atol=1e-12)
+
+
+def test_a_sweep_whose_velocity_three_poses_contradict_is_less_certain(monkeypatch):
+    monkeypatch.setattr(PlacedScan, "turns_otherwise", lambda *_: True)
+    odometry = build_frame_odometry(GicpOdometryConfig().scaled(SCALE))
+    tracks = [odometry.track(odometry.observe(entry.load())) for entry in source().entries()]
+    later = [odometry.in_hindsight(track) for track in tracks]
+    factors = {f.j: f for f in [f for track in tracks for f in track.factors] + list(odometry.finish())}
+
+    changed = [
+        k for k, (t, h) in enumerate(zip(tracks, later, strict=True)) if t.covariance is not h.covariance
+    ]
+
+    assert len(changed) >= 2
+    for track, after in ((tracks[k], later[k]) for k in changed):
+        np.testing.assert_array_equal(after.T_node_body, track.T_node_body)
+        assert np.linalg.eigvalsh((after.covariance - track.covariance)[:3, :3]).min() > 0.0
+        if track.is_keyframe:
+            assert np.linalg.det(factors[track.node].information) < np.linalg.det(track.links[0].information)
+
+
+def test_a_later_session_has_its_doubts_and_covariances_in_hindsight_too():
+    odometry, tracks = tracked()
+    own = [odometry.in_hindsight(track) for track in tracks]
+    after_others = NodeOffset(build_frame_odometry(GicpOdometryConfig().scaled(SCALE)), first_node=7)
+    results = [after_others.track(after_others.read(entry)) for entry in source().entries()]
+
+    later = [after_others.in_hindsight(track) for track in results]
+
+    assert [t.node for t in later] == [t.node + 7 for t in own]
+    assert [t.doubts for t in later] == [t.doubts for t in own]
+    assert [[(f.i, f.j) for f in t.links] for t in later] == [[(f.i, f.j) for f in t.links] for t in results]
+    for track, expected in zip(later, own, strict=True):
+        np.testing.assert_array_equal(track.T_node_body, expected.T_node_body)
+        np.testing.assert_array_equal(track.covariance, expected.covariance)
 
 
 @pytest.mark.parametrize("is_swept", [True, False])

@@ -320,6 +320,32 @@ def test_a_direction_that_disagrees_is_a_doubt_where_the_motion_was_predicted(is
     assert doubts == (() if is_shown else ("30% agree in the weakest direction, 90% is usual",))
 
 
+@pytest.mark.parametrize(
+    ("shares", "off_m", "spread", "is_lost"),
+    [
+        (Shares(0.4, 0.1, 0.001), 0.1, Spread(0.01, 0.05), False),
+        (Shares(0.4, 0.1, 0.03), 0.1, Spread(0.01, 0.05), True),
+        (Shares(0.2, 0.1, 0.001), 0.1, Spread(0.01, 0.05), True),
+        (Shares(0.4, 0.1, 0.001), 0.5, Spread(0.01, 0.05), True),  # a surprise
+        (Shares(0.4, 0.1, 0.001), 1.5, Spread(0.1, 0.5), True),  # after a gap nothing is one
+        (Shares(0.4, 0.1, 0.001), 0.1, None, True),
+    ],
+)
+def test_little_overlap_where_the_pose_was_predicted_is_a_doubt(shares, off_m, spread, is_lost):
+    key = keyframe(room_scan(0, seed=1))
+    found = exp(np.zeros(3), np.array([off_m, 0.0, 0.0]))
+    fit = fit_of(key, key.deskewed, np.eye(4), max_pair_distance_m=0.5)
+    search = PoseSearch(GicpOdometryConfig(), GicpMatcher(GicpOdometryConfig()))
+    for _ in range(6):
+        search.usual.add(Shares(0.9, 0.9, 0.001))
+    candidate = PoseCandidate(
+        key, found, fit, shares, jump_between(np.eye(4), found, spread), MEASURED, "map"
+    )
+
+    assert search.is_lost(candidate) == is_lost
+    assert is_lost or len(search.doubts(candidate)) == 2
+
+
 def test_points_are_where_the_truth_puts_them():
     here, there = room_scan(0, seed=1, noise_m=0.0), room_scan(1, OFF, seed=2, noise_m=0.0)
     _, distances_m = keyframe(here).deskewed.prepared.nearest(apply(OFF, there.points_body))

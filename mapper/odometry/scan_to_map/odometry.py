@@ -8,8 +8,7 @@ import numpy as np
 
 from mapper.core.deskew import STILL, Twist
 from mapper.core.frames import Frame
-from mapper.core.geometry import Array, Transform, adjoint, inverse
-from mapper.core.timebase import NS_PER_S
+from mapper.core.geometry import Transform, adjoint, inverse
 from mapper.features.frame_view import ScanView
 from mapper.graph.model import BetweenFactor
 from mapper.odometry.base import Diagnostics, FrameOdometry, FrameResult, lost_frame
@@ -26,9 +25,9 @@ from mapper.odometry.scan_to_map.sweep_motion import SweepMotion, sweep_motion
 from mapper.odometry.scan_to_map.tracked_scan import PlacedScan, ScanState, TrackedScan
 
 _KEYFRAMES = 5  # so many last ones are compared with
-_NEGLIGIBLE, _SETTLED, _DISPLACED = 0.2, 0.05, 0.5
+_NEGLIGIBLE, _SETTLED = 0.2, 0.05
 """Displacement of a sweep's outer points, in voxels, by a change of the velocity: less is not looked for,
-less ends the search for the velocity, more makes a pose doubtful."""
+less ends the search for the velocity."""
 _ROUNDS = 3
 _WIDENED = 2.0  # expected changes of the velocity, for turns begin and end suddenly
 _CHANGED = 0.25  # of what the velocity may change, where it is not measured
@@ -122,7 +121,7 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
         together with the pose; not before the errors of a few predictions are known, as two scans, each with
         a velocity of its own, fit under wrong ones, too.
         """
-        motion, time_ns = self._motion, _time_ns(observation)
+        motion, time_ns = self._motion, observation.middle_ns
         deskewed, sigmas = observation.deskew(motion.twist), motion.velocity_sigmas(time_ns)
         if motion.turning_change(time_ns) is None or not self._may_be_bent(observation):
             found = self._find_pose(deskewed, time_ns)
@@ -191,7 +190,7 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
         self, first: ScanObservation, second: ScanObservation, T_world_second: Transform
     ) -> PlacedScan | None:
         """Track a map's first two scans again, now that the motion during their sweeps is known."""
-        twist = self._motion.mean_twist(_time_ns(second), T_world_second)
+        twist = self._motion.mean_twist(second.middle_ns, T_world_second)
         turning_radps = float(np.linalg.norm(twist.rotation_radps))
         self._begin(first, twist, turning_radps)  # it may just have begun to turn
         return self._place(second)
@@ -202,7 +201,7 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
         self._matcher.clear()
         self._next_node = keyframe.node
         T_world_middle = keyframe.T_world_body @ twist.over(first.middle_s)
-        self._motion = MotionModel(_time_ns(first), T_world_middle)
+        self._motion = MotionModel(first.middle_ns, T_world_middle)
         self._motion.twist = twist
         self._add_keyframe(first, first.deskew(twist), T_world_middle, sigma_radps)
 
@@ -210,7 +209,7 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
         """Return whether the velocity may have changed so much that it displaces the points of the sweep."""
         if observation.scan.times_s is None:
             return False
-        change_radps = self._motion.turning_change(_time_ns(observation))
+        change_radps = self._motion.turning_change(observation.middle_ns)
         return change_radps is None or observation.displacement(change_radps) > _NEGLIGIBLE
 
     def _after_correction(
@@ -218,12 +217,13 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
     ) -> PlacedScan:
         """Return a scan's pose after the scan before it was tracked again, if its velocity was off.
 
-        Three poses tell the velocity at the one between better than the sweep does, except at a corner. What
-        it leads to counts if nothing speaks against it and both scans fit no less than before.
+        Three poses tell the velocity at the one between better than the sweep does. What it leads to counts
+        if nothing speaks against it and both scans fit no less than before. At a corner neither is sure:
+        poses stay, and the difference of both is an error of the way to the stamp.
         """
-        state, time_ns = before.state, _time_ns(before.observation)
+        state, time_ns = before.state, before.observation.middle_ns
         T_world_before = self._motion.T_world_last
-        elapsed_s = state.motion.elapsed_s(time_ns), self._motion.elapsed_s(_time_ns(observation))
+        elapsed_s = state.motion.elapsed_s(time_ns), self._motion.elapsed_s(observation.middle_ns)
         velocities = velocities_at(
             (state.motion.T_world_last, T_world_before, placed.found.T_world_middle), elapsed_s
         )
@@ -233,11 +233,16 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
         off_radps = float(np.linalg.norm(twist.rotation_radps - self._motion.twist.rotation_radps))
         changes = np.maximum(state.motion.velocity_sigmas(time_ns), change)
         again = replace(before.placed, twist=twist, velocity_covariance=np.diag((_CHANGED * changes) ** 2))
-        is_bent = before.observation.displacement(off_radps) > _NEGLIGIBLE
-        if not is_bent or before.placed.turns_otherwise(again):
+        if before.observation.displacement(off_radps) <= _NEGLIGIBLE:
             return placed
         now = self._state()
         self._restore(state)
+        if before.placed.turns_otherwise(again):
+            result = self._placed(before.observation, replace(before.placed, contradiction_radps=off_radps))
+            self._again[result.stamp_ns], self._waiting = result, tuple(result.factors)
+            keyframes = [*self._keyframes, *([] if self._doubtful is None else [self._doubtful])]
+            keyframe = next(key for key in keyframes if key.node == placed.found.keyframe.node)
+            return replace(placed, found=replace(placed.found, keyframe=keyframe))
         if before.first is not None:
             self._begin(before.first, at_first, float(np.linalg.norm(change[:3])))
         deskewed = before.observation.deskew(twist)
@@ -277,9 +282,9 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
     def _placed(self, observation: ScanObservation, placed: PlacedScan) -> FrameResult:
         """Return the result of a scan whose pose was found, and make it a keyframe if it is far."""
         found, deskewed = placed.found, placed.deskewed
-        time_ns, keyframe = _time_ns(observation), found.keyframe
+        time_ns, keyframe = observation.middle_ns, found.keyframe
         T_key_scan = inverse(keyframe.T_world_middle) @ found.T_world_middle
-        at_stamp = observation.middle_s**2 * placed.velocity_covariance
+        at_stamp = observation.middle_s**2 * placed.covariance_to_stamp
         Ad = adjoint(inverse(T_key_scan))
         noise = self._noise.of(
             found.fit,
@@ -289,7 +294,8 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
             self._motion.elapsed_s(time_ns),
             at_stamp + Ad @ keyframe.covariance_at_stamp @ Ad.T,
         )
-        doubts = (*self._search.doubts(found), *self._sweep_doubts(observation, placed.velocity_covariance))
+        of_sweep = () if self._config.usual_ratio == 0.0 else observation.doubts(placed.velocity_covariance)
+        doubts = (*self._search.doubts(found), *of_sweep)
         fits = not doubts
         covariance = noise.covariance if fits else noise.inflated(found.jump)
         if fits and keyframe is self._doubtful:
@@ -353,17 +359,6 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
             covariance=covariance,
         )
 
-    def _sweep_doubts(self, observation: ScanObservation, velocity_covariance: Array) -> tuple[str, ...]:
-        """Return that the points of a sweep may be displaced, if they may."""
-        turning = float(np.sqrt(np.linalg.eigvalsh(velocity_covariance[:3, :3])[-1]))
-        voxels = observation.displacement(turning)
-        if self._config.usual_ratio == 0.0 or voxels <= _DISPLACED:
-            return ()
-        return (
-            f"its points may be displaced by {voxels * observation.voxel_m:.2f} m: the sensor turned during "
-            f"its sweep of {2.0 * observation.half_s:.2g} s, known to {np.degrees(turning):.0f}° a second",
-        )
-
     def _start(self, observation: ScanObservation, T_world_body: Transform, *, method: str) -> FrameResult:
         """Make a scan the first keyframe of a map, unconnected to earlier maps."""
         self._matcher.clear()
@@ -372,7 +367,7 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
         self._lost_scans, self._first, self._before = 0, observation, None
         waiting, self._waiting = self._waiting, ()
         deskewed = observation.deskew(STILL)
-        self._motion = MotionModel(_time_ns(observation), T_world_body)
+        self._motion = MotionModel(observation.middle_ns, T_world_body)
         node = self._add_keyframe(observation, deskewed, T_world_body, 0.0)
         return FrameResult(
             stamp_ns=observation.scan.stamp_ns,
@@ -413,8 +408,3 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
         self._tree.clear()
         self._next_node += 1
         return self._keyframes[0].node
-
-
-def _time_ns(observation: ScanObservation) -> int:
-    """Return the middle of a scan's sweep."""
-    return observation.scan.stamp_ns + round(observation.middle_s * NS_PER_S)

@@ -219,7 +219,11 @@ class PoseSearch:
         )
 
     def is_lost(self, candidate: PoseCandidate) -> bool:
-        """Return whether next to nothing agrees, or too much speaks against the pose."""
+        """Return whether next to nothing agrees, or too much speaks against the pose.
+
+        Little overlap without contradictions is a doubt where the pose was predicted: the rings of a sensor
+        that rolls soon leave those of the keyframe.
+        """
         if self._config.lost_ratio == 0.0:
             return False
         usual, shares = self.usual, candidate.shares
@@ -227,10 +231,21 @@ class PoseSearch:
             return shares.overlap < 0.5 * self._config.lost_ratio
         share = shares.overlap / usual.usual.overlap
         little = usual.has_little_overlap(shares, usual_ratio=self._config.usual_ratio)
+        contradicts, disagrees = usual.contradicts(shares), usual.disagrees(shares)
+        if little and disagrees and not contradicts and self._is_where_predicted(candidate):
+            return share < 0.5 * self._config.lost_ratio
         if little and usual.excludes(shares):
             return True
-        speaks_against = usual.contradicts(shares) or usual.disagrees(shares)
+        speaks_against = contradicts or disagrees
         return share < (self._config.lost_ratio if speaks_against else 0.5 * self._config.lost_ratio)
+
+    def _is_where_predicted(self, candidate: PoseCandidate) -> bool:
+        """Return whether a pose is no surprise, and nearer to the predicted one than keyframes are."""
+        jump, config = candidate.jump, self._config
+        is_near = (
+            jump.translation_m < config.keyframe_distance_m and jump.rotation_rad < config.keyframe_angle_rad
+        )
+        return is_near and bool(np.isfinite(jump.limit_m)) and not jump.is_unusual
 
     def doubts(self, candidate: PoseCandidate) -> tuple[str, ...]:
         """Return what speaks against a pose, a phrase each; empty if it is believed.

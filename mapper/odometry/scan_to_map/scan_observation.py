@@ -7,6 +7,8 @@ import numpy as np
 from mapper.core.deskew import STILL, Twist, deskewed
 from mapper.core.errors import FrameError
 from mapper.core.frames import Frame, Scan
+from mapper.core.geometry import Array
+from mapper.core.timebase import NS_PER_S
 from mapper.core.voxel_grid import thin
 from mapper.features.frame_view import ScanView
 from mapper.odometry.scan_to_map.config import ScanOdometryConfig
@@ -16,6 +18,7 @@ from mapper.registration.surfaces import prepared
 _MIN_POINTS = 100
 """Fewer points left after thinning do not constrain a pose."""
 _FINER = 0.5  # voxel size of the first thinning, of whose points each prepared point is the mean
+_DISPLACED = 0.5  # displacement of a sweep's outer points, in voxels: more makes a pose doubtful
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,6 +41,11 @@ class ScanObservation:
     deskewed: DeskewedScan | None
     voxel_m: float
 
+    @property
+    def middle_ns(self) -> int:
+        """Time of the middle of the sweep."""
+        return self.scan.stamp_ns + round(self.middle_s * NS_PER_S)
+
     def deskew(self, twist: Twist) -> DeskewedScan:
         """Return the scan as taken all at once in the middle of the sweep, under a constant velocity.
 
@@ -49,6 +57,17 @@ class ScanObservation:
     def displacement(self, turning_radps: float) -> float:
         """Return how far a change of the rotation, rad/s, displaces the sweep's outer points, in voxels."""
         return turning_radps * self.half_s * self.range_m / self.voxel_m
+
+    def doubts(self, velocity_covariance: Array) -> tuple[str, ...]:
+        """Return that the points may be displaced, if they may, by the (6, 6) covariance of the velocity."""
+        turning_radps = float(np.sqrt(np.linalg.eigvalsh(velocity_covariance[:3, :3])[-1]))
+        voxels = self.displacement(turning_radps)
+        if voxels <= _DISPLACED:
+            return ()
+        return (
+            f"its points may be displaced by {voxels * self.voxel_m:.2f} m: the sensor turned during "
+            f"its sweep of {2.0 * self.half_s:.2g} s, known to {np.degrees(turning_radps):.0f}° a second",
+        )
 
     def view(self, twist: Twist | None) -> ScanView:
         """Return the points as taken all at once at the stamp, one per voxel; no twist is no motion."""

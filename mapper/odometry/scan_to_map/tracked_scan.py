@@ -73,12 +73,19 @@ class PlacedScan:
         found: Its pose in the middle of the sweep.
         twist: Velocity then, if it was measured; None is the mean one since the scan before.
         velocity_covariance: (6, 6) of the velocity, (rad/s)² and (m/s)².
+        contradiction_radps: By how much later scans tell another rotation.
     """
 
     deskewed: DeskewedScan
     found: PoseCandidate
     twist: Twist | None
     velocity_covariance: Array
+    contradiction_radps: float = 0.0
+
+    @property
+    def covariance_to_stamp(self) -> Array:
+        """(6, 6) of the velocity between the middle of the sweep and the stamp."""
+        return self.velocity_covariance + np.diag([self.contradiction_radps**2] * 3 + [0.0] * 3)
 
     def turns_otherwise(self, other: "PlacedScan") -> bool:
         """Return whether the measured rotation is farther from another one than their errors explain."""
