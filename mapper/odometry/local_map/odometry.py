@@ -140,12 +140,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         information = frame_information(self._map, tracked_pose)
         covariance = covariance_of(information)
         doubt = self._doubts.assess(
-            tracked_pose,
-            covariance,
-            last,
-            expected,
-            displaced,
-            excess_error(tracked_pose, last, expected),
+            tracked_pose, covariance, last, expected, displaced, excess_error(tracked_pose, last, expected)
         )
         if doubt.is_wild and tracked_pose.inliers < self._config.weak_inliers:
             return self._lost(observation)
@@ -173,7 +168,8 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
                 information = inflated(information, sigma_rad=doubt.sigma_rad, sigma_m=doubt.sigma_m)
         if doubt.repeats:
             result = replace(result, diagnostics=replace(result.diagnostics, method=REPEATED))
-        return replace(result, doubts=doubt.phrases, covariance=covariance_of(information))
+        covariance = covariance_of(information) + self._shutter.pose_covariance(observation.T_body_camera)
+        return replace(result, doubts=doubt.phrases, covariance=covariance)
 
     def view(self, observation: ImageObservation, twist: Twist | None = None, /) -> ImageView:
         """Return the view for place recognition, by the readout time as it is known now.

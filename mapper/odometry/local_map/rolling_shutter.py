@@ -10,6 +10,7 @@ from mapper.core.deskew import Twist
 from mapper.core.geometry import Array, Points, Transform, adjoint, inverse, log
 from mapper.core.linear import solve_positive, twist_exp
 from mapper.core.timebase import NS_PER_S
+from mapper.odometry.local_map.image_sweep import SweepErrors, image_sweep
 from mapper.odometry.local_map.pose_tracker import TrackedPose
 from mapper.odometry.local_map.readout_time import ReadoutTime
 from mapper.registration.reprojection import pose_jacobian, projection_jacobian, residual
@@ -54,6 +55,7 @@ class RollingShutter:
         self._variance = _FIRST_SPREAD**2
         self._velocity: Array | None = None
         self._elapsed_s = np.inf
+        self._errors = SweepErrors()
         self.twist_camera = np.zeros(6)
         """Velocity of the camera in the last image, in its own axes: rotation rad/s, translation m/s."""
 
@@ -61,6 +63,7 @@ class RollingShutter:
         """Forget the velocity, after a gap."""
         self._velocity, self._elapsed_s = None, np.inf
         self.twist_camera = np.zeros(6)
+        self._errors.restart()
 
     @property
     def known_twist(self) -> Array | None:
@@ -99,25 +102,35 @@ class RollingShutter:
             before.T_camera_world @ inverse(tracked_pose.T_camera_world),
             (observation.stamp_ns - before.observation.stamp_ns) / NS_PER_S,
         )
-        readout_s = self._readout.seconds
-        if readout_s == 0.0 or len(points_world) < _MIN_LANDMARKS:
+        velocity = self._velocity if self._elapsed_s <= _MAX_APART_S else None
+        self._errors.follow(velocity)
+        if len(points_world) < _MIN_LANDMARKS:
             return tracked_pose
-        sigma = 0.5 * np.sqrt(self._variance) + _LEAST_SPREAD
         features = np.flatnonzero(tracked_pose.landmark_of_feature >= 0)
-        T_camera_world, sweep_camera = _refine(
-            tracked_pose.T_camera_world,
-            readout_s * self.twist_camera,
-            (readout_s * sigma) ** -2.0,
-            points_world,
-            np.column_stack([observation.pixels[features], observation.measured[features, 2]]),
-            weights,
-            observation.intrinsics,
-            observation.size_px[1],
-        )
-        self.twist_camera = sweep_camera / readout_s
-        return replace(
-            tracked_pose, observation=observation.swept(sweep_camera), T_camera_world=T_camera_world
-        )
+        measured = np.column_stack([observation.pixels[features], observation.measured[features, 2]])
+        image = points_world, measured, weights, observation.intrinsics, observation.size_px[1]
+        readout_s, sweep_camera, refined_pose = self._readout.seconds, np.zeros(6), tracked_pose
+        if readout_s != 0.0:
+            sigma = 0.5 * np.sqrt(self._variance) + _LEAST_SPREAD
+            T_camera_world, sweep_camera = _refine(
+                tracked_pose.T_camera_world,
+                readout_s * self.twist_camera,
+                (readout_s * sigma) ** -2.0,
+                *image,
+            )
+            self.twist_camera = sweep_camera / readout_s
+            refined_pose = replace(
+                tracked_pose, observation=observation.swept(sweep_camera), T_camera_world=T_camera_world
+            )
+        if velocity is not None:
+            self._errors.add(image_sweep(tracked_pose.T_camera_world, *image), velocity, sweep_camera)
+        return refined_pose
+
+    def pose_covariance(self, T_body_camera: Transform) -> Array:
+        """Return the (6, 6) covariance of the last pose by motion that was not taken out, body tangent."""
+        Ad_body_camera = adjoint(T_body_camera)
+        covariance: Array = Ad_body_camera @ self._errors.pose_covariance @ Ad_body_camera.T
+        return covariance
 
     def twist_body(self, observation: ReadByRows) -> Twist:
         """Return the velocity in the last image, in the body's axes."""
