@@ -1,6 +1,8 @@
 """KISS-Matcher (Lim et al. 2025): a motion from matched features without a first guess, refined by GICP."""
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cache
 from typing import Any
 
@@ -93,17 +95,26 @@ def _matched(target: Prepared, source: Prepared) -> Transform | None:
 def _library() -> Any:
     """Return the library, limited to one thread: with more, the order of its points and so its answer vary.
 
-    Its thread pool is sized at the first use, by the cores that the process may run on then.
+    Its thread pools are sized as it is loaded (OpenMP) and at its first use (TBB), by the cores that the
+    thread may run on then.
     """
-    with extra("peers", "KISS-Matcher (Python 3.11 or 3.12)"):
+    few = np.random.default_rng(0).uniform(size=(300, 3)).astype(np.float32)
+    with extra("peers", "KISS-Matcher (Python 3.11 or 3.12)"), _on_one_core():
         import kiss_matcher
 
-    few = np.random.default_rng(0).uniform(size=(300, 3)).astype(np.float32)
-    if hasattr(os, "sched_setaffinity"):  # Linux
-        cores = os.sched_getaffinity(0)
-        os.sched_setaffinity(0, {min(cores)})
-        try:
-            kiss_matcher.KISSMatcher(0.2).estimate(few, few)
-        finally:
-            os.sched_setaffinity(0, cores)
+        kiss_matcher.KISSMatcher(0.2).estimate(few, few)
     return kiss_matcher
+
+
+@contextmanager
+def _on_one_core() -> Iterator[None]:
+    """Run on one core meanwhile, where the system can say so: on Linux."""
+    if not hasattr(os, "sched_setaffinity"):
+        yield
+        return
+    cores = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {min(cores)})
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, cores)
