@@ -95,6 +95,34 @@ class SweepErrors:
 
 
 @njit(cache=True, nogil=True)
+def swept_rows(T, point, measured, sweep, intrinsics, height_px, scratch, r, J_both):  # type: ignore[no-untyped-def]
+    """Fill in a point's residuals (3,) and their Jacobian (3, 12) by pose and motion over all rows.
+
+    Args:
+        T: (4, 4) T_camera_world when the middle row is read.
+        point: (3,) metres, world.
+        measured: (3,) u, v as they were read, and bf/z; NaN without depth.
+        sweep: (6,) the motion.
+        intrinsics: (5,) fx, fy, cx, cy, bf.
+        height_px: Number of rows.
+        scratch: (3, 3) and (3, 6) to work in.
+        r: The residuals.
+        J_both: The Jacobian.
+    """
+    J, J_pose = scratch
+    phase = (measured[1] + 0.5) / height_px - 0.5
+    x, y, z = residual(T, point, measured, intrinsics, r)
+    projection_jacobian(x, y, z, intrinsics, not np.isnan(measured[2]), J)
+    pose_jacobian(x, y, z, J, J_pose)
+    for i in range(3):
+        for a in range(6):
+            J_both[i, a] = J_pose[i, a]
+            # A point moves against the camera; the disparity's change is taken out of it already.
+            J_both[i, 6 + a] = -phase * J_pose[i, a] if i < 2 else 0.0
+            r[i] -= J_both[i, 6 + a] * sweep[a]
+
+
+@njit(cache=True, nogil=True)
 def image_sweep(T_camera_world, points, measured, weights, intrinsics, height_px):  # type: ignore[no-untyped-def]
     """Return the camera's (6,) motion over all rows, its information and the pose's change by it (6, 6).
 
@@ -111,8 +139,7 @@ def image_sweep(T_camera_world, points, measured, weights, intrinsics, height_px
         height_px: Number of rows.
     """
     T, sweep = T_camera_world.copy(), np.zeros(6)
-    r, row = np.empty(3), np.zeros(12)
-    J, J_pose = np.empty((3, 3)), np.empty((3, 6))
+    r, J_both, scratch = np.empty(3), np.zeros((3, 12)), (np.empty((3, 3)), np.empty((3, 6)))
     H, g = np.empty((12, 12)), np.empty(12)
     square_sum = count = 0.0
     for _ in range(_ITERATIONS):
@@ -120,17 +147,9 @@ def image_sweep(T_camera_world, points, measured, weights, intrinsics, height_px
         g[:] = 0.0
         square_sum = count = 0.0
         for n in range(len(points)):
-            phase = (measured[n, 1] + 0.5) / height_px - 0.5
-            x, y, z = residual(T, points[n], measured[n], intrinsics, r)
-            has_depth = not np.isnan(measured[n, 2])
-            projection_jacobian(x, y, z, intrinsics, has_depth, J)
-            pose_jacobian(x, y, z, J, J_pose)
-            for i in range(3 if has_depth else 2):
-                error = r[i]
-                for a in range(6):
-                    row[a] = J_pose[i, a]
-                    row[6 + a] = -phase * J_pose[i, a] if i < 2 else 0.0  # a point moves against the camera
-                    error -= row[6 + a] * sweep[a]
+            swept_rows(T, points[n], measured[n], sweep, intrinsics, height_px, scratch, r, J_both)
+            for i in range(2 if np.isnan(measured[n, 2]) else 3):
+                row, error = J_both[i], r[i]
                 w = weights[n, i]
                 sigmas = np.sqrt(w) * abs(error)
                 if sigmas > HUBER_2DOF:

@@ -10,10 +10,9 @@ from mapper.core.deskew import Twist
 from mapper.core.geometry import Array, Points, Transform, adjoint, inverse, log
 from mapper.core.linear import solve_positive, twist_exp
 from mapper.core.timebase import NS_PER_S
-from mapper.odometry.local_map.image_sweep import SweepErrors, image_sweep
+from mapper.odometry.local_map.image_sweep import SweepErrors, image_sweep, swept_rows
 from mapper.odometry.local_map.pose_tracker import TrackedPose
 from mapper.odometry.local_map.readout_time import ReadoutTime
-from mapper.registration.reprojection import pose_jacobian, projection_jacobian, residual
 
 _ITERATIONS = 2
 _MIN_LANDMARKS = 50
@@ -157,8 +156,7 @@ def _refine(T_camera_world, expected_sweep, information, points, measured, weigh
     Gauss–Newton on both; ``measured`` is as it was read, and the motion has a normal prior.
     """
     T, sweep = T_camera_world.copy(), expected_sweep.copy()
-    r = np.empty(3)
-    J, J_pose, J_both = np.empty((3, 3)), np.empty((3, 6)), np.zeros((3, 12))
+    r, J_both, scratch = np.empty(3), np.zeros((3, 12)), (np.empty((3, 3)), np.empty((3, 6)))
     H, g = np.empty((12, 12)), np.empty(12)
     for _ in range(_ITERATIONS):
         H[:, :] = 0.0
@@ -167,16 +165,7 @@ def _refine(T_camera_world, expected_sweep, information, points, measured, weigh
             H[6 + a, 6 + a] = information[a]
             g[6 + a] = information[a] * (expected_sweep[a] - sweep[a])
         for n in range(len(points)):
-            phase = (measured[n, 1] + 0.5) / height_px - 0.5
-            x, y, z = residual(T, points[n], measured[n], intrinsics, r)
-            projection_jacobian(x, y, z, intrinsics, not np.isnan(measured[n, 2]), J)
-            pose_jacobian(x, y, z, J, J_pose)
-            for i in range(3):
-                for a in range(6):
-                    J_both[i, a] = J_pose[i, a]
-                    # A point moves against the camera; the disparity's change is taken out of it already.
-                    J_both[i, 6 + a] = -phase * J_pose[i, a] if i < 2 else 0.0
-                    r[i] -= J_both[i, 6 + a] * sweep[a]
+            swept_rows(T, points[n], measured[n], sweep, intrinsics, height_px, scratch, r, J_both)
             for i in range(3):
                 for a in range(12):
                     wa = weights[n, i] * J_both[i, a]
