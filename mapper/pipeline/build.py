@@ -1,5 +1,7 @@
 """From a recorded log to a run folder: track, solve, level, fuse."""
 
+from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -10,6 +12,7 @@ import numpy as np
 from mapper.config.build import BuildConfig
 from mapper.core.deskew import deskewed, twist_at
 from mapper.core.errors import FrameError
+from mapper.core.frames import Scan
 from mapper.core.timebase import check_stamps
 from mapper.core.trajectory import Trajectory
 from mapper.mapping.levelling import AXES, Level, find_level
@@ -181,7 +184,9 @@ def _height_warning(source: Log, trajectory: Trajectory) -> str:
 
 def levelled(source: Log, tracking: TrackingResult, config: BuildConfig) -> tuple[TrackingResult, Level]:
     """Return a solved log, at the heights and tilts that its floor shows, and its level frame."""
-    level = _level(source, tracking.tracked_trajectory(), config)
+    trajectory = tracking.tracked_trajectory()
+    scans = _spread_scans(source, trajectory, config.level.frames)
+    level = _level(source, trajectory, scans, config)
     graph = above_floor(
         source,
         tracking.graph,
@@ -192,24 +197,29 @@ def levelled(source: Log, tracking: TrackingResult, config: BuildConfig) -> tupl
     if graph is tracking.graph:
         return tracking, level
     tracking = replace(tracking, graph=graph)
-    return tracking, _level(source, tracking.tracked_trajectory(), config)
+    return tracking, _level(source, tracking.tracked_trajectory(), scans, config)
 
 
-def _level(source: Log, trajectory: Trajectory, config: BuildConfig) -> Level:
-    """Find the level frame from a few frames, spread over the trajectory."""
-    spread = np.unique(np.linspace(0, len(trajectory) - 1, config.level.frames).round().astype(int))
+def _spread_scans(source: Log, trajectory: Trajectory, count: int) -> dict[int, Scan]:
+    """Return the scans of a few poses, spread over the trajectory, by the poses' indices."""
+    spread = np.unique(np.linspace(0, len(trajectory) - 1, count).round().astype(int))
     index_of = {int(trajectory.stamps_ns[index]): int(index) for index in spread}
-    scans = []
+    scans = {}
     for entry in source.entries():
         if entry.stamp_ns in index_of:
-            index = index_of[entry.stamp_ns]
-            try:
-                scan = deskewed(entry.scan(), twist_at(trajectory, index))
-            except FrameError:
-                continue  # it was readable in the first pass; fusing reports it
-            scans.append((scan, trajectory.T_world_body[index]))
+            with suppress(FrameError):  # it was readable in the first pass; fusing reports it
+                scans[index_of[entry.stamp_ns]] = entry.scan()
+    return scans
+
+
+def _level(source: Log, trajectory: Trajectory, scans: Mapping[int, Scan], config: BuildConfig) -> Level:
+    """Find the level frame from scans of some of the poses."""
+    placed = [
+        (deskewed(scan, twist_at(trajectory, index)), trajectory.T_world_body[index])
+        for index, scan in scans.items()
+    ]
     return find_level(
-        scans,
+        placed,
         trajectory=trajectory,
         accelerations=source.accelerations,
         config=config.level,
