@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mapper.core.geometry import fit_rigid
+from mapper.core.geometry import Points, fit_rigid
 from mapper.core.timebase import MAX_TRUTH_GAP_NS, nearest
 from mapper.core.trajectory import Trajectory
 from mapper.graph.model import PoseGraph
@@ -48,13 +48,22 @@ def aligned_truth(truth: Trajectory, trajectory: Trajectory) -> Trajectory | Non
 
     None if they share no three stamps.
     """
-    index, gap_ns = nearest(truth.stamps_ns, trajectory.stamps_ns)
-    near = gap_ns <= MAX_TRUTH_GAP_NS
-    if near.sum() < 3:
+    pairs = with_truth(truth, trajectory)
+    if pairs is None:
         return None
-    T_level_truth, _ = fit_rigid(trajectory.positions_world[near], truth.positions_world[index[near]])
+    estimated, known = pairs
+    T_level_truth, _ = fit_rigid(estimated.positions_world, known)
     first_ns, last_ns = trajectory.stamps_ns[[0, -1]]
     meanwhile = slice(
         *np.searchsorted(truth.stamps_ns, [first_ns - MAX_TRUTH_GAP_NS, last_ns + MAX_TRUTH_GAP_NS])
     )
     return Trajectory(truth.stamps_ns[meanwhile], truth.T_world_body[meanwhile]).moved(T_level_truth)
+
+
+def with_truth(truth: Trajectory, trajectory: Trajectory) -> tuple[Trajectory, Points] | None:
+    """Return the poses whose truth is known, and their (N, 3) true positions; None if fewer than 3 are."""
+    index, gap_ns = nearest(truth.stamps_ns, trajectory.stamps_ns)
+    near = gap_ns <= MAX_TRUTH_GAP_NS
+    if near.sum() < 3:
+        return None
+    return trajectory[near], truth.positions_world[index[near]]

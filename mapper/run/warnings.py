@@ -6,8 +6,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from mapper.core.timebase import MAX_TRUTH_GAP_NS, NS_PER_S, nearest, stretches
-from mapper.core.trajectory import Trajectory
+from mapper.core.timebase import NS_PER_S, stretches
 from mapper.navigation.config import TraversableConfig
 from mapper.run.frame_outcomes import DISCONNECTED, FrameRecord
 from mapper.run.graph_warnings import (
@@ -17,7 +16,7 @@ from mapper.run.graph_warnings import (
     wheel_warnings,
 )
 from mapper.run.manifest import Manifest, RunWarning, Weight
-from mapper.run.results import RunResults
+from mapper.run.results import RunResults, with_truth
 from mapper.run.timeline import TimeLine, counted
 
 FLOOR = "floor"
@@ -276,17 +275,13 @@ def _depth_reach(manifest: Manifest) -> Iterator[RunWarning]:
 
 def _truth(results: RunResults) -> Iterator[RunWarning]:
     """Yield a warning if the path is far from the true poses: one of the two is wrong."""
-    tracked, truth = results.tracked, results.truth
-    if truth is None:
+    pairs = None if results.truth is None else with_truth(results.truth, results.tracked)
+    if pairs is None:
         return
-    index, gap_ns = nearest(truth.stamps_ns, tracked.stamps_ns)
-    near = gap_ns <= MAX_TRUTH_GAP_NS
-    if near.sum() < 3:
-        return
-    seen = Trajectory(tracked.stamps_ns[near], truth.T_world_body[index[near]])
-    off_m = np.linalg.norm(tracked.positions_world[near] - seen.positions_world, axis=1)
-    rmse_m = float(np.sqrt((off_m**2).mean()))
-    path_m = min(tracked.path_length_m, seen.path_length_m)  # errors make a path longer
+    estimated, known = pairs
+    rmse_m = float(np.sqrt(((estimated.positions_world - known) ** 2).sum(axis=1).mean()))
+    true_path_m = float(np.linalg.norm(np.diff(known, axis=0), axis=1).sum())
+    path_m = min(estimated.path_length_m, true_path_m)  # errors make a path longer
     if rmse_m > max(_MAX_ERROR_SHARE * path_m, _LEAST_ERROR_M):
         yield RunWarning(
             kind="truth",
