@@ -152,7 +152,7 @@ def mapped(log: Log, name: str, overrides: Sequence[str] = ()) -> Row:
         solved = solve(tracking.graph, tracking.loops, config.graph)
         tracking = replace(tracking, graph=solved.graph, loops=solved.loops)
         tracking = largest_component(tracking, progress=SILENT)
-        tracking, _ = levelled(log, tracking, config)
+        tracking, *_ = levelled(log, tracking, config)
         seconds = time.perf_counter() - began
         trajectory, records = tracking.trajectory(), records_of(tracking.tracks, tracking.skipped)
         matched = associate(placed_by_neighbours(trajectory, tracking.graph, records), log.truth)

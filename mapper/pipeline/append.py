@@ -89,11 +89,13 @@ def append(
         _refuse_unconnected(second, run, solved.loops, known)
         trusted_ns = tracked_stamps(before.records) | {track.stamp_ns for track in tracking.tracked}
         with writer.clock.stage("level"):
-            graph = above_floor(source, solved.graph, config, up_world=UP_LEVEL, trusted_ns=trusted_ns)
+            graph, floor_nodes = above_floor(
+                source, solved.graph, config, up_world=UP_LEVEL, trusted_ns=trusted_ns
+            )
         later = from_tracking(replace(tracking, graph=graph, loops=solved.loops), None)
         save_places(writer, tracking)
         save_solved(writer, before.solved(graph, solved.loops).then(later, truth=source.truth))
-        writer.update(solve=solved.report)
+        writer.update(solve=solved.report.model_copy(update={"floor_nodes": floor_nodes}))
         write_edits(writer.folder, edits)
         fuse_into(
             writer, source, joined, progress, observer=observer, before=run.scan_updates(), edits=wanted

@@ -155,9 +155,9 @@ class _Steps:
         tracking = replace(tracking, graph=solved.graph, loops=solved.loops)
         tracking = largest_component(tracking, progress=self.progress)
         with self.writer.clock.stage("level"):
-            tracking, level = levelled(self.source, tracking, self.config)
+            tracking, level, floor_nodes = levelled(self.source, tracking, self.config)
         tracking = replace(tracking, graph=tracking.graph.moved(level.T_level_world))
-        return _Solved(tracking, solved.report, level)
+        return _Solved(tracking, solved.report.model_copy(update={"floor_nodes": floor_nodes}), level)
 
     def save(self, solved: _Solved) -> None:
         """Write the solved poses, the graph and the places."""
@@ -182,22 +182,22 @@ def _height_warning(source: Log, trajectory: Trajectory) -> str:
     return f"the camera is {height_m:.1f} m above the floor; is source.camera.depth_factor right?"
 
 
-def levelled(source: Log, tracking: TrackingResult, config: BuildConfig) -> tuple[TrackingResult, Level]:
-    """Return a solved log, at the heights and tilts that its floor shows, and its level frame."""
+def levelled(source: Log, tracking: TrackingResult, config: BuildConfig) -> tuple[TrackingResult, Level, int]:
+    """Return a solved log above its floor, its level frame, and how many nodes see that floor."""
     trajectory = tracking.tracked_trajectory()
     scans = _spread_scans(source, trajectory, config.level.frames)
     level = _level(source, trajectory, scans, config)
-    graph = above_floor(
+    graph, floor_nodes = above_floor(
         source,
         tracking.graph,
         config,
         up_world=level.T_level_world[2, :3],
         trusted_ns={track.stamp_ns for track in tracking.tracked},
     )
-    if graph is tracking.graph:
-        return tracking, level
-    tracking = replace(tracking, graph=graph)
-    return tracking, _level(source, tracking.tracked_trajectory(), scans, config)
+    if floor_nodes:
+        tracking = replace(tracking, graph=graph)
+        level = _level(source, tracking.tracked_trajectory(), scans, config)
+    return tracking, level, floor_nodes
 
 
 def _spread_scans(source: Log, trajectory: Trajectory, count: int) -> dict[int, Scan]:

@@ -78,12 +78,11 @@ def edit_loops(
         _refuse_rejected(loop)
     if len(components(solved.graph)) > len(components(graph)):
         raise LoopError(f"{run.path}: without these loops the graph falls apart; nothing removed")
-    graph = above_floor(
+    graph, floor_nodes = above_floor(
         source, solved.graph, run.config, up_world=UP_LEVEL, trusted_ns=tracked_stamps(tracked.records)
     )
-    return fuse_changed(
-        source, run, tracked.solved(graph, solved.loops), solve=solved.report, progress=progress
-    )
+    report = solved.report.model_copy(update={"floor_nodes": floor_nodes})
+    return fuse_changed(source, run, tracked.solved(graph, solved.loops), solve=report, progress=progress)
 
 
 def _held(loops: Sequence[LoopClosure], pair: Pair) -> int | None:

@@ -32,8 +32,10 @@ def tracked_stamps(records: Iterable[FrameRecord]) -> set[int]:
 
 def above_floor(
     source: Log, graph: PoseGraph, config: BuildConfig, *, up_world: Array, trusted_ns: Container[int]
-) -> PoseGraph:
-    """Return a solved graph with the heights and tilts that the floor shows; as it is, without one floor.
+) -> tuple[PoseGraph, int]:
+    """Return a solved graph with the heights and tilts that the floor shows, and how many nodes see it.
+
+    Without one floor that is followed, the graph is returned as it is, and 0.
 
     Without loops a depth camera's path drifts in height and tilt, along white walls by a decimetre and some
     degrees in ten metres, while every frame that sees the floor shows both to 3 cm and a degree.
@@ -46,13 +48,13 @@ def above_floor(
         trusted_ns: Stamps of the frames that are not doubtful.
     """
     if source.sensor != "rgbd" or not config.level.follow_floor:
-        return graph
+        return graph, 0
     if config.graph.solve != "batch" or config.odometry.kind in BY_POSES:
-        return graph
+        return graph, 0
     T_node_floor = _floors(source, graph, config, up_world, trusted_ns)
     nodes = on_one_floor(graph, T_node_floor)
     if not nodes:
-        return graph
+        return graph, 0
     before = [factor for factor in graph.factors if factor.origin != "loop"]
     loops = [factor for factor in graph.factors if factor.origin == "loop"]
     held = graph
@@ -60,7 +62,8 @@ def above_floor(
         factors = floor_factors(held.T_world_node, T_node_floor, nodes)
         held = held.with_factors([*before, *factors, *loops])
         held = held.with_poses(optimize(held, config.graph).T_world_node)
-    return graph.with_poses(with_height_and_tilt(graph.T_world_node, held.T_world_node, T_node_floor, nodes))
+    combined = with_height_and_tilt(graph.T_world_node, held.T_world_node, T_node_floor, nodes)
+    return graph.with_poses(combined), len(nodes)
 
 
 def _floors(
