@@ -1,4 +1,4 @@
-"""Loop detectors: they search loops while a log is tracked, and decide on every candidate."""
+"""Loop detectors: they search loops while a log is tracked, and accept or reject every candidate."""
 
 from bisect import bisect_right
 from collections.abc import Callable, Mapping, Sequence, Set
