@@ -179,9 +179,9 @@ def _misfit(config: BuildConfig, source: Log) -> str:
         return "odometry.kind=given needs truth"
     sees_scans = source.sensor == "lidar" or isinstance(odometry, ScanOdometryConfig)
     if sees_scans and isinstance(loops, _IMAGE_LOOPS):
-        return f"loops.kind={loops.kind} needs images, odometry.kind={odometry.kind} sees scans"
+        return f"loops.kind={loops.kind} needs images, odometry.kind={odometry.kind} takes scans"
     if not sees_scans and isinstance(loops, ScanLoopsConfig):
-        return f"loops.kind=scans needs scans, odometry.kind={odometry.kind} sees images"
+        return f"loops.kind=scans needs scans, odometry.kind={odometry.kind} takes images"
     return ""
 
 

@@ -103,7 +103,7 @@ def tried(
         return Finding(name, "well", f"{version}, self-test passed in {time.monotonic() - began:.1f} s")
     if ended.returncode < 0:
         killer = signal.Signals(-ended.returncode)
-        return Finding(name, "failed", f"{version}, self-test died of {killer.name}", _after(killer, again))
+        return Finding(name, "failed", f"{version}, self-test ended by {killer.name}", _after(killer, again))
     said = (ended.stderr.strip().splitlines() or [f"exit status {ended.returncode}"])[-1]
     missing = _MISSING_OBJECT.search(said)
     remedy = again if missing is None else apt_line([missing["object"]])

@@ -35,7 +35,7 @@ def check_glibc() -> Finding:
     numbers = tuple(int(number) for number in re.findall(r"\d+", version)[:2])
     if name == "glibc" and numbers < _LEAST_GLIBC:
         return Finding(
-            "glibc", "failed", f"{text}, Open3D's wheel wants 2.35", "use Debian 12, Ubuntu 22.04 or newer"
+            "glibc", "failed", f"{text}, Open3D's wheel needs 2.35", "use Debian 12, Ubuntu 22.04 or newer"
         )
     return Finding("glibc", "well", text)
 
