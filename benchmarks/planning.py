@@ -11,9 +11,10 @@ from typing import Any
 
 import numpy as np
 
+from mapper.core.geometry import path_length
 from mapper.navigation.distance import DistanceField, signed_distances
 from mapper.navigation.distance_transform import squares_to_centres
-from mapper.navigation.line_of_sight import path_length, shortened
+from mapper.navigation.line_of_sight import shortened
 from mapper.navigation.search import shortest_path
 
 EDGE_CELLS = 1000

@@ -76,7 +76,7 @@ SCRIPTS = {"bash": _BASH, "zsh": _ZSH, "fish": _FISH}
 
 
 def answer(command: Any) -> None:
-    """Print the candidates for what the shell asks.
+    """Print the shell's completion candidates.
 
     Args:
         command: The program, as Typer runs it.
@@ -98,7 +98,7 @@ def candidates(command: Any, words: Sequence[str]) -> Iterator[tuple[str, str]]:
         command: The program, as Typer runs it.
         words: After the program's name; the last is being written.
     """
-    from typer._completion_classes import BashComplete  # it alone knows how a command line is taken apart
+    from typer._completion_classes import BashComplete  # only it can parse a command line
 
     *before, word = words
     for item in BashComplete(command, {}, "mapper", ASKED_BY).get_completions(before, word):

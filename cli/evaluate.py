@@ -257,7 +257,7 @@ def _of_merged_map(
 
 def _needed(run: "Run | None", path: Path, option: str) -> "Run":
     if run is None:
-        raise DataError(f"{path}: a bare trajectory has no map; {option} wants a run folder")
+        raise DataError(f"{path}: a trajectory alone has no map; {option} needs a run folder")
     return run
 
 

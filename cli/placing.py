@@ -1,4 +1,4 @@
-"""Options that tell where the worlds of several runs lie."""
+"""Options for where the worlds of several runs lie."""
 
 from collections.abc import Sequence
 from enum import StrEnum

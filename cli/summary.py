@@ -62,7 +62,7 @@ def frame_counts(counts: Counts) -> dict[str, int]:
 
 
 def short_text(run: Run, metrics: Sequence[Metric]) -> str:
-    """Return what a person wants to know first: eight lines, and why a run is not trusted."""
+    """Return the main figures in eight lines, and why a run is not trusted."""
     counts, timing, verdict = run.manifest.counts, run.manifest.timing, run.verdict
     logs = f", of {run.manifest.input.title}" if run.manifest.input.appended else ""
     lengths_m = [metric.value for metric in metrics if metric.name.startswith(_LENGTH)]

@@ -73,7 +73,7 @@ def _print(text: str, coloured: Any) -> None:
 
 
 def has_colours(stream: TextIO) -> bool:
-    """Return whether colours may be written: to a terminal that knows them, without ``NO_COLOR``."""
+    """Return whether colours may be written: to a terminal that supports them, without ``NO_COLOR``."""
     return stream.isatty() and not os.environ.get("NO_COLOR") and os.environ.get("TERM", "dumb") != "dumb"
 
 

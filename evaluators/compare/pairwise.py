@@ -64,7 +64,7 @@ def guesses_for(pair: Pair, guesses: Sequence[GuessConfig], *, level: bool, seed
     Distance and angle are drawn evenly from zero to their limits.
 
     Args:
-        pair: Pair with its true motion; its number and the seed decide what is drawn.
+        pair: Pair with its true motion; its number and the seed determine what is drawn.
         guesses: Sizes of the guesses' errors.
         level: Off in x, y and heading only, as for a robot on level ground.
         seed: Seed of all that is random.

@@ -51,8 +51,7 @@ def depth_of_planes(
     Every frame is cut into tiles, a sixteenth of the image wide. A tile counts if a plane fits it: hardly
     anything lies far off, and what does lie off is noise from pixel to pixel rather than shape. Tiles are
     sorted by distance, in steps of 10 %, and every figure of a distance is the median over its tiles. As
-    nobody knows where a plane really was, errors are those from the plane that was fitted, and what bends a
-    whole tile is not seen.
+    the true planes are unknown, errors are those from the fitted plane; what bends a whole tile is not seen.
 
     Args:
         source: RGB-D log.

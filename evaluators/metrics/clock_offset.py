@@ -35,7 +35,7 @@ class ClockOffset:
 def clock_offset(estimate: Trajectory, truth: Trajectory, alignment: AlignmentKind) -> ClockOffset | None:
     """Return the clock offset that explains at least two thirds of the position error, or None (within 2 s).
 
-    The true positions are interpolated at the estimate's stamps plus the offset, and aligned anew for each.
+    The true positions are interpolated at the estimate's stamps plus each offset, and aligned.
     """
     begin_ns = max(int(estimate.stamps_ns[0]), int(truth.stamps_ns[0]))
     end_ns = min(int(estimate.stamps_ns[-1]), int(truth.stamps_ns[-1]))

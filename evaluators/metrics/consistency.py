@@ -14,7 +14,7 @@ from mapper.run.frame_outcomes import FrameRecord, stamps_of
 from mapper.sensing.wheel_kinematics import pose_at
 
 _NEXT_TO_NOTHING = 1e-6 * np.eye(6)
-"""Information of factors that only ask for the covariance of two nodes relative to each other."""
+"""Information of factors that only serve to query the covariance of two nodes relative to each other."""
 _WINDOW_NS = NS_PER_S
 _MOST_WINDOWS = 300  # spread over the log: the covariance of each takes a while
 

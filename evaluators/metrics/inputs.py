@@ -3,14 +3,19 @@
 import os
 from pathlib import Path
 
-from mapper.core.errors import DataError
+import numpy as np
+
+from mapper.core.errors import DataError, SourceError
 from mapper.core.paths import AnyPath
 from mapper.core.trajectory import Trajectory
-from mapper.evaluators.metrics.pose_files import is_kitti, read_poses
 from mapper.run.folder import Run, open_run
+from mapper.sources.text import parse_stamp, rows
+from mapper.sources.trajectory_files import is_mulran, read_kitti, read_mulran, read_tum
 
 Estimate = Run | Trajectory | AnyPath
-"""A run or its folder, a trajectory, or a file of TUM or KITTI text."""
+"""A run or its folder, a trajectory, or a file of TUM, EuRoC, MulRan or KITTI text."""
+
+_KITTI_COLUMNS = 12
 
 
 def estimate_and_truth(
@@ -32,7 +37,7 @@ def estimate_and_truth(
         if not isinstance(one, Run | Trajectory | str | os.PathLike):
             raise DataError(f"{name}: {type(one).__name__}, want a Trajectory or the path of a file or run")
     paths = [Path(one) if isinstance(one, str | os.PathLike) else None for one in (estimate, truth)]
-    untimed = [path for path in paths if path is not None and path.is_file() and is_kitti(path)]
+    untimed = [path for path in paths if path is not None and path.is_file() and _is_kitti(path)]
     if times is not None and not untimed:
         raise DataError(f"{times}: --times is for poses in KITTI text, which neither file is")
     if times is None and len(untimed) == 1 and truth is not None:
@@ -53,5 +58,21 @@ def estimate_and_truth(
     return estimate, estimate.trajectory, known or estimate.truth
 
 
-def _poses(path: AnyPath, times: AnyPath | None) -> Trajectory:
-    return read_poses(Path(path), times=None if times is None else Path(times))
+def _is_kitti(path: Path) -> bool:
+    """Return whether a file begins with a row-major 3×4 pose, which has no stamp."""
+    try:
+        _, words = next(rows(path), (0, []))
+    except SourceError as error:
+        raise SourceError(f"{error}; want poses as TUM or KITTI text") from None
+    return len(words) == _KITTI_COLUMNS
+
+
+def _poses(given: AnyPath, times: AnyPath | None) -> Trajectory:
+    """Return a file's trajectory; stamps of KITTI text without times are 0, 1, 2 … ns, only an order."""
+    path = Path(given)
+    if not _is_kitti(path):
+        return read_mulran(path) if is_mulran(path) else read_tum(path)
+    if times is None:
+        return read_kitti(path)
+    stamps = [parse_stamp(words[0], where=f"{times}:{number}") for number, words in rows(Path(times))]
+    return read_kitti(path, np.array(stamps, dtype=np.int64))

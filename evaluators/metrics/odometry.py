@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from mapper.core.errors import DataError
-from mapper.core.geometry import Array
+from mapper.core.geometry import Array, path_length
 from mapper.core.timebase import MAX_TRUTH_GAP_NS, NS_PER_S, Stamps, nearest
 from mapper.core.trajectory import Trajectory
 from mapper.evaluators.metrics.trajectory import DeltaUnit, Matched, align, associate, ate, step_errors
@@ -137,7 +137,7 @@ def path_errors(matched: Matched, step: Step) -> PathErrors:
 
 
 def _drift_ratio(matched: Matched) -> float | None:
-    path_m = float(np.linalg.norm(np.diff(matched.T_truth_body[:, :3, 3], axis=0), axis=1).sum())
+    path_m = path_length(matched.T_truth_body[:, :3, 3])
     stretches = [(share * path_m, _step_errors(matched, share * path_m, "m")[0]) for share in _STRETCHES]
     ratios = [errors_m.mean() / length_m for length_m, errors_m in stretches if len(errors_m)]
     return float(np.mean(ratios)) if ratios else None

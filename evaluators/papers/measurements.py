@@ -138,7 +138,7 @@ def ate_rmse_m(estimate: Trajectory, truth: Trajectory) -> float:
     return ate(align(matched, "se3").moved(matched)).rmse
 
 
-_fingerprint = cache(fingerprint)  # of a large log it takes a while, and every measurement asks
+_fingerprint = cache(fingerprint)  # of a large log it takes a while, and every measurement needs it
 
 
 def _records_of(table: str, result: JobResult) -> list[tuple[Place, Mapping[str, Any]]]:

@@ -37,7 +37,7 @@ def find_sequences(folder: Path, names: Sequence[str], given: Mapping[str, Path]
     Args:
         folder: Folder that is searched.
         names: Names in the paper, e.g. "fr1/xyz".
-        given: Paths of logs of other names; these win.
+        given: Paths of logs of other names; these come first.
 
     Raises:
         SourceError: The folder is missing, or none of the sequences is there.

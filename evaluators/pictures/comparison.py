@@ -125,6 +125,6 @@ def _draw_shares(axes: "Axes", errors: Mapping[str, Array], names: Sequence[str]
 
 
 def _reference(paths: Mapping[str, Trajectory], truth: Trajectory | None) -> Array:
-    """Return the positions that decide what is shown."""
+    """Return the positions that determine what is shown."""
     shown = [truth] if truth is not None else [path for path in paths.values() if len(path)]
     return np.concatenate([np.zeros((0, 3)), *(path.positions_world for path in shown)])

@@ -49,7 +49,7 @@ def write_before_and_after(
         points_target: (N, 3) metres.
         points_source: (M, 3) metres, source frame.
         stages: Name and T_target_source of each.
-        sensor: Sensor that took them, which decides the direction up.
+        sensor: Sensor that took them, which determines the direction up.
         title: Headline.
     """
     target, source = _thinned(points_target), _thinned(points_source)

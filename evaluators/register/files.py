@@ -62,7 +62,7 @@ def write_registration(
         target: Scan that stayed.
         source: Scan that was aligned to it.
         names: The user's names of target and source.
-        sensor: Sensor that took them, which decides the direction up.
+        sensor: Sensor that took them, which determines the direction up.
         config: Its settings.
     """
     last = registered.stages[-1]
@@ -100,7 +100,7 @@ def write_registration(
 
 
 def registration_record(registered: Registered) -> dict[str, Any]:
-    """Return what ``manifest.json`` tells of the registration itself."""
+    """Return the entries of ``manifest.json`` on the registration itself."""
     alignment = registered.alignment
     return {
         "method": registered.method,

@@ -43,7 +43,7 @@ class Registered:
         alignment: The answer.
         stages: Stages from the beginning on; without "refined" where there was no answer at all.
         seconds: Wall time of each step, in order.
-        cpu_s: CPU time of all steps: a wall clock sees other programs, too.
+        cpu_s: CPU time of all steps, which other programs do not change.
     """
 
     method: str

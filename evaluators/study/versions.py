@@ -19,7 +19,7 @@ def versions() -> dict[str, str]:
 
 
 def digest(*decides: Any, digits: int) -> str:
-    """Return the first hexadecimal digits of the SHA-256 of everything that decides a result, as JSON."""
+    """Return the first hexadecimal digits of the SHA-256 of everything that a result depends on, as JSON."""
     return hashlib.sha256(json.dumps(decides, sort_keys=True).encode()).hexdigest()[:digits]
 
 

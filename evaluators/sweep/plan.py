@@ -41,7 +41,7 @@ class BuildName:
         log: Its name, unique in the sweep.
         method: Its name.
         configuration: Its name.
-        seed: None if nothing in the build is random, or none was asked for.
+        seed: None if nothing in the build is random, or none was requested.
     """
 
     log: str
@@ -179,9 +179,9 @@ def _misfit(config: BuildConfig, source: Log) -> str:
         return "odometry.kind=given needs truth"
     sees_scans = source.sensor == "lidar" or isinstance(odometry, ScanOdometryConfig)
     if sees_scans and isinstance(loops, _IMAGE_LOOPS):
-        return f"loops.kind={loops.kind} needs images, odometry.kind={odometry.kind} sees scans"
+        return f"loops.kind={loops.kind} needs images, odometry.kind={odometry.kind} takes scans"
     if not sees_scans and isinstance(loops, ScanLoopsConfig):
-        return f"loops.kind=scans needs scans, odometry.kind={odometry.kind} sees images"
+        return f"loops.kind=scans needs scans, odometry.kind={odometry.kind} takes images"
     return ""
 
 
@@ -201,7 +201,7 @@ def _key(log: str, config: BuildConfig, keep: str) -> str:
 
 
 def _files(tree: Any) -> Iterator[Path]:
-    """Yield the files that a configuration names: their content decides the result as well."""
+    """Yield the files that a configuration names: the result depends on their content as well."""
     if isinstance(tree, Path):
         yield tree
     elif isinstance(tree, dict):

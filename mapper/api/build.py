@@ -91,16 +91,7 @@ def build(
     if not isinstance(log, Log):
         log = _opened(log, config, settings)
     out = place_of(None if out is None else Path(out), RUNS / name_of(log.path), overwrite=overwrite)
-    own = None
-    if isinstance(odometry, Trajectory | Odometry) or odometry is None:
-        own = odometry
-    elif callable(odometry):
-        own = poses_of(odometry, log, progress=receiver)
-    else:
-        raise ConfigError(
-            f"odometry: {type(odometry).__name__} is no odometry; want an object with read, track, view, "
-            "matches and finish, a function that returns the pose of a frame, or a Trajectory"
-        )
+    own = _own_odometry(odometry, log, receiver)
     wanted = {**_first_settings(own, out), **flattened(settings or {})}
     if isinstance(config, BuildConfig):
         resolved = overridden(config, settings=wanted)
@@ -115,6 +106,19 @@ def _opened(path: AnyPath, config: BuildConfig | AnyPath | None, settings: Setti
     if isinstance(config, BuildConfig):
         return open_log(path, settings={"source": config.source.model_dump(), **(settings or {})})
     return open_log(path, config=config, settings=settings)
+
+
+def _own_odometry(
+    odometry: OwnOdometry | None, log: Log, progress: Progress
+) -> Odometry[Any] | Trajectory | None:
+    if odometry is None or isinstance(odometry, Trajectory | Odometry):
+        return odometry
+    if callable(odometry):
+        return poses_of(odometry, log, progress=progress)
+    raise ConfigError(
+        f"odometry: {type(odometry).__name__} is no odometry; want an object with read, track, view, "
+        "matches and finish, a function that returns the pose of a frame, or a Trajectory"
+    )
 
 
 def _first_settings(own: Odometry[Any] | Trajectory | None, out: Path) -> dict[str, Any]:

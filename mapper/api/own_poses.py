@@ -17,7 +17,7 @@ def poses_of(track: Callable[[Frame], ArrayLike | None], log: Log, *, progress: 
     """Return the poses that a function gives a log's frames, called once for each in time order.
 
     Args:
-        track: Takes a frame; returns (4, 4) T_world_body, or None where it knows none.
+        track: Takes a frame; returns (4, 4) T_world_body, or None where there is none.
         log: The log; frames that cannot be read are left out.
         progress: Receives the stage and its counts.
 

@@ -1,7 +1,7 @@
 """Description of every setting: key, type, default, unit, choices and meaning, read from the models.
 
 The meaning of a setting is the docstring below it in its class, or in the class that it inherits from. Python
-drops these, so they are parsed from the sources, when asked for.
+drops these, so they are parsed from the sources, on first use.
 """
 
 import ast
@@ -51,7 +51,7 @@ class Setting:
     """Description of one setting, or of the table that holds some.
 
     A key stands more than once where the kinds of a method give it different defaults or meanings; ``needs``
-    tells them apart.
+    distinguishes them.
     """
 
     key: str

@@ -50,6 +50,6 @@ def register_config(method: str, *sensors: Sensor) -> RegisterConfig:
     if issubclass(member, HoughConfig):
         others = [name for name, other in _METHODS.items() if not issubclass(other, HoughConfig)]
         raise ConfigError(
-            f"method {method}: wants z up, and a camera's frame has it ahead; choose {', '.join(others)}"
+            f"method {method}: needs z up, and a camera's frame has it ahead; choose {', '.join(others)}"
         )
     return RegisterConfig(registration=member(voxel_m=VOXEL_M[sensor]))

@@ -69,6 +69,11 @@ def distances_along(points: Array) -> Array:
     return np.concatenate([[0.0], np.cumsum(steps_m)])
 
 
+def path_length(points: Array) -> float:
+    """Return the length of the straight lines between consecutive (N, D) points, in their own unit."""
+    return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
+
+
 def skew(v: Array) -> Array:
     """Return the (3, 3) matrix with ``skew(v) @ w == cross(v, w)``."""
     x, y, z = v

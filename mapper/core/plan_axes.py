@@ -9,7 +9,7 @@ if TYPE_CHECKING:
 def plan_axes(axes: "Axes | None") -> "Axes":
     """Return axes of x and y in metres, of equal scale: those given, or of a new figure of pyplot's."""
     if axes is None:
-        import matplotlib.pyplot as plt  # keeps global state, which only a caller without axes wants
+        import matplotlib.pyplot as plt  # keeps global state, which only a caller without axes needs
 
         axes = plt.subplots(layout="constrained")[1]
     axes.set_aspect("equal")

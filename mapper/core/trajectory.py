@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.errors import DataError
-from mapper.core.geometry import Array, Transform, inverse, is_rigid
+from mapper.core.geometry import Array, Transform, inverse, is_rigid, path_length
 from mapper.core.plan_axes import plan_axes
 from mapper.core.timebase import NS_PER_S, Stamps
 
@@ -102,7 +102,7 @@ class Trajectory:
     @property
     def path_length_m(self) -> float:
         """Length of the straight segments between consecutive positions."""
-        return float(np.linalg.norm(np.diff(self.positions_world, axis=0), axis=1).sum())
+        return path_length(self.positions_world)
 
     def moved(self, T_new_world: Transform) -> "Trajectory":
         """Return the same motion in another world frame."""

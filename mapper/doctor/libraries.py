@@ -1,4 +1,4 @@
-"""Checks of every library: installed, new enough, and right about a tiny job."""
+"""Checks of every library: installed, new enough, and correct on a tiny job."""
 
 import os
 import re
@@ -84,7 +84,7 @@ def tried(
         name: Name of the library.
         version: Version of the library.
         command: Ends with status 0 if the library works.
-        again: Command that installs the library afresh.
+        again: Command that reinstalls the library.
         patience_s: Longer is a failure; None: a minute, and more where processes wait for processors.
     """
     if patience_s is None:
@@ -103,7 +103,7 @@ def tried(
         return Finding(name, "well", f"{version}, self-test passed in {time.monotonic() - began:.1f} s")
     if ended.returncode < 0:
         killer = signal.Signals(-ended.returncode)
-        return Finding(name, "failed", f"{version}, self-test died of {killer.name}", _after(killer, again))
+        return Finding(name, "failed", f"{version}, self-test ended by {killer.name}", _after(killer, again))
     said = (ended.stderr.strip().splitlines() or [f"exit status {ended.returncode}"])[-1]
     missing = _MISSING_OBJECT.search(said)
     remedy = again if missing is None else apt_line([missing["object"]])

@@ -35,7 +35,7 @@ def check_glibc() -> Finding:
     numbers = tuple(int(number) for number in re.findall(r"\d+", version)[:2])
     if name == "glibc" and numbers < _LEAST_GLIBC:
         return Finding(
-            "glibc", "failed", f"{text}, Open3D's wheel wants 2.35", "use Debian 12, Ubuntu 22.04 or newer"
+            "glibc", "failed", f"{text}, Open3D's wheel needs 2.35", "use Debian 12, Ubuntu 22.04 or newer"
         )
     return Finding("glibc", "well", text)
 
@@ -48,9 +48,9 @@ def processors() -> int:
 
 
 def check_threads() -> Finding:
-    """Return how many processors we may use, and whether libraries start threads of their own."""
+    """Return how many processors are available, and whether libraries start threads of their own."""
     each = os.environ.get(_THREADS, "unset")
-    text = f"{processors()} processors for us, {_THREADS} is {each}"
+    text = f"{processors()} processors available, {_THREADS} is {each}"
     if each != "1":
         return Finding(
             "threads", "warning", text, f"unset {_THREADS}: small matrices are slower with several"
@@ -59,7 +59,7 @@ def check_threads() -> Finding:
 
 
 def check_memory() -> Finding:
-    """Return how much memory is there."""
+    """Return the machine's memory."""
     meminfo = Path("/proc/meminfo")
     if not meminfo.exists():
         return Finding("memory", "well", "this system does not report it")

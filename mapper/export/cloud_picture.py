@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _MARGIN_M = 0.3
-_HEADROOM_M = 0.3  # above the highest camera position; what lies higher would hide the rooms from above
+HEADROOM_M = 0.3
+"""Above the highest pose; what lies higher would hide the rooms from above."""
 _VIEW_PX = 900
 _TILT_RAD = np.deg2rad(32.0)
 _TURN_RAD = np.deg2rad(-35.0)
@@ -50,7 +51,7 @@ def write_cloud_views(
     """
     positions = trajectory.positions_world
     points, colors = thinned_to_view(points, colors)
-    below = points[:, 2] <= positions[:, 2].max() + _HEADROOM_M
+    below = points[:, 2] <= positions[:, 2].max() + HEADROOM_M
     if below.any():
         points, colors = points[below], colors[below]
     heights_m = None

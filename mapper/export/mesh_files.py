@@ -51,7 +51,7 @@ def _write_obj(path: Path, points: Points32, colors: Colors, triangles: Triangle
 def _write_glb(path: Path, points: Points32, colors: Colors, triangles: Triangles) -> None:
     """Write one self-contained file, to be drawn as photographed: without a lamp of the viewer's own."""
     positions = np.ascontiguousarray(points @ _R_GLTF_WORLD.T, "<f4")
-    rgba = np.full((len(points), 4), 0xFFFF, "<u2")  # rows of four, for glTF wants them aligned
+    rgba = np.full((len(points), 4), 0xFFFF, "<u2")  # rows of four, as glTF requires them aligned
     rgba[:, :3] = _linear_light()[colors]
     parts = [positions.tobytes(), rgba.tobytes(), triangles.astype("<u4").tobytes()]
     starts = np.cumsum([0, *map(len, parts)]).tolist()

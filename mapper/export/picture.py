@@ -27,13 +27,14 @@ from mapper.export.page import (
 from mapper.export.palette import DOUBTFUL, END, ESTIMATE, FACTORS, PLAN, START, TRUTH, UNKNOWN_CELL, Rgb
 from mapper.export.panels import color_of
 from mapper.export.path_band import SIGMAS, band_image
-from mapper.octree.grid import FREE, OCCUPIED, OccupancyGrid
+from mapper.octree.grid import FREE, OCCUPIED, OccupancyGrid, shrunk
 from mapper.run.pose_covariances import UncertainPoses
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _MARGIN_M = 0.3
+_MOST_CELLS = 2000  # along an edge of a merged map: more than a page has pixels
 _NAMED = 12  # of many runs only the first are in the legend
 _ARROWS = 6  # along a path
 _SWEPT_PX = 4  # pixels per cell
@@ -120,7 +121,7 @@ def _draw_doubtful(axes: "Axes", poses: UncertainPoses) -> None:
 
 
 def _draw_direction(axes: "Axes", positions: Array) -> None:
-    """Draw arrows that tell which way a path goes, evenly spread along it."""
+    """Draw arrows in the direction of a path, evenly spread along it."""
     reached_m = distances_along(positions[:, :2])
     style = {
         "arrowstyle": "-|>",
@@ -223,7 +224,7 @@ def write_merged(
         title: Headline.
         lines: Figures worth knowing, shown below the headline.
     """
-    paths = list(paths_world.values())
+    grid, paths = shrunk(grid, _MOST_CELLS), list(paths_world.values())
     low, high = _extent(grid, paths)
     with _grid_page(path, grid, paths, title, lines) as axes:
         for draw, (start, end) in zip((axes.axvline, axes.axhline), zip(low, high, strict=True), strict=True):
@@ -251,7 +252,7 @@ def write_layers(
         title: Headline.
         lines: Figures worth knowing, shown below the headline.
     """
-    paths_world = [centres for centres, _ in layers.values()]
+    grid, paths_world = shrunk(grid, _MOST_CELLS), [centres for centres, _ in layers.values()]
     with _grid_page(path, grid, paths_world, title, lines) as axes:
         for name, (centres, color) in layers.items():
             cells = np.unique(np.floor(centres[:, :2] / grid.resolution_m).astype(np.int64), axis=0)

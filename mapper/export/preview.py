@@ -125,7 +125,7 @@ class Preview:
             with atomic_file(self._path) as part:
                 cv2.imwrite(str(part), picture)
         except WriteError:
-            self._is_off = True  # what the build itself writes will tell
+            self._is_off = True  # the build itself reports a full disk
             return
         if not self._has_picture:
             self._has_picture = True

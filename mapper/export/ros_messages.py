@@ -51,7 +51,7 @@ def encode_uncertain_pose(
 
     Args:
         T_frame_body: (4, 4) pose of the body.
-        covariance: (6, 6) in the body's tangent (rotation, translation); ROS wants (translation, rotation)
+        covariance: (6, 6) in the body's tangent (rotation, translation); ROS has (translation, rotation)
             along the frame's axes.
         stamp_ns: The message's time.
         frame_id: The frame.

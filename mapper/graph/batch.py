@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mapper.core.errors import GraphError
+from mapper.graph.terms import solver_errors
 from mapper.runtime.progress import Report
 
 if TYPE_CHECKING:
@@ -83,7 +84,7 @@ def solve(
 
     problem = problem_of(chain(terms, more_terms))
     where = f"the graph of {start.size()} nodes from node {min(start.keys())}"
-    try:
+    with solver_errors(f"{where} cannot be solved"):
         quick = _quick_descent(problem, start, effort)
         if not quick.rose:
             return quick.values, quick.iterations
@@ -91,9 +92,6 @@ def solve(
         # A step that would raise the error by less than this share ends GTSAM's search for a damping.
         parameters.setRelativeErrorTol(min(effort.relative_error, parameters.getRelativeErrorTol()))
         damped = _descend(gtsam.LevenbergMarquardtOptimizer(problem, quick.values, parameters), effort)
-    except RuntimeError as error:  # how GTSAM's C++ exceptions arrive, several lines long
-        reason = " ".join(str(error).split())
-        raise GraphError(f"{where} cannot be solved: {reason}") from None
     if damped.rose:
         raise GraphError(f"{where} cannot be solved: its error is not finite; look for absurd information")
     return damped.values, quick.iterations + damped.iterations

@@ -10,7 +10,7 @@ from mapper.core.errors import GraphError
 from mapper.core.geometry import Array, nearest_rotation
 from mapper.graph.batch import Part, problem_of
 from mapper.graph.config import GraphConfig
-from mapper.graph.terms import between
+from mapper.graph.terms import between, solver_errors
 
 if TYPE_CHECKING:
     import gtsam
@@ -68,14 +68,12 @@ def chordal_start(part: Part) -> gtsam.Values:
     one, zero = np.eye(3), np.zeros(3)
     for factor in factors:
         turns.add(factor.i, -factor.T_i_j[:3, :3].T, factor.j, one, zero)
-    try:
+    with solver_errors(f"no chordal start from node {part.fixed}"):
         rows = [_solved(turns, nodes, part.fixed, row) for row in kept.rotation().matrix()]
         R_world_node = nearest_rotation(np.stack(rows, axis=1))
         for factor in factors:
             steps.add(factor.i, -one, factor.j, one, R_world_node[place[factor.i]] @ factor.T_i_j[:3, 3])
         positions = _solved(steps, nodes, part.fixed, kept.translation())
-    except RuntimeError as error:  # how GTSAM's C++ exceptions arrive, several lines long
-        raise GraphError(f"no chordal start from node {part.fixed}: {' '.join(str(error).split())}") from None
     values = gtsam.Values()
     for node, R, position in zip(nodes, R_world_node, positions, strict=True):
         values.insert(node, gtsam.Pose3(gtsam.Rot3(R), position))

@@ -29,6 +29,16 @@ def component_numbers(graph: PoseGraph) -> dict[int, int]:
     return {node: number for number, nodes in enumerate(components(graph)) for node in nodes}
 
 
+def components_with_factors(graph: PoseGraph) -> list[tuple[list[int], list[int]]]:
+    """Return (nodes, indices of their factors) of every component that has any factor."""
+    parts = components(graph)
+    component_of = {node: part for part, nodes in enumerate(parts) for node in nodes}
+    factors: list[list[int]] = [[] for _ in parts]
+    for k, factor in enumerate(graph.factors):
+        factors[component_of[factor.i]].append(k)
+    return [(nodes, indices) for nodes, indices in zip(parts, factors, strict=True) if indices]
+
+
 def align_components(graph: PoseGraph) -> PoseGraph:
     """Return the graph with every component of the odometry moved to where its first factor puts it.
 

@@ -20,7 +20,7 @@ _NEIGHBOURS = 5
 _RECENT = 3
 _MIN_NODES = 10
 _MAX_CONTRADICTING = 0.05
-"""Share of the pairs of keyframes that may see different planes, by what the odometry says."""
+"""Share of the pairs of keyframes that may see different planes by odometry."""
 _ROBUST_CHI2 = 6.0
 _PLANE_ITERATIONS = 8
 
@@ -28,8 +28,8 @@ _PLANE_ITERATIONS = 8
 def on_one_floor(graph: PoseGraph, T_node_floor: Mapping[int, Transform]) -> list[int]:
     """Return the nodes that see one floor; none if the odometry contradicts that there is only one.
 
-    A node belongs to it if most of the nodes before it that do see the same plane, as far as the odometry
-    tells. Then pairs of nodes are compared at distances of one node, two, four and so on: stairs and ramps
+    A node belongs to it if by odometry it sees the same plane as most of the nodes of that floor before it.
+    Then pairs of nodes are compared at distances of one node, two, four and so on: stairs and ramps
     show between neighbours or, where these look over their edge, between nodes farther apart.
 
     Args:
@@ -96,8 +96,8 @@ def with_height_and_tilt(
 
     The first node stays where it was.
 
-    The odometry errs in height and tilt together with place and heading where it knows little. What the floor
-    shows is sure; what follows from that for the place is not: on simulated logs it was as often worse.
+    Where odometry is uncertain, its errors of height and tilt are correlated with those of place and heading.
+    The floor measures the former; the corrections of the latter made simulated logs worse as often as better.
 
     Args:
         before: T_world_node without the floor.

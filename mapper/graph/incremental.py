@@ -20,9 +20,9 @@ _LARGEST_RATIO = 1e16
 class IncrementalSolver:
     """Current poses of a growing graph. Loops are under Huber's kernel, which never ignores one altogether.
 
-    Nodes and factors wait until ``update``, and a node without factors waits on; a waiting node is where
-    it was put. Every connected component keeps its first node where that was put. When a loop joins two
-    components, the younger is moved to the older; if both are solved, they are solved afresh.
+    Nodes and factors are pending until ``update``, nodes without factors also after it; a pending node has
+    its first estimate. Every connected component keeps its first node at its first estimate. When a loop
+    joins two components, the later is moved to the earlier; if both are solved, they are solved again.
     """
 
     def __init__(self) -> None:
@@ -34,7 +34,7 @@ class IncrementalSolver:
         self._restart()
 
     def _restart(self) -> None:
-        """Drop the solution: everything waits."""
+        """Drop the solution: everything is pending."""
         import gtsam
 
         parameters = gtsam.ISAM2Params()
@@ -68,19 +68,19 @@ class IncrementalSolver:
             self._factors.append(factor)
 
     def update(self) -> None:
-        """Solve with all that waits.
+        """Solve with all that is pending.
 
         Raises:
             GraphError: The factors do not determine the poses; look for absurd information.
         """
         import gtsam
 
-        waiting = self._factors[self._used :]
-        if not waiting:
+        pending = self._factors[self._used :]
+        if not pending:
             return
         terms = gtsam.NonlinearFactorGraph()
         connected: dict[int, None] = {}
-        for factor in waiting:
+        for factor in pending:
             terms.add(between(factor, kernel=_HUBER if factor.origin == "loop" else None))
             connected |= dict.fromkeys((factor.i, factor.j))
         for first in dict.fromkeys(self._component[node] for node in connected):
@@ -90,7 +90,7 @@ class IncrementalSolver:
         new = [node for node in connected if node not in self._solved]
         try:
             self._isam.update(terms, values_of(self._T_world_node, new))
-            if any(factor.origin == "loop" for factor in waiting):
+            if any(factor.origin == "loop" for factor in pending):
                 self._isam.update()  # a loop moves poses farther than one linearisation holds
         except RuntimeError as error:  # how GTSAM's C++ exceptions arrive, several lines long
             if self._factorization == "CHOLESKY" and _are_commensurable(self._factors):

@@ -9,12 +9,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.core.errors import GraphError
 from mapper.core.geometry import Array, adjoint, inverse
 from mapper.graph.batch import problem_of
-from mapper.graph.components import components
-from mapper.graph.model import BetweenFactor, PoseGraph, PoseSigmas
-from mapper.graph.terms import anchor, between, values_of
+from mapper.graph.components import components_with_factors
+from mapper.graph.model import PoseGraph, PoseSigmas
+from mapper.graph.terms import anchor, between, solver_errors, values_of
 
 if TYPE_CHECKING:
     import gtsam
@@ -52,22 +51,12 @@ def marginals_of(graph: PoseGraph) -> Marginals:
 
     covariances = {node: np.zeros((_DIMENSION, _DIMENSION)) for node in graph.T_world_node}
     relative: dict[tuple[int, int], Array] = {}
-    parts = components(graph)
-    part_of = {node: number for number, nodes in enumerate(parts) for node in nodes}
-    factors: list[list[BetweenFactor]] = [[] for _ in parts]
-    for factor in graph.factors:
-        factors[part_of[factor.i]].append(factor)
-    for nodes, known in zip(parts, factors, strict=True):
-        if not known:
-            continue
+    for nodes, indices in components_with_factors(graph):
+        known = [graph.factors[k] for k in indices]
         problem = problem_of([*map(between, known), anchor(nodes[0], graph.T_world_node[nodes[0]], _HELD)])
         linear = problem.linearize(values_of(graph.T_world_node, nodes))
-        try:
+        with solver_errors(f"covariances of {len(nodes)} nodes from node {nodes[0]}"):
             net = linear.eliminateSequential(gtsam.Ordering.ColamdGaussianFactorGraph(linear))
-        except RuntimeError as error:  # how GTSAM's C++ exceptions arrive, several lines long
-            raise GraphError(
-                f"covariances of {len(nodes)} nodes from node {nodes[0]}: {' '.join(str(error).split())}"
-            ) from None
         pairs = list(dict.fromkeys((factor.i, factor.j) for factor in known))
         blocks = _recover(_supernodes([net.at(k) for k in range(net.size())]), pairs)
         covariances |= {node: blocks[node, node] for node in nodes[1:]}

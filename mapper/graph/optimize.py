@@ -7,16 +7,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mapper.core.errors import GraphError
-from mapper.core.geometry import is_rigid
+from mapper.core.geometry import Array, is_rigid
 from mapper.graph.batch import Part
 from mapper.graph.chordal_initialization import start_of
-from mapper.graph.components import components
+from mapper.graph.components import components_with_factors
 from mapper.graph.config import GraphConfig
 from mapper.graph.model import PoseGraph, Solution
 from mapper.graph.proportional_correction import distribute
 from mapper.graph.robust import solve_part
 from mapper.graph.terms import anchor, between, poses_of, values_of
-from mapper.runtime.progress import SILENT, Progress, Report
+from mapper.runtime.progress import SILENT, Progress
 
 if TYPE_CHECKING:
     import gtsam
@@ -48,8 +48,7 @@ def optimize(graph: PoseGraph, config: GraphConfig, *, progress: Progress = SILE
     terms = [between(factor) for factor in graph.factors]
     given = values_of(graph.T_world_node, graph.T_world_node)
     before = _errors(terms, given)
-    weights = [1.0] * len(terms)
-    iterations = 0
+    weights, iterations = [1.0] * len(terms), 0
     match config.solve:
         case "none":
             T_world_node = dict(graph.T_world_node)
@@ -57,10 +56,10 @@ def optimize(graph: PoseGraph, config: GraphConfig, *, progress: Progress = SILE
             T_world_node = distribute(graph)
         case "batch":
             T_world_node = dict(graph.T_world_node)
-            for nodes, factors in _connected_components(graph):
+            for nodes, factors in components_with_factors(graph):
+                fixed = _fixed_node(graph, nodes, progress)
                 loops = [k for k in factors if graph.factors[k].origin == "loop"]
                 known = [k for k in factors if graph.factors[k].origin != "loop"]
-                fixed = _fixed_node(graph, nodes, progress)
                 part = Part(
                     known=[graph.factors[k] for k in known],
                     loops=[graph.factors[k] for k in loops],
@@ -68,15 +67,7 @@ def optimize(graph: PoseGraph, config: GraphConfig, *, progress: Progress = SILE
                     start=given if len(nodes) == given.size() else values_of(graph.T_world_node, nodes),
                     fixed=fixed,
                 )
-                part = replace(part, start=start_of(part, config))
-                with progress.stage("solve") as report:
-                    watched = _Watched(report)
-                    solved, loop_weights, more = solve_part(part, config, report=watched)
-                if watched.done >= config.max_iterations:
-                    progress.note(
-                        f"the solve of {len(nodes)} nodes was ended by max_iterations="
-                        f"{config.max_iterations}, not by convergence; raise it"
-                    )
+                solved, loop_weights, more = _solve_component(part, config, progress)
                 T_world_node |= poses_of(solved)
                 iterations += more
                 for k, weight in zip(loops, loop_weights, strict=True):
@@ -85,30 +76,29 @@ def optimize(graph: PoseGraph, config: GraphConfig, *, progress: Progress = SILE
     return Solution(T_world_node, iterations, before, after, tuple(weights))
 
 
-class _Watched:
-    """Receiver of the iterations, which remembers how many there were."""
+def _solve_component(
+    part: Part, config: GraphConfig, progress: Progress
+) -> tuple["gtsam.Values", Array, int]:
+    """Return what ``solve_part`` does from the configured start, with a note if it did not converge."""
+    part, last = replace(part, start=start_of(part, config)), 0
+    with progress.stage("solve") as report:
 
-    def __init__(self, report: Report) -> None:
-        self._report = report
-        self.done = 0
+        def watched(done: int, total: int) -> None:
+            nonlocal last
+            last = done
+            report(done, total)
 
-    def __call__(self, done: int, total: int) -> None:
-        self.done = done
-        self._report(done, total)
+        solution = solve_part(part, config, report=watched)
+    if last >= config.max_iterations:
+        progress.note(
+            f"the solve of {part.start.size()} nodes was ended by max_iterations={config.max_iterations}, "
+            "not by convergence; raise it"
+        )
+    return solution
 
 
 def _errors(terms: Sequence["gtsam.NonlinearFactor"], values: "gtsam.Values") -> tuple[float, ...]:
     return tuple(term.error(values) for term in terms)
-
-
-def _connected_components(graph: PoseGraph) -> list[tuple[list[int], list[int]]]:
-    """Return (nodes, indices of their factors) of every component that has any factor."""
-    parts = components(graph)
-    component_of = {node: part for part, nodes in enumerate(parts) for node in nodes}
-    factors: list[list[int]] = [[] for _ in parts]
-    for k, factor in enumerate(graph.factors):
-        factors[component_of[factor.i]].append(k)
-    return [(nodes, indices) for nodes, indices in zip(parts, factors, strict=True) if indices]
 
 
 def _fixed_node(graph: PoseGraph, nodes: Sequence[int], progress: Progress) -> int:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mapper.core.errors import GraphError
 from mapper.core.geometry import Array, Transform
 from mapper.graph.config import KernelKind
 
@@ -100,3 +102,16 @@ def _pose3(T_a_b: Transform) -> gtsam.Pose3:
     import gtsam
 
     return gtsam.Pose3(gtsam.Rot3.ClosestTo(T_a_b[:3, :3]), T_a_b[:3, 3])
+
+
+@contextmanager
+def solver_errors(what: str) -> Iterator[None]:
+    """Raise GTSAM's C++ exceptions, RuntimeErrors of several lines, as GraphErrors of one line.
+
+    Args:
+        what: What has failed, the beginning of the message.
+    """
+    try:
+        yield
+    except RuntimeError as error:
+        raise GraphError(f"{what}: {' '.join(str(error).split())}") from None

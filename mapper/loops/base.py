@@ -81,7 +81,7 @@ class Verification:
 
 
 class Verifier(Protocol[Place]):
-    """Verifier of loops: decides whether two places are one, and measures the motion between them."""
+    """Verifier of loops: tests whether two places are one, and measures the motion between them."""
 
     def describe(self, seen: FrameView, /) -> Place:
         """Return the description of a keyframe that is kept.

@@ -1,4 +1,4 @@
-"""Loop detectors: they search loops while a log is tracked, and decide on every candidate."""
+"""Loop detectors: they search loops while a log is tracked, and accept or reject every candidate."""
 
 from bisect import bisect_right
 from collections.abc import Callable, Mapping, Sequence, Set
@@ -27,8 +27,8 @@ from mapper.runtime.archived import Archived, ArchivedMapping, archived
 
 ViewOf = Callable[[], FrameView]
 
-ALONE = "alone: no loop found from nearby tells the same"
-"""Reason of a measured loop that waits for another to confirm it."""
+ALONE = "alone: no loop from a keyframe nearby agrees"
+"""Reason of a measured loop that no other has confirmed yet."""
 
 
 class LoopDetector(Protocol):

@@ -87,7 +87,7 @@ class OdometryChain:
             self._connect(factor.i, factor.j)
 
     def _connect(self, i: int, j: int) -> None:
-        """Make the components of two nodes one: the smaller takes on the larger one's number."""
+        """Join the components of two nodes under the larger one's number."""
         self._make_room(max(i, j))
         a, b = int(self._component[i]), int(self._component[j])
         if a == b:
@@ -100,7 +100,7 @@ class OdometryChain:
         self._members[a] = members_a
 
     def _make_room(self, node: int) -> None:
-        """Let every node up to this one have a component, its own to begin with."""
+        """Add the nodes up to this one, each as a component of its own."""
         while (size := len(self._component)) <= node:
             self._component = np.concatenate([self._component, np.arange(size, 2 * size)])
 

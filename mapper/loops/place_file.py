@@ -29,7 +29,7 @@ def write_places(path: Path, places: Mapping[int, AnyPlace], nodes: Iterable[int
     """Write places by node, of one sensor; single precision, but for poses. Atomic.
 
     Pixels keep 1e-4 px and depths 1e-6 of themselves; the points of features follow from them. Each place is
-    asked for once, and none is kept: there may be more than fit into memory.
+    read once, and none is kept: there may be more than fit into memory.
 
     Args:
         path: The file.

@@ -169,7 +169,7 @@ def _verify_all(
 
 
 class _Candidate(NamedTuple):
-    """A pair of places to be compared: the less, the sooner.
+    """A pair of places to be compared, the smallest first.
 
     Attributes:
         rank: Number of more similar places that the earlier run has for the keyframe. Each keyframe is

@@ -1,4 +1,4 @@
-"""Searches of a loop detector, kept so that its state can be found again without their cost."""
+"""Record of a loop detector's searches, from which its state is restored without repeating them."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -24,7 +24,7 @@ class LoopSearch:
 
 
 class VerificationLog:
-    """Verifier that keeps what another one finds, and gives it back when a search is repeated.
+    """Verifier that records the results of another one, and returns them when a search is repeated.
 
     All else in a loop detector follows from the nodes and from this, and is cheap: given the same nodes and
     the same searches, a new detector comes to the same state, to the bit.
@@ -61,7 +61,7 @@ class VerificationLog:
         return LoopSearch(new.place, new.found)
 
     def repeat(self, search: LoopSearch | None) -> None:
-        """Give a search's results from now on; None goes on with new ones."""
+        """Return a search's results from now on; None returns to verifying."""
         self._repeated = search
         self._new = _Search()
 
@@ -69,7 +69,7 @@ class VerificationLog:
         """Return what stands for the view of the node whose search is repeated.
 
         Raises:
-            FrameError: It could not be read then, or was not asked for.
+            FrameError: It could not be read then, or was not requested.
         """
         if self._repeated is None or self._repeated.place is None:
             raise FrameError("a frame from which no loop was searched")

@@ -45,15 +45,13 @@ def fuse_clouds(
 ) -> tuple[tuple[Points32, Colors], tuple[Points32, Colors]]:
     """Return the points and colours of what stands still and of what moved.
 
-    Every ``cloud.frame_stride``-th frame adds its points.
-
-    Frames that cannot be read are left out.
+    Every ``cloud.frame_stride``-th frame adds its points; frames that cannot be read are left out.
 
     Args:
         source: The log that was tracked.
         trajectory: Final body poses in the levelled world.
         config: Settings of the maps.
-        objects: What moved; None if that is not asked.
+        objects: What moved; None if it is not separated.
         progress: Receives progress.
     """
     still, moving = CloudBuilder(config.cloud.voxel_m), CloudBuilder(config.cloud.voxel_m)

@@ -71,9 +71,9 @@ class Region(Config):
         if not self.model_fields_set:
             raise ValueError(f"no condition; want one or more of {', '.join(Region.model_fields)}")
         if self.box_m is not None and not all(low < high for low, high in zip(*self.box_m, strict=True)):
-            raise ValueError(f"box_m = {_text(self.box_m)}: want the lowest corner, then the highest")
+            raise ValueError(f"box_m = {json.dumps(self.box_m)}: want the lowest corner, then the highest")
         if self.height_m is not None and not self.height_m[0] < self.height_m[1]:
-            raise ValueError(f"height_m = {_text(self.height_m)}: want the lowest z, then the highest")
+            raise ValueError(f"height_m = {json.dumps(self.height_m)}: want the lowest z, then the highest")
         low_m, high_m = self.z_range_m
         if not low_m < high_m:
             raise ValueError("box_m and height_m have no height in common")
@@ -92,28 +92,24 @@ class Region(Config):
     @property
     def lines(self) -> list[str]:
         """The conditions as lines of TOML."""
-        return [f"{name} = {_text(value)}" for name, value in self if value is not None]
-
-
-def _text(value: object) -> str:
-    return json.dumps(value)
+        return [f"{name} = {json.dumps(value)}" for name, value in self if value is not None]
 
 
 def _refuse_crossed(corners: tuple[_Point2, ...]) -> None:
     """Refuse a polygon without an area, or with two sides that cross: its corners are in another order."""
     if len(set(corners)) < len(corners) or len(corners) < 3:
-        raise ValueError(f"polygon_m has corners {_text(corners)}: want 3 or more, each once")
+        raise ValueError(f"polygon_m has corners {json.dumps(corners)}: want 3 or more, each once")
     sides = list(zip(corners, corners[1:] + corners[:1], strict=True))
     for number, (a, b) in enumerate(sides):
         for c, d in sides[:number]:
             apart = _cross(a, b, c) * _cross(a, b, d), _cross(c, d, a) * _cross(c, d, b)
             if max(apart) < 0.0:
                 raise ValueError(
-                    f"polygon_m: its sides {_text([c, d])} and {_text([a, b])} cross; "
+                    f"polygon_m: its sides {json.dumps([c, d])} and {json.dumps([a, b])} cross; "
                     "want the corners in order around it"
                 )
     if math.isclose(sum(_cross((0.0, 0.0), *side) for side in sides), 0.0, abs_tol=1e-9):
-        raise ValueError(f"polygon_m has corners {_text(corners)}, without an area between them")
+        raise ValueError(f"polygon_m has corners {json.dumps(corners)}, without an area between them")
 
 
 def _cross(a: _Point2, b: _Point2, c: _Point2) -> float:

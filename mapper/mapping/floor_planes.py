@@ -7,7 +7,7 @@ from mapper.core.geometry import Array, Transform, transform
 from mapper.mapping.planes import flat_cells, levels_of
 
 _REACH_M = 5.0
-"""Farther away a depth camera's floor is bent by more than its tilt can be told."""
+"""Farther away depth errors bend the floor by more than its tilt."""
 _POINTS = 8000
 _LEVEL_COSINE = np.cos(np.radians(15.0))
 """A pose and a vertical that have drifted are off by a few degrees."""

@@ -3,7 +3,6 @@
 import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 
@@ -273,11 +272,9 @@ def _fuse_scans(
     if config.octree.moving != "removed":
         return octree, None
     with after.reopened() as updates:
-        return octree, remove_moving_objects(octree, partial(_updates, updates, config.workers))
-
-
-def _updates(written: ScanUpdateFile, workers: int) -> Iterator[ScanUpdate]:
-    return ordered_map(CachedUpdate.update, written.entries(), workers=workers)
+        return octree, remove_moving_objects(
+            octree, lambda: ordered_map(CachedUpdate.update, updates.entries(), workers=config.workers)
+        )
 
 
 class _Casters(threading.local):
@@ -333,7 +330,7 @@ def _prepared(job: _Job, config: FuseSettings, caster: Caster) -> _Fused:
     unreached = 0
     try:
         update = pack(caster.cast(scan, frame.T_world_body))
-    except DataError:  # not asked before: looking at every point of every scan would cost more
+    except DataError:  # not checked before casting: that would read every point of every scan once more
         scan, unreached = within_reach(scan, frame.T_world_body, config.octree)
         update = pack(caster.cast(scan, frame.T_world_body))
     cached = cache_update(frame.entry.stamp_ns, frame.T_world_body, update)

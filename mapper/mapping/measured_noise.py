@@ -54,12 +54,11 @@ def measure_noise(source: Log, *, given: DepthNoiseConfig | None = None, workers
     distance, in steps of 10 %; the noise at a distance is the lower quartile of the standard deviations
     from the planes. It is taken to be σ_z = c·z² (Khoshelham & Elberink 2012, eq. 10), with the median of
     σ_z / z² over the farther half of the distances: a curve with more terms fits better where planes are
-    seen, but is worth nothing beyond, and sensors whose noise grows more slowly are trusted less than they
-    might be, not more.
+    seen, but does not extrapolate, and for sensors whose noise grows more slowly this errs on the safe side.
 
     Args:
         source: RGB-D log.
-        given: The noise, where the user knows it; then only depths are collected.
+        given: The noise, where the user has set it; then only depths are collected.
         workers: Threads that decode frames.
     """
     entries = source.spread_entries(_FRAMES)

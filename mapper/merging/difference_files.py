@@ -10,7 +10,6 @@ from mapper.export.palette import APPEARED, NOT_SEEN_AGAIN, VANISHED, Rgb
 from mapper.export.picture import write_layers
 from mapper.export.ply import write_ply
 from mapper.merging.differences import Cluster, Differences
-from mapper.octree.grid import shrunk
 from mapper.run.folder import Run
 from mapper.runtime.atomic import MANIFEST_NAME, FolderKind, atomic_folder, write_json
 
@@ -20,7 +19,6 @@ _FOLDER = FolderKind(
     manifest_keys=frozenset({"before", "after", "T_before_after"}),
     files=frozenset({_PICTURE, "*.ply"}),
 )
-_MOST_CELLS = 2000  # more than a page has pixels
 
 
 def write_differences(
@@ -51,7 +49,7 @@ def write_differences(
             write_ply(folder / f"{name.replace(' ', '_')}.ply", centres.astype(np.float32), colors)
         write_layers(
             folder / _PICTURE,
-            grid=shrunk(before.slice, _MOST_CELLS),
+            grid=before.slice,
             layers=layers,
             title=f"{before.path.resolve().name} → {after.path.resolve().name}",
             lines=[summary(found), placed],

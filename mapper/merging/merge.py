@@ -114,18 +114,7 @@ def merge(
     placed = placing.placed
     tiling = tiling_for(config.resolution_m, tile_m)
     bent, rigid = runs_to_fuse(placed, within_m=stays_within_m(config))
-    manifest = MapManifest(
-        status="merging",
-        octree=config,
-        slice=placed[0].run.config.slice,
-        traversable=placed[0].run.config.traversable,
-        costmap=placed[0].run.config.costmap,
-        tile_m=tiling.edge_m,
-        floor_z_m=_floor_z_m(placed[0]),
-        runs=described_runs(placing, fused_again=bent),
-        ties=() if placing.joint is None else placing.joint.ties,
-        left_out=dict(placing.left_out),
-    )
+    manifest = _first_manifest(placing, config, tile_m=tiling.edge_m, fused_again=bent)
     with (
         make_executor(workers) as executor,
         atomic_folder(
@@ -142,9 +131,11 @@ def merge(
         octrees = fuse_runs(workspace, stages, placed, manifest)
         tiles = None if known is None else known_tiles(known, placed, manifest, tiling)
         split, untouched = _split(workspace, stages, placed, octrees, tiles)
-        follows_ground = manifest.slice.above == "ground"
-        joined = _join(workspace, stages, split, untouched, follows_ground=follows_ground)
         has_colors = any(part.has_colors for part in split)
+        follows_ground = manifest.slice.above == "ground"
+        joined = _join(
+            workspace, stages, split, untouched, has_colors=has_colors, follows_ground=follows_ground
+        )
         write_whole_ot(folder / files.OCTREE_OT, workspace, joined, has_colors=has_colors)
         write_whole_bt(folder / files.OCTREE_BT, workspace, joined)
         sliced = slice_map(workspace, stages, joined, manifest, placed)
@@ -184,6 +175,25 @@ def _common_config(placed: Sequence[Placed]) -> OctreeConfig:
                 )
     attributes = all(item.run.config.octree.attributes for item in placed)
     return first.config.octree.model_copy(update={"attributes": attributes})
+
+
+def _first_manifest(
+    placing: Placing, config: OctreeConfig, *, tile_m: float, fused_again: set[int]
+) -> MapManifest:
+    """Return the manifest of a map that is being merged; the first run's settings apply to all of it."""
+    first = placing.placed[0]
+    return MapManifest(
+        status="merging",
+        octree=config,
+        slice=first.run.config.slice,
+        traversable=first.run.config.traversable,
+        costmap=first.run.config.costmap,
+        tile_m=tile_m,
+        floor_z_m=_floor_z_m(first),
+        runs=described_runs(placing, fused_again=fused_again),
+        ties=() if placing.joint is None else placing.joint.ties,
+        left_out=dict(placing.left_out),
+    )
 
 
 def _floor_z_m(first: Placed) -> float:
@@ -269,13 +279,13 @@ def _join(
     split: Sequence[SplitRun],
     untouched: Mapping[int, KnownTile],
     *,
+    has_colors: bool,
     follows_ground: bool,
 ) -> dict[int, JoinedTile]:
     """Return the result of every tile, in Morton order."""
     tiles = sorted({tile for part in split for tile in part.part_bytes})
     if not tiles:
         raise RunError("nothing is known in any of the runs' maps; there is nothing to merge")
-    has_colors = any(part.has_colors for part in split)
     jobs: dict[str, Callable[[], JoinedTile]] = {}
     for tile in tiles:
         if tile in untouched:

@@ -31,7 +31,7 @@ from mapper.merging.placing import Placed
 from mapper.merging.stages import Stages
 from mapper.navigation.floor import Floor, driven_ground
 from mapper.navigation.traversable import Storey, traversable
-from mapper.octree.grid import OccupancyGrid, shrunk, with_obstacles
+from mapper.octree.grid import OccupancyGrid, with_obstacles
 from mapper.octree.ground_height import (
     NOTHING,
     DrivenGround,
@@ -42,7 +42,6 @@ from mapper.octree.ground_height import (
 )
 from mapper.octree.slice import floor_below, free_path, grid_of
 
-_MOST_CELLS = 2000  # more than a page has pixels
 _MAX_TILT_RAD = np.deg2rad(5.0)
 
 
@@ -264,7 +263,7 @@ def _save_ground(
 
 @dataclass(frozen=True, slots=True)
 class _Lowest:
-    """Tops of the lowest occupied voxels in all columns of the map, read when they are asked for.
+    """Tops of the lowest occupied voxels in all columns of the map, read on access.
 
     Attributes:
         raster: Raster of the map.
@@ -293,7 +292,7 @@ def draw(path: Path, grid: OccupancyGrid, placed: Sequence[Placed], manifest: Ma
     """Draw the runs' paths over the slice."""
     write_merged(
         path,
-        grid=shrunk(grid, _MOST_CELLS),
+        grid=grid,
         paths_world={item.run.path.name: item.trajectory_map.positions_world for item in placed},
         tile_m=manifest.tile_m,
         title=f"{len(placed)} runs merged",

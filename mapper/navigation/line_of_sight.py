@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from mapper.core.geometry import Array
+from mapper.core.geometry import Array, path_length
 from mapper.navigation.distance import DistanceField, Distances, interpolated
 
 _GAIN = 1e-4  # of the length: a round that shortens by less is the last
@@ -39,11 +39,6 @@ def shortened(field: DistanceField, path: Array, *, radius_m: float) -> Array:
         if path_length(best) > (1.0 - _GAIN) * length:
             break
     return best
-
-
-def path_length(path: Array) -> float:
-    """Return the length of a polyline, in its own unit."""
-    return float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
 
 
 def in_sight(field: DistanceField, begin: Array, end: Array, *, radius_m: float) -> bool:

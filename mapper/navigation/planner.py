@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.errors import PlanError
-from mapper.core.geometry import Array, Points
+from mapper.core.geometry import Array, Points, path_length
 from mapper.navigation.config import PlanConfig
 from mapper.navigation.distance import DistanceField, distance_field
-from mapper.navigation.line_of_sight import in_sight, path_length, shortened
+from mapper.navigation.line_of_sight import in_sight, shortened
 from mapper.navigation.search import Cell, shortest_path
 from mapper.navigation.voxels import VoxelGrid, cut_box, known_box, layer
 from mapper.octree.grid import OCCUPIED, UNKNOWN, OccupancyGrid

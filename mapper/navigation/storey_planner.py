@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.errors import PlanError
-from mapper.core.geometry import Array
+from mapper.core.geometry import Array, path_length
 from mapper.navigation.config import PlanConfig
 from mapper.navigation.line_of_sight import shortened
 from mapper.navigation.planner import Plan, Space, clearance_of, point_text, space_of
@@ -64,24 +64,17 @@ def plan_storeys(
             f"{len(chain) - sum(is_link[number] for number in chain)} storeys "
             f"for a radius of {config.radius_m:g} m; plan with a smaller radius"
         )
-    waypoints, clearance_m = [], np.inf
-    for place, number in enumerate(chain):
-        space = spaces[number]
-        cells = found.cells[found.cells[:, 0] == 2 * place] + 0.5
-        cells[:, 0] = 0.5
-        if place == 0:
-            cells = np.vstack([space.in_cells(ends[0]), cells])
-        if place == len(chain) - 1:
-            cells = np.vstack([cells, space.in_cells(ends[1])])
-        part_world = space.world(shortened(space.field, cells, radius_m=space.least_m))
-        clearance_m = min(clearance_m, clearance_of(space.field, part_world))
-        at = np.floor(np.array([space.in_cells(point) for point in part_world])[:, 1:]).astype(np.int64)
-        tops, _ = nearest_heights(heights[number])  # closed gaps have the height of the floor around them
-        part_world[:, 2] = tops[at[:, 0], at[:, 1]] * storeys[0].grid.resolution_m
-        waypoints.append(part_world)
-    waypoints_world = np.concatenate(waypoints)
-    length_m = float(np.linalg.norm(np.diff(waypoints_world, axis=0), axis=1).sum())
+    cells = found.cells.astype(np.float64) + 0.5
+    parts: list[Array] = [cells[found.cells[:, 0] == 2 * place, 1:] for place in range(len(chain))]
+    parts[0] = np.vstack([first.in_cells(ends[0])[1:], parts[0]])
+    parts[-1] = np.vstack([parts[-1], last.in_cells(ends[1])[1:]])
+    on_floors = [
+        _on_floor(spaces[number], heights[number], cells) for number, cells in zip(chain, parts, strict=True)
+    ]
+    waypoints_world = np.concatenate([part_world for part_world, _ in on_floors])
+    clearance_m = min(clearance_m for _, clearance_m in on_floors)
     visited = dict.fromkeys((numbers[0], *(number for number in chain if not is_link[number]), numbers[1]))
+    length_m = path_length(waypoints_world)
     return Plan(waypoints_world, length_m, clearance_m, config, storeys=tuple(visited))
 
 
@@ -102,6 +95,17 @@ def _aligned(storeys: tuple[Storey, ...]) -> tuple[list[OccupancyGrid], list[NDA
         grids.append(OccupancyGrid(cells, low * cell_m, cell_m))
         heights.append(tops)
     return grids, heights
+
+
+def _on_floor(space: Space, heights: NDArray[np.int32], cells: Array) -> tuple[Array, float]:
+    """Return waypoints on a storey's floor through (N, 2) rows and columns, and their clearance."""
+    cells = np.column_stack([np.full(len(cells), 0.5), cells])
+    part_world = space.world(shortened(space.field, cells, radius_m=space.least_m))
+    clearance_m = clearance_of(space.field, part_world)
+    at = np.floor(np.array([space.in_cells(point) for point in part_world])[:, 1:]).astype(np.int64)
+    tops, _ = nearest_heights(heights)  # closed gaps have the height of the floor around them
+    part_world[:, 2] = tops[at[:, 0], at[:, 1]] * space.field.resolution_m
+    return part_world, clearance_m
 
 
 def _storey_at(storeys: tuple[Storey, ...], point_world: Array) -> int:

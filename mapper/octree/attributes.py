@@ -175,7 +175,7 @@ class AttributeLayer:
         _add_rows(self.claim(own[held]), self._arrays, rows[slots[held]], other.arrays)
 
     def clear_unknown(self) -> None:
-        """Remove the attributes of voxels that the map does not know any more."""
+        """Remove the attributes of voxels that have become unknown."""
         slots = self.slots
         which, voxels = np.nonzero(np.isnan(self._blocks.table.values[slots]))
         index = self._arrays.rows[slots][which], voxels

@@ -83,7 +83,7 @@ def _read_pgm(path: Path) -> NDArray[np.uint8]:
         data = path.read_bytes()
     except OSError as error:
         raise MapFileError(f"{path}: cannot be read: {error.strerror}") from None
-    # OpenCV reads every PGM flavour; it answers None to what is none.
+    # OpenCV reads every variant of PGM, and returns None for other data.
     pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
     if pixels is None or pixels.ndim != 2 or pixels.dtype != np.uint8:
         raise MapFileError(f"{path}: not a grey 8-bit image")

@@ -243,7 +243,7 @@ def _aim(axis, vectors, lengths, borders, first, bits, resolution_m, times, plac
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _step(times, places, path, first, x_bits, y_bits, z_bits):
-    """Take some steps along every ray, and return how many rays go on after them.
+    """Take some steps along every ray, and return how many rays have not ended then.
 
     The inner loop vectorises: all its rows are at constant distances in two arrays, and it has no branch.
 

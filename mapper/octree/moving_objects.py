@@ -1,6 +1,6 @@
 """Removal of what moved: voxels that held something in some scans and were seen empty in others.
 
-OctoMap lets the majority of scans decide, and every ray frees whatever voxels it crosses. So what stood
+In OctoMap the majority of scans counts, and every ray frees whatever voxels it crosses. So what stood
 for long stays, and ground that is seen at a slant is erased by the rays that pass low above it. Here
 the evidence of a ray is weighed by what the same scan saw around it:
 

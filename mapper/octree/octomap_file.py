@@ -194,7 +194,7 @@ def _parse_header(path: Path, data: bytes) -> tuple[_Header, int]:
 def _binary_leaves(
     path: Path, header: _Header, payload: memoryview, sensor: SensorModel
 ) -> tree_reader.TreeLeaves:
-    # A word describes at most eight nodes, which bounds the memory that a damaged count asks for.
+    # A word describes at most eight nodes, which bounds the memory that a damaged count can claim.
     if len(payload) % 2 or header.node_count > 1 + 4 * len(payload):
         raise MapFileError(
             f"{path}: {len(payload)} bytes cannot hold {header.node_count} nodes; it is truncated"

@@ -102,7 +102,7 @@ class WindowBuffer:
 def _sparse_zeros(size: int) -> NDArray[np.uint8]:
     """Return (size,) zeros that take memory only where they are written.
 
-    ``np.zeros`` asks for huge pages: a ray that enters one would pay for clearing and keeping 2 MiB.
+    ``np.zeros`` allocates huge pages: a ray that enters one would pay for clearing and keeping 2 MiB.
     """
     advice = getattr(mmap, "MADV_NOHUGEPAGE", None)
     if advice is None:  # no Linux

@@ -17,7 +17,7 @@ def write_octree(path: Path, octree: "OctreeMap") -> None:
     """Write a map to a file; atomic.
 
     Args:
-        path: ``.octree`` keeps all that the map knows, OctoMap's ``.ot`` log-odds and colours, and its
+        path: ``.octree`` keeps the whole map, OctoMap's ``.ot`` log-odds and colours, and its
             ``.bt`` whether voxels are free or occupied.
         octree: The map.
 

@@ -1,4 +1,4 @@
-"""Identity of a build: all that decides its result. An unfinished build is resumed only if it is the same."""
+"""Identity of a build: all that its result depends on. Only the same build is resumed."""
 
 import hashlib
 import json
@@ -20,11 +20,11 @@ from mapper.sources.base import Log
 IDENTITY = "identity.json"
 """File of a folder of checkpoints, written first."""
 _WITHOUT_EFFECT = {"octree": {"max_memory_mb"}}
-"""Settings that decide nothing: a build that ran out of memory may be resumed with another limit."""
+"""Settings without effect on the result: a build that ran out of memory is resumed with another limit."""
 
 
 def identity_of(source: Log, config: BuildConfig, poses: Trajectory | None) -> dict[str, Any]:
-    """Return all that decides the result of a build: log, settings and their files, poses, versions."""
+    """Return all that the result of a build depends on: log, settings and their files, poses, versions."""
     manifest = Manifest.model_fields
     return {
         "log": str(source.path.resolve()),
@@ -60,7 +60,7 @@ def _code_digest() -> str:
 
 
 def write_identity(path: Path, identity: Mapping[str, Any]) -> None:
-    """Write what decides the result of a build, with a digest of it; atomic."""
+    """Write what the result of a build depends on, with a digest of it; atomic."""
     write_json(path, {**identity, "digest": _digest_of(identity)}, indent=1)
 
 

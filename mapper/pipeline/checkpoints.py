@@ -84,7 +84,7 @@ class Checkpoints:
 
         Args:
             writer: Writer of the run.
-            identity: All that decides the result.
+            identity: All that the result depends on.
             progress: Receives notes.
             every_s: Seconds between two checkpoints, at least; 0 keeps one of every frame, and waits for it.
         """
@@ -100,7 +100,7 @@ class Checkpoints:
         self.journal = Journal(self.folder / _JOURNAL)
         self.archive = Archive(self.journal)
         self._try(partial(self._begin, identity))
-        with suppress(OSError, ValidationError):  # the history alone, which decides nothing
+        with suppress(OSError, ValidationError):  # the history alone, which changes no result
             known = Timing.model_validate_json((self.folder / _TIMES).read_bytes())
             writer.update(timing=writer.manifest.timing.model_copy(update={"resumed": known.resumed}))
 

@@ -1,4 +1,4 @@
-"""What a run tells about the distortion of its depth images."""
+"""Warnings about the distortion of a log's depth images."""
 
 from mapper.run.manifest import RunWarning
 from mapper.sources.base import Log

@@ -1,4 +1,4 @@
-"""Jumps that the odometry did not notice: the path is cut where constraints to a map say that it jumped."""
+"""Jumps that the odometry missed: the path is cut where constraints to a map show them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -31,6 +31,7 @@ from mapper.pipeline.track import Start, depth_cautions, track_log, wheel_measur
 from mapper.pipeline.tracking_result import TrackingResult, from_tracking
 from mapper.run import files
 from mapper.run.localised import LocalisedManifest, find_stretches
+from mapper.run.manifest import Solve
 from mapper.run.pose_covariances import uncertain_poses, write_poses
 from mapper.run.results import RunResults
 from mapper.run.stored_tracking import save_frames
@@ -84,23 +85,12 @@ def localise(
     manifest = LocalisedManifest(map=str(known.path.resolve()), **dict(start))
     with write_run(out, manifest, config, overwrite=overwrite, kind=files.LOCALISED_LOG) as writer:
         writer.warn(warnings)
-        map_node = known.places.map_node
         with writer.clock.stage("track"):
             tracking = track_log(source, config, progress=progress, start=_start(source, known, config))
         writer.warn(tracking.warnings)
         with writer.clock.stage("solve"):
-            tracking = without_jumps(
-                tracking, map_node, loops_between_days(config.loops, source.sensor).gate, progress=progress
-            )
-            tracking = _supported(tracking)
-            _refuse_unplaced(source, known, tracking)
-            solved = solve(tracking.graph, tracking.loops, config.graph)
-            tracking = _supported(replace(tracking, graph=solved.graph, loops=solved.loops))
-            _refuse_unplaced(source, known, tracking)
-            tracking = component_of(tracking, map_node, progress=progress)
-            tracking = replace(tracking, graph=_with_scaled_constraints(tracking.graph, config.graph))
-        tracking = _doubtful_unless_confirmed(tracking, loops_between_days(config.loops, source.sensor))
-        writer.update(solve=solved.report)
+            tracking, report = _solved_in_map(source, known, tracking, config, progress)
+        writer.update(solve=report)
         with writer.clock.stage("write"):
             _write(writer, source, known, tracking)
     finished = writer.manifest
@@ -128,6 +118,21 @@ def _start(source: Log, known: KnownMap, config: BuildConfig) -> Start:
     detector = build_map_constraint_detector(loops_between_days(config.loops, source.sensor), known.places)
     graph = PoseGraph({map_node: np.eye(4)}, {map_node: 0})
     return Start(NodeOffset(odometry, first_node=map_node + 1), detector, graph)
+
+
+def _solved_in_map(
+    source: Log, known: KnownMap, tracking: TrackingResult, config: BuildConfig, progress: Progress
+) -> tuple[TrackingResult, Solve]:
+    """Return the part of a tracked log that constraints tie to the map, at its solution, and its record."""
+    map_node, loops = known.places.map_node, loops_between_days(config.loops, source.sensor)
+    tracking = _supported(without_jumps(tracking, map_node, loops.gate, progress=progress))
+    _refuse_unplaced(source, known, tracking)
+    solved = solve(tracking.graph, tracking.loops, config.graph)
+    tracking = _supported(replace(tracking, graph=solved.graph, loops=solved.loops))
+    _refuse_unplaced(source, known, tracking)
+    tracking = component_of(tracking, map_node, progress=progress)
+    tracking = replace(tracking, graph=_with_scaled_constraints(tracking.graph, config.graph))
+    return _doubtful_unless_confirmed(tracking, loops), solved.report
 
 
 def _refuse_unplaced(source: Log, known: KnownMap, tracking: TrackingResult) -> None:

@@ -72,8 +72,8 @@ def place_jointly(
     """Place runs by one pose graph over all their keyframes, so that each bends where it had drifted.
 
     The poses of ``place_by_shared_places`` are the first estimate. The loops between runs are those places
-    that agree with it; graduated non-convexity decides over them and over the runs' own loops. The world of
-    the first run is the map's, and its first node is held. Every other world lies where the run's solved
+    that agree with it; graduated non-convexity rejects outliers among them and the runs' own loops. The world
+    of the first run is the map's, and its first node is held. Every other world lies where the run's solved
     keyframes are nearest to where they were in it; what is left is the bend.
 
     Args:

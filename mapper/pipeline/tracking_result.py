@@ -82,7 +82,7 @@ def refuse_a_fragment(tracking: TrackingResult, config: BuildConfig, *, sensor: 
     """Refuse to make a map from too little.
 
     Raises:
-        TrackingError: Fewer frames were tracked, without a doubt, than the configuration asks for.
+        TrackingError: Fewer frames were tracked, without a doubt, than the configuration requires.
     """
     read, tracked = len(tracking.tracks), len(tracking.tracked)
     enough = max(config.min_tracked_frames, config.min_tracked_ratio * read)

@@ -85,7 +85,7 @@ def _build(folder: Path, name: str, *overrides: str) -> None:
 
 @contextmanager
 def _watched(report: Report) -> Iterator[None]:
-    """Report the kernels that there are by now, again and again while inside."""
+    """Report the number of compiled kernels regularly while inside."""
     ended = threading.Event()
     watcher = threading.Thread(target=_watch, args=(report, ended.wait), daemon=True)
     watcher.start()

@@ -19,8 +19,6 @@ VOXEL_M = {"lidar": 0.3, "rgbd": 0.05}
 NEED_NO_GUESS = frozenset({"hough-gicp", "hough-ndt", "kiss-matcher"})
 """Global methods: they search all motions, and use no guess."""
 
-Distances = Annotated[tuple[PositiveFloat, ...], Field(min_length=1)]
-
 
 class AcceptanceConfig(Config):
     """Acceptance of a motion."""
@@ -40,10 +38,8 @@ class RefinedConfig(Config):
     """Scans are reduced to one point in each such voxel; every other length is a multiple of it."""
     neighbours: Annotated[int, Field(ge=5)] = 10
     """Number of nearest points for each normal and covariance."""
-    pair_distances_voxels: Distances = (7.0, 3.5)
-    """Largest distance between the points of a pair, from coarse to fine."""
     max_iterations: PositiveInt = 40
-    """Largest number of iterations at each of these distances."""
+    """Largest number of iterations at each of the pair distances, a coarse one and a fine one."""
     acceptance: AcceptanceConfig = AcceptanceConfig()
 
 
@@ -73,10 +69,8 @@ class NdtConfig(Config):
     """The source is reduced to one point in each such voxel; every other length is a multiple of it."""
     neighbours: Annotated[int, Field(ge=5)] = 10
     """Number of nearest points for each normal, with which the result is assessed."""
-    cells_voxels: Distances = (7.0, 3.5)
-    """Edges of the target's cells, each with one Gaussian, from coarse to fine."""
     max_iterations: PositiveInt = 30
-    """Largest number of iterations at each of these cell sizes."""
+    """Largest number of iterations at each of the cell sizes, a coarse one and a fine one."""
     acceptance: AcceptanceConfig = AcceptanceConfig()
 
 

@@ -10,6 +10,9 @@ from mapper.registration.surfaces import Prepared, prepared
 
 AnyIcp = IcpConfig | PlaneIcpConfig | GicpConfig
 
+_PAIR_DISTANCES_VOXELS = (7.0, 3.5)
+"""Largest distance between the points of a pair: 2 m of a street from poor guesses, then 1 m."""
+
 
 class Icp:
     """ICP and its variants: scans are registered by their nearest pairs."""
@@ -49,7 +52,7 @@ def refined(
         target: Cloud that stays.
         source: Cloud that moves.
         T_target_source: (4, 4) guess.
-        config: Pair distances, from coarse to fine, iterations and acceptance.
+        config: Voxel, iterations and acceptance.
         kind: Error that is minimised.
     """
     alignment = refine(
@@ -57,7 +60,7 @@ def refined(
         source,
         T_target_source,
         kind=kind,
-        pair_distances_m=[voxels * config.voxel_m for voxels in config.pair_distances_voxels],
+        pair_distances_m=[voxels * config.voxel_m for voxels in _PAIR_DISTANCES_VOXELS],
         max_iterations=config.max_iterations,
     )
     if not alignment.converged:

@@ -13,6 +13,8 @@ from mapper.registration.config import NdtConfig
 from mapper.registration.surfaces import Prepared, prepared
 from mapper.runtime.extras import extra
 
+_CELLS_VOXELS = (7.0, 3.5)
+"""Edges of the target's cells, each with one Gaussian: 2 m in a street, then 1 m."""
 _MIN_POINTS = 6
 """Cells with fewer points have no Gaussian: twice as many as span a plane."""
 
@@ -46,7 +48,7 @@ class NdtAligner:
             self._points_target,
             cloud.points,
             T_target_source,
-            cells_m=[cell_voxels * config.voxel_m for cell_voxels in config.cells_voxels],
+            cells_m=[cell_voxels * config.voxel_m for cell_voxels in _CELLS_VOXELS],
             max_iterations=config.max_iterations,
         )
         if isinstance(found, str):

@@ -1,4 +1,4 @@
-"""Run folder: a finished run, its log, and its files, read when they are asked for."""
+"""Run folder: a finished run, its log, and its files, read on first access."""
 
 from collections.abc import Iterable
 from contextlib import AbstractContextManager, nullcontext
@@ -49,7 +49,7 @@ if TYPE_CHECKING:  # compiled code, which takes longer to load than most files o
 
 @dataclass(frozen=True)
 class Run:
-    """A finished run: its folder, whose files are read when they are asked for, each once.
+    """A finished run: its folder, whose files are read on first access, each once.
 
     Attributes:
         path: Its folder.
@@ -231,7 +231,7 @@ class Run:
 
 
 def open_run(path: AnyPath) -> Run:
-    """Return a finished run; its files are read when they are asked for.
+    """Return a finished run; its files are read on first access.
 
     Args:
         path: Its folder.

@@ -1,4 +1,4 @@
-"""A log's frames in time, as warnings tell of them."""
+"""A log's frames in time, as warnings describe them."""
 
 from dataclasses import dataclass
 

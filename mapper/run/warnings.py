@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from mapper.core.geometry import path_length
 from mapper.core.timebase import NS_PER_S, stretches
 from mapper.navigation.config import TraversableConfig
 from mapper.run.frame_outcomes import DISCONNECTED, FrameRecord
@@ -280,7 +281,7 @@ def _truth(results: RunResults) -> Iterator[RunWarning]:
         return
     estimated, known = pairs
     rmse_m = float(np.sqrt(((estimated.positions_world - known) ** 2).sum(axis=1).mean()))
-    true_path_m = float(np.linalg.norm(np.diff(known, axis=0), axis=1).sum())
+    true_path_m = path_length(known)
     path_m = min(estimated.path_length_m, true_path_m)  # errors make a path longer
     if rmse_m > max(_MAX_ERROR_SHARE * path_m, _LEAST_ERROR_M):
         yield RunWarning(

@@ -86,7 +86,7 @@ class Archive:
         return data
 
     def forget(self) -> None:
-        """Forget all, as where the journal begins anew."""
+        """Drop all data, as the journal does when it is deleted."""
         self._recent.clear()
         self._references.clear()
         self._new, self._size = [], 0

@@ -1,4 +1,4 @@
-"""Data that never changes once it is made: in memory, or read from an archive when it is asked for."""
+"""Data that never changes once it is made: in memory, or read from an archive on use."""
 
 from collections.abc import Iterator, Mapping
 from typing import Any, Generic, Protocol, TypeVar, cast
@@ -24,7 +24,7 @@ class Reader(Protocol):
 
 
 class Archived(Generic[Data]):
-    """Reference to data that may lie on the disk: whoever keeps it for long keeps this and not the data."""
+    """Reference to data that may lie on the disk: what is kept for long refers to data by it."""
 
     __slots__ = ("_data", "_reader", "place")
 
@@ -68,7 +68,7 @@ def archived(data: Data) -> Archived[Data]:
 
 
 def reference_of(data: Archivable) -> Archived[Any] | None:
-    """Return the reference to some data; None if nobody has asked for one."""
+    """Return the reference to some data; None if there is none yet."""
     known: Archived[Any] | None = getattr(data, "_archived", None)
     return known
 
@@ -79,7 +79,7 @@ def refer(data: Archivable, reference: Archived[Any]) -> None:
 
 
 class ArchivedMapping(Mapping[int, Data]):
-    """Mapping to data that may lie on the disk: a value is read when it is asked for."""
+    """Mapping to data that may lie on the disk: a value is read on access."""
 
     def __init__(self, references: Mapping[int, Archived[Data]]) -> None:
         """Take over references, in their order."""

@@ -15,7 +15,7 @@ from pathlib import Path
 from mapper.core.errors import RunError, SourceError, WriteError, listed
 
 MANIFEST_NAME = "manifest.json"
-"""File that tells what a folder of ours is."""
+"""File that identifies a folder of ours."""
 
 _TEMPORARY = ".*.part*"
 _DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO}

@@ -36,7 +36,7 @@ def _imported() -> list[ModuleType]:
 
 
 def _linked_packages() -> list[Path]:
-    """Return the folders that are links in ours, in a source tree; ``compileall`` follows none."""
+    """Return this package's folders that are links, as in a source tree; ``compileall`` follows none."""
     return [path.resolve() for path in Path(mapper.__file__).parent.iterdir() if path.is_symlink()]
 
 

@@ -225,7 +225,7 @@ class _DaskCluster(AbstractContextManager["_DaskCluster"]):
             raise self._gone() from None
         if isinstance(error, self._killed):
             begun = error.allowed_failures + 1
-            return index, Failure(f"its worker died, {begun} of {begun} times; its log may say why", begun)
+            return index, Failure(f"its worker ended, {begun} of {begun} times; its log may say why", begun)
         return index, Failure(_reason(error), 1)
 
     def _gone(self) -> ConfigError:

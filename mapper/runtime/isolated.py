@@ -123,7 +123,7 @@ if __name__ == "__main__":
         import resource
 
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent decides
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent handles it
     with os.fdopen(os.dup(1), "wb") as stdout:
         os.dup2(2, 1)  # what a library prints is no answer
         _serve(sys.stdin.buffer, stdout)

@@ -1,8 +1,7 @@
-"""Files that a killed process leaves whole: a journal of records, and a state of which two versions are kept.
+"""Files that survive a killed process: a journal of records, and a state of which two versions are kept.
 
 A journal is only appended to. A state is written over the older of its two versions, and counts once it is on
-the disk; it tells how much of the journal belongs to it. All has digests, so that what was torn or damaged is
-found.
+the disk; it holds the length of the journal that belongs to it. Both have digests, which reveal damage.
 """
 
 import hashlib
@@ -37,20 +36,20 @@ class Journal:
 
     path: Path
     end: int = 0
-    _waiting: list[bytes] = field(default_factory=list)
+    _pending: list[bytes] = field(default_factory=list)
     _opened: BinaryIO | None = None
 
     def append(self, record: bytes) -> int:
-        """Return the place of a new record, which waits until it is taken and written."""
+        """Return the place of a new record, which is pending until it is taken and written."""
         place = self.end
-        self._waiting += (_HEAD.pack(len(record), _digest(record)), record)
+        self._pending += (_HEAD.pack(len(record), _digest(record)), record)
         self.end += _HEAD.size + len(record)
         return place
 
     def take(self) -> list[bytes]:
-        """Return what waits, to be written by ``write`` in any thread."""
-        waiting, self._waiting = self._waiting, []
-        return waiting
+        """Return the pending records, to be written by ``write`` in any thread."""
+        pending, self._pending = self._pending, []
+        return pending
 
     def write(self, taken: list[bytes]) -> None:
         """Append what was taken, and wait until it is on the disk."""
@@ -60,14 +59,14 @@ class Journal:
             os.fsync(file.fileno())
 
     def truncate(self, end: int) -> None:
-        """Leave out what is beyond an end: records that no state knows, and a torn one."""
+        """Leave out what is beyond an end: records that belong to no state, and an incomplete one."""
         os.truncate(self.path, end)
         self.end = end
 
     def remove(self) -> None:
-        """Delete the file and what waits, and begin anew."""
+        """Delete the file and all pending records."""
         self.close()
-        self._waiting, self.end = [], 0
+        self._pending, self.end = [], 0
         self.path.unlink(missing_ok=True)
 
     def close(self) -> None:

@@ -28,7 +28,7 @@ class Job:
 
     Attributes:
         key: Name of the result's file. The same key stands for the same result, in other sessions too, so it
-            is a hash of all that decides the result unless its folder is for one piece of work alone.
+            is a hash of all that the result depends on unless its folder is for one piece of work alone.
         label: Name of the job in messages.
         run: Does the work, and can be pickled; ``mapper.runtime.executor`` says how.
     """

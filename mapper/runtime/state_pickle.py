@@ -1,6 +1,6 @@
-"""Pickling of the state of a computation, so that what goes on from the copy gives the same bits.
+"""Pickling of the state of a computation, so that a copy continues it to the same bits.
 
-Arrays come back with the same memory layout, as sums in another order would round otherwise, and objects that
+Arrays keep their memory layout, as sums in another order would round otherwise, and objects that
 were one are one again. What cannot or need not be written is referred to: parts that exist before the
 computation begins, by name, and data that never changes, by where a journal has it.
 """

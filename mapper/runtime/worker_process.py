@@ -77,7 +77,7 @@ class WorkerProcess:
 
 
 def _serve(connection: Connection) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent decides
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent handles it
     one_thread_per_library()
     threading.Thread(target=_exit_with_parent, daemon=True).start()
     while True:

@@ -1,20 +1,20 @@
-"""All textures of a scene in one flat array of mip-maps (Williams 1983), for the compiled shader."""
+"""All textures of a scene in one flat array of mip-maps (Williams 1983), and where they are on the boxes."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.frames import Image
+from mapper.core.geometry import Array
 
 LEVELS = 8
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Atlas:
-    """Textures and their successive halvings.
+class Atlas(NamedTuple):
+    """Textures and their successive halvings, as plain arrays for compiled code.
 
     Attributes:
         texels: (T, 3) uint8 RGB, level after level, row after row.
@@ -27,6 +27,22 @@ class Atlas:
     starts: NDArray[np.int64]
     heights_px: NDArray[np.int64]
     widths_px: NDArray[np.int64]
+
+
+class Faces(NamedTuple):
+    """Affine texture maps of N boxes' faces: texel = scale · metres from the face's top left + offset.
+
+    Attributes:
+        textures: (N, 6) int64 index in the atlas.
+        scales: (N, 6, 2) float64 texels per metre along columns and rows.
+        offsets: (N, 6, 2) float64 texels.
+        shades: (N, 6) float64 brightness.
+    """
+
+    textures: NDArray[np.int64]
+    scales: Array
+    offsets: Array
+    shades: Array
 
 
 def build_atlas(images: Sequence[Image]) -> Atlas:

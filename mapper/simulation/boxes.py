@@ -5,14 +5,15 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from mapper.core.errors import DataError
-from mapper.core.geometry import Array, Points
+from mapper.core.frames import PinholeCamera
+from mapper.core.geometry import Array, Points, Transform
 from mapper.runtime.atomic import write_json
 
 
@@ -72,6 +73,35 @@ class Boxes:
                 self.names, self.centers_world, self.half_sizes_m, self.yaws_rad, strict=True
             )
         ]
+
+
+class BoxView(NamedTuple):
+    """N boxes seen by a camera, as plain arrays for compiled code.
+
+    Attributes:
+        halves: (N, 3) half sizes of the boxes, metres.
+        R_box_camera: (N, 3, 3) the camera's axes in the box frames.
+        origin_box: (N, 3) the camera's centre in the box frames, metres.
+        intrinsics: (4,) fx, fy, cx, cy in pixels.
+    """
+
+    halves: Array
+    R_box_camera: Array
+    origin_box: Array
+    intrinsics: Array
+
+
+def view_of(boxes: Boxes, camera: PinholeCamera, T_world_camera: Transform) -> BoxView:
+    """Return the boxes in the view of a camera without distortion."""
+    cosine, sine = np.cos(boxes.yaws_rad), np.sin(boxes.yaws_rad)
+    R_box_world = np.zeros((len(boxes), 3, 3))
+    R_box_world[:, 0, 0], R_box_world[:, 0, 1] = cosine, sine
+    R_box_world[:, 1, 0], R_box_world[:, 1, 1] = -sine, cosine
+    R_box_world[:, 2, 2] = 1.0
+    R_box_camera = np.ascontiguousarray(R_box_world @ T_world_camera[:3, :3])
+    origin_box = np.einsum("nij,nj->ni", R_box_world, T_world_camera[:3, 3] - boxes.centers_world)
+    intrinsics = np.array([camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px])
+    return BoxView(boxes.half_sizes_m, R_box_camera, origin_box, intrinsics)
 
 
 def write_scene(

@@ -4,10 +4,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mapper.core.frames import Image
 from mapper.core.geometry import Array
+from mapper.simulation.atlas import Faces
 from mapper.simulation.boxes import Boxes
 
 FACES = 6
@@ -47,23 +47,6 @@ class Skin:
     texture: int
     px_per_m: float | None = None
     offset_m: tuple[float, float] = (0.0, 0.0)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Faces:
-    """Affine texture maps of N boxes' faces: texel = scale · metres from the face's top left + offset.
-
-    Attributes:
-        textures: (N, 6) int64 index in the atlas.
-        scales: (N, 6, 2) float64 texels per metre along columns and rows.
-        offsets: (N, 6, 2) float64 texels.
-        shades: (N, 6) float64 brightness.
-    """
-
-    textures: NDArray[np.int64]
-    scales: Array
-    offsets: Array
-    shades: Array
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,7 +109,7 @@ class Builder:
         self.skins.append(tuple((faces or {}).get(face, skin) for face in range(FACES)))
 
     def repeat(self, numbers: Sequence[int], *, shift_m: float) -> None:
-        """Add boxes once more, so far along x."""
+        """Add copies of boxes, moved along x."""
         for i in numbers:
             x, *rest = self.rows[i]
             self.names.append(self.names[i])

@@ -204,18 +204,6 @@ UNCALIBRATED: Mapping[str, float] = {
 }
 """Settings of a sensor whose errors a factory calibration leaves, as those of a real Kinect."""
 
-IDEAL_SENSOR = SensorConfig(
-    axial_noise_ratio=0.0,
-    lateral_noise_px=0.0,
-    disparity_step_px=0.0,
-    dropout_ratio=0.0,
-    min_depth_m=0.0,
-    fade_depth_m=1e3,
-    max_depth_m=1e3,
-    image_noise_levels=0.0,
-)
-"""Exact depth and noise-free images."""
-
 
 class LidarSensorConfig(Config):
     """A spinning multi-beam LiDAR; by default the rings of a Velodyne HDL-64E."""
@@ -391,6 +379,3 @@ LIDAR_SCENES: Mapping[str, LidarSynthConfig] = {
     ),
 }
 """Settings with which ``mapper synth`` begins, by scene of a LiDAR."""
-
-IDEAL_LIDAR = LidarSensorConfig(range_noise_m=0.0, dropout_ratio=0.0, min_range_m=0.0)
-"""Exact ranges."""

@@ -23,8 +23,8 @@ class Studio:
     Attributes:
         builder: Takes the boxes.
         shop: Materials.
-        rng: Decides what a piece looks like, and where it stands.
-        another_day: Decides where loose pieces stand instead; None leaves them where they are.
+        rng: Draws what a piece looks like, and where it stands.
+        another_day: Draws where loose pieces stand instead; None leaves them where they are.
     """
 
     builder: Builder

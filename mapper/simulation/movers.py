@@ -6,8 +6,9 @@ from typing import Any
 import numpy as np
 
 from mapper.core.geometry import Array, distances_along
+from mapper.simulation.atlas import Faces
 from mapper.simulation.boxes import Boxes
-from mapper.simulation.builder import ORIGIN, Builder, Faces, Skin
+from mapper.simulation.builder import ORIGIN, Builder, Skin
 from mapper.simulation.config import SynthConfig
 from mapper.simulation.path import Motion
 from mapper.simulation.people import PARTS, Walkers, build_people, make_walkers
@@ -63,12 +64,7 @@ class Movers:
             np.concatenate([a.half_sizes_m, b.half_sizes_m]),
             np.concatenate([a.yaws_rad, b.yaws_rad]),
         )
-        faces = Faces(
-            *(
-                np.concatenate([getattr(scene.faces, name), getattr(self.faces, name)])
-                for name in ("textures", "scales", "offsets", "shades")
-            )
-        )
+        faces = Faces._make(map(np.concatenate, zip(scene.faces, self.faces, strict=True)))
         return replace(scene, boxes=boxes, faces=faces)
 
     def as_json(self, times_s: Array) -> list[dict[str, Any]]:

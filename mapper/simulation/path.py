@@ -96,7 +96,7 @@ def _look(angles_rad: Array) -> Array:
 
 
 def _shake(config: SynthConfig, rng: np.random.Generator) -> Callable[[Array], Array]:
-    """Each axis sways with three sines between breathing and walking pace."""
+    """Return the sway of each axis by time: three sines between breathing and walking pace."""
     amplitudes = np.array([config.shake_m] * 3 + [config.shake_rad] * 3) * (config.wheels is None)
     rates_hz = rng.uniform([[0.2], [0.6], [1.2]], [[0.5], [1.1], [1.9]], (3, 6))
     phases_rad = rng.uniform(0.0, 2.0 * np.pi, (3, 6))
@@ -113,7 +113,7 @@ def _shake(config: SynthConfig, rng: np.random.Generator) -> Callable[[Array], A
 def _loop(
     config: SynthConfig, plan: Plan, rng: np.random.Generator
 ) -> tuple[float, Callable[[Array], tuple[Array, Array]]]:
-    """Walk the route, looking ahead and around; position and gaze repeat exactly every lap."""
+    """Return the duration, and positions and gaze by time, of walking the route: both repeat every lap."""
     parameter = np.linspace(0.0, len(plan.route), 400 * len(plan.route), endpoint=False)
     points = closed_spline(plan.route, parameter)
     steps_m = np.linalg.norm(np.diff(points, axis=0, append=points[:1]), axis=1)
@@ -138,14 +138,10 @@ def _loop(
     grid_m = np.linspace(0.0, lap_m, round(_SAMPLES_PER_M * lap_m), endpoint=False)
     yaw = np.unwrap(heading(grid_m))
     lap_turn = 2.0 * np.pi * round((yaw[-1] - yaw[0]) / (2.0 * np.pi))
-    step_m = lap_m / len(grid_m)
-    yaw_rad_per_m = np.diff(yaw, append=yaw[0] + lap_turn) / step_m
-    turning_mps = config.max_yaw_rate_rad_s / np.maximum(np.abs(yaw_rad_per_m), 1e-9)
-    speed_mps = np.minimum(config.speed_mps, turning_mps)
-    clock_s = np.concatenate([[0.0], np.cumsum(step_m / _eased(speed_mps, round(_EASE_M / step_m)))])
-    lap_s = float(clock_s[-1])
     closed_grid_m = np.append(grid_m, lap_m)
     closed_yaw = np.append(yaw, yaw[0] + lap_turn)
+    clock_s = _walked_s(config, closed_yaw, lap_m / len(grid_m))
+    lap_s = float(clock_s[-1])
 
     def walked_m(times_s: Array) -> Array:
         laps = np.floor(times_s / lap_s)
@@ -164,6 +160,14 @@ def _loop(
 
     overlap_s = float(np.interp(config.overlap_m, closed_grid_m, clock_s))
     return config.laps * lap_s + overlap_s, steady
+
+
+def _walked_s(config: SynthConfig, yaw_rad: Array, step_m: float) -> Array:
+    """Return the (N,) seconds at which (N,) points of a lap, a step apart, are passed; turns take longer."""
+    yaw_rad_per_m = np.diff(yaw_rad) / step_m
+    turning_mps = config.max_yaw_rate_rad_s / np.maximum(np.abs(yaw_rad_per_m), 1e-9)
+    speed_mps = np.minimum(config.speed_mps, turning_mps)
+    return np.concatenate([[0.0], np.cumsum(step_m / _eased(speed_mps, round(_EASE_M / step_m)))])
 
 
 def _eased(speed_mps: Array, window: int) -> Array:
@@ -185,7 +189,7 @@ def _eased(speed_mps: Array, window: int) -> Array:
 
 
 def _before_desk(plan: Plan, rng: np.random.Generator) -> Callable[[Array], tuple[Array, Array]]:
-    """Sway along all axes at an arm's length from the desk, as in TUM's fr1_xyz."""
+    """Return positions and gaze by time that sway an arm's length from the desk, as in TUM's fr1_xyz."""
     center = np.array([plan.desk_center[0], plan.desk_center[1] + 1.0, DESK_SIZE_M[2] + 0.5])
     phases_rad = rng.uniform(0.0, 2.0 * np.pi, 3)
     rates_hz, reach_m = np.array([0.21, 0.13, 0.29]), np.array([0.3, 0.18, 0.18])
@@ -199,7 +203,7 @@ def _before_desk(plan: Plan, rng: np.random.Generator) -> Callable[[Array], tupl
 
 
 def _before_wall(config: SynthConfig, plan: Plan) -> Callable[[Array], tuple[Array, Array]]:
-    """Look straight at the first room's wall x = x0, which has no door."""
+    """Return positions and gaze by time, facing the first room's wall x = x0, which has no door."""
     room = plan.rooms[0]
     if config.wall_distance_m > room.x1_m - room.x0_m:
         raise SourceError(
@@ -216,7 +220,7 @@ def _before_wall(config: SynthConfig, plan: Plan) -> Callable[[Array], tuple[Arr
 
 
 def _spin(config: SynthConfig, plan: Plan) -> Callable[[Array], tuple[Array, Array]]:
-    """Turn in the first room's free middle, now slower, now at the highest rate."""
+    """Return positions and gaze by time, turning in the first room's middle at up to the highest rate."""
     spot = closed_spline(plan.route, np.zeros(1))[0]
     fastest, breath_hz, nods = config.max_yaw_rate_rad_s, 0.2, config.wheels is None
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from mapper.core.errors import DataError
 from mapper.core.frames import NO_DISTORTION, DepthImage, Image, PinholeCamera
 from mapper.core.geometry import Array, Transform
-from mapper.simulation.boxes import Boxes
+from mapper.simulation.boxes import BoxView, view_of
 from mapper.simulation.scene import Scene
 from mapper.simulation.shade import locate, paint
 
@@ -24,7 +24,7 @@ _NEAR_M = 0.02
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rendering:
-    """Image and depth of by an ideal.
+    """Image and depth of a scene by an ideal camera.
 
     Attributes:
         rgb: (H, W, 3) uint8.
@@ -43,80 +43,34 @@ def render(scene: Scene, camera: PinholeCamera, T_world_camera: Transform) -> Re
     """Return the exact image and depth of a scene from a pose of the camera's optical frame.
 
     Raises:
-        DataError: The camera has distortion, which this renderer does not know.
+        DataError: The camera has distortion, which this renderer does not support.
     """
     if camera.distortion != NO_DISTORTION:
         raise DataError(f"render: camera with distortion {camera.distortion}; want a camera without")
-    boxes, faces, atlas = scene.boxes, scene.faces, scene.atlas
-    R_box_camera, origin_box = _box_frames(boxes, T_world_camera)
-    intrinsics = np.array([camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px])
+    view = view_of(scene.boxes, camera, T_world_camera)
     shape = (camera.height_px, camera.width_px)
     depth_m = np.full(shape, np.inf)
     surface = np.full(shape, -1, dtype=np.int32)
-    rectangles, nearest_m = _project(boxes.half_sizes_m, R_box_camera, origin_box, intrinsics, shape)
+    rectangles, nearest_m = _project(view, shape)
     order = np.argsort(nearest_m, kind="stable")
     order = order[np.isfinite(nearest_m[order])]
-    _trace(
-        boxes.half_sizes_m,
-        R_box_camera,
-        origin_box,
-        intrinsics,
-        order,
-        rectangles,
-        nearest_m,
-        depth_m,
-        surface,
-    )
+    _trace(view, order, rectangles, nearest_m, depth_m, surface)
     rgb = np.zeros((*shape, 3), dtype=np.uint8)
     cosine = np.zeros(shape, dtype=np.float32)
     footprint = np.zeros((*shape, 6), dtype=np.float32)
-    locate(
-        boxes.half_sizes_m,
-        R_box_camera,
-        origin_box,
-        intrinsics,
-        depth_m,
-        surface,
-        faces.scales,
-        faces.offsets,
-        footprint,
-        cosine,
-    )
-    paint(
-        footprint,
-        surface,
-        faces.textures,
-        faces.shades,
-        atlas.texels,
-        atlas.starts,
-        atlas.heights_px,
-        atlas.widths_px,
-        rgb,
-    )
+    locate(view, scene.faces, depth_m, surface, footprint, cosine)
+    paint(scene.faces, scene.atlas, footprint, surface, rgb)
     depth_m[surface < 0] = 0.0
     return Rendering(rgb, depth_m.astype(np.float32), surface, cosine)
 
 
-def _box_frames(boxes: Boxes, T_world_camera: Transform) -> tuple[Array, Array]:
-    """Return the camera's axes (N, 3, 3) and its centre (N, 3) in every box's own frame."""
-    cosine, sine = np.cos(boxes.yaws_rad), np.sin(boxes.yaws_rad)
-    R_box_world = np.zeros((len(boxes), 3, 3))
-    R_box_world[:, 0, 0], R_box_world[:, 0, 1] = cosine, sine
-    R_box_world[:, 1, 0], R_box_world[:, 1, 1] = -sine, cosine
-    R_box_world[:, 2, 2] = 1.0
-    offsets_world = T_world_camera[:3, 3] - boxes.centers_world
-    R_box_camera = np.ascontiguousarray(R_box_world @ T_world_camera[:3, :3])
-    return R_box_camera, np.einsum("nij,nj->ni", R_box_world, offsets_world)
-
-
 @njit(cache=True, nogil=True)
-def _project(
-    halves: Array, R_box_camera: Array, origin_box: Array, intrinsics: Array, shape: tuple[int, int]
-) -> tuple[NDArray[np.int64], Array]:
+def _project(view: BoxView, shape: tuple[int, int]) -> tuple[NDArray[np.int64], Array]:
     """Return each box's pixel rectangle (first column, first row, end column, end row) and nearest depth.
 
     Edges that pass behind the camera are cut at the near plane. A box that cannot be seen has depth inf.
     """
+    halves, R_box_camera, origin_box, intrinsics = view
     fx, fy, cx, cy = intrinsics
     rectangles = np.zeros((len(halves), 4), dtype=np.int64)
     nearest = np.full(len(halves), np.inf)
@@ -156,10 +110,7 @@ def _project(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _trace(
-    halves: Array,
-    R_box_camera: Array,
-    origin_box: Array,
-    intrinsics: Array,
+    view: BoxView,
     order: NDArray[np.int64],
     rectangles: NDArray[np.int64],
     nearest: Array,
@@ -167,6 +118,7 @@ def _trace(
     surface: NDArray[np.int32],
 ) -> None:
     """Fill depth and surface of every pixel; ``order`` lists boxes from near to far."""
+    halves, R_box_camera, origin_box, intrinsics = view
     height, width = depth.shape
     deepest = np.full((-(-height // _TILE_PX), -(-width // _TILE_PX)), np.inf)
     for b in order:

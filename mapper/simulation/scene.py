@@ -1,7 +1,7 @@
 """The scene of a camera: walls, floors, ceilings, doors, furniture and pictures."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import assert_never
 
 import numpy as np
@@ -9,9 +9,9 @@ import numpy as np
 from mapper.core.frames import Image
 from mapper.core.geometry import Array
 from mapper.simulation import surfaces
-from mapper.simulation.atlas import Atlas, build_atlas
+from mapper.simulation.atlas import Atlas, Faces, build_atlas
 from mapper.simulation.boxes import Boxes
-from mapper.simulation.builder import DAYLIGHT, ORIGIN, Builder, Faces, Light, Place, Skin
+from mapper.simulation.builder import DAYLIGHT, ORIGIN, Builder, Light, Place, Skin
 from mapper.simulation.config import SynthConfig
 from mapper.simulation.furniture import PIECES, Studio, desk
 from mapper.simulation.plan import (
@@ -71,7 +71,7 @@ class _Footprint:
 
 
 def make_scene(config: SynthConfig) -> Scene:
-    """Return the scene of a configuration; its seed decides everything that is left open."""
+    """Return the scene of a configuration; its seed determines everything that is left open."""
     plan = make_plan(config, rng_of(config.seed, Stream.PLAN))
     builder = Builder()
     rng = rng_of(config.seed, Stream.FURNITURE)
@@ -90,7 +90,7 @@ def make_scene(config: SynthConfig) -> Scene:
     if config.texture_contrast < 1.0:
         textures = [_whitened(texture, config.texture_contrast) for texture in textures]
         shades = 1.0 - config.texture_contrast * (1.0 - faces.shades)
-        faces = replace(faces, shades=shades)
+        faces = faces._replace(shades=shades)
     return Scene(builder.boxes(), faces, build_atlas(textures), plan)
 
 

@@ -5,7 +5,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from mapper.core.geometry import Array
-from mapper.simulation.atlas import LEVELS
+from mapper.simulation.atlas import LEVELS, Atlas, Faces
+from mapper.simulation.boxes import BoxView
 
 _TAPS_APART = 0.1
 """Taps closer than this share of a filtered texel are one."""
@@ -19,31 +20,25 @@ _T_SIGN = np.array([-1.0, -1.0, -1.0, -1.0, 1.0, -1.0])
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def locate(
-    halves: Array,
-    R_box_camera: Array,
-    origin_box: Array,
-    intrinsics: Array,
+    view: BoxView,
+    faces: Faces,
     depth: Array,
     surface: NDArray[np.int32],
-    scales: Array,
-    offsets: Array,
     footprint: NDArray[np.float32],
     cosine: NDArray[np.float32],
 ) -> None:
     """Fill where on its texture each pixel with a surface lies, and how far its neighbours are.
 
     Args:
-        halves: (N, 3) half sizes of the boxes, metres.
-        R_box_camera: (N, 3, 3) the camera's axes in the box frames.
-        origin_box: (N, 3) the camera's centre in the box frames, metres.
-        intrinsics: fx, fy, cx, cy in pixels.
+        view: The boxes and the camera.
+        faces: The boxes' faces.
         depth: (H, W) metres along the optical axis.
         surface: (H, W) 6 · box + face, or −1.
-        scales: (N, 6, 2) texels per metre along the texture's columns and rows.
-        offsets: (N, 6, 2) texels at the face's top left corner.
         footprint: (H, W, 6), written: texel (s, t), and its exact derivatives along image columns and rows.
         cosine: (H, W), written: between the ray and the face's normal.
     """
+    halves, R_box_camera, origin_box, intrinsics = view
+    scales, offsets = faces.scales, faces.offsets
     fx, fy, cx, cy = intrinsics
     height, width = depth.shape
     for v in range(height):
@@ -74,30 +69,19 @@ def locate(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def paint(
+    faces: Faces,
+    atlas: Atlas,
     footprint: NDArray[np.float32],
     surface: NDArray[np.int32],
-    textures: NDArray[np.int64],
-    shades: Array,
-    texels: NDArray[np.uint8],
-    starts: NDArray[np.int64],
-    heights: NDArray[np.int64],
-    widths: NDArray[np.int64],
     rgb: NDArray[np.uint8],
 ) -> None:
-    """Fill the colour of each pixel with a surface.
-
-    A footprint is covered by one trilinear tap, or by two along its longer side where that is much
-    longer, so that floors seen at a slant stay sharp without aliasing.
+    """Fill the colour of each pixel with a surface, from trilinear taps (Williams 1983).
 
     Args:
+        faces: The boxes' faces.
+        atlas: Their textures.
         footprint: (H, W, 6) as ``locate`` writes it.
         surface: (H, W) 6 · box + face, or −1.
-        textures: (N, 6) texture of every face.
-        shades: (N, 6) brightness of every face.
-        texels: As in ``Atlas``, and so are ``starts``, ``heights`` and ``widths``.
-        starts: First texel of every texture's levels.
-        heights: Rows of every texture's levels.
-        widths: Columns of every texture's levels.
         rgb: (H, W, 3), written.
     """
     for v in range(surface.shape[0]):
@@ -105,28 +89,21 @@ def paint(
             if surface[v, u] < 0:
                 continue
             b, face = surface[v, u] // 6, surface[v, u] % 6
-            texture, shade = textures[b, face], shades[b, face]
+            texture, shade = faces.textures[b, face], faces.shades[b, face]
             s, t = footprint[v, u, 0], footprint[v, u, 1]
-            s_tap, t_tap = footprint[v, u, 2], footprint[v, u, 3]
-            s_v, t_v = footprint[v, u, 4], footprint[v, u, 5]
-            long_px, short_px = np.sqrt(s_tap * s_tap + t_tap * t_tap), np.sqrt(s_v * s_v + t_v * t_v)
-            if long_px < short_px:
-                long_px, short_px, s_tap, t_tap = short_px, long_px, s_v, t_v
-            # The taps part smoothly, to a quarter of the long side once it is twice the short one.
-            apart = min(0.5 - 0.5 * short_px / long_px, 0.25)
-            level_px = max(short_px, 0.5 * long_px, 1.0)
-            level = min(np.log2(level_px), LEVELS - 1.0) if level_px > 1.0 else 0.0
+            level, taps, s_tap, t_tap = _cover(
+                footprint[v, u, 2], footprint[v, u, 3], footprint[v, u, 4], footprint[v, u, 5]
+            )
             fine = int(level)
             f = level - fine
-            taps = 2 if apart * long_px > _TAPS_APART * level_px else 1
-            s_tap, t_tap = (taps - 1) * apart * s_tap, (taps - 1) * apart * t_tap
-            s_unit, t_unit = 1.0 / widths[texture, 0], 1.0 / heights[texture, 0]
+            s_unit, t_unit = 1.0 / atlas.widths_px[texture, 0], 1.0 / atlas.heights_px[texture, 0]
             red, green, blue = 0.0, 0.0, 0.0
             for tap in range(taps):
                 s_here, t_here = s + (2 * tap - 1) * s_tap, t + (2 * tap - 1) * t_tap
                 for k in range(fine, fine + (2 if f > 0.0 else 1)):
                     weight = (1.0 - f if k == fine else f) / taps
-                    rows, columns, start = heights[texture, k], widths[texture, k], starts[texture, k]
+                    rows, columns = atlas.heights_px[texture, k], atlas.widths_px[texture, k]
+                    start = atlas.starts[texture, k]
                     # Sizes halve with rounding, so a level's true scale is its own size over the first one's.
                     column = s_here * (columns * s_unit) - 0.5
                     row = t_here * (rows * t_unit) - 0.5
@@ -137,15 +114,34 @@ def paint(
                     for r, r_share in ((r0, 1.0 - low_share), (r1, low_share)):
                         for c, c_share in ((c0, 1.0 - right_share), (c1, right_share)):
                             i, w = start + r * columns + c, weight * r_share * c_share
-                            red += w * texels[i, 0]
-                            green += w * texels[i, 1]
-                            blue += w * texels[i, 2]
+                            red += w * atlas.texels[i, 0]
+                            green += w * atlas.texels[i, 1]
+                            blue += w * atlas.texels[i, 2]
             rgb[v, u, 0] = np.uint8(min(shade * red + 0.5, 255.0))
             rgb[v, u, 1] = np.uint8(min(shade * green + 0.5, 255.0))
             rgb[v, u, 2] = np.uint8(min(shade * blue + 0.5, 255.0))
 
 
+@njit(cache=True, nogil=True, error_model="numpy")
+def _cover(s_u: float, t_u: float, s_v: float, t_v: float) -> tuple[float, int, float, float]:
+    """Return the level and the number of the taps that cover a footprint, and their offset in s and t.
+
+    A footprint is given by the texel's derivatives along image columns (u) and rows (v). Two taps lie along
+    its longer side where that is much longer, so that floors seen at a slant stay sharp without aliasing.
+    """
+    long_px, short_px = np.sqrt(s_u * s_u + t_u * t_u), np.sqrt(s_v * s_v + t_v * t_v)
+    if long_px < short_px:
+        long_px, short_px, s_u, t_u = short_px, long_px, s_v, t_v
+    # The taps part smoothly, to a quarter of the long side once it is twice the short one.
+    apart = min(0.5 - 0.5 * short_px / long_px, 0.25)
+    level_px = max(short_px, 0.5 * long_px, 1.0)
+    level = min(np.log2(level_px), LEVELS - 1.0) if level_px > 1.0 else 0.0
+    if apart * long_px > _TAPS_APART * level_px:
+        return level, 2, apart * s_u, apart * t_u
+    return level, 1, 0.0, 0.0
+
+
 @njit(cache=True, nogil=True)
 def _wrapped(index: int, size: int) -> int:
-    """Return index modulo size: textures repeat; the division is dear and seldom needed."""
+    """Return index modulo size: textures repeat; the division is slow and rarely needed."""
     return index if 0 <= index < size else index % size

@@ -164,7 +164,7 @@ class Log:
         return len(self.stamps_ns)
 
     def __iter__(self) -> Iterator[Frame]:
-        """Yield every frame in time order, read and decoded; ``entries`` reads none before it is asked to.
+        """Yield every frame in time order, read and decoded; ``entries`` reads none by itself.
 
         Raises:
             FrameError: A frame cannot be read.

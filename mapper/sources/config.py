@@ -1,4 +1,4 @@
-"""Which part of a log is used, and what the log does not tell by itself."""
+"""Settings of a log: which part is used, and what its files do not state."""
 
 from pathlib import Path
 from typing import Self

@@ -40,7 +40,7 @@ def undistorted(log: Log) -> Log:
 
 @dataclass(slots=True, eq=False)
 class _MeasuredOnce:
-    """Distortion of a log, measured by the first thread that asks for it."""
+    """Distortion of a log, measured on first use, by one thread."""
 
     log: Log
     _lock: threading.Lock = field(default_factory=threading.Lock)

@@ -20,7 +20,7 @@ _MIN_MEASURED_SHARE = 0.05
 _NEAR_M, _FAR_M = 0.1, 8.0
 """Least median and largest 90th percentile of depth that cameras deliver; farther surfaces return little."""
 _USUALLY_NEAR_M = 0.3
-"""Least depth of most cameras and ways to hold them: where nothing tells the units, what is nearer may be
+"""Least depth of most cameras and ways to hold them: where nothing states the units, nearer values may be
 millimetres taken for TUM's fifths of these."""
 
 _PAIR_WITHIN_NS = NS_PER_S // 2

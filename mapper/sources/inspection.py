@@ -214,7 +214,7 @@ def _calibration_text(camera: PinholeCamera) -> str:
 def _damage(checks: ReadingChecks) -> Iterator[str]:
     """Load frames from all over an RGB-D log, and yield a note if some cannot be read.
 
-    Around images that repeat all frames are loaded, so that the checks know where that begins and ends. Scans
+    Around images that repeat all frames are loaded, so that the checks find where that begins and ends. Scans
     are not loaded: as text, a single one may take seconds.
     """
     if checks.log.sensor == "lidar":

@@ -27,7 +27,7 @@ def within(folder: Path, name: str, *, where: str) -> Path:
 
 
 def present(paths: Iterable[Path]) -> list[bool]:
-    """Tell which files exist, listing each folder once: a stat per file is slow on network disks.
+    """Return which files exist, listing each folder once: a stat per file is slow on network disks.
 
     What is neither a regular file nor a link to one does not.
     """

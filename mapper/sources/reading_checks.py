@@ -91,7 +91,7 @@ class ReadingChecks:
         ]
 
     def doubts(self) -> dict[int, list[str]]:
-        """Return why frames tell nothing of their own, by stamp: they repeat the images of an earlier one."""
+        """Return why frames are doubtful, by stamp: they repeat the images of an earlier one."""
         doubts: dict[int, list[str]] = {}
         frozen_images = self.repeated("image", fewest=FROZEN_FRAMES)
         frozen_depths = self.repeated("depth", fewest=FROZEN_DEPTHS)

@@ -134,7 +134,7 @@ def _stamp_in(stem: str) -> int | None:
 
 
 def _epoch_ns(text: str) -> int | None:
-    """Return a whole number of s, ms, µs or ns since the epoch as nanoseconds: its size tells the unit."""
+    """Return a whole number of s, ms, µs or ns since the epoch, by its size, as nanoseconds."""
     value = int(text) if text.isdecimal() and len(text) < 20 else 0
     units = (unit for unit in _UNITS_PER_S if value // unit in _EPOCH_S)
     return next((value * (NS_PER_S // unit) for unit in units), None)

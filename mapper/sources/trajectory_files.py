@@ -28,7 +28,7 @@ def read_tum(path: Path) -> Trajectory:
     """Read ``stamp tx ty tz qx qy qz qw`` lines (Sturm et al. 2012), or EuRoC's (Burri et al. 2016).
 
     EuRoC's have whole nanoseconds, commas, w before x, and velocities and biases after the pose, which are
-    left out. A header above the first pose that names qw before qx tells the order, too. Quaternions are
+    left out. A header above the first pose that names qw before qx sets the order, too. Quaternions are
     normalised.
 
     Of two poses with the same stamp the first counts: fr2_desk's truth rounds two samples to one stamp.

@@ -1,4 +1,4 @@
-"""Removal of the sensor's own vehicle from the frames of a log, before any other part of mapper sees them."""
+"""Removal of the sensor's own vehicle from the frames of a log, before they are used."""
 
 from dataclasses import dataclass, replace
 

@@ -31,7 +31,7 @@ class _Scale:
     Attributes:
         cell_m: Edge of the cells that returns are counted in.
         vehicle_m: The vehicle is within this distance.
-        around_m: The world around it is looked at up to here, to tell walls that stand beside it.
+        around_m: Returns up to here are used to distinguish walls that stand beside it.
         ground_m: Returns up to so far above the ground are the ground's; None where up is not known.
     """
 

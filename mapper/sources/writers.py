@@ -49,7 +49,7 @@ def write_log(
         source: Log that is written.
         out: File or folder to make; it must not exist or be empty.
         kind: The format.
-        on_progress: Told how many frames are done, after each.
+        on_progress: Receives the number of frames done, after each.
 
     Raises:
         SourceError: OUT is not empty, or no frame of the source can be read and is of a kind that the format

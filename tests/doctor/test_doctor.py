@@ -63,9 +63,9 @@ def test_a_library_that_works_is_well():
 @pytest.mark.parametrize(
     ("code", "detail", "remedy"),
     [
-        ("import os, signal; os.kill(os.getpid(), signal.SIGSEGV)", "self-test died of SIGSEGV", AGAIN),
-        ("import os, signal; os.kill(os.getpid(), signal.SIGILL)", "died of SIGILL", "build the library"),
-        ("import os, signal; os.kill(os.getpid(), signal.SIGKILL)", "died of SIGKILL", "was there memory"),
+        ("import os, signal; os.kill(os.getpid(), signal.SIGSEGV)", "self-test ended by SIGSEGV", AGAIN),
+        ("import os, signal; os.kill(os.getpid(), signal.SIGILL)", "ended by SIGILL", "build the library"),
+        ("import os, signal; os.kill(os.getpid(), signal.SIGKILL)", "ended by SIGKILL", "was there memory"),
         ("raise ValueError('got [0, 0, 0]')", "1.2, ValueError: got [0, 0, 0]", AGAIN),
         (
             "raise ImportError('libGL.so.1: cannot open shared object file: No such file or directory')",

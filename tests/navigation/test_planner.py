@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 
 from mapper.core.errors import MapSizeError, PlanError
+from mapper.core.geometry import path_length
 from mapper.navigation.config import PlanConfig
 from mapper.navigation.distance import distance_2d
-from mapper.navigation.line_of_sight import path_length
 from mapper.navigation.planner import plan_2d, plan_3d
 from mapper.navigation.search import shortest_path
 from mapper.octree.config import OctreeConfig

@@ -18,7 +18,8 @@ from mapper.octree.grid_file import read_grid
 from mapper.octree.map import OctreeMap
 from mapper.octree.slice import cut_slice
 from mapper.simulation import Boxes, CameraSimulator
-from mapper.simulation.config import IDEAL_SENSOR, SynthConfig
+from mapper.simulation.config import SynthConfig
+from tests.support.ideal_sensors import IDEAL_SENSOR
 
 CELL = 0.05
 BAND = SliceConfig(min_height_m=0.1, max_height_m=1.2)

@@ -67,7 +67,7 @@ def test_what_ended_its_worker_once_gets_another(diary):
 def test_what_ends_a_cluster_s_worker_is_the_only_one_lost(diary, dask_scheduler):
     jobs = [Work(diary, "1", "exit"), Work(diary, "2"), Work(diary, "3")]
     outcomes = outcomes_of(jobs, Workers(scheduler=dask_scheduler), attempts=1)
-    assert outcomes == {0: Failure("its worker died, 1 of 1 times; its log may say why", 1), 1: 4, 2: 9}
+    assert outcomes == {0: Failure("its worker ended, 1 of 1 times; its log may say why", 1), 1: 4, 2: 9}
     assert told(diary) == {"1": 1, "2": 1, "3": 1}
 
 

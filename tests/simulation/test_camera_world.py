@@ -20,8 +20,9 @@ from mapper.simulation import (
 )
 from mapper.simulation.atlas import build_atlas
 from mapper.simulation.builder import ORIGIN, Builder, Skin
-from mapper.simulation.config import IDEAL_SENSOR, SynthConfig
+from mapper.simulation.config import SynthConfig
 from mapper.simulation.path import START_NS, make_motion, seconds_of
+from tests.support.ideal_sensors import IDEAL_SENSOR
 
 SMALL = SynthConfig(texture_px_per_m=64, width_px=160, height_px=120, sensor=IDEAL_SENSOR)
 PLAIN = SMALL.model_copy(update={"texture_px_per_m": 16})

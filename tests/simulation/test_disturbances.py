@@ -8,7 +8,6 @@ import pytest
 from mapper.core.geometry import angle_between
 from mapper.simulation import CameraSimulator, write_tum_log
 from mapper.simulation.config import (
-    IDEAL_SENSOR,
     UNCALIBRATED,
     DisturbanceConfig,
     SensorConfig,
@@ -19,6 +18,7 @@ from mapper.simulation.path import seconds_of
 from mapper.simulation.sensor import BASELINE_M, DISPARITY_FOCAL_PX
 from mapper.simulation.shutter import make_lens
 from mapper.simulation.source import camera_of
+from tests.support.ideal_sensors import IDEAL_SENSOR
 
 PLAIN = SynthConfig(
     furniture_per_room=2,

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from mapper.simulation import CameraSimulator
-from mapper.simulation.config import IDEAL_LIDAR, LIDAR_SCENES, SynthConfig
+from mapper.simulation.config import LIDAR_SCENES, SynthConfig
 from mapper.simulation.lidar import LidarSimulator
 from mapper.simulation.lidar.scene import make_outdoor_scene
+from tests.support.ideal_sensors import IDEAL_LIDAR
 
 FLAT = SynthConfig(seed=4, texture_px_per_m=16, width_px=160, height_px=120, frame_rate_hz=2.0)
 STREET = LIDAR_SCENES["street"].model_copy(

@@ -5,11 +5,12 @@ import pytest
 from pydantic import ValidationError
 
 from mapper.simulation import CameraSimulator, render
-from mapper.simulation.config import CAMERA_SCENES, IDEAL_SENSOR, LIDAR_SCENES, SynthConfig
+from mapper.simulation.config import CAMERA_SCENES, LIDAR_SCENES, SynthConfig
 from mapper.simulation.lidar import LidarSimulator
 from mapper.simulation.lidar.staircase import STOREY_M
 from mapper.simulation.path import seconds_of
 from mapper.simulation.plan import TWIN_DISTANCE_M
+from tests.support.ideal_sensors import IDEAL_SENSOR
 
 SMALL = {"texture_px_per_m": 16, "width_px": 160, "height_px": 120, "sensor": IDEAL_SENSOR}
 

@@ -9,7 +9,6 @@ from mapper.core.errors import SourceError
 from mapper.core.geometry import angle_between, apply, inverse
 from mapper.simulation.config import (
     COURTYARD,
-    IDEAL_LIDAR,
     LIDAR_SCENES,
     STREET,
     LidarSensorConfig,
@@ -24,6 +23,7 @@ from mapper.simulation.lidar import (
 from mapper.simulation.lidar.solids import Shape
 from mapper.simulation.path import seconds_of
 from mapper.sources import open_source
+from tests.support.ideal_sensors import IDEAL_LIDAR
 
 SMALL = {"rings": 16, "lowest_ring_rad": -0.35, "highest_ring_rad": 0.25, "azimuth_steps": 180}
 EXACT = IDEAL_LIDAR.model_copy(update=SMALL)

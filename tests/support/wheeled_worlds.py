@@ -1,6 +1,7 @@
 """Synthetic worlds driven through on wheels whose readings are exact."""
 
-from mapper.simulation.config import IDEAL_LIDAR, IDEAL_SENSOR, STREET, SynthConfig, SynthWheelsConfig
+from mapper.simulation.config import STREET, SynthConfig, SynthWheelsConfig
+from tests.support.ideal_sensors import IDEAL_LIDAR, IDEAL_SENSOR
 
 EXACT = SynthWheelsConfig(path_sigma=0.0, turn_sigma=0.0, heading_rad_per_sqrt_m=0.0)
 FLAT = SynthConfig(

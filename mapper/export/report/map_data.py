@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from mapper.core.errors import DataError
 from mapper.core.timebase import NS_PER_S, Stamps, nearest
+from mapper.export.cloud_picture import HEADROOM_M
 from mapper.export.report.data import Chapter, data_uri, four_digits
 from mapper.export.report.observations import Observations, observations_of
 from mapper.export.report.packing import Plane, pack_layers, pack_points
@@ -37,7 +38,6 @@ _FREE, _OCCUPIED = 1, 2  # a cell that is neither is 0: unknown
 _BASE64_RATIO = 4 / 3
 _NEVER_SEEN = 1023  # of the steps in which the time of the first hit is given
 _HITS_PER_OCTAVE = 16
-_HEADROOM_M = 0.3  # above the highest pose; what lies higher hides the rooms from above
 _MOST_IMAGES = 160
 _IMAGE_PX = 256
 _IMAGE_QUALITY = 70
@@ -69,7 +69,7 @@ def map_of(chapter: Chapter, *, runs: int = 1, most_points: int = MOST_POINTS) -
         "is_observed": observed is not None,
         "frames": list(_frames(chapter, [stamp_ns for stamp_ns, _ in images])),
         "images": [data_uri("jpeg", jpeg) for _, jpeg in images],
-        "headroom_m": four_digits(float(trajectory.positions_world[:, 2].max()) + _HEADROOM_M),
+        "headroom_m": four_digits(float(trajectory.positions_world[:, 2].max()) + HEADROOM_M),
     }
     most, room = most_points // runs - shown["voxels"]["count"], _MOST_BYTES // runs - len(json.dumps(shown))
     cloud = _cloud(chapter, octree.resolution_m, observed, most=most, has_colors=bool(snapshots))
@@ -95,7 +95,7 @@ def map_of_octree(octree: OctreeMap, *, highest_m: float) -> dict[str, Any]:
         "is_observed": False,
         "frames": [],
         "images": [],
-        "headroom_m": four_digits(highest_m + _HEADROOM_M),
+        "headroom_m": four_digits(highest_m + HEADROOM_M),
     }
 
 

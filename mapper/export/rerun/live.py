@@ -190,6 +190,6 @@ def live_recording(target: str, source: Log, config: RerunConfig) -> Iterator[Li
 
 
 def _stride(items: int, wanted: int, *, power: int) -> int:
-    """Return every how many-th item, along each of so many axes, leaves about as many as wanted."""
+    """Return the stride, the same along each of ``power`` axes, that leaves about ``wanted`` items."""
     ratio: float = (items / wanted) ** (1.0 / power)
     return max(1, round(ratio))

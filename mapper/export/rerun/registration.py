@@ -33,7 +33,7 @@ def record_registration(
         points_target: (N, 3) metres; the recording's world is the target's frame.
         points_source: (M, 3) metres, source frame.
         stages: A line of text on each, and T_target_source after it.
-        sensor: Decides which axis is up.
+        sensor: Determines which axis is up.
         name: Name of the recording in the viewer.
 
     Raises:

@@ -64,7 +64,7 @@ class OutdoorScene:
 
 
 def make_outdoor_scene(config: LidarSynthConfig) -> OutdoorScene:
-    """Return the scene of a configuration; its seed decides everything that is left open."""
+    """Return the scene of a configuration; its seed determines everything that is left open."""
     route = make_route(config)
     ground = make_ground(
         rng_of(config.seed, Stream.GROUND), slope_rad=config.slope_rad, undulation_m=config.undulation_m

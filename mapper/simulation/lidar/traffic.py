@@ -107,7 +107,7 @@ class Traffic:
 
 
 def make_traffic(config: LidarSynthConfig, route: Route, ground: Ground) -> Traffic:
-    """Return the traffic of a configuration; its seed decides what each looks like and how it moves."""
+    """Return the traffic of a configuration; its seed determines what each looks like and how it moves."""
     rng, movers = rng_of(config.seed, Stream.MOVERS), []
     for _ in range(config.cars):
         ahead = rng.random() < 0.4

@@ -32,7 +32,7 @@ def read_cloud(path: Path, *, scale: float | None = None, bin_columns: int | Non
     """Return the cloud of a file, without missing returns.
 
     Args:
-        path: A file; its ending decides the format.
+        path: A file; its ending determines the format.
         scale: Metres per unit of the file. None is 1, and refuses what looks like millimetres.
         bin_columns: Numbers of a record in a .bin file. None is KITTI's four, and refuses others.
 

@@ -49,7 +49,7 @@ def other_width(numbers: NDArray[np.float32]) -> tuple[int, bool] | None:
 
 
 def _are_halves_alike(records: NDArray[np.float32]) -> bool:
-    """Tell whether records of six are two of x y z: their columns spread as far as those three further on."""
+    """Return whether records of six are two of x y z: their columns spread as far as those three later."""
     sample = np.nan_to_num(records[:: 1 + len(records) // _SAMPLES], nan=_MOST).clip(-_MOST, _MOST)
     spreads = _LEAST_STEP + sample.std(axis=0)
     return bool(np.abs(np.log(spreads[:3] / spreads[3:])).max() < np.log(_ALIKE_RATIO))

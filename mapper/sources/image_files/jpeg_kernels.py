@@ -100,7 +100,7 @@ def _unstuffed(data: NDArray[np.uint8], at: int, coded: NDArray[np.uint8]) -> tu
 
 @njit(cache=True, nogil=True)
 def _is_padding(coded: NDArray[np.uint8], bits: int, size: int) -> bool:
-    """Tell whether what follows the last bit read is a part of a byte, or bytes of which cameras add some."""
+    """Return whether the last bit read is followed by padding: part of a byte, or bytes that cameras add."""
     first = (bits + 7) >> 3
     zeros = ones = True
     for i in range(first, size):

@@ -35,7 +35,7 @@ def size_of(data: bytes) -> tuple[int, int]:
 
 
 def is_plain(data: bytes) -> bool:
-    """Tell whether ``data`` starts a PNG that :func:`decode` reads: RGB 8 or grey 16 bit, not interlaced."""
+    """Return whether ``data`` starts a PNG for :func:`decode`: RGB 8 or grey 16 bit, not interlaced."""
     if not data.startswith(SIGNATURE + b"\x00\x00\x00\x0dIHDR") or len(data) < _HEADER_END:
         return False
     _, _, *layout = _HEADER.unpack_from(data, _HEADER_START)

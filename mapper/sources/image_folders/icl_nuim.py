@@ -39,7 +39,7 @@ _NUMBER = re.compile(r"\d{1,6}")  # a stamp of the epoch has more digits
 
 
 def recognise(path: Path) -> bool:
-    """Tell whether a path is a folder with associations by frame number, or with ICL-NUIM's truth."""
+    """Return whether a path is a folder with associations by frame number, or with ICL-NUIM's truth."""
     return _lists_numbers(path / _LIST) or (_has_truth(path) and find_images(path) is not None)
 
 
@@ -78,7 +78,7 @@ def _has_truth(folder: Path) -> bool:
 
 
 def _lists_numbers(path: Path) -> bool:
-    """Tell whether the first line of a list, which need not exist, pairs images named by its numbers."""
+    """Return whether the first line of a list, which need not exist, pairs images named by its numbers."""
     if not path.is_file():
         return False
     words = next((words for _, words in rows(path)), [])

@@ -38,7 +38,7 @@ _STAMP_NAME = re.compile(r"\d+\.\d+")
 
 
 def recognise(path: Path) -> bool:
-    """Tell whether a path is an mbag file, or a folder with exactly one."""
+    """Return whether a path is an mbag file, or a folder with exactly one."""
     return _mbag_file(path) is not None
 
 
@@ -107,7 +107,7 @@ def _parse(file: Path, number: int, words: list[str]) -> tuple[FramePair, list[s
     stamp_ns = parse_stamp(words[0], where=where)
     # The thesis's own recordings were made on Windows.
     colour, depth = (within(file.parent, word.replace("\\", "/"), where=where) for word in words[1:3])
-    # The format has one stamp a line; an image named by its stamp, as TUM's are, still tells its own.
+    # The format has one stamp a line; an image named by its stamp, as TUM's are, still has its own.
     depth_stamp_ns = ns_from_seconds_text(depth.stem) if _STAMP_NAME.fullmatch(depth.stem) else stamp_ns
     return FramePair(stamp_ns, colour, depth_stamp_ns, depth), words[3:]
 

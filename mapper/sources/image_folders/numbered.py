@@ -80,7 +80,7 @@ class Place:
 
 
 def recognise(path: Path) -> bool:
-    """Tell whether a path is a folder of numbered colour and depth images, or holds ``seq-*`` folders."""
+    """Return whether a path is a folder of numbered colour and depth images, or holds ``seq-*`` folders."""
     return find_images(path) is not None or bool(_sequences(path))
 
 

@@ -31,7 +31,7 @@ _TRUTH_NAME = re.compile(r"ground|(?:^|[^a-z])gt(?:[^a-z]|$)", re.IGNORECASE)
 
 
 def recognise(path: Path) -> bool:
-    """Tell whether a path is a folder of numbered images with a truth of seven columns."""
+    """Return whether a path is a folder of numbered images with a truth of seven columns."""
     return _truth_file(path) is not None and find_images(path) is not None
 
 

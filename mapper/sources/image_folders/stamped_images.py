@@ -24,7 +24,7 @@ _AFTER = re.compile(r"\D+$")
 
 
 def recognise(path: Path) -> bool:
-    """Tell whether a path is a folder with two or more colour and depth images named by their stamps."""
+    """Return whether a path is a folder with two or more colour and depth images named by their stamps."""
     return path.is_dir() and not any(path.glob("*.mbag")) and _images(path) is not None
 
 

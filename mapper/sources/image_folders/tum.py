@@ -38,7 +38,7 @@ _ASSOCIATIONS = ("associations.txt", "associated.txt", "association.txt", "assoc
 
 
 def recognise(path: Path) -> bool:
-    """Tell whether a path is a folder with TUM's list of colour images, or with a list of pairs."""
+    """Return whether a path is a folder with TUM's list of colour images, or with a list of pairs."""
     return (path / _LIST).is_file() or _associations(path) is not None
 
 

@@ -15,7 +15,7 @@ _IN_FOLDERS = (".mcap", ".db3", _PACKED)
 
 
 def recognise(path: Path) -> bool:
-    """Tell whether a path is named as a recording, or a folder as ROS 2 records it."""
+    """Return whether a path is named as a recording, or a folder as ROS 2 records it."""
     if path.is_dir():
         return bool(_parts(path))
     return path.suffix in (*_ENDINGS, _PACKED) and path.is_file()

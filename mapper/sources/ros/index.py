@@ -136,6 +136,6 @@ def stamp_of(topic: Topic, data: memoryview) -> int:
         raise DataError(f"{topic.name}: a message of {len(data)} bytes has no header")
     if topic.encoding == "ros1":  # a sequence number, then seconds and nanoseconds
         sec, nanosec = struct.unpack_from("<II", data, 4)
-    else:  # CDR's own header of four bytes, whose second tells the byte order
+    else:  # CDR's own header of four bytes, whose second is the byte order
         sec, nanosec = struct.unpack_from("<iI" if data[1] & 1 else ">iI", data, 4)
     return int(sec * NS_PER_S + nanosec)

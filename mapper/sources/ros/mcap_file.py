@@ -156,7 +156,7 @@ def _summary(file: BinaryIO) -> tuple[memoryview, int]:
 
 
 def _is_chunk(file: BinaryIO, span: Span) -> bool:
-    """Tell whether a chunk of this length lies there."""
+    """Return whether a chunk of this length lies there."""
     file.seek(span.start)
     header = file.read(_RECORD.size)
     return len(header) == _RECORD.size and _RECORD.unpack(header) == (

@@ -29,7 +29,7 @@ def message_writer(path: Path, *, kind: RecordingKind) -> Iterator[MessageWriter
     """Yield a writer of a file, compressed by LZ4, that appears whole or not at all."""
     with atomic_file(path) as part:
         if kind == "bag":
-            part.unlink()  # the writer of bags wants to make the file itself
+            part.unlink()  # the writer of bags makes the file itself
             bag = BagFileWriter(part)
             bag.set_compression(BagFileWriter.CompressionFormat.LZ4)
             with bag:

@@ -135,7 +135,7 @@ class Contents(ABC):
         )
 
     def are_apart(self) -> bool:
-        """Tell whether every block ends before the next begins: a damaged index may name one many times."""
+        """Return whether every block ends before the next begins: a damaged index may name one many times."""
         return all(a.start + a.length <= b.start for a, b in pairwise(self.blocks))
 
 

@@ -43,7 +43,7 @@ def recording_log(reader: RecordingReader, config: SourceConfig) -> Log:
     """Return a recording as a log; no frame is decoded before its time.
 
     Raises:
-        SourceError: Nothing in it can be mapped, a topic that was asked for is not there, images do not
+        SourceError: Nothing in it can be mapped, a requested topic is missing, images do not
             pair, or the camera is unknown.
     """
     recording = reader.recording

@@ -105,7 +105,7 @@ def _epochs(stamps_ns: Stamps) -> NDArray[np.int64]:
 
 
 def _without_overlap(stamps_ns: Stamps, epochs: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Tell which messages to keep: the largest epoch, and of the others what lies before or after it."""
+    """Return which messages to keep: the largest epoch, and of the others what lies before or after it."""
     sizes = np.bincount(epochs)
     main = int(sizes.argmax())
     kept: NDArray[np.bool_] = epochs == main

@@ -54,7 +54,7 @@ class Choice:
         frames: Topics that are mapped: images, or clouds.
         imu: Inertial readings, if there are any.
         truth: True poses, if there are any.
-        wheels: Wheel odometry, if it was asked for or is called so.
+        wheels: Wheel odometry, if it was requested or is called so.
         notes: Guesses, a sentence each.
     """
 
@@ -215,7 +215,7 @@ def _depth_rank(name: str) -> tuple[int, ...]:
 
 
 def is_called_registered(name: str) -> bool:
-    """Tell whether the name of a depth topic says that it is registered to colour."""
+    """Return whether the name of a depth topic says that it is registered to colour."""
     return any(word in name.lower() for word in ("aligned", "registered", "to_rgb", "to_color"))
 
 

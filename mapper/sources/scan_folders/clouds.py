@@ -20,7 +20,7 @@ TRUTH_FILES = ("groundtruth.txt", "poses.txt")
 
 
 def recognise(path: Path) -> bool:
-    """Tell whether a path is a cloud, a folder with two clouds or more, or holds such folders."""
+    """Return whether a path is a cloud, a folder with two clouds or more, or holds such folders."""
     return (path.is_file() and is_cloud_name(path)) or bool(_folders(path))
 
 

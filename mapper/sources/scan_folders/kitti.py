@@ -27,7 +27,7 @@ _ROUGHLY_RIGID = 1e-3  # calib.txt has 12 digits; anything further off is no rot
 
 
 def recognise(path: Path) -> bool:
-    """Tell whether a path is a sequence with one of the folders of scans in it, or holds such sequences."""
+    """Return whether a path is a sequence with one of the folders of scans in it, or holds such sequences."""
     return bool(_sequences(path))
 
 
@@ -65,7 +65,7 @@ def read_log(path: Path, config: SourceConfig) -> Log:
 
 
 def _moves_as_a_camera(truth: Trajectory) -> bool:
-    """Tell whether poses move along z, a camera's forward; a LiDAR's z points up."""
+    """Return whether poses move along z, a camera's forward; a LiDAR's z points up."""
     T = truth.T_world_body
     moved_world = np.diff(T[:, :3, 3], axis=0)
     along_z_m = np.abs((moved_world * T[:-1, :3, 2]).sum(axis=1)).sum()

@@ -28,7 +28,7 @@ def write_kitti_log(
     Args:
         source: Log that is written.
         out: Folder to make.
-        on_progress: Told how many scans are done, after each.
+        on_progress: Receives the number of scans done, after each.
 
     Raises:
         SourceError: No frame of the source is a readable scan.

@@ -28,7 +28,7 @@ _SAMPLED = 5
 
 
 def is_cloud_name(path: Path) -> bool:
-    """Tell whether a path is called as a cloud is: by its ending, and a text file also by a number."""
+    """Return whether a path is called as a cloud is: by its ending, and a text file also by a number."""
     ending = path.suffix.lower()
     return ending in ENDINGS and (ending not in _TEXT_ENDINGS or path.stem[-1:].isdecimal())
 

@@ -189,7 +189,7 @@ def test_it_can_be_watched_in_rerun(clouds, tmp_path):
         (("{log}@1", "{log}@0", "--guess", "1 2 3 0 0 0"), "hough-gicp has no use for one"),
         (
             ("{log}@1", "{log}@0"),
-            "wants z up, and a camera's frame has it ahead; choose icp, plane-icp, gicp",
+            "needs z up, and a camera's frame has it ahead; choose icp, plane-icp, gicp",
         ),
         (
             ("{log}@1", "{log}@0", "--method", "icp", "--set", "registration.nonsense=1"),

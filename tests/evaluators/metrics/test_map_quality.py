@@ -17,8 +17,9 @@ from mapper.octree.config import OctreeConfig
 from mapper.octree.map import OctreeMap
 from mapper.octree.octomap_file import write_bt
 from mapper.simulation.boxes import Boxes, write_scene
-from mapper.simulation.config import IDEAL_LIDAR, LidarSynthConfig
+from mapper.simulation.config import LidarSynthConfig
 from mapper.simulation.lidar import make_outdoor_scene, render_scan
+from tests.support.ideal_sensors import IDEAL_LIDAR
 
 EDGE_M = 0.05
 ROW = np.arange(-1.0, 1.0, 0.02) + 0.01

@@ -13,7 +13,8 @@ from mapper.octree.map import OctreeMap
 from mapper.octree.moving_objects import remove_moving_objects
 from mapper.octree.scan_update import pack
 from mapper.simulation import Boxes, CameraSimulator, read_scene, write_tum_log
-from mapper.simulation.config import IDEAL_SENSOR, SynthConfig
+from mapper.simulation.config import SynthConfig
+from tests.support.ideal_sensors import IDEAL_SENSOR
 
 PLAIN = SynthConfig(
     furniture_per_room=3,

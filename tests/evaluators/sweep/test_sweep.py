@@ -108,14 +108,14 @@ def test_what_does_not_fit_a_sensor_is_left_out(swept, desk_log, scans, tmp_path
     )
     entries = plan_sweep(file, tmp_path / "out").entries
     found = {(p.log, p.method): "" if isinstance(e, Job) else e for p, e in entries.items()}
-    blind = "loops.kind=places needs images, odometry.kind=gicp sees scans"
+    blind = "loops.kind=places needs images, odometry.kind=gicp takes scans"
     assert found == {
         ("desk", "default"): "",
         ("desk", "ISVD"): "",
         ("desk", "GICP"): blind,
         ("desk", "words"): blind,
         ("desk", "wheels"): "odometry.kind=wheels needs wheels",
-        ("desk", "scans"): "loops.kind=scans needs scans, odometry.kind=local-map sees images",
+        ("desk", "scans"): "loops.kind=scans needs scans, odometry.kind=local-map takes images",
         ("scans", "default"): "",
         ("scans", "ISVD"): "odometry.kind=isvd needs images",
         ("scans", "GICP"): "",
