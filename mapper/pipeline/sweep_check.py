@@ -34,7 +34,8 @@ _WRONG = 0.4
 mistakes at 0, -1 and shares of a sweep."""
 _LONGEST_SWEEP, _FEWEST_SCANS = 1.5, 10  # of the usual time from one scan to the next
 _NEAREST = 0.15  # to a whole factor that explains itself
-_BETTER, _LEAST_GAIN, _ERRORS = 0.75, 0.05, 3.0
+_POSSIBLE = (-1.5, 4.0)  # others show that poses are wrong
+_BETTER, _LEAST_GAIN, _ERRORS = 0.75, 0.1, 3.0
 """Share of the pairs that have to fit better, their mean gain, and how many standard errors that has to be.
 Gains of wrong times are 0.2 to 0.5."""
 
@@ -60,7 +61,8 @@ def sweep_warnings(source: Log, tracks: Sequence[FrameResult], config: BuildConf
     gains = measured.gains
     mean, error = float(gains.mean()), float(gains.std(ddof=1)) / np.sqrt(len(gains))
     is_better = (gains > 0.0).mean() >= _BETTER and mean > max(_LEAST_GAIN, _ERRORS * error)
-    if not is_better or abs(measured.factor - float(has_times)) < _WRONG:
+    is_possible = _POSSIBLE[0] <= measured.factor <= _POSSIBLE[1]
+    if not is_better or not is_possible or abs(measured.factor - float(has_times)) < _WRONG:
         return []
     pairs = f"{(gains > 0.0).sum()} of {len(gains)} pairs of scans, by {mean:.0%}"
     if has_times:
