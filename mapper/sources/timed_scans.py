@@ -3,6 +3,7 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mapper.core.frames import Frame, Scan
 from mapper.sources.base import Log, WrappedEntry
@@ -46,8 +47,20 @@ class _TimedEntry(WrappedEntry):
 
     def _timed(self, scan: Scan) -> Scan:
         if scan.times_s is not None:
-            is_timed = self.time_scale != 0.0
-            return replace(scan, times_s=np.float32(self.time_scale) * scan.times_s if is_timed else None)
+            return replace(scan, times_s=_scaled(scan.times_s, self.time_scale))
         if self.sweep_s is None:
             return scan
         return replace(scan, times_s=azimuth_times_s(scan.points_body, scan.origin_body, self.sweep_s))
+
+
+def _scaled(times_s: NDArray[np.float32], scale: float) -> NDArray[np.float32] | None:
+    """Return scaled times; None for a scale of 0.
+
+    Of times that count backwards the largest is that of the stamp: of those until the end of the sweep, and
+    of negative ones that ought to be positive.
+    """
+    if scale == 0.0 or len(times_s) == 0:
+        return None
+    from_s = times_s.max() if scale < 0.0 else np.float32(0.0)
+    scaled_s: NDArray[np.float32] = np.float32(scale) * (times_s - from_s)
+    return scaled_s
