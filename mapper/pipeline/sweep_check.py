@@ -101,14 +101,14 @@ def _overlap(source: Log, config: SourceConfig) -> RunWarning | None:
 
 
 def _of_times(factor: float, pairs: str, config: SourceConfig) -> RunWarning:
-    said = "their times have another unit or clock"
-    for whole, cause in ((0.0, "they seem to be deskewed already"), (-1.0, "times seem to count backwards")):
-        if abs(factor - whole) < _NEAREST:
-            said, factor = cause, whole
+    how, said = f"if their points' times are multiplied by {factor:.2g}", "these have another unit or clock"
+    if abs(factor) < _NEAREST:
+        factor, how, said = 0.0, "if not deskewed by their points' times", "they seem to be deskewed already"
+    elif abs(factor + 1.0) < _NEAREST:
+        factor, how, said = -1.0, "with their points' times reversed", "these seem to count backwards"
     return RunWarning(
         kind="sweep",
-        sentence=f"scans fit each other better if deskewed by {factor:.2g} times what their points' times "
-        f"say ({pairs}): {said}",
+        sentence=f"scans fit each other better {how} ({pairs}): {said}",
         suggestion=_corrected(config, factor),
         weight="doubt",
     )
