@@ -32,7 +32,7 @@ _OTHERS: Mapping[bool, tuple[float, ...]] = {True: (0.5, 0.0, -1.0), False: (0.5
 _WRONG = 0.4
 """Least difference from the assumed factor that is a doubt: right times are within 0.1, and the possible
 mistakes at 0, -1 and shares of a sweep."""
-_LONGEST_SWEEP, _FEWEST_SCANS = 1.5, 10  # of the usual time from one scan to the next
+_LONGEST_SWEEP, _FEWEST_SCANS = 3.0, 10  # of the usual time from scan to scan, half where scans are repeated
 _NEAREST = 0.15  # to a whole factor that explains itself
 _POSSIBLE = (-1.5, 4.0)  # others show that poses are wrong
 _BETTER, _LEAST_GAIN, _ERRORS = 0.75, 0.1, 3.0
