@@ -18,6 +18,7 @@ from mapper.loops.factory import build_loop_detector, build_verifier
 from mapper.loops.verification_log import VerificationLog
 from mapper.odometry.base import FrameResult, HindsightOdometry, Odometry, SensorCheck
 from mapper.odometry.factory import build_odometry, odometry_for
+from mapper.pipeline.sweep_check import sweep_warnings
 from mapper.pipeline.tracking_checkpoints import FrameCheckpoint, TrackingCheckpoints
 from mapper.pipeline.tracking_result import BY_POSES, TrackingResult
 from mapper.run.manifest import RunWarning
@@ -129,7 +130,7 @@ def track_log(
             search = searches.take()
             if checkpoints is not None:
                 checkpoints.add(FrameCheckpoint(result, search, ms, checks.reading(done - 1)), odometry)
-    return first_pass.result(odometry, checks, progress)
+    return first_pass.result(odometry, checks, progress, sweep_warnings(source, first_pass.tracks, config))
 
 
 def _observe(odometry: Odometry[Any], entry: FrameRef) -> tuple[FrameRef, Any, float]:
@@ -147,6 +148,7 @@ class _FirstPass:
 
     Attributes:
         skipped: The frames that could not be read.
+        tracks: The others' results.
         frame_ms: Wall milliseconds that each frame took, by stamp.
     """
 
@@ -162,7 +164,7 @@ class _FirstPass:
         self.frame_ms: dict[int, float] = {}
         self._start = start
         self._graph = PoseGraph(dict(before.T_world_node), dict(before.stamps_ns), list(before.factors))
-        self._tracks: list[FrameResult] = []
+        self.tracks: list[FrameResult] = []
         self._wheels = wheels
         self._wheel_factors: list[BetweenFactor] = []
 
@@ -174,7 +176,7 @@ class _FirstPass:
             self._start.detector.add(track.node, replace(track, links=(*track.links, *driven)), view)
             self._wheel_factors.extend(driven)
         self._graph.add_factors(track.factors)
-        self._tracks.append(track)
+        self.tracks.append(track)
 
     def repeat(self, frames: Iterable[FrameCheckpoint], searches: VerificationLog) -> None:
         """Add frames that an earlier process has tracked, with what its searches for loops found."""
@@ -187,11 +189,17 @@ class _FirstPass:
             self.frame_ms[frame.result.stamp_ns] = frame.frame_ms
         searches.repeat(None)
 
-    def result(self, odometry: Odometry[Any], checks: ReadingChecks, progress: Progress) -> TrackingResult:
-        """Return the result of all frames; nothing is added afterwards."""
-        tracks = _in_hindsight(self._tracks, odometry, checks)
+    def result(
+        self,
+        odometry: Odometry[Any],
+        checks: ReadingChecks,
+        progress: Progress,
+        more: Iterable[RunWarning],
+    ) -> TrackingResult:
+        """Return the result of all frames, with more warnings; nothing is added afterwards."""
+        tracks = _in_hindsight(self.tracks, odometry, checks)
         self._graph.add_factors(odometry.finish())
-        warnings = self._warnings(odometry, checks)
+        warnings = [*self._warnings(odometry, checks), *more]
         for warning in warnings:
             progress.note(warning.sentence)
         self._graph.add_factors(self._wheel_factors)

@@ -21,7 +21,9 @@ from mapper.run.results import RunResults, with_truth
 from mapper.run.timeline import TimeLine, counted
 
 FLOOR = "floor"
-INPUT_KINDS = frozenset({"log", "depth", "camera", "shutter", "frozen", "far returns", "conflict", FLOOR})
+INPUT_KINDS = frozenset(
+    {"log", "depth", "camera", "shutter", "sweep", "frozen", "far returns", "conflict", FLOOR}
+)
 """Kinds that are found while the log is read or fused; a finished run has them in its manifest alone."""
 
 _ORDER: tuple[Weight, ...] = ("break", "doubt", "note")

@@ -142,3 +142,9 @@ class SourceConfig(Config):
     bin_columns: int | None = Field(default=None, ge=3, le=64)
     """float32 numbers of a point in a LiDAR log's .bin files, of which the first three are x y z, e.g. 5 for
     nuScenes; None is KITTI's 4, and refuses what shows another number."""
+    point_time_scale: float = 1.0
+    """Factor on the times of a LiDAR's points: 0 for scans that were deskewed already, -1 for times that
+    count backwards, 0.1 for shares of sweeps of 0.1 s. The warning ``sweep`` reports which fits."""
+    sweep_s: PositiveFloat | None = None
+    """Duration of one turn of a spinning LiDAR whose points have no times: they get times by their azimuth
+    from the first point of the file, and are deskewed. The warning ``sweep`` reports it if scans are bent."""

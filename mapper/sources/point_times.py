@@ -27,6 +27,12 @@ MAX_SWEEP_S = 2.0
 
 _UNITS_PER_S = (1, 1_000, 1_000_000, NS_PER_S)
 
+_SAME_STEP_RAD, _NEXT_STEP_RAD = 1e-6, 0.1
+"""Azimuths of consecutive points of a spinning LiDAR's file: of one column, or of two columns nearby."""
+_FEWEST_STEPS, _MIN_ONE_WAY = 100, 0.5
+"""Steps, and the share of them in one direction less that in the other: near none in files of another
+order."""
+
 
 def time_field(names: Iterable[str]) -> str | None:
     """Return the first name, in the case it is written in, that drivers give a point's time."""
@@ -71,6 +77,32 @@ def relative_times_s(values: NDArray[np.number], stamp_ns: int) -> NDArray[np.fl
     after_stamp_s /= units_per_s
     after_stamp_s += first_after_stamp_ns / NS_PER_S
     times_s: NDArray[np.float32] = after_stamp_s.astype(np.float32)
+    return times_s
+
+
+def azimuth_times_s(
+    points: NDArray[np.floating], origin: Array, sweep_s: float
+) -> NDArray[np.float32] | None:
+    """Return times after the first point of one turn of a spinning LiDAR, by azimuth; None if none is seen.
+
+    Whether a file lists columns or rings, its points go round in the sensor's direction, and the first was
+    measured first.
+
+    Args:
+        points: (N, 3) in the order of the file, metres.
+        origin: (3,) of the rays; the LiDAR turns about z.
+        sweep_s: Duration of a turn.
+    """
+    if len(points) < 2:
+        return None
+    azimuth_rad = np.arctan2(points[:, 1] - origin[1], points[:, 0] - origin[0]).astype(np.float64)
+    steps_rad = np.remainder(np.diff(azimuth_rad) + np.pi, 2.0 * np.pi) - np.pi
+    size_rad = np.abs(steps_rad)
+    signs = np.sign(steps_rad[(size_rad > _SAME_STEP_RAD) & (size_rad < _NEXT_STEP_RAD)])
+    if len(signs) < _FEWEST_STEPS or abs(one_way := float(signs.mean())) < _MIN_ONE_WAY:
+        return None
+    turned_rad = np.remainder(np.sign(one_way) * (azimuth_rad - azimuth_rad[0]), 2.0 * np.pi)
+    times_s: NDArray[np.float32] = (turned_rad * (sweep_s / (2.0 * np.pi))).astype(np.float32)
     return times_s
 
 

@@ -221,6 +221,44 @@ def test_a_dusty_log_is_tracked_without_doubt():
     assert np.linalg.norm(tracks[-1].T_world_body[:3, 3] - poses[-1][:3, 3]) < 0.02
 
 
+def test_a_log_in_rain_is_tracked_once_its_first_scans_have_told_what_is_usual():
+    odometry = ScanOdometry(INDOOR, GicpMatcher(INDOOR))
+    poses = [exp(np.array([0.0, 0.0, 0.02 * k]), np.array([0.1 * k, 0.0, 0.0])) for k in range(12)]
+    scans = [dusty_scan(round(1e8) * k, T, seed=k, one_in=10) for k, T in enumerate(poses)]
+    tracks = [odometry.track(odometry.observe(scan)) for scan in scans]
+
+    doubtful = [bool(track.doubts) for track in tracks]
+    assert doubtful == [False, True, True, True, *[False] * 8]
+    assert "where earlier rays passed" in tracks[1].doubts[0]
+    assert np.linalg.norm(tracks[-1].T_world_body[:3, 3] - poses[-1][:3, 3]) < 0.04
+
+
+@pytest.mark.parametrize(
+    ("shares", "contradicting", "is_usual"),
+    [
+        ((0.9, 0.6), (0.05, 0.06, 0.055), True),
+        ((0.9, 0.6), (0.05, 0.06), False),  # too few
+        ((0.9, 0.6), (0.05, 0.06, 0.08), False),  # not alike
+        ((0.9, 0.6), (0.05, 0.06, 0.005, 0.055), False),  # not in a row
+        ((0.6, 0.6), (0.05, 0.06, 0.055), False),  # little overlap
+        ((0.9, 0.3), (0.05, 0.06, 0.055), False),  # a direction disagrees
+    ],
+)
+def test_what_all_first_scans_contradict_alike_is_usual(shares, contradicting, is_usual):
+    usual = UsualFit()
+    for share in contradicting:
+        usual.add_doubtful(Shares(*shares, contradicting=share))
+    assert usual.contradicts(Shares(*shares, contradicting=0.06)) != is_usual
+
+
+def test_later_contradictions_are_not_usual():
+    usual = UsualFit()
+    usual.add(Shares(0.9, 0.6, 0.0))
+    for _ in range(5):
+        usual.add_doubtful(Shares(0.9, 0.6, 0.05))
+    assert usual.contradicts(Shares(0.9, 0.6, 0.05))
+
+
 def test_a_wrong_pose_contradicts_free_space():
     here, there = room_scan(0, seed=1, points=30000), room_scan(1, OFF, seed=2, points=30000)
     key, description = keyframe(here), described(keyframe(there).deskewed)

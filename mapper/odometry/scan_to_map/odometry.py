@@ -324,6 +324,8 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
             self._doubtful = None
             self._search.usual.add(found.shares)
             self._matcher.add(deskewed, found.T_world_middle, is_keyframe=is_keyframe)
+        else:
+            self._search.usual.add_doubtful(found.shares)
         if is_keyframe:
             node = self._next_node
             self._next_node += 1

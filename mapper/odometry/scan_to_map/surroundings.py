@@ -30,8 +30,17 @@ def adapted_to(config: OdometryConfig, log: Log) -> OdometryConfig:
         distance_m = _median_distance_m(log)
         if distance_m is None:
             return config
-        scale = min(1.0, max(_VOXEL_SHARE * distance_m, _SMALLEST_VOXEL_M) / config.voxel_m)
+        scale = _scale(config, distance_m)
     return config.scaled(scale)
+
+
+def adapted_to_scan(config: AnyScanOdometryConfig, scan: Scan) -> AnyScanOdometryConfig:
+    """Return the settings with lengths for the surroundings of one scan; see ``adapted_to``."""
+    return config.scaled(_scale(config, spaciousness_m(scan)) if config.scale is None else config.scale)
+
+
+def _scale(config: AnyScanOdometryConfig, distance_m: float) -> float:
+    return min(1.0, max(_VOXEL_SHARE * distance_m, _SMALLEST_VOXEL_M) / config.voxel_m)
 
 
 def spaciousness_m(scan: Scan) -> float:

@@ -1,7 +1,7 @@
 """Fit that scans of this log usually have, and what speaks against a pose that fits less."""
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -18,6 +18,9 @@ _LEAST_AGREEMENT_SPREAD = 0.06
 _MAX_CONTRADICTING, _TIMES_CONTRADICTING = 0.012, 4.0
 """Share of points in space that rays passed, none of them by a grazing ray: right poses have up to 0.007,
 wrong ones 0.013 to 0.03 and more. It may be so many times the usual one where people or traffic move."""
+_FIRST_SCANS, _FIRST_OVERLAP, _FIRST_AGREEMENT, _FIRST_SPREAD = 3, 0.7, 0.4, 1.5
+"""The first scans of a map that all contradict, by shares within this factor of each other, while so much
+overlaps and agrees, do so by rain, dust or a crowd: under wrong poses they agree less and differ more."""
 _OTHER_PLACE, _HARDLY = 0.1, 0.2
 _JUMP_SPREADS = 8.0
 _LEAST_JUMP_M, _LEAST_JUMP_RAD = 0.15, 0.09
@@ -82,6 +85,7 @@ class UsualFit:
 
     def __init__(self) -> None:
         self._recent: deque[Shares] = deque(maxlen=_RECENT)
+        self._first: list[float] = []
         self.clear()
 
     def add(self, shares: Shares) -> None:
@@ -95,9 +99,22 @@ class UsualFit:
             self._overlap_spread = max(float(spreads[0]), _LEAST_OVERLAP_SPREAD)
             self._agreement_spread = max(float(spreads[1]), _LEAST_AGREEMENT_SPREAD)
 
+    def add_doubtful(self, shares: Shares) -> None:
+        """Add those of a doubtful scan: what contradicts alike in all first scans of a map is usual there.
+
+        Doubtful scans do not enter the map, so a log of whose scans all contradict would never begin.
+        """
+        agrees = shares.overlap >= _FIRST_OVERLAP and shares.agreement >= _FIRST_AGREEMENT
+        self._first = [*self._first, shares.contradicting] if agrees and self.contradicts(shares) else []
+        if self.is_known or len(self._first) < _FIRST_SCANS:
+            return
+        if max(self._first) <= _FIRST_SPREAD * min(self._first):
+            self.usual = replace(self.usual, contradicting=float(np.median(self._first)))
+
     def clear(self) -> None:
         """Forget all."""
         self._recent.clear()
+        self._first = []
         self.usual = Shares(overlap=1.0, agreement=1.0, contradicting=0.0)
         self._overlap_spread, self._agreement_spread = _LEAST_OVERLAP_SPREAD, _LEAST_AGREEMENT_SPREAD
 
