@@ -133,15 +133,19 @@ def test_depth_is_taken_where_points_were_when_it_was_measured(any_observation):
         np.concatenate(log(walk.pose(t) @ inverse(walk.pose(t + offset_s)))) / offset_s for t in times_s
     ]
     depth = ShiftedDepth(bundle, observations, [*twists[:-1], None])
+
+    def corrected(value_s):
+        return depth.corrected(bundle, np.array([value_s]))
+
     exact_px = INTRINSICS[4] / bundle.points_camera()[:, 2]
-    before_px, found_px = (depth.corrected(bundle, value)[0].measured[:, 2] for value in (0.0, offset_s))
+    before_px, found_px = (corrected(value)[0].measured[:, 2] for value in (0.0, offset_s))
     known = ~np.isnan(found_px)
     assert known.mean() > 0.6
     assert not known[bundle.edges[:, 0] == WINDOW_KEYFRAMES - 1].any()
     assert np.nanmedian(np.abs(found_px - exact_px)) < 0.1 * np.nanmedian(np.abs(before_px - exact_px))
     step_s = 1e-5
-    behind, ahead = (depth.corrected(bundle, offset_s + h)[0].measured[:, 2] for h in (-step_s, step_s))
-    slopes = depth.corrected(bundle, offset_s)[1][:, 2]
+    behind, ahead = (corrected(offset_s + h)[0].measured[:, 2] for h in (-step_s, step_s))
+    slopes = corrected(offset_s)[1][0, :, 2]
     assert np.nanmedian(np.abs((ahead - behind) / (2.0 * step_s) - slopes)) < 1e-4 * np.abs(slopes).max()
 
 
