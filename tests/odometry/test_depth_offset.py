@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from mapper.config.loading import load_config
-from mapper.core.frames import PinholeCamera
 from mapper.core.geometry import apply, exp, inverse, log
 from mapper.core.timebase import NS_PER_S, seconds_text_from_ns
 from mapper.odometry.config import LocalMapConfig
@@ -19,34 +18,15 @@ from mapper.pipeline.track import track_log
 from mapper.runtime.progress import SILENT
 from mapper.sources import open_source
 from mapper.sources.writers import write_log
+from tests.support.corner_of_walls import CAMERA, INTRINSICS, depth_image, inverse_depth
 from tests.support.desk_frames import ate_rmse_m, desk_frames, desk_walk
 
-CAMERA = PinholeCamera(320, 240, 262.0, 260.0, 159.5, 119.5)
-INTRINSICS = np.array([262.0, 260.0, 159.5, 119.5, 40.0])
 FRAME_S = 1.0 / 30.0
-NORMALS = np.array([[0.3, 0.1, 1.0], [-0.8, 0.2, 0.6], [0.1, 0.9, 0.4]])
-NORMALS /= np.linalg.norm(NORMALS, axis=1, keepdims=True)
-HEIGHTS_M = np.array([2.5, 1.6, 1.2])
-"""A corner of three walls, n · x = h, in the world."""
 
 
 @pytest.fixture(scope="module")
 def any_observation():
     return build_frame_odometry(LocalMapConfig()).observe(desk_frames()[0])
-
-
-def inverse_depth(T_camera_world, pixels):
-    """Return 1 / z of the walls at pixels, exactly."""
-    rays = np.column_stack([(pixels - INTRINSICS[2:4]) / INTRINSICS[:2], np.ones(len(pixels))])
-    T_world_camera = inverse(T_camera_world)
-    heights_m = HEIGHTS_M - NORMALS @ T_world_camera[:3, 3]
-    return (rays @ T_world_camera[:3, :3].T @ NORMALS.T / heights_m).max(axis=1)
-
-
-def depth_image(T_camera_world):
-    columns, rows = np.meshgrid(np.arange(CAMERA.width_px), np.arange(CAMERA.height_px))
-    inverses = inverse_depth(T_camera_world, np.column_stack([columns.ravel(), rows.ravel()]))
-    return (1.0 / inverses).astype(np.float32).reshape(CAMERA.height_px, CAMERA.width_px)
 
 
 def observed(any_observation, T_camera_world, pixels, *, depth_delay_s=0.0):
