@@ -90,7 +90,7 @@ def window(rng, any_observation, walk, *, offset_s, noise=1.0):
     return bundle, observations, times_s
 
 
-def checked(any_observation, *, offset_s, delay_s=0.0, windows=4, constant=False):
+def checked(any_observation, *, offset_s, delay_s=0.0, windows=4, constant=False, unknown=0):
     """Return a check that was given windows of keyframes whose depth images are late."""
     rng = np.random.default_rng(5)
     check = DepthOffsetCheck()
@@ -98,7 +98,7 @@ def checked(any_observation, *, offset_s, delay_s=0.0, windows=4, constant=False
         walk = Walk(rng, constant=constant)
         keyframes = range(n * WINDOW_KEYFRAMES, (n + 1) * WINDOW_KEYFRAMES)
         bundle, observations, times_s = window(rng, any_observation, walk, offset_s=offset_s)
-        for keyframe, time_s in zip(keyframes, times_s, strict=True):
+        for keyframe, time_s in list(zip(keyframes, times_s, strict=True))[unknown:]:
             around = ((round(t * NS_PER_S), walk.pose(t)) for t in (time_s - FRAME_S, time_s + FRAME_S))
             check.pass_keyframe(keyframe, *around)
         check.add(bundle, keyframes, [replace(o, depth_delay_s=delay_s) for o in observations])
@@ -157,6 +157,13 @@ def test_the_offset_is_estimated(any_observation, offset_s):
 def test_an_offset_that_the_stamps_tell_is_none(any_observation):
     found_s, sigma_s = checked(any_observation, offset_s=0.033, delay_s=0.033).estimate()
     assert abs(found_s) < 4.0 * sigma_s
+
+
+def test_windows_of_which_half_the_velocities_are_known_tell_it(any_observation):
+    found_s, sigma_s = checked(any_observation, offset_s=0.066, unknown=5).estimate()
+    assert sigma_s < 0.005
+    assert abs(found_s - 0.066) < 4.0 * sigma_s + 0.0066
+    assert checked(any_observation, offset_s=0.066, unknown=6).estimate() == (0.0, math.inf)
 
 
 def test_constant_velocity_hardly_tells_it(any_observation):

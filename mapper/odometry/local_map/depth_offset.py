@@ -17,8 +17,9 @@ _MIN_WINDOWS, _MIN_OBSERVERS = 3, 3
 _STEPS, _MAX_STEP_S = 8, 0.05
 _MIN_OFFSET_S, _MIN_SIGMAS = 0.02, 4.0
 """Images so far apart are still paired, by default."""
-_MOST_UNKNOWN = 3
-"""Keyframes without a known velocity, as where something moves by itself, of the ten of a window."""
+_MOST_UNKNOWN = 5
+"""Keyframes without a known velocity, as where something moves by itself, of the ten of a window. Where depth
+is two frames late, many points seem to move by themselves."""
 _MAX_APART_S = 0.3
 """Poses farther apart tell no velocity in between."""
 
