@@ -150,7 +150,7 @@ def test_the_offset_is_estimated(any_observation, offset_s):
     if offset_s == 0.0:
         assert doubt == ""
     else:
-        assert f"add {found_s:.3f} to source.depth_offset_s" in doubt
+        assert f"add {found_s:.3f} to source.depth_offset_s, which pairs images of one time" in doubt
         assert ("later" in doubt) == (offset_s > 0.0)
 
 

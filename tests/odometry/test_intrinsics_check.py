@@ -70,6 +70,7 @@ def test_intrinsics_are_estimated_together(errors, wrong):
     named = re.findall(r"(f[xy]|c[xy]) = ", sentence)
     assert named == wrong
     settings = dict(re.findall(r"--set source\.camera\.(\w+)_px=([\d.]+)", sentence))
+    assert ("source.camera.distortion" in sentence) == bool(wrong)
     if wrong:
         assert list(settings) == ["fx", "fy", "cx", "cy"]  # which the setting wants together
         np.testing.assert_allclose(

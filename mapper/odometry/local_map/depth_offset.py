@@ -82,7 +82,8 @@ class DepthOffsetCheck:
         return (
             f"depth images show the scene {1e3 * abs(offset_s):.0f} ± {1e3 * sigma_s:.0f} ms "
             f"{'later' if offset_s > 0.0 else 'earlier'} than colour images of the same stamps: add "
-            f"{offset_s:.3f} to source.depth_offset_s, or synchronise the sensor's two cameras"
+            f"{offset_s:.3f} to source.depth_offset_s, which pairs images of one time if there are any, or "
+            "synchronise the sensor's two cameras"
         )
 
 

@@ -80,7 +80,7 @@ class IntrinsicsCheck:
         ]
         return (
             f"the images fit {', '.join(wrong)}; distances across the view are wrong by as much: check the "
-            f"log's calibration, or {' '.join(settings)}"
+            f"log's calibration, or {' '.join(settings)} (with source.camera.distortion, if the lens has any)"
         )
 
 
