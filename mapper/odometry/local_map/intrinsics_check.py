@@ -10,9 +10,9 @@ from mapper.odometry.local_map.bundle import Bundle, WindowEstimates, estimated
 _MIN_WINDOWS, _MIN_OBSERVERS = 3, 3
 _STEPS, _MAX_STEP = 10, 0.1
 """Enough for the intrinsics of images of twice or half the size."""
-_MIN_FOCAL_ERROR, _MIN_CENTRE_ERROR, _MIN_SIGMAS = 0.03, 0.025, 4.0
+_MIN_FOCAL_ERROR, _MIN_CENTRE_ERROR, _MIN_SIGMAS = 0.04, 0.035, 4.0
 """Smaller errors, relative to the focal length, are usual: lens distortion that is not modelled, and makers'
-nominal values. On real and simulated logs with right intrinsics they stay below half of these."""
+values; parts of a real log with right intrinsics give 0.025 ± 0.007. Of 0.05 a path is 1 % wrong."""
 
 
 _NAMES = ("fx", "fy", "cx", "cy")
