@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from mapper.config.loading import load_config
-from mapper.core.frames import PinholeCamera
 from mapper.core.geometry import apply, exp, inverse, log
 from mapper.core.timebase import NS_PER_S, seconds_text_from_ns
 from mapper.odometry.config import LocalMapConfig
@@ -19,34 +18,15 @@ from mapper.pipeline.track import track_log
 from mapper.runtime.progress import SILENT
 from mapper.sources import open_source
 from mapper.sources.writers import write_log
+from tests.support.corner_of_walls import CAMERA, INTRINSICS, depth_image, inverse_depth
 from tests.support.desk_frames import ate_rmse_m, desk_frames, desk_walk
 
-CAMERA = PinholeCamera(320, 240, 262.0, 260.0, 159.5, 119.5)
-INTRINSICS = np.array([262.0, 260.0, 159.5, 119.5, 40.0])
 FRAME_S = 1.0 / 30.0
-NORMALS = np.array([[0.3, 0.1, 1.0], [-0.8, 0.2, 0.6], [0.1, 0.9, 0.4]])
-NORMALS /= np.linalg.norm(NORMALS, axis=1, keepdims=True)
-HEIGHTS_M = np.array([2.5, 1.6, 1.2])
-"""A corner of three walls, n · x = h, in the world."""
 
 
 @pytest.fixture(scope="module")
 def any_observation():
     return build_frame_odometry(LocalMapConfig()).observe(desk_frames()[0])
-
-
-def inverse_depth(T_camera_world, pixels):
-    """Return 1 / z of the walls at pixels, exactly."""
-    rays = np.column_stack([(pixels - INTRINSICS[2:4]) / INTRINSICS[:2], np.ones(len(pixels))])
-    T_world_camera = inverse(T_camera_world)
-    heights_m = HEIGHTS_M - NORMALS @ T_world_camera[:3, 3]
-    return (rays @ T_world_camera[:3, :3].T @ NORMALS.T / heights_m).max(axis=1)
-
-
-def depth_image(T_camera_world):
-    columns, rows = np.meshgrid(np.arange(CAMERA.width_px), np.arange(CAMERA.height_px))
-    inverses = inverse_depth(T_camera_world, np.column_stack([columns.ravel(), rows.ravel()]))
-    return (1.0 / inverses).astype(np.float32).reshape(CAMERA.height_px, CAMERA.width_px)
 
 
 def observed(any_observation, T_camera_world, pixels, *, depth_delay_s=0.0):
@@ -110,7 +90,7 @@ def window(rng, any_observation, walk, *, offset_s, noise=1.0):
     return bundle, observations, times_s
 
 
-def checked(any_observation, *, offset_s, delay_s=0.0, windows=4, constant=False):
+def checked(any_observation, *, offset_s, delay_s=0.0, windows=4, constant=False, unknown=0):
     """Return a check that was given windows of keyframes whose depth images are late."""
     rng = np.random.default_rng(5)
     check = DepthOffsetCheck()
@@ -118,7 +98,7 @@ def checked(any_observation, *, offset_s, delay_s=0.0, windows=4, constant=False
         walk = Walk(rng, constant=constant)
         keyframes = range(n * WINDOW_KEYFRAMES, (n + 1) * WINDOW_KEYFRAMES)
         bundle, observations, times_s = window(rng, any_observation, walk, offset_s=offset_s)
-        for keyframe, time_s in zip(keyframes, times_s, strict=True):
+        for keyframe, time_s in list(zip(keyframes, times_s, strict=True))[unknown:]:
             around = ((round(t * NS_PER_S), walk.pose(t)) for t in (time_s - FRAME_S, time_s + FRAME_S))
             check.pass_keyframe(keyframe, *around)
         check.add(bundle, keyframes, [replace(o, depth_delay_s=delay_s) for o in observations])
@@ -133,15 +113,19 @@ def test_depth_is_taken_where_points_were_when_it_was_measured(any_observation):
         np.concatenate(log(walk.pose(t) @ inverse(walk.pose(t + offset_s)))) / offset_s for t in times_s
     ]
     depth = ShiftedDepth(bundle, observations, [*twists[:-1], None])
+
+    def corrected(value_s):
+        return depth.corrected(bundle, np.array([value_s]))
+
     exact_px = INTRINSICS[4] / bundle.points_camera()[:, 2]
-    before_px, found_px = (depth.corrected(bundle, value)[0].measured[:, 2] for value in (0.0, offset_s))
+    before_px, found_px = (corrected(value)[0].measured[:, 2] for value in (0.0, offset_s))
     known = ~np.isnan(found_px)
     assert known.mean() > 0.6
     assert not known[bundle.edges[:, 0] == WINDOW_KEYFRAMES - 1].any()
     assert np.nanmedian(np.abs(found_px - exact_px)) < 0.1 * np.nanmedian(np.abs(before_px - exact_px))
     step_s = 1e-5
-    behind, ahead = (depth.corrected(bundle, offset_s + h)[0].measured[:, 2] for h in (-step_s, step_s))
-    slopes = depth.corrected(bundle, offset_s)[1][:, 2]
+    behind, ahead = (corrected(offset_s + h)[0].measured[:, 2] for h in (-step_s, step_s))
+    slopes = corrected(offset_s)[1][0, :, 2]
     assert np.nanmedian(np.abs((ahead - behind) / (2.0 * step_s) - slopes)) < 1e-4 * np.abs(slopes).max()
 
 
@@ -166,13 +150,20 @@ def test_the_offset_is_estimated(any_observation, offset_s):
     if offset_s == 0.0:
         assert doubt == ""
     else:
-        assert f"add {found_s:.3f} to source.depth_offset_s" in doubt
+        assert f"add {found_s:.3f} to source.depth_offset_s, which pairs images of one time" in doubt
         assert ("later" in doubt) == (offset_s > 0.0)
 
 
 def test_an_offset_that_the_stamps_tell_is_none(any_observation):
     found_s, sigma_s = checked(any_observation, offset_s=0.033, delay_s=0.033).estimate()
     assert abs(found_s) < 4.0 * sigma_s
+
+
+def test_windows_of_which_half_the_velocities_are_known_tell_it(any_observation):
+    found_s, sigma_s = checked(any_observation, offset_s=0.066, unknown=5).estimate()
+    assert sigma_s < 0.005
+    assert abs(found_s - 0.066) < 4.0 * sigma_s + 0.0066
+    assert checked(any_observation, offset_s=0.066, unknown=6).estimate() == (0.0, math.inf)
 
 
 def test_constant_velocity_hardly_tells_it(any_observation):

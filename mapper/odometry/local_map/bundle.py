@@ -1,6 +1,5 @@
 """Bundles of a few keyframes by themselves, and parameters of the sensor that are common to them."""
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -8,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.geometry import Array, Points
-from mapper.odometry.local_map.bundle_adjustment import adjust, common_parameter
+from mapper.odometry.local_map.bundle_adjustment import adjust, common_parameters
 
 WINDOW_KEYFRAMES = 10
 """Keyframes that are adjusted by themselves: neighbours outside would hold them to the parameter given."""
@@ -62,45 +61,52 @@ class Bundle:
         return points
 
 
-Corrected = Callable[[Bundle, float], tuple[Bundle, Array]]
-"""Returns a bundle with measurements or intrinsics that allow for a value of a parameter, and the (E, 2 or 3)
-change of its residuals with the parameter. The value 0 is what the bundle was measured with."""
+Corrected = Callable[[Bundle, Array], tuple[Bundle, Array]]
+"""Returns a bundle with measurements or intrinsics that allow for values of N parameters, and the
+(N, E, 2 or 3) change of its residuals with each. All are 0 in what the bundle was measured with."""
 
 
-def estimated(bundle: Bundle, corrected: Corrected, *, steps: int, max_step: float) -> tuple[float, float]:
-    """Return the value of a parameter of the sensor and its information; both 0 if nothing tells it.
+def estimated(
+    bundle: Bundle, corrected: Corrected, *, parameters: int, steps: int, max_step: float
+) -> tuple[Array, Array]:
+    """Return the (N,) values of parameters of the sensor and their (N, N) information.
 
-    It is one more unknown of a bundle adjustment (Triggs et al. 2000, §2.2), whose first keyframe stays where
+    Both are 0 if nothing tells one of them.
+
+    They are more unknowns of a bundle adjustment (Triggs et al. 2000, §2.2), whose first keyframe stays where
     it is.
 
     Args:
         bundle: Keyframes that share their points.
-        corrected: How the parameter changes the bundle.
+        corrected: How the parameters change the bundle.
+        parameters: Their number N.
         steps: Largest number of Gauss–Newton steps, each after an adjustment.
-        max_step: Largest change of the parameter at each of them.
+        max_step: Largest change of a parameter at each of them; of several, all steps are shortened alike.
     """
-    value = information = 0.0
+    values, nothing = np.zeros(parameters), np.zeros((parameters, parameters))
+    information = nothing
     if not len(bundle.edges):
-        return value, information
+        return values, nothing
     first_edge = np.searchsorted(bundle.edges[:, 1], np.arange(len(bundle.points) + 1)).astype(np.int32)
     free = np.arange(-1, len(bundle.poses) - 1, dtype=np.int32)
     for _ in range(steps):
-        at, slopes = corrected(bundle, value)
+        at, slopes = corrected(bundle, values)
         observed = first_edge, at.edges, at.measured, at.weights, at.intrinsics
         poses, points, agree = adjust(at.poses, free, at.points, *observed, _NO_LINKS, _ROUNDS, _ITERATIONS)
         bundle = replace(bundle, poses=poses, points=points)
-        information, gradient = common_parameter(poses, free, points, *observed, agree, slopes)
-        if information <= 0.0:
-            return 0.0, 0.0
-        step = float(np.clip(-gradient / information, -max_step, max_step))
-        value += step
-        if abs(step) * math.sqrt(information) < _CONVERGED_SIGMAS:
+        information, gradient = common_parameters(poses, free, points, *observed, agree, slopes)
+        if np.linalg.eigvalsh(information)[0] <= 0.0:
+            return np.zeros(parameters), nothing
+        step = -np.linalg.solve(information, gradient)
+        step *= min(1.0, max_step / max(np.abs(step).max(), 1e-12))
+        values = values + step
+        if step @ information @ step < parameters * _CONVERGED_SIGMAS**2:
             break
-    return value, information
+    return values, information
 
 
 class WindowEstimates:
-    """Estimates of a parameter in windows that share no observation; their spread tells how certain it is."""
+    """Estimates of parameters in windows that share no observation, whose spread tells the uncertainty."""
 
     def __init__(self, *, least: int) -> None:
         """Start without any.
@@ -109,25 +115,28 @@ class WindowEstimates:
             least: Fewer windows tell nothing.
         """
         self._least = least
-        self._values: list[float] = []
-        self._information: list[float] = []
+        self._values: list[Array] = []
+        self._information: list[Array] = []
 
     @property
     def are_complete(self) -> bool:
         """Whether enough windows were added."""
         return len(self._values) >= _MAX_WINDOWS
 
-    def add(self, value: float, information: float) -> None:
-        """Add a window's estimate, unless it has no information."""
-        if information > 0.0:
-            self._values.append(value)
+    def add(self, values: Array, information: Array) -> None:
+        """Add a window's (N,) estimate, unless it has no (N, N) information."""
+        if information.any():
+            self._values.append(values)
             self._information.append(information)
 
-    def mean(self) -> tuple[float, float]:
-        """Return the mean and its standard deviation; 0 and infinity where windows are too few."""
+    def mean(self) -> tuple[Array, Array] | None:
+        """Return the (N,) means and their standard deviations; None where windows are too few."""
         if len(self._values) < self._least:
-            return 0.0, math.inf
+            return None
         values, information = np.array(self._values), np.array(self._information)
-        mean = float(np.average(values, weights=information))
-        excess = float((information * (values - mean) ** 2).sum()) / (len(values) - 1)
-        return mean, math.sqrt(max(excess, 1.0) / information.sum())
+        total = information.sum(axis=0)
+        mean: Array = np.linalg.solve(total, np.einsum("kij,kj->i", information, values))
+        apart = values - mean
+        excess = float(np.einsum("ki,kij,kj->", apart, information, apart)) / (values.size - len(mean))
+        sigma: Array = np.sqrt(max(excess, 1.0) * np.diag(np.linalg.inv(total)))
+        return mean, sigma

@@ -293,7 +293,28 @@ def adjust(poses, free, points, first_edge, edges, measured, weights, intrinsics
 def common_parameter(poses, free, points, first_edge, edges, measured, weights, intrinsics, active, slopes):
     """Return the information on a parameter common to all edges, and the gradient of half their χ².
 
-    Poses and points are eliminated, so the parameter's Gauss–Newton step is −gradient / information.
+    As ``common_parameters`` of one parameter, whose slopes are (E, 2 or 3).
+    """
+    information, gradient = common_parameters(
+        poses,
+        free,
+        points,
+        first_edge,
+        edges,
+        measured,
+        weights,
+        intrinsics,
+        active,
+        slopes.reshape((1, slopes.shape[0], slopes.shape[1])),
+    )
+    return information[0, 0], gradient[0]
+
+
+@njit(cache=True, nogil=True)
+def common_parameters(poses, free, points, first_edge, edges, measured, weights, intrinsics, active, slopes):
+    """Return the information on parameters common to all edges, and the gradient of half their χ².
+
+    Poses and points are eliminated, so the parameters' Gauss–Newton step is −information⁻¹ · gradient.
 
     Args:
         poses: As for ``adjust``, at its solution, likewise all but the last two.
@@ -305,19 +326,20 @@ def common_parameter(poses, free, points, first_edge, edges, measured, weights, 
         weights: As for ``adjust``.
         intrinsics: As for ``adjust``.
         active: (E,) edges that take part.
-        slopes: (E, 2) change of the residuals of u and v with the parameter, or (E, 3) with that of bf/z.
+        slopes: (N, E, 2) change of the residuals of u and v with each of N parameters, or (N, E, 3) with that
+            of bf/z.
     """
-    cameras = int(free.max()) + 1
+    cameras, count = int(free.max()) + 1, len(slopes)
     Hcc, bc = np.empty((cameras, 6, 6)), np.empty((cameras, 6))
     Hpp, bp = np.empty((len(points), 3, 3)), np.empty((len(points), 3))
     W = np.zeros((len(edges), 6, 3))
     blocks = Hcc, bc, Hpp, bp, W
     _linearise(poses, free, points, edges, measured, weights, intrinsics, active, False, blocks)
-    coupling_c, coupling_p = np.zeros((cameras, 6)), np.zeros((len(points), 3))
+    coupling_c, coupling_p = np.zeros((count, cameras, 6)), np.zeros((count, len(points), 3))
     r = np.empty(3)
     J = np.empty((3, 3))
     J_pose = np.empty((3, 6))
-    information = gradient = 0.0
+    information, gradient = np.zeros((count, count)), np.zeros(count)
     for e in range(len(edges)):
         if not active[e]:
             continue
@@ -327,18 +349,21 @@ def common_parameter(poses, free, points, first_edge, edges, measured, weights, 
         projection_jacobian(x, y, z, intrinsics, not np.isnan(measured[e, 2]), J)
         pose_jacobian(x, y, z, J, J_pose)
         f = free[c]
-        for i in range(slopes.shape[1]):
-            ws = weights[e, i] * slopes[e, i]
-            information += ws * slopes[e, i]
-            gradient += ws * r[i]
-            for a in range(3):
-                coupling_p[p, a] += ws * (J[i, 0] * T[0, a] + J[i, 1] * T[1, a] + J[i, 2] * T[2, a])
-            if f >= 0:
-                for a in range(6):
-                    coupling_c[f, a] += ws * J_pose[i, a]
-    for f in range(cameras):  # the residuals' own gradient gives way to that of the coupling
-        bc[f] = coupling_c[f]
-    bp[:] = coupling_p
-    moved_c, moved_p = _step(free, first_edge, edges, active, blocks, 0.0)
-    information -= (coupling_c * moved_c).sum() + (coupling_p * moved_p).sum()
+        for n in range(count):
+            for i in range(slopes.shape[2]):
+                ws = weights[e, i] * slopes[n, e, i]
+                for m in range(n + 1):
+                    information[n, m] += ws * slopes[m, e, i]
+                gradient[n] += ws * r[i]
+                for a in range(3):
+                    coupling_p[n, p, a] += ws * (J[i, 0] * T[0, a] + J[i, 1] * T[1, a] + J[i, 2] * T[2, a])
+                if f >= 0:
+                    for a in range(6):
+                        coupling_c[n, f, a] += ws * J_pose[i, a]
+    for n in range(count):  # the residuals' own gradient gives way to that of the coupling
+        bc[:], bp[:] = coupling_c[n], coupling_p[n]
+        moved_c, moved_p = _step(free, first_edge, edges, active, blocks, 0.0)
+        for m in range(n + 1):
+            information[n, m] -= (coupling_c[m] * moved_c).sum() + (coupling_p[m] * moved_p).sum()
+            information[m, n] = information[n, m]
     return information, gradient

@@ -1,5 +1,6 @@
 """Check of the time between colour and depth images: sensors that are not synchronised bend every map."""
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
@@ -16,8 +17,9 @@ _MIN_WINDOWS, _MIN_OBSERVERS = 3, 3
 _STEPS, _MAX_STEP_S = 8, 0.05
 _MIN_OFFSET_S, _MIN_SIGMAS = 0.02, 4.0
 """Images so far apart are still paired, by default."""
-_MOST_UNKNOWN = 3
-"""Keyframes without a known velocity, as where something moves by itself, of the ten of a window."""
+_MOST_UNKNOWN = 5
+"""Keyframes without a known velocity, as where something moves by itself, of the ten of a window. Where depth
+is two frames late, many points seem to move by themselves."""
 _MAX_APART_S = 0.3
 """Poses farther apart tell no velocity in between."""
 
@@ -63,11 +65,14 @@ class DepthOffsetCheck:
             return
         bundle = bundle.of_points_seen_by(_MIN_OBSERVERS)
         depth = ShiftedDepth(bundle, observed, twists)
-        self._offsets_s.add(*estimated(bundle, depth.corrected, steps=_STEPS, max_step=_MAX_STEP_S))
+        self._offsets_s.add(
+            *estimated(bundle, depth.corrected, parameters=1, steps=_STEPS, max_step=_MAX_STEP_S)
+        )
 
     def estimate(self) -> tuple[float, float]:
-        """Return the offset and its standard deviation, seconds, by all windows."""
-        return self._offsets_s.mean()
+        """Return the offset and its standard deviation, seconds; 0 and infinity where windows are too few."""
+        found = self._offsets_s.mean()
+        return (0.0, math.inf) if found is None else (float(found[0][0]), float(found[1][0]))
 
     def contradiction(self) -> str:
         """Return in words that depth images show another time than their stamps say; empty if they do not."""
@@ -77,7 +82,8 @@ class DepthOffsetCheck:
         return (
             f"depth images show the scene {1e3 * abs(offset_s):.0f} ± {1e3 * sigma_s:.0f} ms "
             f"{'later' if offset_s > 0.0 else 'earlier'} than colour images of the same stamps: add "
-            f"{offset_s:.3f} to source.depth_offset_s, or synchronise the sensor's two cameras"
+            f"{offset_s:.3f} to source.depth_offset_s, which pairs images of one time if there are any, or "
+            "synchronise the sensor's two cameras"
         )
 
 
@@ -102,23 +108,23 @@ class ShiftedDepth:
                 surface = surface_of(observation.depth_cells)
                 self._views.append((edges, pixels, surface, twist, observation.depth_delay_s))
 
-    def corrected(self, bundle: Bundle, offset_s: float) -> tuple[Bundle, Array]:
+    def corrected(self, bundle: Bundle, offset_s: Array) -> tuple[Bundle, Array]:
         """Return the bundle with the disparities of points from where they were when depth was measured.
 
         Points that were on no plane then have no depth.
 
         Args:
             bundle: The one of the beginning, perhaps adjusted.
-            offset_s: By how much depth was measured later than its stamps tell.
+            offset_s: (1,) by how much depth was measured later than its stamps tell.
 
         Returns:
-            The bundle, and the (E, 3) change of its residuals with the offset, px/s.
+            The bundle, and the (1, E, 3) change of its residuals with the offset, px/s.
         """
-        disparity_px, slope = self._disparity(bundle, offset_s)
+        disparity_px, slope = self._disparity(bundle, float(offset_s[0]))
         disparity_px[np.isnan(bundle.measured[:, 2])] = np.nan
         measured = np.column_stack([bundle.measured[:, :2], disparity_px])
         slopes = np.column_stack([np.zeros((len(slope), 2)), np.nan_to_num(slope)])
-        return replace(bundle, measured=measured), slopes
+        return replace(bundle, measured=measured), slopes[np.newaxis]
 
     def _disparity(self, bundle: Bundle, offset_s: float) -> tuple[Array, Array]:
         """Return the (E,) corrected disparities and their derivatives; NaN where they are unknown."""
