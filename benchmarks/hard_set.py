@@ -1,7 +1,7 @@
 """The hard set: logs that are hard to track, and whether a run that fails reports it.
 
     python benchmarks/hard_set.py CACHE [--data DATA] [--only NAME…] [--seed 1] [--set key=value] [--json OUT]
-    python benchmarks/hard_set.py CACHE --neighbours --only NAME
+    python benchmarks/hard_set.py CACHE --neighbours --only NAME --seed 1 2 3 4 5
 
 Logs are made once by `mapper synth` and kept in CACHE. With DATA also `tum_fr1_xyz`, `kitti_00` and
 `mulran_kaist03` in it are mapped, at several strides. Each log is tracked, searched for loops and solved with
@@ -180,9 +180,9 @@ def mapped(log: Log, name: str, overrides: Sequence[str] = ()) -> Row:
 
 
 def logs(
-    cache: Path, data: Path | None, only: Sequence[str], seed: int, overrides: Sequence[str] = ()
-) -> Iterator[tuple[str, Log]]:
-    """Yield every log with its name; synthetic ones are made where they are not there yet.
+    cache: Path, data: Path | None, only: Sequence[str], seeds: Sequence[int], overrides: Sequence[str] = ()
+) -> Iterator[tuple[str, str, Log]]:
+    """Yield every log with its name and its label; synthetic ones are made where they are not there yet.
 
     Raises:
         SystemExit: A name is unknown.
@@ -192,17 +192,17 @@ def logs(
     if unknown := set(only) - set(HARD_LOGS) - set(real):
         raise SystemExit(f"no log is called {', '.join(sorted(unknown))}; want of {[*HARD_LOGS, *real]}")
     for name, hard in HARD_LOGS.items():
-        if not only or name in only:
+        for seed in seeds if not only or name in only else ():
             folder = cache / (name if seed == 1 else f"{name}_s{seed}")
             if not folder.exists():
                 arguments = ["synth", str(folder), *hard.arguments, "--seed", str(seed), "--quiet"]
                 app(arguments, standalone_mode=False)
-            yield folder.name, open_source(folder, config)
+            yield name, folder.name, open_source(folder, config)
     for name, strides in real.items():
         if data and (not only or name in only):
             log = open_source(data / name, config)
             for stride in strides:
-                yield f"{name}:{stride}", every(log, stride)
+                yield name, f"{name}:{stride}", every(log, stride)
 
 
 def every(log: Log, stride: int) -> Log:
@@ -220,14 +220,26 @@ def neighbours(log: Log, name: str, overrides: Sequence[str]) -> list[Row]:
     for stride in (2, 3):
         rows.append(mapped(every(log, stride), f"stride {stride}", overrides))
         print(line(rows[-1]), flush=True)
-    errors_m = [np.inf if row.ate_m is None else row.ate_m for row in rows[1:]]
-    median_m, worst_m = float(np.median(errors_m)), max(errors_m)
-    silent = max(row.silent or 0 for row in rows)
-    print(
-        f"{name}: {len(errors_m)} neighbours: ATE median {median_m:.4f} m, worst {worst_m:.4f} m "
-        f"({worst_m / median_m:.2f} times the median); most silent windows {silent}"
-    )
+    print(summary(name, [rows]))
     return rows
+
+
+def summary(name: str, runs: Sequence[Sequence[Row]]) -> str:
+    """Return the median and worst neighbour of a log in a line; of several seeds, by each one's median.
+
+    The error of one short log depends on its noise as much as on the settings: alone it varies by the same
+    factor that is looked for between settings.
+    """
+    errors_m = np.array([[np.inf if row.ate_m is None else row.ate_m for row in rows[1:]] for rows in runs])
+    pooled_m = np.median(errors_m, axis=0)
+    median_m, worst = float(np.median(pooled_m)), int(np.argmax(pooled_m))
+    silent = max(row.silent or 0 for rows in runs for row in rows)
+    seeds = f" by the medians of {len(runs)} seeds" if len(runs) > 1 else ""
+    worst_m = pooled_m[worst]
+    return (
+        f"{name}: {len(pooled_m)} neighbours{seeds}: ATE median {median_m:.4f} m, worst {worst_m:.4f} m "
+        f"({worst_m / median_m:.2f} times the median: {runs[0][1 + worst].log}); most silent windows {silent}"
+    )
 
 
 def main() -> None:
@@ -238,7 +250,7 @@ def main() -> None:
     parser.add_argument("cache", type=Path, help="folder of the synthetic logs")
     parser.add_argument("--data", type=Path, help="folder of the real logs")
     parser.add_argument("--only", nargs="+", default=[], metavar="NAME", help="these logs")
-    parser.add_argument("--seed", type=int, default=1, help="of the synthetic logs")
+    parser.add_argument("--seed", type=int, nargs="+", default=[1], help="of the synthetic logs")
     parser.add_argument("--set", dest="overrides", action="append", default=[], help="key.path=value")
     parser.add_argument("--neighbours", action="store_true", help="12 neighbouring settings on each log")
     parser.add_argument("--json", type=Path, help="file for the table as JSON")
@@ -247,16 +259,21 @@ def main() -> None:
     arguments.cache.mkdir(parents=True, exist_ok=True)
     print(HEADER)
     rows: list[Row] = []
-    for name, log in logs(
+    runs: dict[str, list[list[Row]]] = {}
+    for name, label, log in logs(
         arguments.cache, arguments.data, arguments.only, arguments.seed, arguments.overrides
     ):
         if arguments.neighbours:
-            rows += neighbours(log, name, arguments.overrides)
+            runs.setdefault(name, []).append(neighbours(log, label, arguments.overrides))
+            rows += runs[name][-1]
         else:
-            rows.append(mapped(log, name, arguments.overrides))
+            rows.append(mapped(log, label, arguments.overrides))
             print(line(rows[-1]), flush=True)
         if arguments.json:
             arguments.json.write_text(json.dumps([asdict(row) for row in rows], indent=1) + "\n")
+    for name, of_seeds in runs.items():
+        if len(of_seeds) > 1:
+            print(summary(name, of_seeds))
     if not arguments.neighbours:
         silent = [row.log for row in rows if row.silent]
         false = sum(row.false_loops or 0 for row in rows)

@@ -9,6 +9,7 @@ from mapper.core.geometry import apply, exp
 from mapper.core.trajectory import trajectory_from
 from mapper.odometry.config import LocalMapConfig
 from mapper.odometry.factory import build_frame_odometry
+from mapper.odometry.local_map.landmarks import MIN_SHARED_LANDMARKS
 from mapper.odometry.local_map.pose_tracker import project
 from mapper.odometry.local_map.ray_uncertainty import ray_slope, updated_ray_sigma_m
 from mapper.odometry.local_map.triangulation import triangulated, weights_with_landmarks
@@ -135,9 +136,9 @@ def near_sighted(frames):
     return track(frames, triangulate=True)
 
 
-def track(frames, *, triangulate):
+def track(frames, *, triangulate, **settings):
     limit_m = float(np.quantile(frames[0].depth_m[frames[0].depth_m > 0.0], 0.35))
-    odometry = build_frame_odometry(LocalMapConfig(align_depth=False, triangulate=triangulate))
+    odometry = build_frame_odometry(LocalMapConfig(align_depth=False, triangulate=triangulate, **settings))
     near = [replace(f, depth_m=np.where(f.depth_m > limit_m, 0.0, f.depth_m)) for f in frames]
     return odometry, [odometry.track(odometry.observe(frame)) for frame in near]
 
@@ -205,3 +206,22 @@ def test_triangulated_landmarks_do_not_outvote_features_that_measure_the_scale(n
     alone = added_variances(np.concatenate([triangulated_ones, measured[:19]]))
     beside = added_variances(np.concatenate([triangulated_ones, measured]))
     assert (beside > 0.2 * len(triangulated_ones) * alone).all()
+
+
+@pytest.mark.parametrize("triangulate", [True, False])
+def test_keyframes_that_place_triangulated_landmarks_are_adjusted_beyond_the_window(frames, triangulate):
+    odometry, _ = track(frames, triangulate=triangulate, keyframe_ratio=1.0)
+    landmark_map = odometry._map
+    index = len(landmark_map.keyframes) - 1
+    ids = landmark_map.landmarks_of(index)
+    shared = landmark_map.shared_counts(ids[landmark_map.landmarks["ray_sigma_m"][ids] > 0.0])
+    keyframes = landmark_map.keyframes
+    before = [keyframe.T_camera_world for keyframe in keyframes]
+    covisible = [k for k, _ in landmark_map.covisible(index, min_shared=MIN_SHARED_LANDMARKS)]
+    landmark_map.refine(index, window=2)
+    moved = {
+        k for k, T in enumerate(before) if not np.array_equal(T, landmark_map.keyframes[k].T_camera_world)
+    }
+    placing = [k for k in covisible[1:] if shared[k] >= MIN_SHARED_LANDMARKS]
+    assert bool(placing) == triangulate
+    assert moved == {index, covisible[0], *placing[:4]} - {0}

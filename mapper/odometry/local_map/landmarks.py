@@ -25,6 +25,8 @@ MIN_SHARED_LANDMARKS = 15
 _MIN_FOUND_RATIO = 0.25
 """Young landmarks found in a smaller share of the frames that should show them are removed (ibid., §VI-B)."""
 _BUNDLE_ROUNDS, _BUNDLE_ITERATIONS = 2, 5
+_MOST_WIDENED = 3
+"""A window is widened to at most this many times its size."""
 _NEWEST = 3
 _NEVER_LINKED = -2
 
@@ -275,10 +277,17 @@ class LandmarkMap:
         """Adjust a keyframe, its most covisible ones and their landmarks; drop observations that disagree.
 
         Keyframes outside the window that observe these landmarks take part but stay fixed, as does the first
-        of a sub-map. Depth links hold keyframes of few landmarks.
+        of a sub-map. Depth links hold keyframes of few landmarks. Those that share triangulated landmarks
+        with the keyframe widen the window: their positions give these landmarks' depths, and held fixed with
+        their errors they shrink the scale from window to window.
         """
-        covisible = self.covisible(index, min_shared=MIN_SHARED_LANDMARKS)
-        members = [index, *(k for k, _ in covisible[: window - 1])]
+        covisible = [k for k, _ in self.covisible(index, min_shared=MIN_SHARED_LANDMARKS)]
+        members = [index, *covisible[: window - 1]]
+        if len(covisible) >= window:
+            ids = self.landmarks_of(index)
+            shared = self.shared_counts(ids[self.landmarks["ray_sigma_m"][ids] > 0.0])
+            members += [k for k in covisible[window - 1 :] if shared[k] >= MIN_SHARED_LANDMARKS]
+            members = members[: _MOST_WIDENED * window]
         movable = sorted(k for k in members if k != self.keyframes[k].origin)
         if not movable:
             return
@@ -310,11 +319,11 @@ class LandmarkMap:
         )
         if self.readout.is_estimated and len(linked) == 0:
             slopes = self._observations["slope"][observations]
-            self.readout.learn(
-                *common_parameter(
-                    poses, free, points, first, edges, measured, weights, intrinsics, agree, slopes
-                )
+            information, gradient = common_parameter(
+                poses, free, points, first, edges, measured, weights, intrinsics, agree, slopes
             )
+            share = min(window / len(members), 1.0)  # an observation is in as many windows as one has members
+            self.readout.learn(share * information, share * gradient)
         for k, f in zip(keyframe_ids, free, strict=True):
             if f >= 0:
                 self.keyframes[k].T_camera_world = poses[np.searchsorted(keyframe_ids, k)].copy()
