@@ -1,5 +1,7 @@
 """The default odometry on a short synthetic log: accurate, repeatable, and lost where it should be."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -13,6 +15,7 @@ from mapper.graph.model import PoseGraph
 from mapper.graph.optimize import optimize
 from mapper.odometry.config import LocalMapConfig
 from mapper.odometry.factory import build_frame_odometry
+from mapper.odometry.local_map.keyframe_decision import KeyframeDecision
 from tests.support.desk_frames import ate_rmse_m, blank
 
 
@@ -119,6 +122,30 @@ def test_a_view_that_is_mostly_new_becomes_a_keyframe(frames):
     """The more of a view must be known, the more keyframes it takes."""
     few, many = (track(frames[:20], LocalMapConfig(mapped_ratio=ratio))[0] for ratio in (0.0, 0.9))
     assert sum(step.is_keyframe for step in few) < sum(step.is_keyframe for step in many)
+
+
+def test_a_keyframe_is_young_for_a_time_and_not_only_for_frames(frames):
+    """At 5 Hz the view changes within a few frames, which must not wait for the next keyframe."""
+    odometry = build_frame_odometry(LocalMapConfig(mapped_ratio=0.0))
+    odometry.track(odometry.observe(frames[0]))
+    first = odometry._last
+
+    def seen(after_s, share):
+        count = int(share * len(first.observation))
+        landmark_of_feature = np.where(
+            np.arange(len(first.observation)) < count, first.landmark_of_feature, -1
+        )
+        observation = replace(first.observation, stamp_ns=first.stamp_ns + round(1e9 * after_s))
+        return replace(first, observation=observation, landmark_of_feature=landmark_of_feature)
+
+    def is_due(period_s):
+        decision = KeyframeDecision(odometry._config, odometry._map)
+        assert not decision.is_due(seen(period_s, 1.0))
+        return decision.is_due(seen(2.0 * period_s, 0.65))
+
+    assert seen(0.0, 0.65).inliers >= odometry._config.weak_inliers
+    assert not is_due(1.0 / 30.0)
+    assert is_due(1.0 / 5.0)
 
 
 def test_factors_connect_every_keyframe_to_an_earlier_one(frames):

@@ -6,6 +6,9 @@ from mapper.odometry.local_map.pose_tracker import TrackedPose
 
 _MIN_GAP = 4
 """Frames for which the last keyframe is young."""
+_YOUNG_NS = 150_000_000
+"""Time for which it is young at most: four frames at 30 Hz. At 5 Hz four frames may show a whole turn, and
+the landmarks of one keyframe place the last of them badly."""
 _DEPTH_OVERLAP = 0.9
 """With less overlap of the surfaces a frame without landmarks becomes a keyframe: what is left may not show
 every motion."""
@@ -45,7 +48,8 @@ class KeyframeDecision:
             )
             return textured or tracked_pose.depth.overlap < _DEPTH_OVERLAP
         kept_ratio = inliers / self._most_inliers
-        young = self._frames < _MIN_GAP and inliers >= config.weak_inliers
+        age_ns = tracked_pose.stamp_ns - self._map.keyframes[-1].stamp_ns
+        young = self._frames < _MIN_GAP and age_ns < _YOUNG_NS and inliers >= config.weak_inliers
         share = _YOUNG_SHARE if young else 1.0
         # Landmarks at one edge of the image constrain the pose badly, however many they are.
         ids = tracked_pose.landmark_of_feature
