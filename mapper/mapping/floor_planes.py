@@ -4,7 +4,7 @@ import numpy as np
 
 from mapper.core.frames import Scan
 from mapper.core.geometry import Array, Transform, transform
-from mapper.mapping.planes import flat_cells, levels_of
+from mapper.registration.planes import flat_cells, levels_of
 
 _REACH_M = 5.0
 """Farther away depth errors bend the floor by more than its tilt."""

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mapper.core.geometry import Array
-from mapper.mapping.planes import Patches
+from mapper.registration.planes import Patches
 
 _UPRIGHT_SINE = np.sin(np.radians(8.0))
 _QUARTER_RAD = 0.5 * np.pi

@@ -13,7 +13,7 @@ from mapper.core.timebase import nearest
 from mapper.core.trajectory import Trajectory
 from mapper.mapping.config import LevelConfig
 from mapper.mapping.heading import WallHeading, wall_heading
-from mapper.mapping.planes import (
+from mapper.registration.planes import (
     Patches,
     Vertical,
     least_support,
@@ -56,7 +56,6 @@ _SAME_DIRECTION_RAD = np.radians(3.0)
 _CLEAR_SPREAD_RATIO = 1.25
 
 _MIN_PATCHES = 30
-_MIN_AGREEING_RATIO = 0.3
 _FLAT_COSINE = np.cos(np.radians(10.0))
 _NEAR_FLOOR_M = 0.15
 _MAX_BELOW_FLOOR_RATIO = 0.01
@@ -150,7 +149,7 @@ def _up(
     if len(patches) >= _MIN_PATCHES:
         vertical = vertical_of(patches, up_guess_world=up_guess, tolerance_m=tolerance_m)
         detail = _planes_text(vertical, len(patches))
-        if vertical.horizontal_ratio + vertical.upright_ratio >= _MIN_AGREEING_RATIO:
+        if vertical.is_agreed:
             return vertical.up_world, "planes", "; ".join([*details, detail])
         details.append(f"planes do not agree: {detail}")
     else:

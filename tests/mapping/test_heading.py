@@ -3,7 +3,7 @@ import pytest
 
 from mapper.core.geometry import rotation_exp
 from mapper.mapping.heading import wall_heading
-from mapper.mapping.planes import Patches
+from mapper.registration.planes import Patches
 
 UP = np.array([0.0, 0.0, 1.0])
 

@@ -12,7 +12,8 @@ from mapper.odometry.scan_to_map.gicp import GicpMatcher
 from mapper.odometry.scan_to_map.motion_model import MotionModel, Spread
 from mapper.odometry.scan_to_map.observed_part import MEASURED, observed_part
 from mapper.odometry.scan_to_map.odometry import ScanOdometry
-from mapper.odometry.scan_to_map.pose_search import Answers, PoseCandidate, PoseSearch
+from mapper.odometry.scan_to_map.pose_candidate import Answers, PoseCandidate, best_of
+from mapper.odometry.scan_to_map.pose_search import PoseSearch
 from mapper.odometry.scan_to_map.scan_fit import contradiction, described, fit_of
 from mapper.odometry.scan_to_map.usual_fit import Shares, UsualFit, jump_between
 from tests.support.room_scans import OFF, keyframe, room_scan
@@ -41,6 +42,10 @@ class MisledMatcher(GicpMatcher):
 
 
 INDOOR = GicpOdometryConfig(voxel_m=0.2, cell_m=0.25, coarse_cell_m=1.0, min_range_m=0.3, rescue=None)
+CRATES = (
+    np.array([[-2.5, -1.2], [0.6, 2.0], [-1.2, 1.0]]),
+    np.array([[-1.0, 0.8], [-1.8, -0.8], [-1.2, 1.6]]),
+)
 
 
 def test_a_wrong_pose_of_the_matcher_is_replaced_by_one_that_fits():
@@ -54,6 +59,21 @@ def test_a_wrong_pose_of_the_matcher_is_replaced_by_one_that_fits():
     miss = inverse(poses[-1]) @ track.T_world_body
     assert track.diagnostics.method != "map"
     assert track.doubts == ()
+    assert np.linalg.norm(miss[:3, 3]) < 0.05
+    assert angle_between(np.eye(3), miss[:3, :3]) < 0.02
+
+
+@pytest.mark.parametrize("turn_rad", [3.0, -2.8])
+def test_a_scan_that_is_turned_and_tilted_beyond_the_other_guesses_is_found(turn_rad):
+    odometry = ScanOdometry(INDOOR, GicpMatcher(INDOOR))
+    for k in range(8):
+        odometry.track(odometry.observe(room_scan(k * 500_000_000, seed=k, more=CRATES)))
+    turned = exp(np.array([0.25, 0.0, turn_rad]), np.array([0.7, 0.3, 0.0]))
+
+    track = odometry.track(odometry.observe(room_scan(4_000_000_000, turned, seed=8, more=CRATES)))
+
+    assert track.diagnostics.method == "rescued"
+    miss = inverse(turned) @ track.T_world_body
     assert np.linalg.norm(miss[:3, 3]) < 0.05
     assert angle_between(np.eye(3), miss[:3, :3]) < 0.02
 
@@ -126,14 +146,10 @@ def test_a_strange_scan_is_not_tracked_and_does_not_enter_the_map():
 def test_tracking_goes_on_from_a_doubtful_keyframe_that_the_next_scan_fits():
     config = INDOOR.model_copy(update={"keyframe_distance_m": 0.2})
     odometry = ScanOdometry(config, GicpMatcher(config))
-    crates = (
-        np.array([[-2.5, -1.2], [0.6, 2.0], [-1.2, 1.0]]),
-        np.array([[-1.0, 0.8], [-1.8, -0.8], [-1.2, 1.6]]),
-    )
     poses = [exp(np.array([0.0, 0.0, 0.01 * k]), np.array([0.25 * (k - 6), 0.0, 0.0])) for k in range(12)]
     tracks = []
     for k, pose in enumerate(poses):
-        scan = room_scan(k * 500_000_000, pose, seed=k, points=20000, more=crates if k >= 8 else ())
+        scan = room_scan(k * 500_000_000, pose, seed=k, points=20000, more=CRATES if k >= 8 else ())
         tracks.append(odometry.track(odometry.observe(scan)))
 
     assert [bool(track.doubts) for track in tracks] == [k == 8 for k in range(12)]
@@ -356,6 +372,46 @@ def test_a_direction_that_disagrees_is_a_doubt_where_the_motion_was_predicted(is
     )
 
     assert doubts == (() if is_shown else ("30% agree in the weakest direction, 90% is usual",))
+
+
+@pytest.mark.parametrize(
+    ("method", "agreement", "is_doubted"),
+    [
+        ("rescued", 0.45, True),
+        ("rescued", 0.2, False),
+        ("map", 0.45, False),
+    ],
+)
+def test_a_pose_that_was_searched_is_a_doubt_if_another_fits_as_well(method, agreement, is_doubted):
+    key = keyframe(room_scan(0, seed=1))
+    fit = fit_of(key, key.deskewed, np.eye(4), max_pair_distance_m=0.5)
+    search = PoseSearch(GicpOdometryConfig(), GicpMatcher(GicpOdometryConfig()))
+
+    def candidate(T_world_middle, share):
+        jump = jump_between(np.eye(4), T_world_middle, None)
+        return PoseCandidate(key, T_world_middle, fit, Shares(0.6, share, 0.0), jump, MEASURED, method)
+
+    there = exp(np.zeros(3), np.array([3.0, 0.0, 0.0]))
+    nearly = exp(np.zeros(3), np.array([0.02, 0.0, 0.0]))
+    best = best_of(
+        [candidate(np.eye(4), 0.5), candidate(nearly, 0.49), candidate(there, agreement)], other_m=0.5
+    )
+
+    assert best.rival_score == agreement
+    assert search.doubts(best) == (("another pose fits as well",) if is_doubted else ())
+
+
+def test_less_than_a_part_of_the_usual_fit_is_unusual_however_much_scans_differ():
+    usual = UsualFit()
+    for overlap, agreement in [(0.3, 0.1), (0.9, 0.9), (0.6, 0.5), (0.4, 0.2), (0.8, 0.8)]:
+        usual.add(Shares(overlap, agreement, 0.0))
+
+    assert usual.has_little_overlap(Shares(0.3, 0.5, 0.0), usual_ratio=0.8)
+    assert not usual.has_little_overlap(Shares(0.4, 0.5, 0.0), usual_ratio=0.8)
+    assert usual.disagrees(Shares(0.6, 0.1, 0.0))
+    assert not usual.disagrees(Shares(0.6, 0.2, 0.0))
+    assert usual.agrees_little(Shares(0.6, 0.25, 0.0))
+    assert not usual.agrees_little(Shares(0.6, 0.35, 0.0))
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,8 @@ from mapper.odometry.keyframe_distance import is_far
 from mapper.odometry.scan_to_map.config import ScanOdometryConfig
 from mapper.odometry.scan_to_map.keyframe_tree import KeyframeTree
 from mapper.odometry.scan_to_map.motion_model import MotionModel, velocities_at
-from mapper.odometry.scan_to_map.pose_search import PoseCandidate, PoseSearch
+from mapper.odometry.scan_to_map.pose_candidate import PoseCandidate
+from mapper.odometry.scan_to_map.pose_search import PoseSearch, UnplacedScan
 from mapper.odometry.scan_to_map.scan_fit import ScanKeyframe
 from mapper.odometry.scan_to_map.scan_matcher import DeskewedScan, ScanMatcher
 from mapper.odometry.scan_to_map.scan_noise import ScanNoise, independent_covariance
@@ -181,9 +182,8 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
         self, deskewed: DeskewedScan, time_ns: int, T_world_guess: Transform | None = None
     ) -> PoseCandidate | None:
         """Return the pose that fits best; None if next to nothing agrees with any."""
-        found = self._search.find(
-            deskewed, self._keyframes, self._doubtful, self._last, self._motion, time_ns, T_world_guess
-        )
+        scan = UnplacedScan(deskewed, self._keyframes, self._doubtful, self._last, self._motion, time_ns)
+        found = self._search.find(scan, T_world_guess)
         return None if found is None or self._search.is_lost(found) else found
 
     def _begin_again(

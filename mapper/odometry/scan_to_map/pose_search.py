@@ -2,15 +2,16 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
-from mapper.core.geometry import Transform, angle_between, exp, inverse
+from mapper.core.geometry import Transform, exp, inverse, transform
 from mapper.odometry.scan_to_map.config import ScanOdometryConfig
-from mapper.odometry.scan_to_map.motion_model import MotionModel
-from mapper.odometry.scan_to_map.observed_part import MEASURED, Blend, observed_part
+from mapper.odometry.scan_to_map.motion_model import MotionModel, Spread
+from mapper.odometry.scan_to_map.observed_part import MEASURED, observed_part
+from mapper.odometry.scan_to_map.pose_candidate import Answers, PoseCandidate, best_of
 from mapper.odometry.scan_to_map.scan_fit import (
-    ScanFit,
     ScanKeyframe,
     contradiction,
     described,
@@ -18,52 +19,64 @@ from mapper.odometry.scan_to_map.scan_fit import (
     fit_of,
 )
 from mapper.odometry.scan_to_map.scan_matcher import DeskewedScan, ScanMatcher
-from mapper.odometry.scan_to_map.usual_fit import Jump, Shares, UsualFit, jump_between
+from mapper.odometry.scan_to_map.usual_fit import Shares, UsualFit, jump_between
 from mapper.registration.base import Aligner
 from mapper.registration.factory import build_registration
+from mapper.registration.free_space import ScanDescription
+from mapper.registration.planes import turn_to_z, up_of
 from mapper.registration.refining import refined_motion
 
 _TURNS_RAD = (0.3, -0.3, 0.6, -0.6, 1.0, -1.0)  # about the vertical, from the predicted pose
+_HEADINGS = 8  # evenly around the vertical
 _PAIR_DISTANCES = (4.0, 2.0, 1.0)  # of a scan to the last keyframe or scan, in largest pair distances
 _MAX_POINTS = 2500  # of the scan; fewer than twice as many are used
-_CONTRADICTION_WEIGHT = 15.0
-_ALIKE = 0.1  # scores nearer than this do not decide
 _GOOD = 0.75  # a score of this part of the usual one ends the search
 _FAIR, _GUESSES = 0.5, 3  # and so does one of this part to which so many guesses lead
-_SAME_VOXELS, _SAME_RAD = 0.25, 0.01  # two answers of a registration that differ less are one
+_LEAST_AGREEMENT = 0.1  # of a pose that is searched for: where scans hardly overlap, nothing contradicts
+
+_Attempt = tuple[int, Transform | None, str]
+"""Number of the guess, that of the predicted pose is 0; the pose that it led to; the method."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class PoseCandidate:
-    """A pose of the body in the middle of a scan's sweep.
+@dataclass(frozen=True, eq=False)
+class UnplacedScan:
+    """Scan whose pose is searched for, and what it is compared with.
 
     Attributes:
-        keyframe: That it was compared with.
-        T_world_middle: (4, 4) the pose.
-        fit: On that keyframe.
-        shares: What of it is compared with the usual.
-        jump: From the predicted pose.
-        blend: Of what was found and what was predicted.
-        method: Step that found it.
+        deskewed: The scan.
+        keyframes: The last ones, the newest first.
+        doubtful: Keyframe after them whose pose is in doubt.
+        last: The last scan, if it is not a keyframe.
+        motion: For the predicted pose.
+        time_ns: Of the middle of the sweep.
     """
 
-    keyframe: ScanKeyframe
-    T_world_middle: Transform
-    fit: ScanFit
-    shares: Shares
-    jump: Jump
-    blend: Blend
-    method: str
+    deskewed: DeskewedScan
+    keyframes: Sequence[ScanKeyframe]
+    doubtful: ScanKeyframe | None
+    last: ScanKeyframe | None
+    motion: MotionModel
+    time_ns: int
 
-    @property
-    def is_measured(self) -> bool:
-        """Whether surfaces show all of the motion."""
-        return bool(self.fit.observability.min() >= 1.0)
+    @cached_property
+    def prediction(self) -> Transform:
+        """(4, 4) T_world_middle by the motion model."""
+        return self.motion.predicted(self.time_ns)
 
-    @property
-    def score(self) -> float:
-        """Agreement less what contradicts, weighted; overlap does not tell, as ground lies on any ground."""
-        return _score(self.shares)
+    @cached_property
+    def spread(self) -> Spread | None:
+        """Errors of earlier predictions."""
+        return self.motion.spread(self.time_ns)
+
+    @cached_property
+    def directions(self) -> int:
+        """Number of directions in which the scan has returns."""
+        return directions_of(self.deskewed)
+
+    @cached_property
+    def description(self) -> ScanDescription:
+        """Points and rays for the free-space check."""
+        return described(self.deskewed)
 
 
 class PoseSearch:
@@ -80,107 +93,96 @@ class PoseSearch:
         """Go on with another map and other usual shares."""
         self._matcher, self.usual = matcher, usual
 
-    def find(
-        self,
-        deskewed: DeskewedScan,
-        keyframes: Sequence[ScanKeyframe],
-        doubtful: ScanKeyframe | None,
-        last: ScanKeyframe | None,
-        motion: MotionModel,
-        time_ns: int,
-        T_world_guess: Transform | None = None,
-    ) -> PoseCandidate | None:
+    def find(self, scan: UnplacedScan, T_world_guess: Transform | None = None) -> PoseCandidate | None:
         """Return the pose that fits best; None if no method finds one.
 
         Args:
-            deskewed: The scan.
-            keyframes: The last ones, the newest first.
-            doubtful: Keyframe after them whose pose is in doubt.
-            last: The last scan, if it is not a keyframe.
-            motion: For the predicted pose.
-            time_ns: Of the middle of the sweep.
+            scan: The scan.
             T_world_guess: (4, 4) where the matcher begins; None is the predicted pose.
         """
-        T_world_predicted = motion.predicted(time_ns)
-        spread = motion.spread(time_ns)
         is_believed = self._config.usual_ratio == 0.0
-        directions = directions_of(deskewed)
-
-        def assessed(found: Transform | None, key: ScanKeyframe, method: str) -> PoseCandidate | None:
-            if found is None:
-                return None
-            fit = fit_of(
-                key,
-                deskewed,
-                inverse(key.T_world_middle) @ found,
-                max_pair_distance_m=self._config.max_pair_distance_m,
-            )
-            if fit is None:
-                return None
-            view = key.view_share(directions)
-            shares = Shares(min(1.0, fit.overlap / view), min(1.0, fit.agreement / view), fit.contradicting)
-            T_world_middle, blend = found, MEASURED
-            if not is_believed:
-                voxel_m = deskewed.prepared.voxel_m
-                T_world_middle, blend = observed_part(fit, T_world_predicted, found, spread, voxel_m=voxel_m)
-            jump = jump_between(T_world_predicted, T_world_middle, spread)
-            return PoseCandidate(key, T_world_middle, fit, shares, jump, blend, method)
-
-        T_world_begin = T_world_predicted if T_world_guess is None else T_world_guess
-        T_world_near = self._matcher.match(deskewed, T_world_begin, reach="near")
+        T_world_begin = scan.prediction if T_world_guess is None else T_world_guess
+        T_world_near = self._matcher.match(scan.deskewed, T_world_begin, reach="near")
         best: PoseCandidate | None = None
-        for key in keyframes:
-            near = assessed(T_world_near, key, "map")
+        for key in scan.keyframes:
+            near = self._assessed(scan, T_world_near, key, "map")
             if near is not None and (is_believed or (not self.is_suspect(near) and near.is_measured)):
                 return near
             best = self._preferred(best, near)
         if best is not None and not self.is_suspect(best):
             return best
-        description = described(deskewed)
+        candidates = [] if best is None else [_compared(scan, best)]
+        keys = [scan.keyframes[0]]
+        if scan.doubtful is not None and not any(map(self.fits, candidates)):
+            keys.append(scan.doubtful)
+            on_doubtful = self._assessed(scan, T_world_near, scan.doubtful, "map")
+            candidates += [] if on_doubtful is None else [_compared(scan, on_doubtful)]
+        return self._searched(scan, keys, candidates)
 
-        def compared(candidate: PoseCandidate) -> PoseCandidate:
-            """Return a candidate with the contradictions of both scans."""
-            T_key_scan = inverse(candidate.keyframe.T_world_middle) @ candidate.T_world_middle
-            share = contradiction(candidate.keyframe, description, T_key_scan)
-            return replace(candidate, shares=replace(candidate.shares, contradicting=share))
+    def _searched(
+        self, scan: UnplacedScan, keys: Sequence[ScanKeyframe], candidates: list[PoseCandidate]
+    ) -> PoseCandidate | None:
+        """Return the best pose of all ways, tried in turn until one is good enough.
 
-        candidates = [] if best is None else [compared(best)]
-        keys = [keyframes[0]]
-        if doubtful is not None and not any(map(self.fits, candidates)):
-            keys.append(doubtful)
-            on_doubtful = assessed(T_world_near, doubtful, "map")
-            candidates += [] if on_doubtful is None else [compared(on_doubtful)]
+        Args:
+            scan: The scan.
+            keys: Keyframes that it is registered to.
+            candidates: Poses by prediction, with the contradictions of both scans.
+        """
         # A pose that does not fit the keyframes may fit the doubtful one, so each has answers of its own.
         answers = {
             is_doubtful: Answers(
-                deskewed.prepared.voxel_m,
-                [c.T_world_middle for c in candidates if (c.keyframe is doubtful) == is_doubtful],
+                scan.deskewed.prepared.voxel_m,
+                [c.T_world_middle for c in candidates if (c.keyframe is scan.doubtful) == is_doubtful],
             )
             for is_doubtful in (False, True)
         }
 
         def enough() -> PoseCandidate | None:
             """Return the best pose so far if no other has to be tried."""
-            best = _best(candidates)
-            is_enough = best is not None and self._is_enough(best, answers[best.keyframe is doubtful])
+            best = best_of(candidates, other_m=self._config.max_pair_distance_m)
+            is_enough = best is not None and self._is_enough(best, answers[best.keyframe is scan.doubtful])
             return best if is_enough else None
 
         if (found := enough()) is not None:
             return found
-        for way in (self._nearby, self._globally):
-            if way == self._globally and any(map(self.fits, candidates)):
+        for way in (self._nearby, self._by_heading, self._globally):
+            if way != self._nearby and any(map(self.fits, candidates)):
                 break
             for key in keys:
-                for guess, T_world_middle, method in way(deskewed, key, last, motion, T_world_predicted):
+                for guess, T_world_middle, method in way(scan, key):
                     if T_world_middle is None:
                         continue
-                    if answers[key is doubtful].add(T_world_middle, guess):
-                        candidate = assessed(T_world_middle, key, method)
-                        if candidate is not None:
-                            candidates.append(compared(candidate))
+                    if answers[key is scan.doubtful].add(T_world_middle, guess):
+                        candidate = self._assessed(scan, T_world_middle, key, method)
+                        if candidate is not None and candidate.shares.agreement >= _LEAST_AGREEMENT:
+                            candidates.append(_compared(scan, candidate))
                     if (found := enough()) is not None:
                         return found
-        return _best(candidates)
+        return best_of(candidates, other_m=self._config.max_pair_distance_m)
+
+    def _assessed(
+        self, scan: UnplacedScan, found: Transform | None, key: ScanKeyframe, method: str
+    ) -> PoseCandidate | None:
+        """Return a pose with its fit on a keyframe; None if nothing fits."""
+        if found is None:
+            return None
+        fit = fit_of(
+            key,
+            scan.deskewed,
+            inverse(key.T_world_middle) @ found,
+            max_pair_distance_m=self._config.max_pair_distance_m,
+        )
+        if fit is None:
+            return None
+        view = key.view_share(scan.directions)
+        shares = Shares(min(1.0, fit.overlap / view), min(1.0, fit.agreement / view), fit.contradicting)
+        T_world_middle, blend = found, MEASURED
+        if self._config.usual_ratio > 0.0:
+            voxel_m = scan.deskewed.prepared.voxel_m
+            T_world_middle, blend = observed_part(fit, scan.prediction, found, scan.spread, voxel_m=voxel_m)
+        jump = jump_between(scan.prediction, T_world_middle, scan.spread)
+        return PoseCandidate(key, T_world_middle, fit, shares, jump, blend, method)
 
     def _preferred(self, one: PoseCandidate | None, other: PoseCandidate | None) -> PoseCandidate | None:
         """Return the one that is less suspect and whose keyframe shows more of the motion."""
@@ -202,9 +204,9 @@ class PoseSearch:
             or not self.fits(candidate)
         )
 
-    def _is_enough(self, best: PoseCandidate, answers: "Answers") -> bool:
+    def _is_enough(self, best: PoseCandidate, answers: Answers) -> bool:
         """Return whether no other pose has to be tried: it fits well, or several guesses lead to it."""
-        usual = _score(self.usual.usual)
+        usual = self.usual.usual.score
         if best.score >= _GOOD * usual and not self.is_suspect(best):
             return True
         return best.score >= _FAIR * usual and answers.guesses_of(best.T_world_middle) >= _GUESSES
@@ -262,7 +264,11 @@ class PoseSearch:
         if not usual.is_known:
             little = disagrees = False
         is_alone = not contradicts and little + disagrees + jumps < 2
-        tells_alone = (jumps and candidate.method == "rescued") or (disagrees and not candidate.is_measured)
+        tells_alone = (
+            candidate.is_one_of_two
+            or (jumps and candidate.method == "rescued")
+            or (disagrees and not candidate.is_measured)
+        )
         if is_alone and not tells_alone:
             return ()
         phrases = []
@@ -277,117 +283,75 @@ class PoseSearch:
             phrases.append(
                 f"{shares.agreement:.0%} agree in the weakest direction, {usual.usual.agreement:.0%} is usual"
             )
+        if candidate.is_one_of_two:
+            phrases.append("another pose fits as well")
         if jumps:
             phrases.append(candidate.jump.text)
         return tuple(phrases)
 
-    def _nearby(
-        self,
-        deskewed: DeskewedScan,
-        keyframe: ScanKeyframe,
-        last: ScanKeyframe | None,
-        motion: MotionModel,
-        T_world_predicted: Transform,
-    ) -> Iterator[tuple[int, Transform | None, str]]:
-        """Yield poses that are found from the predicted one, from no motion, and from turns of both.
-
-        Each comes with the number of its guess; that of the predicted pose is 0.
-        """
-        yield 0, self._matcher.match(deskewed, T_world_predicted, reach="far"), "far"
+    def _nearby(self, scan: UnplacedScan, keyframe: ScanKeyframe) -> Iterator[_Attempt]:
+        """Yield poses that are found from the predicted one, from no motion, and from turns of both."""
+        T_world_predicted = scan.prediction
+        yield 0, self._matcher.match(scan.deskewed, T_world_predicted, reach="far"), "far"
         up = T_world_predicted[2, :3]
         turned = [T_world_predicted @ exp(turn * up, np.zeros(3)) for turn in _TURNS_RAD]
-        for guess, T_world_guess in enumerate((T_world_predicted, *turned, motion.T_world_last)):
+        for guess, T_world_guess in enumerate((T_world_predicted, *turned, scan.motion.T_world_last)):
             if self._matcher.uses_guess and guess > 0:  # from the predicted pose it was the first try
-                yield guess, self._matcher.match(deskewed, T_world_guess, reach="near"), "turned"
-            for key in dict.fromkeys((keyframe, keyframe if last is None else last)):
-                T_key_scan = refined_motion(
-                    key.deskewed.prepared,
-                    deskewed.prepared,
-                    inverse(key.T_world_middle) @ T_world_guess,
-                    kind="plane-icp",
-                    pair_distances_m=[k * self._config.max_pair_distance_m for k in _PAIR_DISTANCES],
-                    max_points=_MAX_POINTS,
-                )
-                if not isinstance(T_key_scan, str):
-                    T_world_found = key.T_world_middle @ T_key_scan
-                    method = "keyframe" if key is keyframe else "scan"
-                    yield guess, self._matcher.match(deskewed, T_world_found, reach="near"), method
+                yield guess, self._matcher.match(scan.deskewed, T_world_guess, reach="near"), "turned"
+            for key in dict.fromkeys((keyframe, keyframe if scan.last is None else scan.last)):
+                method = "keyframe" if key is keyframe else "scan"
+                for T_world_found in self._registered(scan, key, T_world_guess):
                     yield guess, T_world_found, method
 
-    def _globally(
-        self,
-        deskewed: DeskewedScan,
-        keyframe: ScanKeyframe,
-        last: ScanKeyframe | None,  # noqa: ARG002
-        motion: MotionModel,  # noqa: ARG002
-        T_world_predicted: Transform,  # noqa: ARG002
-    ) -> Iterator[tuple[int, Transform | None, str]]:
+    def _by_heading(self, scan: UnplacedScan, keyframe: ScanKeyframe) -> Iterator[_Attempt]:
+        """Yield poses that are found from all headings where the last scan was.
+
+        In each the scan is as upright as the keyframe, by the planes in both.
+        """
+        up, up_of_key = up_of(scan.deskewed.prepared), keyframe.up
+        if up is None or up_of_key is None:
+            return
+        R_world_level = keyframe.T_world_middle[:3, :3] @ turn_to_z(up_of_key).T
+        for k in range(_HEADINGS):
+            heading = exp(np.array([0.0, 0.0, 2.0 * np.pi * k / _HEADINGS]), np.zeros(3))[:3, :3]
+            T_world_guess = transform(
+                R_world_level @ heading @ turn_to_z(up), scan.motion.T_world_last[:3, 3]
+            )
+            for T_world_found in self._registered(scan, keyframe, T_world_guess):
+                yield len(_TURNS_RAD) + 2 + k, T_world_found, "rescued"
+
+    def _globally(self, scan: UnplacedScan, keyframe: ScanKeyframe) -> Iterator[_Attempt]:
         """Yield the pose that is found without a guess."""
         if self._rescue is None:
             return
         if self._rescuer is None or self._rescuer[0] is not keyframe.deskewed:
             self._rescuer = keyframe.deskewed, self._rescue.prepare(keyframe.deskewed.scan)
-        found = self._rescuer[1].align(deskewed.scan, np.eye(4))
+        found = self._rescuer[1].align(scan.deskewed.scan, np.eye(4))
         if found.converged:
             T_world_found = keyframe.T_world_middle @ found.T_target_source
-            yield len(_TURNS_RAD) + 2, self._matcher.match(deskewed, T_world_found, reach="near"), "rescued"
-            yield len(_TURNS_RAD) + 2, T_world_found, "rescued"
+            yield -1, self._matcher.match(scan.deskewed, T_world_found, reach="near"), "rescued"
+            yield -1, T_world_found, "rescued"
+
+    def _registered(
+        self, scan: UnplacedScan, key: ScanKeyframe, T_world_guess: Transform
+    ) -> Iterator[Transform | None]:
+        """Yield the pose to which the registration to another scan leads, refined on the map and as it is."""
+        T_key_scan = refined_motion(
+            key.deskewed.prepared,
+            scan.deskewed.prepared,
+            inverse(key.T_world_middle) @ T_world_guess,
+            kind="plane-icp",
+            pair_distances_m=[k * self._config.max_pair_distance_m for k in _PAIR_DISTANCES],
+            max_points=_MAX_POINTS,
+        )
+        if not isinstance(T_key_scan, str):
+            T_world_found = key.T_world_middle @ T_key_scan
+            yield self._matcher.match(scan.deskewed, T_world_found, reach="near")
+            yield T_world_found
 
 
-class Answers:
-    """Poses that registrations found, each with the guesses that led to it."""
-
-    def __init__(self, voxel_m: float, first: Sequence[Transform]) -> None:
-        """Begin with poses that guess 0 led to."""
-        self._near_m = _SAME_VOXELS * voxel_m
-        self._poses = [(T_world_body, {0}) for T_world_body in first]
-
-    def add(self, T_world_body: Transform, guess: int) -> bool:
-        """Add a pose; return whether it is a new one."""
-        if (guesses := self._of(T_world_body)) is not None:
-            guesses.add(guess)
-            return False
-        self._poses.append((T_world_body, {guess}))
-        return True
-
-    def guesses_of(self, T_world_body: Transform) -> int:
-        """Return how many guesses led to a pose."""
-        return len(self._of(T_world_body) or ())
-
-    def _of(self, T_world_body: Transform) -> set[int] | None:
-        for other, guesses in self._poses:
-            difference = inverse(other) @ T_world_body
-            if (
-                np.linalg.norm(difference[:3, 3]) < self._near_m
-                and angle_between(np.eye(3), difference[:3, :3]) < _SAME_RAD
-            ):
-                return guesses
-        return None
-
-
-def _score(shares: Shares) -> float:
-    return shares.agreement - _CONTRADICTION_WEIGHT * shares.contradicting
-
-
-def _best(candidates: Sequence[PoseCandidate]) -> PoseCandidate | None:
-    """Return the best score, of those alike the one nearest to the predicted pose; None without any."""
-    if not candidates:
-        return None
-    highest = max(candidate.score for candidate in candidates)
-    alike = [candidate for candidate in candidates if candidate.score >= highest - _ALIKE]
-    if len(alike) == 1:
-        return alike[0]
-    surprises = [_surprise(candidate) for candidate in alike]
-    least = min(surprises)
-    return max(
-        (c for c, surprise in zip(alike, surprises, strict=True) if surprise <= least + 1.0),
-        key=lambda candidate: candidate.score,
-    )
-
-
-def _surprise(candidate: PoseCandidate) -> float:
-    """Return the jump in units of what would be much, or of 1 m and 1 rad where that is unknown."""
-    jump = candidate.jump
-    if not np.isfinite(jump.limit_m):
-        return jump.translation_m + jump.rotation_rad
-    return max(jump.translation_m / jump.limit_m, jump.rotation_rad / jump.limit_rad)
+def _compared(scan: UnplacedScan, candidate: PoseCandidate) -> PoseCandidate:
+    """Return a candidate with the contradictions of both scans."""
+    T_key_scan = inverse(candidate.keyframe.T_world_middle) @ candidate.T_world_middle
+    share = contradiction(candidate.keyframe, scan.description, T_key_scan)
+    return replace(candidate, shares=replace(candidate.shares, contradicting=share))

@@ -13,6 +13,7 @@ from mapper.odometry.scan_to_map.surface_covariance import surface_covariance
 from mapper.registration.acceptance import weakest_direction
 from mapper.registration.degeneracy import Degeneracy, degeneracy_of
 from mapper.registration.free_space import FreeSpaceCheck, ScanDescription, range_image
+from mapper.registration.planes import up_of
 
 _MIN_PAIRS = 20
 _SURFACE_VOXELS = 0.33  # a point this near to a surface agrees with it
@@ -71,6 +72,11 @@ class ScanKeyframe:
     def directions(self) -> int:
         """Number of directions in which it has returns."""
         return directions_of(self.deskewed)
+
+    @cached_property
+    def up(self) -> Array | None:
+        """(3,) up of the scan by the planes in it, body frame; None if they leave it open."""
+        return up_of(self.deskewed.prepared)
 
     def view_share(self, directions: int) -> float:
         """Return the share of its view in that of a scan with returns in so many directions, at most 1.

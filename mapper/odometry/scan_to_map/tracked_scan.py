@@ -11,7 +11,7 @@ from mapper.core.geometry import Array
 from mapper.odometry.base import FrameResult
 from mapper.odometry.scan_to_map.keyframe_tree import KeyframeTree
 from mapper.odometry.scan_to_map.motion_model import MotionModel
-from mapper.odometry.scan_to_map.pose_search import PoseCandidate
+from mapper.odometry.scan_to_map.pose_candidate import PoseCandidate
 from mapper.odometry.scan_to_map.scan_fit import ScanKeyframe
 from mapper.odometry.scan_to_map.scan_matcher import DeskewedScan, ScanMatcher
 from mapper.odometry.scan_to_map.scan_noise import ScanNoise

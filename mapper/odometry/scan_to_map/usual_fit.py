@@ -13,6 +13,9 @@ _SPREADS = 4.0  # so many standard deviations below its median a share is unusua
 _FEW_SPREADS, _LITTLE = 2.0, 0.75  # and so many, of this part of it, make a search worth its time
 _NORMAL = 1.4826  # standard deviations in a median absolute deviation
 _FEWEST = 5
+_LEAST_OVERLAP, _LEAST_AGREEMENT, _SEARCHED_AGREEMENT = 0.6, 0.3, 0.6
+"""Less than these parts of the usual ones is unusual, and makes a search worth its time, however much the
+scans of a log differ."""
 _LEAST_OVERLAP_SPREAD = 0.04
 _LEAST_AGREEMENT_SPREAD = 0.06
 _MAX_CONTRADICTING, _TIMES_CONTRADICTING = 0.012, 4.0
@@ -21,6 +24,7 @@ wrong ones 0.013 to 0.03 and more. It may be so many times the usual one where p
 _FIRST_SCANS, _FIRST_OVERLAP, _FIRST_AGREEMENT, _FIRST_SPREAD = 3, 0.7, 0.4, 1.5
 """The first scans of a map that all contradict, by shares within this factor of each other, while so much
 overlaps and agrees, do so by rain, dust or a crowd: under wrong poses they agree less and differ more."""
+_CONTRADICTION_WEIGHT = 15.0
 _OTHER_PLACE, _HARDLY = 0.1, 0.2
 _JUMP_SPREADS = 8.0
 _LEAST_JUMP_M, _LEAST_JUMP_RAD = 0.15, 0.09
@@ -39,6 +43,11 @@ class Shares:
     overlap: float
     agreement: float
     contradicting: float
+
+    @property
+    def score(self) -> float:
+        """Agreement less what contradicts, weighted; overlap does not tell, as ground lies on any ground."""
+        return self.agreement - _CONTRADICTION_WEIGHT * self.contradicting
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,18 +134,21 @@ class UsualFit:
 
     def has_little_overlap(self, shares: Shares, *, usual_ratio: float) -> bool:
         """Return whether the overlap is below the log's spread, and this share of the usual one."""
-        least = self.usual.overlap - _SPREADS * self._overlap_spread
+        usual = self.usual.overlap
+        least = max(usual - _SPREADS * self._overlap_spread, _LEAST_OVERLAP * usual)
         return shares.overlap < min(least, usual_ratio * self.usual.overlap)
 
     def disagrees(self, shares: Shares) -> bool:
         """Return whether a direction agrees less than the log's spread explains, and than half as usual."""
-        least = self.usual.agreement - _SPREADS * self._agreement_spread
+        usual = self.usual.agreement
+        least = max(usual - _SPREADS * self._agreement_spread, _LEAST_AGREEMENT * usual)
         return shares.agreement < min(least, 0.5 * self.usual.agreement)
 
     def agrees_little(self, shares: Shares) -> bool:
         """Return whether a direction agrees less than most scans' do, so that a search is worth it."""
-        least = self.usual.agreement - _FEW_SPREADS * self._agreement_spread
-        return self.is_known and shares.agreement < min(least, _LITTLE * self.usual.agreement)
+        usual = self.usual.agreement
+        least = max(usual - _FEW_SPREADS * self._agreement_spread, _SEARCHED_AGREEMENT * usual)
+        return self.is_known and shares.agreement < min(least, _LITTLE * usual)
 
     def contradicts(self, shares: Shares) -> bool:
         """Return whether too much stands where rays passed."""

@@ -8,6 +8,7 @@ from mapper.core.frames import Points32
 from mapper.core.geometry import Array, Points, Transform, transform
 from mapper.registration.hough.config import LevellingConfig
 from mapper.registration.hough.ground_kernels import score_planes, thin
+from mapper.registration.planes import turn_to_z
 
 LEVEL_ABOVE_RAD = 0.09
 """A smaller tilt stays: on a sloping street the plane would tilt what gravity has levelled."""
@@ -69,7 +70,7 @@ def level(points_body: Points32, config: LevellingConfig) -> Levelling:
     if ratio < MIN_INLIER_RATIO:
         return _WITHOUT_GROUND
     tilt_rad = float(np.arccos(np.clip(up[2], -1.0, 1.0)))
-    R = _shortest_turn(up) if tilt_rad > LEVEL_ABOVE_RAD else np.eye(3)
+    R = turn_to_z(up) if tilt_rad > LEVEL_ABOVE_RAD else np.eye(3)
     return Levelling(transform(R, np.array([0.0, 0.0, height_m])), tilt_rad, ratio)
 
 
@@ -81,11 +82,3 @@ def _refitted(points: Points, plane: Array, inlier_m: float) -> Array:
     up = np.linalg.eigh(offsets.T @ offsets)[1][:, 0]
     up *= np.copysign(1.0, up[2])
     return np.append(up, -up @ centre)
-
-
-def _shortest_turn(up: Array) -> Array:
-    """Return the rotation that takes ``up`` to z without turning about z (Rodrigues 1840)."""
-    x, y, z = up
-    K = np.array([[0.0, 0.0, -x], [0.0, 0.0, -y], [x, y, 0.0]])
-    R: Array = np.eye(3) + K + K @ K / (1.0 + z)
-    return R
