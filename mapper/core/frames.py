@@ -59,6 +59,21 @@ class PinholeCamera:
         """(9,) fx, fy, cx, cy in pixels and the distortion's coefficients, as compiled code takes them."""
         return np.array([self.fx_px, self.fy_px, self.cx_px, self.cy_px, *self.distortion])
 
+    def resized(self, width_px: int, height_px: int) -> "PinholeCamera":
+        """Return the camera of the same view in another size; pixel 0 is the centre of the first."""
+        if (width_px, height_px) == (self.width_px, self.height_px):
+            return self
+        across, down = width_px / self.width_px, height_px / self.height_px
+        return PinholeCamera(
+            width_px,
+            height_px,
+            self.fx_px * across,
+            self.fy_px * down,
+            (self.cx_px + 0.5) * across - 0.5,
+            (self.cy_px + 0.5) * down - 0.5,
+            distortion=self.distortion,
+        )
+
     def undistort(self, pixels: NDArray[np.floating]) -> Array:
         """Return the (N, 2) undistorted positions of (N, 2) measured pixels (column, row), in pixels."""
         ideal: Array = np.asarray(pixels, dtype=np.float64)

@@ -45,6 +45,8 @@ class ImageFiles:
         depth_units_per_m: Depth image units per metre.
         recorded_units_per_m: Units per metre of the recording that it is encoded from; None if they are the
             same.
+        colour_px: Width and height of the colour image; None if they are the frame's.
+        depth_px: As ``colour_px``, of the depth image.
     """
 
     colour: ImageFile
@@ -52,6 +54,8 @@ class ImageFiles:
     depth_stamp_ns: int
     depth_units_per_m: float
     recorded_units_per_m: float | None = None
+    colour_px: tuple[int, int] | None = None
+    depth_px: tuple[int, int] | None = None
 
 
 class FrameRef(Protocol):

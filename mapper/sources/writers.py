@@ -120,13 +120,15 @@ def _write_images_log(
 
 
 def _camera_of(source: Log) -> PinholeCamera:
-    """Return the camera of the first readable frame: one without any is no RGB-D log."""
+    """Return the camera of the first readable frame's colour image: a log without any is no RGB-D log."""
     if source.sensor == "lidar":
         raise SourceError(f"{source.path}: scans without images; TUM and mbag hold RGB-D frames: --as kitti")
     reason = "it has no frames"
     for entry in source.entries():
         try:
-            return _load(entry).camera
+            camera = _load(entry).camera
+            files = entry.files
+            return camera if files is None or files.colour_px is None else camera.resized(*files.colour_px)
         except FrameError as error:
             reason = str(error)
     raise SourceError(f"{source.path}: no frame can be written: {reason}")

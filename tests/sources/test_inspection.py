@@ -7,6 +7,7 @@ import pytest
 from mapper.core.errors import SourceError
 from mapper.export.mcap_log import McapLog
 from mapper.sources.config import SourceConfig
+from mapper.sources.image_files.reading import encode_depth
 from mapper.sources.inspection import inspect_log, timing_of
 from tests.support.command_line import invoke
 from tests.support.recordings import CAMERA, COLOR, DEPTH, shots, write
@@ -150,3 +151,12 @@ def test_stamps_that_no_run_can_have_are_said_before_anything_is_tracked(tiny_tu
     assert result.exit_code == 1
     assert reason in result.stderr
     assert not list(tmp_path.glob("run*"))
+
+
+def test_both_sizes_and_what_is_resized_are_said(tiny_tum_log):
+    log = tiny_tum_log(2)
+    for path in (log / "depth").iterdir():
+        path.write_bytes(encode_depth(np.full((24, 32), 1.0, np.float32), 5000.0))
+    facts = inspect_log(log, SourceConfig()).log
+    assert facts.content.startswith("colour and depth of 64×48 px")
+    assert any("colour of 64×48 and depth of 32×24 px" in note for note in facts.notes)

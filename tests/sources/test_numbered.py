@@ -167,6 +167,30 @@ def test_a_malformed_trajectory_is_named_with_its_line(tmp_path, text, message):
         open_source(folder)
 
 
+def test_an_exported_scannet_folder(tmp_path):
+    folder = tmp_path / "scene0000_00"
+    (folder / "pose").mkdir(parents=True)
+    (folder / "intrinsic").mkdir()
+    for i in range(3):
+        write_picture(folder / f"color/{i}.jpg", tmp_path / "unused.png", i, width_px=108, height_px=80)
+        write_picture(tmp_path / "unused.jpg", folder / f"depth/{i}.png", i, width_px=64, height_px=48)
+        T = np.full((4, 4), -np.inf) if i == 1 else POSES[i]  # the camera was lost there
+        (folder / f"pose/{i}.txt").write_text(matrix_text(T))
+    for name, fx in (("color", 90.0), ("depth", 53.0)):
+        K = np.diag([fx, fx, 1.0, 1.0])
+        K[:2, 2] = 53.5, 39.5
+        (folder / f"intrinsic/intrinsic_{name}.txt").write_text(matrix_text(K))
+    with pytest.raises(SourceError, match="colour has 108×80 px and depth 64×48, which is another aspect"):
+        open_source(folder)
+    for i in range(3):
+        write_picture(folder / f"color/{i}.jpg", tmp_path / "unused.png", i, width_px=128, height_px=96)
+    source = open_source(folder)
+    assert (source[2].camera.width_px, source[2].camera.fx_px) == (128, 90.0)
+    assert source[2].depth_m.shape == (96, 128)
+    np.testing.assert_allclose(source.truth.T_world_body, [POSES[0], POSES[2]], atol=1e-6)
+    assert "pose files: 1 of 3 poses are not finite rigid motions; dropped" in source.notes
+
+
 def test_the_nominal_camera_is_assumed_only_for_its_own_size(tmp_path):
     small = redwood(tmp_path / "small", ["0"])
     (small / "calibration.toml").unlink()

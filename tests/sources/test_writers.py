@@ -5,6 +5,7 @@ from mapper.core.errors import FrameError, SourceError
 from mapper.core.frames import PinholeCamera, RgbdFrame, Scan
 from mapper.core.trajectory import trajectory_from
 from mapper.sources import open_source
+from mapper.sources.image_files.reading import encode_depth
 from mapper.sources.writers import left_out, write_log
 from tests.support.logs import MemoryEntry, log_in_memory
 from tests.support.tum_logs import FIRST_NS, PERIOD_NS, picture
@@ -147,3 +148,19 @@ def test_recordings_leave_out_what_is_before_time_0_and_say_so(kind, tmp_path):
     again = open_source(tmp_path / f"log.{kind}")
     assert [entry.stamp_ns for entry in again.entries()] == [30_000_000]
     assert again.truth.stamps_ns.tolist() == [0, 40_000_000]
+
+
+@pytest.mark.parametrize("kind", ["tum", "mbag", "mcap", "bag"])
+def test_images_of_two_sizes_stay_as_they_are_with_the_camera_of_colour(tiny_tum_log, tmp_path, kind):
+    log = tiny_tum_log(2)
+    for path in (log / "depth").iterdir():
+        path.write_bytes(encode_depth(np.full((24, 32), 1.0 + float(path.stem) % 1.0, np.float32), 5000.0))
+    source = open_source(log)
+    out = tmp_path / (f"log.{kind}" if kind in ("mcap", "bag") else kind)
+    assert write_log(source, out, kind=kind) == []
+    again = open_source(out)
+    assert (again[0].camera.width_px, again[0].camera.fx_px) == (64, 60.0)
+    np.testing.assert_array_equal(again[1].depth_m, source[1].depth_m)
+    assert "colour of 64×48 and depth of 32×24 px" in " ".join(again.notes)
+    if kind == "tum":
+        assert "width_px = 64\n" in (out / "calibration.toml").read_text()

@@ -113,20 +113,6 @@ def depth_m_from(units: NDArray[np.uint16], units_per_m: float) -> DepthImage:
     return depth_m
 
 
-def check_size(shape: tuple[int, ...], camera: PinholeCamera, where: str) -> None:
-    """Refuse an (H, W, …) image that is not as large as its camera's; ``where`` is what an error names.
-
-    Raises:
-        FrameError: It is not.
-    """
-    want = (camera.height_px, camera.width_px)
-    if shape[:2] != want:
-        raise FrameError(
-            f"{where}: {shape[1]}×{shape[0]} px, but the log has {want[1]}×{want[0]}; "
-            "want one size, colour and depth registered to it"
-        )
-
-
 def scan_of(depth_m: DepthImage, camera: PinholeCamera, *, stamp_ns: int) -> Scan:
     """Return the measured pixels of (H, W) depth as a scan in the camera's frame, without a colour image."""
     no_image = np.broadcast_to(np.uint8(0), depth_m.shape)

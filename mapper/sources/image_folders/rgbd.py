@@ -8,14 +8,15 @@ from pathlib import Path
 import numpy as np
 
 from mapper.core.errors import FrameError, SourceError
-from mapper.core.frames import DepthImage, Image, PinholeCamera, RgbdFrame, Scan
+from mapper.core.frames import DepthImage, Image, RgbdFrame, Scan
 from mapper.core.timebase import NS_PER_S
 from mapper.core.trajectory import Trajectory
 from mapper.sources.base import Accelerations, ImageFiles, Log
 from mapper.sources.calibration import Calibration, configured
 from mapper.sources.calibration_file import calibration_file, read_calibration
 from mapper.sources.config import CameraConfig
-from mapper.sources.image_files.reading import check_size, read_colour, read_depth_m, read_grey, scan_of
+from mapper.sources.image_files.image_sizes import RecordedCamera, Size, recorded_camera
+from mapper.sources.image_files.reading import read_colour, read_depth_m, read_grey, scan_of
 from mapper.sources.listed_files import refuse_links_out
 from mapper.sources.text import parse_numbers, parse_stamp, table, time_order
 
@@ -29,14 +30,14 @@ class RgbdEntry:
     Attributes:
         stamp_ns: Time of the colour image, nanoseconds.
         files: Both images as they are encoded.
-        camera: Camera of both images.
+        recorded: Camera of the frame, and the sizes of both images as recorded.
         read_image: Returns the (H, W, 3) RGB image, or the grey one where its argument is false.
         read_depth_m: Returns (H, W) depth in metres.
     """
 
     stamp_ns: int
     files: ImageFiles
-    camera: PinholeCamera
+    recorded: RecordedCamera
     read_image: Callable[[bool], Image]
     read_depth_m: Callable[[], DepthImage]
 
@@ -44,12 +45,11 @@ class RgbdEntry:
         """Read and decode both images.
 
         Raises:
-            FrameError: An image is missing, damaged, of the wrong kind or of another size than the camera's.
+            FrameError: An image is missing, damaged, of the wrong kind or not as large as the log's first.
         """
-        image = self.read_image(colour)
-        check_size(image.shape, self.camera, f"{self.files.colour}")
+        image = self.recorded.image(self.read_image(colour), f"{self.files.colour}")
         delay_s = (self.files.depth_stamp_ns - self.stamp_ns) / NS_PER_S
-        return RgbdFrame(self.stamp_ns, image, self._depth_m(), self.camera, depth_delay_s=delay_s)
+        return RgbdFrame(self.stamp_ns, image, self._depth_m(), self.recorded.camera, depth_delay_s=delay_s)
 
     def scan(self) -> Scan:
         """Read and decode the depth image alone.
@@ -57,12 +57,10 @@ class RgbdEntry:
         Raises:
             FrameError: As ``load``.
         """
-        return scan_of(self._depth_m(), self.camera, stamp_ns=self.stamp_ns)
+        return scan_of(self._depth_m(), self.recorded.camera, stamp_ns=self.stamp_ns)
 
     def _depth_m(self) -> DepthImage:
-        depth_m = self.read_depth_m()
-        check_size(depth_m.shape, self.camera, f"{self.files.depth}")
-        return depth_m
+        return self.recorded.depth_m(self.read_depth_m(), f"{self.files.depth}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +89,7 @@ def rgbd_log(
 
     Args:
         pairs: Its frames, in strictly increasing time.
-        calibration: Intrinsics of all of them; the first colour image that can be read gives their size. With
+        calibration: Intrinsics of all of them; the first images that can be read give their sizes. With
             fy < 0 the truth is in left-handed frames, whose y points up: both are mirrored, not the images.
         depth_units_per_m: Depth image units per metre.
         path: Folder that was opened, or a file in the folder of the log.
@@ -102,8 +100,9 @@ def rgbd_log(
         are_units_assumed: Whether the units of depth are a guess, as of :class:`Log`.
 
     Raises:
-        SourceError: No colour image can be read, they are not of the calibration's size, an image is a link
-            out of the log, or a line of ``accelerometer.txt`` is malformed.
+        SourceError: No colour image can be read, they are not of the calibration's size, depth shows another
+            view by its aspect ratio, an image is a link out of the log, or a line of ``accelerometer.txt`` is
+            malformed.
     """
     if calibration.fy_px < 0.0:
         calibration = calibration.with_y_down()
@@ -111,12 +110,19 @@ def rgbd_log(
         notes = [*notes, "fy < 0: the camera's y axis points up; y of camera and truth is mirrored"]
     folder = path if path.is_dir() else path.parent
     refuse_links_out((file for pair in pairs for file in (pair.colour, pair.depth)), log=folder)
-    camera = _camera_of(pairs, calibration)
+    camera = _camera_of(pairs, calibration, depth_units_per_m=depth_units_per_m, path=path)
     accelerations, acceleration_notes = read_accelerations(folder)
 
     def entry_at(index: int) -> RgbdEntry:
         pair = pairs[index]
-        files = ImageFiles(pair.colour, pair.depth, pair.depth_stamp_ns, depth_units_per_m)
+        files = ImageFiles(
+            pair.colour,
+            pair.depth,
+            pair.depth_stamp_ns,
+            depth_units_per_m,
+            colour_px=camera.colour_px,
+            depth_px=camera.depth_px,
+        )
         return RgbdEntry(
             pair.stamp_ns,
             files,
@@ -135,7 +141,7 @@ def rgbd_log(
         truth=truth,
         accelerations=accelerations,
         are_units_assumed=are_units_assumed,
-        notes=[*notes, *acceleration_notes],
+        notes=[*notes, *camera.notes(), *acceleration_notes],
     )
 
 
@@ -179,16 +185,29 @@ def _renamed(folder: Path) -> str:
     return f"; if {found[0]} has them, call it camera.yaml" if len(found) == 1 else ""
 
 
-def _camera_of(pairs: Sequence[FramePair], calibration: Calibration) -> PinholeCamera:
+def _camera_of(
+    pairs: Sequence[FramePair], calibration: Calibration, *, depth_units_per_m: float, path: Path
+) -> RecordedCamera:
+    colour_px, why = _first_size([pair.colour for pair in pairs], read_grey)
+    if colour_px is None:
+        raise SourceError(f"none of {len(pairs)} colour images can be read; the first: {why}")
+    depth_px, _ = _first_size(
+        [pair.depth for pair in pairs], lambda file: read_depth_m(file, depth_units_per_m)
+    )
+    return recorded_camera(calibration, colour_px=colour_px, depth_px=depth_px or colour_px, where=f"{path}")
+
+
+def _first_size(files: Sequence[Path], read: Callable[[Path], Image | DepthImage]) -> tuple[Size | None, str]:
+    """Return width and height of the first image that can be read; None, and why not the first, without."""
     first_reason = ""
-    for pair in pairs:
+    for file in files:
         try:
-            height_px, width_px = read_grey(pair.colour).shape
+            height_px, width_px = read(file).shape
         except FrameError as error:
             first_reason = first_reason or str(error)
         else:
-            return calibration.camera(width_px=width_px, height_px=height_px)
-    raise SourceError(f"none of {len(pairs)} colour images can be read; the first: {first_reason}")
+            return (width_px, height_px), ""
+    return None, first_reason
 
 
 def unpaired_note(alone: int, total: int, *, max_gap_s: float) -> list[str]:

@@ -3,9 +3,10 @@
 from dataclasses import dataclass
 
 from mapper.core.errors import DataError, FrameError
-from mapper.core.frames import DepthImage, PinholeCamera, Scan
+from mapper.core.frames import DepthImage, Scan
 from mapper.core.geometry import Transform
 from mapper.sources.base import ImageFiles
+from mapper.sources.image_files.image_sizes import RecordedCamera
 from mapper.sources.image_files.reading import encode_colour, encode_depth
 from mapper.sources.image_folders.rgbd import RgbdEntry
 from mapper.sources.ros.cloud_messages import scan_from
@@ -54,7 +55,7 @@ class Located:
 def rgbd_entry(
     colour: Located,
     depth: Located,
-    camera: PinholeCamera,
+    recorded: RecordedCamera,
     *,
     units_per_m: float,
     float_units_per_m: float | None,
@@ -67,7 +68,7 @@ def rgbd_entry(
     Args:
         colour: Colour or grey image; its time is the frame's.
         depth: Depth image, registered to it.
-        camera: Camera of both.
+        recorded: Camera of the frame, and the sizes of both images.
         units_per_m: 16-bit depth units per metre.
         float_units_per_m: Units per metre of depth that is recorded as 32-bit numbers; None if it is not.
         colour_suffix: Ending of a colour image's file.
@@ -76,9 +77,15 @@ def rgbd_entry(
     return RgbdEntry(
         colour.stamp_ns,
         ImageFiles(
-            _ColourFile(colour, colour_suffix), depth_file, depth.stamp_ns, units_per_m, float_units_per_m
+            _ColourFile(colour, colour_suffix),
+            depth_file,
+            depth.stamp_ns,
+            units_per_m,
+            float_units_per_m,
+            colour_px=recorded.colour_px,
+            depth_px=recorded.depth_px,
         ),
-        camera,
+        recorded,
         read_image=lambda in_colour: image_of(colour.image(), colour=in_colour, where=f"{colour}"),
         read_depth_m=lambda: depth_file.depth_m_of(depth.image()),
     )

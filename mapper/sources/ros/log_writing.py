@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from mapper.core.errors import FrameError, SourceError
-from mapper.core.frames import RgbdFrame, Scan
+from mapper.core.frames import PinholeCamera, RgbdFrame, Scan
 from mapper.sources.base import FrameRef, ImageFiles, Log, Skipped
 from mapper.sources.image_files.reading import image_bytes, read_colour, read_depth_m
 from mapper.sources.ros.encode_ros import (
@@ -92,15 +92,16 @@ def _frames(
                 yield _not_early(_cloud(entry))
             else:
                 colour, depth = map(_not_early, _images(entry))
+                colour_camera, depth_camera = _cameras(first.camera, entry.files)
                 if depth.stamp_ns != depth_stamp_ns:  # the nearest to two colour images is written once
                     depth_stamp_ns = depth.stamp_ns
                     yield depth
                     yield camera_info_message(
-                        depth.stamp_ns, f"{DEPTH}/camera_info", first.camera, frame=_CAMERA_FRAME
+                        depth.stamp_ns, f"{DEPTH}/camera_info", depth_camera, frame=_CAMERA_FRAME
                     )
                 yield colour
                 yield camera_info_message(
-                    colour.stamp_ns, f"{COLOR}/camera_info", first.camera, frame=_CAMERA_FRAME
+                    colour.stamp_ns, f"{COLOR}/camera_info", colour_camera, frame=_CAMERA_FRAME
                 )
         except FrameError as error:
             skipped.append(Skipped(entry.stamp_ns, str(error)))
@@ -134,6 +135,13 @@ def _images(entry: FrameRef) -> tuple[SerializedMessage, SerializedMessage]:
             entry.stamp_ns, f"{DEPTH}/image_raw", frame.depth_m, encoding="32FC1", frame=_CAMERA_FRAME
         ),
     )
+
+
+def _cameras(camera: PinholeCamera, files: ImageFiles | None) -> tuple[PinholeCamera, PinholeCamera]:
+    """Return the cameras of a frame's colour and depth image in the sizes in which they are written."""
+    sizes_px = (None, None) if files is None else (files.colour_px, files.depth_px)
+    colour, depth = (camera if px is None else camera.resized(*px) for px in sizes_px)
+    return colour, depth
 
 
 def _colour_of_files(stamp_ns: int, files: ImageFiles) -> SerializedMessage:

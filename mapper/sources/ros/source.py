@@ -6,11 +6,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mapper.core.errors import SourceError
-from mapper.core.frames import NO_DISTORTION, PinholeCamera, Sensor
+from mapper.core.frames import NO_DISTORTION, Sensor
 from mapper.core.timebase import Stamps
 from mapper.sources.base import FrameRef, Log
 from mapper.sources.calibration import Calibration, configured
 from mapper.sources.config import SourceConfig
+from mapper.sources.image_files.image_sizes import RecordedCamera, Size, recorded_camera
 from mapper.sources.image_files.reading import FINE_UNITS_PER_M
 from mapper.sources.image_folders.pairing import depth_offset_ns
 from mapper.sources.ros.entries import CloudEntry, rgbd_entry
@@ -92,6 +93,7 @@ def _rgbd(reader: RecordingReader, topics: CameraTopics, config: SourceConfig) -
     first_color, first_depth = _first_image(reader, color), _first_image(reader, depth)
     camera = _camera(reader, topics, config)
     _refuse_unregistered(reader, topics, camera)
+    notes += camera.notes()
     frame, depth_frame = frame_of(first_color), frame_of(first_depth)
     if config.topics.depth is None and not is_called_registered(depth.topic.name):
         _refuse_apart(reader, topics, frame, depth_frame)
@@ -158,11 +160,9 @@ def _first_image(reader: RecordingReader, series: Series) -> ImageMessage:
     return first
 
 
-def _camera(reader: RecordingReader, topics: CameraTopics, config: SourceConfig) -> PinholeCamera:
-    """Return the colour camera: the user's, else the recording's."""
+def _camera(reader: RecordingReader, topics: CameraTopics, config: SourceConfig) -> RecordedCamera:
+    """Return the frames' camera, by the colour camera's calibration: the user's, else the recording's."""
     name = topics.color.topic.name
-    first = _first_image(reader, topics.color)
-    width_px, height_px = size_of(first, where=f"{reader.recording.path}: {name}")
     calibration = configured(config.camera)
     if calibration is None:
         info = topics.info and reader.firsts.get(topics.info.topic.name)
@@ -172,7 +172,16 @@ def _camera(reader: RecordingReader, topics: CameraTopics, config: SourceConfig)
                 "source.topics.camera_info=… or --set source.camera.fx_px=… and so on"
             )
         calibration = _calibration(info, is_rectified="rect" in name, name=topics.info.topic.name)
-    return calibration.camera(width_px=width_px, height_px=height_px)
+    return recorded_camera(
+        calibration,
+        colour_px=_size(reader, topics.color),
+        depth_px=_size(reader, topics.depth),
+        where=f"{reader.recording.path}: {name}, {topics.depth.topic.name}",
+    )
+
+
+def _size(reader: RecordingReader, images: Series) -> Size:
+    return size_of(_first_image(reader, images), where=f"{reader.recording.path}: {images.topic.name}")
 
 
 def _calibration(info: CameraMessage, *, is_rectified: bool, name: str) -> Calibration:
@@ -194,21 +203,19 @@ def _calibration(info: CameraMessage, *, is_rectified: bool, name: str) -> Calib
     return Calibration(name, K[0], K[4], K[2], K[5], distortion=(k1, k2, p1, p2, k3), size_px=size_px)
 
 
-def _refuse_unregistered(reader: RecordingReader, topics: CameraTopics, camera: PinholeCamera) -> None:
-    """Refuse depth that is not on colour's pixels: of another size or, if both are known, focal length."""
-    name = topics.depth.topic.name
-    first = _first_image(reader, topics.depth)
-    size_px = size_of(first, where=f"{reader.recording.path}: {name}")
-    found = f"{size_px[0]}×{size_px[1]} px"
-    is_same = size_px == (camera.width_px, camera.height_px)
+def _refuse_unregistered(reader: RecordingReader, topics: CameraTopics, recorded: RecordedCamera) -> None:
+    """Refuse depth of another focal length than colour, if both are known: it is not on colour's pixels."""
     info = topics.depth_info and reader.firsts.get(topics.depth_info.topic.name)
-    if isinstance(info, CameraMessage) and info.K.shape == (9,) and info.K[0] > 0.0:
-        found += f", focal length {info.K[0]:.1f} px"
-        is_same &= abs(info.K[0] / camera.fx_px - 1.0) <= _SAME_LENS_RATIO
-    if not is_same:
-        color = topics.color.topic.name
+    if not isinstance(info, CameraMessage) or info.K.shape != (9,) or not info.K[0] > 0.0:
+        return
+    width_px, height_px = recorded.depth_px
+    fx_px = recorded.camera.fx_px
+    if recorded.depth_px != recorded.colour_px:
+        fx_px *= (info.width_px or width_px) / recorded.camera.width_px
+    if abs(info.K[0] / fx_px - 1.0) > _SAME_LENS_RATIO:
         raise SourceError(
-            f"{reader.recording.path}: {name} ({found}) is not registered to {color} "
-            f"({camera.width_px}×{camera.height_px} px, focal length {camera.fx_px:.1f} px); record depth "
-            "that is, such as aligned_depth_to_color, or choose it with source.topics.depth=…"
+            f"{reader.recording.path}: {topics.depth.topic.name} ({width_px}×{height_px} px, focal length "
+            f"{info.K[0]:.1f} px) is not registered to {topics.color.topic.name} (focal length {fx_px:.1f} "
+            "px at that size); record depth that is, such as aligned_depth_to_color, or choose it with "
+            "source.topics.depth=…"
         )

@@ -162,9 +162,26 @@ def test_depth_that_is_not_registered_is_refused(tmp_path):
     why = r"aligned_depth/image_raw \(64×48 px, focal length 45.0 px\) is not registered to /cam/color"
     with pytest.raises(SourceError, match=why):
         opened(tmp_path / "a.mcap", messages)
-    small = [image(FIRST_NS, DEPTH, np.ones((24, 32), np.uint16), "16UC1"), *shots(1)[1:]]
-    with pytest.raises(SourceError, match=r"\(32×24 px\) is not registered"):
-        opened(tmp_path / "b.mcap", small)
+    cropped = [image(FIRST_NS, DEPTH, np.ones((20, 32), np.uint16), "16UC1"), *shots(1)[1:]]
+    why = r"/cam/aligned_depth/image_raw: colour has 64×48 px and depth 32×20, which is another aspect ratio"
+    with pytest.raises(SourceError, match=why):
+        opened(tmp_path / "b.mcap", cropped)
+
+
+def test_depth_of_another_size_is_brought_to_colours(tmp_path):
+    units = np.arange(24 * 32, dtype=np.uint16).reshape(24, 32)
+    small = [image(FIRST_NS, DEPTH, units, "16UC1"), *(one for one in shots(1) if one.topic != DEPTH)]
+    of_depth = camera_info(FIRST_NS, "/cam/aligned_depth/camera_info", CAMERA.resized(32, 24))
+    source = opened(tmp_path / "a.mcap", [*small, of_depth])
+    assert source[0].camera == CAMERA
+    np.testing.assert_array_equal(source[0].depth_m, units.repeat(2, 0).repeat(2, 1) / np.float32(1000))
+    assert any("depth is resized to 64×48" in note for note in source.notes)
+    other = camera_info(FIRST_NS, "/cam/aligned_depth/camera_info", CAMERA)  # a copy of colour's
+    wide = PinholeCamera(32, 24, 20.0, 20.0, 15.5, 11.5)
+    assert opened(tmp_path / "b.mcap", [*small, other])[0].camera == CAMERA
+    why = r"\(32×24 px, focal length 20.0 px\) is not registered to /cam/color/image_raw .focal length 30.0"
+    with pytest.raises(SourceError, match=why):
+        opened(tmp_path / "c.mcap", [*small, camera_info(FIRST_NS, "/cam/aligned_depth/camera_info", wide)])
 
 
 def test_depth_that_tf_places_elsewhere_is_refused_unless_it_is_chosen_or_called_registered(tmp_path):
