@@ -68,6 +68,11 @@ def find_warnings(results: RunResults, manifest: Manifest) -> list[RunWarning]:
         *step_warnings(results, timeline),
         *_truth(results),
     ]
+    if any(warning.suggestion == SEE_MORE for warning in found):
+        found = [
+            warning.model_copy(update={"suggestion": SEE_MORE}) if warning.kind == "uncertainty" else warning
+            for warning in found
+        ]
     return sorted(found, key=lambda warning: _ORDER.index(warning.weight))
 
 

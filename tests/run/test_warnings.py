@@ -107,6 +107,10 @@ def test_motions_that_nothing_shows_have_another_remedy_than_settings():
     trial = Trial(where="1 … 2 s", frames=15, unplaced=8, tried={"odometry.voxel_m=0.2": 1})
     assert with_trial(warning, trial) == warning
 
+    results = results_of(changed={k: doubted(unseen) for k in range(11, 19)}, sigmas=PoseSigmas(0.04, 0.05))
+    (uncertain,) = found(results, kind="uncertainty")
+    assert uncertain.suggestion == warning.suggestion  # not to come back, for loops
+
     few = {k: doubted(unseen) for k in range(11, 14)} | {k: doubted() for k in range(20, 30)}
     assert not only(results_of(changed=few)).suggestion
 
