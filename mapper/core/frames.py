@@ -166,6 +166,13 @@ class Scan:
         return self.stamp_ns / NS_PER_S
 
     @property
+    def checksum(self) -> int | None:
+        """Number by which clouds differ: a frozen sensor's have the same; None of an empty one."""
+        if len(self.points_body) == 0:
+            return None
+        return int(isal_zlib.crc32(np.ascontiguousarray(self.points_body)))
+
+    @property
     def points(self) -> Points32:
         """(N, 3) float32, metres, body frame: ``points_body``."""
         return self.points_body

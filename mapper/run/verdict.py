@@ -13,7 +13,7 @@ def verdict_of(warnings: Sequence[RunWarning], trial: Trial | None = None) -> Ve
 
     Args:
         warnings: Warnings from ``find_warnings``.
-        trial: Result of the trial of other settings, which is the suggestion for frames lost and doubtful.
+        trial: Result of the trial of other settings, which is suggested for lost and doubtful frames.
     """
     heavy = [with_trial(warning, trial) for warning in warnings if warning.weight != "note"]
     weights = {warning.weight for warning in heavy}
@@ -22,7 +22,10 @@ def verdict_of(warnings: Sequence[RunWarning], trial: Trial | None = None) -> Ve
 
 
 def with_trial(warning: RunWarning, trial: Trial | None) -> RunWarning:
-    """Return the warning with what a trial found as its suggestion, if it is one of tracking."""
-    if trial is None or warning.kind not in TRACKING_KINDS or warning.weight == "note":
+    """Return the warning with what a trial found as its suggestion, if it is one of tracking without any.
+
+    Where surfaces do not show a motion, no setting does.
+    """
+    if trial is None or warning.suggestion or warning.kind not in TRACKING_KINDS or warning.weight == "note":
         return warning
     return warning.model_copy(update={"suggestion": trial.text})

@@ -9,6 +9,7 @@ import numpy as np
 from mapper.core.geometry import path_length
 from mapper.core.timebase import NS_PER_S, stretches
 from mapper.navigation.config import TraversableConfig
+from mapper.odometry.base import SEE_MORE, UNSEEN
 from mapper.run.frame_outcomes import DISCONNECTED, FrameRecord
 from mapper.run.graph_warnings import (
     loop_warnings,
@@ -67,6 +68,11 @@ def find_warnings(results: RunResults, manifest: Manifest) -> list[RunWarning]:
         *step_warnings(results, timeline),
         *_truth(results),
     ]
+    if any(warning.suggestion == SEE_MORE for warning in found):
+        found = [
+            warning.model_copy(update={"suggestion": SEE_MORE}) if warning.kind == "uncertainty" else warning
+            for warning in found
+        ]
     return sorted(found, key=lambda warning: _ORDER.index(warning.weight))
 
 
@@ -233,11 +239,13 @@ def _doubtful(records: Sequence[FrameRecord], timeline: TimeLine) -> Iterator[Ru
     first, last = max(
         stretches([record.outcome == "doubtful" for record in records]), key=lambda run: run[1] - run[0]
     )
+    unseen = sum(any(UNSEEN in doubt for doubt in record.doubts) for record in doubtful)
     too_many = len(doubtful) > _FEW_FRAMES and share > _MAX_DOUBTFUL_SHARE
     yield RunWarning(
         kind="doubtful",
         sentence=f"{len(doubtful)} of {placed} placed frames are doubtful, {share:.1%} "
         f"(at most {_MAX_DOUBTFUL_SHARE:.0%} are usual): {'; '.join(texts)}",
+        suggestion=SEE_MORE if too_many and 2 * unseen > len(doubtful) else "",
         where=timeline.place(first, last),
         weight="doubt" if too_many else "note",
     )

@@ -1,4 +1,4 @@
-"""Checks of a log's frames while they are read: images that repeat, and far returns."""
+"""Checks of a log's frames while they are read: images and scans that repeat, and far returns."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -15,16 +15,27 @@ FROZEN_FRAMES = 10
 drivers repeat a frame or two when a sensor is late."""
 FROZEN_DEPTHS = 5
 """As ``FROZEN_FRAMES``, of depth images, whose noise is stronger."""
+FROZEN_SCANS = 3
+"""As ``FROZEN_FRAMES``, of scans, of whose thousands of ranges even two never agree."""
+
+_Repeating = Literal["image", "depth", "scan"]
+_FROZEN: tuple[tuple[_Repeating, str, str, int], ...] = (
+    ("image", "show the same image; was the camera frozen?", "same image", FROZEN_FRAMES),
+    ("depth", "have the same depth image; was the depth camera frozen?", "same depth image", FROZEN_DEPTHS),
+    ("scan", "have the same points; was the LiDAR or its driver frozen?", "same points", FROZEN_SCANS),
+)
+"""Data that may repeat, what is said of a run and of one frame of it, and its least length."""
 
 _FEWEST_FRAMES, _LONG_NS = 3, NS_PER_S
 
 
 @dataclass(frozen=True, slots=True)
 class _Reading:
-    """Data of a frame that the checks keep: checksums of its two images, or the number of its far returns."""
+    """Data of a frame that the checks keep: checksums of its images or of its points, and its far returns."""
 
     image: int | None = None
     depth: int | None = None
+    scan: int | None = None
     far_returns: int = 0
 
 
@@ -54,8 +65,8 @@ class ReadingChecks:
         if reading is not None:
             self._readings[index] = reading
 
-    def repeated(self, what: Literal["image", "depth"], *, fewest: int) -> list[range]:
-        """Return the runs of so many frames or more, or of a second and more, with the same images.
+    def repeated(self, what: _Repeating, *, fewest: int) -> list[range]:
+        """Return the runs of so many frames or more, or of a second and more, with the same data.
 
         A frame that was not loaded, or could not be, counts as those around it.
         """
@@ -78,27 +89,20 @@ class ReadingChecks:
         return [*self.frozen(), *self.far_returns()]
 
     def frozen(self) -> list[str]:
-        """Return where a camera seems to have been frozen, a sentence each."""
+        """Return where a sensor seems to have been frozen, a sentence each."""
         return [
-            *(
-                f"{self._named(run)} show the same image; was the camera frozen?"
-                for run in self.repeated("image", fewest=FROZEN_FRAMES)
-            ),
-            *(
-                f"{self._named(run)} have the same depth image; was the depth camera frozen?"
-                for run in self.repeated("depth", fewest=FROZEN_DEPTHS)
-            ),
+            f"{self._named(run)} {said}"
+            for what, said, _, fewest in _FROZEN
+            for run in self.repeated(what, fewest=fewest)
         ]
 
     def doubts(self) -> dict[int, list[str]]:
-        """Return why frames are doubtful, by stamp: they repeat the images of an earlier one."""
+        """Return why frames are doubtful, by stamp: they repeat the data of an earlier one."""
         doubts: dict[int, list[str]] = {}
-        frozen_images = self.repeated("image", fewest=FROZEN_FRAMES)
-        frozen_depths = self.repeated("depth", fewest=FROZEN_DEPTHS)
-        for named, runs in (("image", frozen_images), ("depth image", frozen_depths)):
-            for run in runs:
+        for what, _, named, fewest in _FROZEN:
+            for run in self.repeated(what, fewest=fewest):
                 for index in run[1:]:
-                    said = f"same {named} as {index - run[0]} frames before"
+                    said = f"{named} as {index - run[0]} frames before"
                     doubts.setdefault(int(self._stamps_ns[index]), []).append(said)
         return doubts
 
@@ -131,5 +135,5 @@ class _CheckedEntry(WrappedEntry):
 
 def _reading_of(frame: Frame) -> _Reading:
     if isinstance(frame, Scan):
-        return _Reading(far_returns=frame.far_returns)
+        return _Reading(scan=frame.checksum, far_returns=frame.far_returns)
     return _Reading(image=frame.image_checksum, depth=frame.depth_checksum)

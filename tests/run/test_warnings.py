@@ -10,9 +10,10 @@ from mapper.core.trajectory import Trajectory
 from mapper.graph.model import BetweenFactor, PoseSigmas
 from mapper.loops.closure import Discrepancy, LoopClosure
 from mapper.run.frame_outcomes import DISCONNECTED
-from mapper.run.manifest import AppendedLog, Levelling, RunWarning, SkippedFrame
+from mapper.run.manifest import AppendedLog, Levelling, RunWarning, SkippedFrame, Trial
 from mapper.run.pose_covariances import uncertain_poses
 from mapper.run.results import aligned_truth
+from mapper.run.verdict import with_trial
 from mapper.run.warnings import find_warnings, merge_warnings
 from mapper.sources.config import SourceConfig
 from tests.support.run_results import MANIFEST, STEP_NS, doubted, lost, results_of
@@ -97,6 +98,21 @@ def test_doubtful_frames_and_their_main_reasons():
     )
     assert warning.where == "1.1 … 1.8 s"
     assert only(results_of(changed={12: doubted(), 51: doubted(), 99: doubted()})).weight == "note"
+
+
+def test_motions_that_nothing_shows_have_another_remedy_than_settings():
+    unseen = "translation along x is not seen but predicted, to ±2.80 m and 0.1° a second"
+    warning = only(results_of(changed={k: doubted(unseen) for k in range(11, 19)}))
+    assert "wheel odometry" in warning.suggestion
+    trial = Trial(where="1 … 2 s", frames=15, unplaced=8, tried={"odometry.voxel_m=0.2": 1})
+    assert with_trial(warning, trial) == warning
+
+    results = results_of(changed={k: doubted(unseen) for k in range(11, 19)}, sigmas=PoseSigmas(0.04, 0.05))
+    (uncertain,) = found(results, kind="uncertainty")
+    assert uncertain.suggestion == warning.suggestion  # not to come back, for loops
+
+    few = {k: doubted(unseen) for k in range(11, 14)} | {k: doubted() for k in range(20, 30)}
+    assert not only(results_of(changed=few)).suggestion
 
 
 def test_skipped_frames():

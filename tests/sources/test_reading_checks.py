@@ -15,7 +15,7 @@ from mapper.pipeline.build import build
 from mapper.sources import inspection, open_source
 from mapper.sources.config import SourceConfig
 from mapper.sources.inspection import inspect_log
-from mapper.sources.reading_checks import FROZEN_DEPTHS, FROZEN_FRAMES, ReadingChecks
+from mapper.sources.reading_checks import FROZEN_DEPTHS, FROZEN_FRAMES, FROZEN_SCANS, ReadingChecks
 from tests.support.logs import MemoryEntry, log_in_memory
 
 CAMERA = PinholeCamera(8, 6, 6.0, 6.0, 3.5, 2.5)
@@ -62,6 +62,29 @@ def test_frames_that_repeat_earlier_ones_are_doubted():
     assert doubts[log.stamps_ns[31]] == ["same depth image as 1 frames before"]
 
 
+def scans_of(seeds):
+    """A log at 10 Hz whose scan i has the points of seeds[i]."""
+    scans = [
+        Scan(i * NS_PER_S // 10, np.random.default_rng(seed).uniform(1.0, 2.0, (50, 3)).astype(np.float32))
+        for i, seed in enumerate(seeds)
+    ]
+    return log_in_memory([MemoryEntry(scan.stamp_ns, scan) for scan in scans])
+
+
+def test_scans_that_repeat_are_noted_and_doubted():
+    log = scans_of(frozen(20, 12, FROZEN_SCANS))
+    assert notes_on(log) == [
+        "frames 12 … 14, 1.2 … 1.4 s after the first, have the same points; was the LiDAR or its driver "
+        "frozen?"
+    ]
+    checks = ReadingChecks(log)
+    for entry in checks.log.entries():
+        entry.load()
+    assert sorted(checks.doubts()) == log.stamps_ns[13:15].tolist()
+    assert checks.doubts()[log.stamps_ns[14]] == ["same points as 2 frames before"]
+    assert notes_on(scans_of(frozen(20, 12, FROZEN_SCANS - 1))) == []
+
+
 def test_a_second_of_the_same_image_is_long_whatever_the_frame_rate():
     log = log_of(frozen(6, 2, 3), range(100, 106))
     slow = replace(log, stamps_ns=log.stamps_ns * 6)
@@ -89,8 +112,8 @@ def test_the_same_image_now_and_again_is_no_frozen_camera():
 
 
 def test_far_returns_are_counted_over_the_log():
-    points = np.ones((20, 3), np.float32)
-    entries = [MemoryEntry(i, Scan(i, points, far_returns=i % 3)) for i in range(6)]
+    scans = [Scan(i, np.full((20, 3), i, np.float32), far_returns=i % 3) for i in range(6)]
+    entries = [MemoryEntry(scan.stamp_ns, scan) for scan in scans]
     assert notes_on(log_in_memory(entries, sensor="lidar")) == [
         "6 returns in 4 of 6 scans are farther than 5000 m, which no sensor reaches; left out"
     ]

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mapper.core.geometry import Array, Transform, adjoint, inverse
+from mapper.odometry.base import UNSEEN
 from mapper.odometry.scan_to_map.observed_part import Blend
 from mapper.odometry.scan_to_map.scan_fit import ScanFit
 from mapper.odometry.scan_to_map.usual_fit import Jump
@@ -63,6 +64,7 @@ class ScanNoise:
 
     def __init__(self) -> None:
         self._unseen = 0  # scans in a row that left a motion open
+        self._unseen_s = 0.0
         self._steps = 0.0
         self._since_seen = PredictedPart()
 
@@ -98,11 +100,13 @@ class ScanNoise:
         covariance += _along(fit, fit.observability * fit.shown_m)
         unseen, step = self._since_seen.add(blend, T_last_scan, elapsed_s)
         if fit.observability.min() >= 1.0:
-            self._unseen = 0
+            self._unseen, self._unseen_s = 0, 0.0
             return PoseNoise(covariance, independent)
         self._unseen += 1
+        self._unseen_s += elapsed_s
         self._steps += self._unseen
-        predicted = _along(fit, np.minimum(blend.open_m * self._steps, fit.degeneracy.extent_m))
+        predicted_m = np.minimum(blend.open_m * self._steps, fit.degeneracy.extent_m)
+        predicted = _along(fit, np.hypot(predicted_m, blend.unknown_mps * self._unseen_s))
         rates = _largest(step) / max(elapsed_s, _SHORTEST_S)
         (sigma_rad, sigma_m), (rate_radps, rate_mps) = _largest(unseen), rates
         doubts: tuple[str, ...] = ()
@@ -110,7 +114,9 @@ class ScanNoise:
         if turns or (rate_mps > _TRUSTED_MPS and sigma_m > _TRUSTED_M):
             name = fit.unobservable or "a motion"
             known = f"±{rate_mps:.2f} m and {np.degrees(rate_radps):.1f}° a second"
-            doubts = (f"{name} is not seen but predicted, to {known}",)
+            doubts = (f"{name} {UNSEEN} but predicted, to {known}",)
+            if blend.unknown_mps.any():
+                doubts = (f"{name} {UNSEEN}, and was not before: its velocity is unknown",)
         return PoseNoise(covariance + predicted, independent, doubts)
 
 
