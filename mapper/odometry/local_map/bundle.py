@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.geometry import Array, Points
-from mapper.odometry.local_map.bundle_adjustment import adjust, common_parameters
+from mapper.odometry.local_map.bundle_adjustment import Observations, adjust, common_parameters
 
 WINDOW_KEYFRAMES = 10
 """Keyframes that are adjusted by themselves: neighbours outside would hold them to the parameter given."""
@@ -26,9 +26,9 @@ class Bundle:
         points: (P, 3) metres, world.
         edges: (E, 2) int32 keyframe and point of each observation, grouped by point.
         features: (E,) feature of each observation among those of its keyframe.
-        measured: (E, 3) as for ``adjust``.
-        weights: (E, 3) as for ``adjust``.
-        intrinsics: (5,) as for ``adjust``.
+        measured: (E, 3) as in ``Observations``.
+        weights: (E, 3) as in ``Observations``.
+        intrinsics: (5,) as in ``Observations``.
     """
 
     poses: Array
@@ -91,10 +91,10 @@ def estimated(
     free = np.arange(-1, len(bundle.poses) - 1, dtype=np.int32)
     for _ in range(steps):
         at, slopes = corrected(bundle, values)
-        observed = first_edge, at.edges, at.measured, at.weights, at.intrinsics
-        poses, points, agree = adjust(at.poses, free, at.points, *observed, _NO_LINKS, _ROUNDS, _ITERATIONS)
+        observed = Observations(first_edge, at.edges, at.measured, at.weights, at.intrinsics)
+        poses, points, agree = adjust(at.poses, free, at.points, observed, _NO_LINKS, _ROUNDS, _ITERATIONS)
         bundle = replace(bundle, poses=poses, points=points)
-        information, gradient = common_parameters(poses, free, points, *observed, agree, slopes)
+        information, gradient = common_parameters(poses, free, points, observed, agree, slopes)
         if np.linalg.eigvalsh(information)[0] <= 0.0:
             return np.zeros(parameters), nothing
         step = -np.linalg.solve(information, gradient)
