@@ -10,10 +10,11 @@ from mapper.odometry.config import KeyframeOdometryConfig
 from mapper.odometry.local_map.depth_alignment import (
     DEPTH_ONLY,
     DepthAlignment,
-    Landmarks,
+    ReferenceSurfaces,
     align_depth,
     observes_all,
 )
+from mapper.odometry.local_map.depth_kernels import Landmarks, PosePrior
 from mapper.odometry.local_map.depth_surfaces import DepthCells, DepthSurface, surface_of
 from mapper.odometry.local_map.earlier_depth import EarlierDepth
 from mapper.odometry.local_map.image_observation import ImageObservation
@@ -109,15 +110,11 @@ class DepthTracker:
             return found
         if found is None and self._unobserved_s(observation) > _MAX_UNOBSERVED_S:
             return None
-        if T_predicted is None:
-            gap_s = (observation.stamp_ns - last.observation.stamp_ns) / NS_PER_S
-            predicted = _Prediction(last.T_camera_world, _UNKNOWN_SPEED_SIGMA, 0.0, gap_s)
-        else:
-            predicted = _Prediction(T_predicted, _SPEED_SIGMA, _SURE_S, 0.0)
+        predicted = _predicted(observation, last, T_predicted)
         starts = [] if found is None else [found.T_camera_world]
         for T_camera_world in (*starts, predicted.T_camera_world):
             alignment = self._aligned(observation, T_camera_world, predicted, last, found)
-            if alignment is not None and _agrees(alignment):
+            if alignment is not None:
                 break
         else:
             if found is not None:
@@ -137,9 +134,7 @@ class DepthTracker:
         if found is None:
             return self._by_depth(observation, alignment, reference, predicted)
         joint = self._aligned(observation, found.T_camera_world, predicted, last, found)
-        if joint is None or not _agrees(joint):
-            return found
-        return self._by_both(observation, joint, found, predicted)
+        return found if joint is None else self._by_both(observation, joint, found, predicted)
 
     def _suffices(self, found: TrackedPose) -> bool:
         """Return whether landmarks alone give a pose: many, or some that tell the translation.
@@ -162,23 +157,21 @@ class DepthTracker:
         last: TrackedPose,
         found: TrackedPose | None,
     ) -> DepthAlignment | None:
-        surfaces, T_surfaces_world = self._models(observation, last)
-        if observation.depth_cells is None or not surfaces:
+        """Return the alignment to the latest keyframes; None if it fails or disagrees with them."""
+        reference = self._reference(observation, last)
+        if observation.depth_cells is None or not reference.surfaces:
             return None
         unsure_s = max(self._unobserved_s(observation), _LEAST_ELAPSED_S)
         ids = unmatched(observation) if found is None else found.landmark_of_feature
         features = np.flatnonzero(ids >= 0)
         points = observation.depth_cells.points()
         moved = self._earlier_depth.moved(observation, T_camera_world, last.reference, points)
-        return align_depth(
+        alignment = align_depth(
             observation.depth_cells,
             points[~moved],
-            surfaces,
-            T_surfaces_world,
-            keyframes=len(self._keyframes),
+            reference,
             T_camera_world=T_camera_world,
-            T_prior=predicted.T_camera_world,
-            prior=np.eye(6) / (predicted.speed_sigma * unsure_s) ** 2,
+            prior=PosePrior(predicted.T_camera_world, np.eye(6) / (predicted.speed_sigma * unsure_s) ** 2),
             landmarks=Landmarks(
                 self._map.landmarks["position"][ids[features]],
                 observation.measured[features],
@@ -187,28 +180,28 @@ class DepthTracker:
             ),
             noise=self._config.depth_noise,
         )
+        return alignment if alignment is not None and _agrees(alignment) else None
 
-    def _models(
-        self, observation: ImageObservation, last: TrackedPose
-    ) -> tuple[list[DepthSurface], list[Transform]]:
-        """Return the surfaces of the latest keyframes and of the last frame, and their T_camera_world."""
+    def _reference(self, observation: ImageObservation, last: TrackedPose) -> ReferenceSurfaces:
+        """Return the surfaces of the latest keyframes and of the last frame."""
         keyframes, cells = self._map.keyframes, observation.depth_cells
         origin = keyframes[last.reference].origin
         self._keyframes = [
             k
             for k in self._map.latest(last.reference)
-            if keyframes[k].origin == origin and _alike(self._map.observation(k).depth_cells, cells)
+            if keyframes[k].origin == origin and _of_one_camera(self._map.observation(k).depth_cells, cells)
         ]
         models = [(self._map.observation(k), keyframes[k].T_camera_world, k) for k in self._keyframes]
         blind = last.doubts or (last.depth is not None and last.depth.unobservable)
         if not blind and all(earlier.stamp_ns != last.observation.stamp_ns for earlier, _, _ in models):
             models.append((last.observation, last.T_camera_world, last.reference))
-        models = [model for model in models if _alike(model[0].depth_cells, cells)]
+        models = [model for model in models if _of_one_camera(model[0].depth_cells, cells)]
         self._surfaces = {
             earlier.stamp_ns: self._surfaces.get(earlier.stamp_ns) or self._still_surface(earlier, T, k)
             for earlier, T, k in models
         }
-        return [self._surfaces[earlier.stamp_ns] for earlier, _, _ in models], [T for _, T, _ in models]
+        surfaces = [self._surfaces[earlier.stamp_ns] for earlier, _, _ in models]
+        return ReferenceSurfaces(surfaces, [T for _, T, _ in models], len(self._keyframes))
 
     def _still_surface(
         self, observation: ImageObservation, T_camera_world: Transform, reference: int
@@ -297,7 +290,17 @@ class DepthTracker:
         return int(((pixels >= 0.0) & (pixels < observation.size_px)).all(axis=1).sum())
 
 
-def _alike(cells: DepthCells | None, others: DepthCells | None) -> bool:
+def _predicted(
+    observation: ImageObservation, last: TrackedPose, T_predicted: Transform | None
+) -> _Prediction:
+    """Return the predicted pose, or the last frame's if nothing predicts it."""
+    if T_predicted is not None:
+        return _Prediction(T_predicted, _SPEED_SIGMA, _SURE_S, 0.0)
+    gap_s = (observation.stamp_ns - last.observation.stamp_ns) / NS_PER_S
+    return _Prediction(last.T_camera_world, _UNKNOWN_SPEED_SIGMA, 0.0, gap_s)
+
+
+def _of_one_camera(cells: DepthCells | None, others: DepthCells | None) -> bool:
     """Return whether there are two depth images, of the same camera."""
     return cells is not None and others is not None and cells.camera == others.camera
 
