@@ -239,12 +239,28 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
         if candidates:
             self._nearest_match = self._corrected(tracked), candidates[0]
         self._earlier.add(tracked)
-        nearest = candidates[0].alignment if candidates else None
         self._errors.add(observation.stamp_ns, candidates)
-        # All rest on this frame's features. Were the earlier ones' the same, too, each factor would have its
-        # share of the information, were they others, all: it has the geometric mean.
+        factors = self._factors(node, candidates)
+        return FrameResult(
+            stamp_ns=observation.stamp_ns,
+            node=node,
+            T_node_body=np.eye(4),
+            T_world_body=T_world_body,
+            is_keyframe=True,
+            diagnostics=_diagnostics(observation, candidates, method),
+            factors=factors,
+            links=factors,
+            twist=twist,
+        )
+
+    def _factors(self, node: int, candidates: Sequence[PoseCandidate]) -> tuple[BetweenFactor, ...]:
+        """Return a factor from each candidate's earlier frame.
+
+        All rest on this frame's features. Were the earlier ones' the same, too, each factor would have its
+        share of the information, were they others, all: it has the geometric mean.
+        """
         shared_by = math.sqrt(max(len(candidates), 1))
-        factors = tuple(
+        return tuple(
             BetweenFactor(
                 candidate.earlier.node,
                 node,
@@ -252,24 +268,6 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
                 self._errors.honest(candidate) / shared_by,
             )
             for candidate in candidates
-        )
-        return FrameResult(
-            stamp_ns=observation.stamp_ns,
-            node=node,
-            T_node_body=np.eye(4),
-            T_world_body=T_world_body,
-            is_keyframe=True,
-            diagnostics=Diagnostics(
-                features=len(observation.features),
-                matches=len(candidates[0].pairs) if candidates else 0,
-                inliers=nearest.pairs if nearest else 0,
-                residual=nearest.inlier_rmse_m if nearest else 0.0,
-                residual_unit="m",
-                method=method,
-            ),
-            factors=factors,
-            links=factors,
-            twist=twist,
         )
 
     def _follow(self, observation: IsvdObservation, T_world_body: Transform) -> Twist:
@@ -296,3 +294,17 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
                 twists_body=(candidate.earlier.twist, tracked.twist),
             )
         )
+
+
+def _diagnostics(
+    observation: IsvdObservation, candidates: Sequence[PoseCandidate], method: str
+) -> Diagnostics:
+    nearest = candidates[0].alignment if candidates else None
+    return Diagnostics(
+        features=len(observation.features),
+        matches=len(candidates[0].pairs) if candidates else 0,
+        inliers=nearest.pairs if nearest else 0,
+        residual=nearest.inlier_rmse_m if nearest else 0.0,
+        residual_unit="m",
+        method=method,
+    )

@@ -5,6 +5,7 @@ of a scene that stands still lie where they lay: if many do not, the pose is tha
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -86,9 +87,7 @@ class EarlierDepth:
         before = (
             np.array([_cells_of(self._map, k).inverse_depth for k in earlier]),
             np.array([self._map.keyframes[k].T_camera_world for k in earlier]),
-            cells.camera.parameters,
-            cells.cell_px,
-            self._noise,
+            _DepthCamera(cells.camera.parameters, cells.cell_px, self._noise),
         )
         moved: NDArray[np.bool_] = _in_free_space(points, T_camera_world, *before)
         if moved.sum() <= _MOST_MOVED_RATIO * (~np.isnan(points[:, 2])).sum():
@@ -124,9 +123,7 @@ class EarlierDepth:
             T_camera_world,
             _cells_of(self._map, earlier[0]).inverse_depth,
             keyframe.T_camera_world,
-            cells.camera.parameters,
-            cells.cell_px,
-            self._noise,
+            _DepthCamera(cells.camera.parameters, cells.cell_px, self._noise),
             *(_UNSYNCHRONISED_S * twist for twist in twists),
         )
         is_beside = beside_m > 0.0
@@ -168,11 +165,18 @@ def _cells_of(landmark_map: LandmarkMap, keyframe: int) -> DepthCells:
     return cells
 
 
+class _DepthCamera(NamedTuple):
+    """Camera of depth images: (9,) as ``PlaneModel.optics``, cells' edge, (3,) a, b, c of a + b·z + c·z²."""
+
+    optics: Array
+    cell_px: int
+    noise: Array
+
+
 @njit(cache=True, nogil=True)
-def _in_free_space(  # type: ignore[no-untyped-def]
-    points, T_camera_world, inverse_depth, T_keyframes_world, optics, cell_px, noise
-):
+def _in_free_space(points, T_camera_world, inverse_depth, T_keyframes_world, camera):  # type: ignore[no-untyped-def]
     """Return (N,) which points lie in front of all nine cells about the one that a keyframe sees them in."""
+    optics, cell_px, noise = camera
     moved = np.zeros(len(points), np.bool_)
     shape = inverse_depth.shape[1:]
     for k in range(len(inverse_depth)):
@@ -197,13 +201,14 @@ def _in_free_space(  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _apart(  # type: ignore[no-untyped-def]
-    points, T_camera_world, inverse_depth, T_keyframe_world, optics, cell_px, noise, motion, keyframe_motion
+    points, T_camera_world, inverse_depth, T_keyframe_world, camera, motion, keyframe_motion
 ):
     """Return (M,) which points lie on a keyframe's surfaces or beside them, and how far beside; 0 is on them.
 
     The inverse depth of a plane is linear in the image, so it is interpolated between the cells' middles.
     ``motion`` and ``keyframe_motion`` (6,) are the cameras' own in the time by which their depth may be late.
     """
+    optics, cell_px, noise = camera
     T = between(T_keyframe_world, T_camera_world)
     rows, columns = inverse_depth.shape
     compared = np.empty(len(points), np.intp)

@@ -191,16 +191,7 @@ def observe_image(
     )
     bits = pack(features.descriptors[order])
     sigma_px = detector.scale_factor ** octave.astype(np.float64)
-    disparity_sigma_px = sigma_px * config.disparity_sigma_px
-    if config.depth_noise is not None:
-        sigma_m = feature_depth_sigma_m(
-            frame.depth_m, column, row, sigma_px=sigma_px, noise=config.depth_noise
-        )
-        # Without depth the weight is not used, but it is a factor in sums.
-        known_px = config.virtual_baseline_px_m / depth_m**2 * sigma_m
-        disparity_sigma_px = np.where(np.isnan(depth_m), disparity_sigma_px, known_px)
-    sensor_m = np.hypot(depth_sigma_m(config.depth_noise or KINECT_NOISE, depth_m), _SCALE_ERROR * depth_m)
-    sensor_px = np.fmin(config.virtual_baseline_px_m / depth_m**2 * sensor_m, disparity_sigma_px)
+    disparity_sigma_px, sensor_px = _disparity_sigmas_px(frame, depth_m, (column, row), sigma_px, config)
     cells = None
     if config.align_depth:
         cells = depth_cells(frame.depth_m, camera, distortion_per_m=frame.removed_distortion_per_m)
@@ -223,6 +214,24 @@ def observe_image(
         "depth_delay_s": frame.depth_delay_s,
     }
     return _unswept(measured, config.depth_residual)
+
+
+def _disparity_sigmas_px(
+    frame: RgbdFrame,
+    depth_m: Array,
+    at: tuple[NDArray[np.intp], NDArray[np.intp]],
+    sigma_px: Array,
+    config: KeyframeOdometryConfig,
+) -> tuple[Array, Array]:
+    """Return the (N,) standard deviations of virtual disparities, and by the sensor's noise where smaller."""
+    px_per_m, noise = config.virtual_baseline_px_m / depth_m**2, config.depth_noise
+    disparity_px = sigma_px * config.disparity_sigma_px
+    if noise is not None:
+        sigma_m = feature_depth_sigma_m(frame.depth_m, *at, sigma_px=sigma_px, noise=noise)
+        # Without depth the weight is not used, but it is a factor in sums.
+        disparity_px = np.where(np.isnan(depth_m), disparity_px, px_per_m * sigma_m)
+    sensor_m = np.hypot(depth_sigma_m(noise or KINECT_NOISE, depth_m), _SCALE_ERROR * depth_m)
+    return disparity_px, np.fmin(px_per_m * sensor_m, disparity_px)
 
 
 def _unswept(measured: Mapping[str, Any], has_disparity: bool) -> ImageObservation:

@@ -139,27 +139,8 @@ def image_sweep(T_camera_world, points, measured, weights, intrinsics, height_px
         height_px: Number of rows.
     """
     T, sweep = T_camera_world.copy(), np.zeros(6)
-    r, J_both, scratch = np.empty(3), np.zeros((3, 12)), (np.empty((3, 3)), np.empty((3, 6)))
-    H, g = np.empty((12, 12)), np.empty(12)
-    square_sum = count = 0.0
     for _ in range(_ITERATIONS):
-        H[:, :] = 0.0
-        g[:] = 0.0
-        square_sum = count = 0.0
-        for n in range(len(points)):
-            swept_rows(T, points[n], measured[n], sweep, intrinsics, height_px, scratch, r, J_both)
-            for i in range(2 if np.isnan(measured[n, 2]) else 3):
-                row, error = J_both[i], r[i]
-                w = weights[n, i]
-                sigmas = np.sqrt(w) * abs(error)
-                if sigmas > HUBER_2DOF:
-                    w *= HUBER_2DOF / sigmas
-                square_sum += w * error * error
-                count += 1.0
-                for a in range(12):
-                    g[a] += w * row[a] * error
-                    for b in range(12):
-                        H[a, b] += w * row[a] * row[b]
+        H, g, precision = _normal_equations(T, sweep, points, measured, weights, intrinsics, height_px)
         with_prior = H.copy()
         for a in range(6):
             with_prior[6 + a, 6 + a] += _WIDE[a] ** -2
@@ -169,6 +150,36 @@ def image_sweep(T_camera_world, points, measured, weights, intrinsics, height_px
         step = solve_positive(with_prior, g)
         T = twist_exp(step[:6], T)
         sweep += step[6:]
+    information, change = _marginal(H)
+    return sweep, information * precision, change
+
+
+@njit(cache=True, nogil=True)
+def _normal_equations(T, sweep, points, measured, weights, intrinsics, height_px):  # type: ignore[no-untyped-def]
+    """Return the (12, 12) and (12,) equations of pose and motion, and the inverse variance of residuals."""
+    r, J_both, scratch = np.empty(3), np.zeros((3, 12)), (np.empty((3, 3)), np.empty((3, 6)))
+    H, g = np.zeros((12, 12)), np.zeros(12)
+    square_sum = count = 0.0
+    for n in range(len(points)):
+        swept_rows(T, points[n], measured[n], sweep, intrinsics, height_px, scratch, r, J_both)
+        for i in range(2 if np.isnan(measured[n, 2]) else 3):
+            row, error = J_both[i], r[i]
+            w = weights[n, i]
+            sigmas = np.sqrt(w) * abs(error)
+            if sigmas > HUBER_2DOF:
+                w *= HUBER_2DOF / sigmas
+            square_sum += w * error * error
+            count += 1.0
+            for a in range(12):
+                g[a] += w * row[a] * error
+                for b in range(12):
+                    H[a, b] += w * row[a] * row[b]
+    return H, g, max(count - 12.0, 1.0) / max(square_sum, 1e-9)
+
+
+@njit(cache=True, nogil=True)
+def _marginal(H):  # type: ignore[no-untyped-def]
+    """Return the motion's (6, 6) information with the pose eliminated, and the pose's change by it (6, 6)."""
     information, change = H[6:, 6:].copy(), np.empty((6, 6))
     H_pose = H[:6, :6] + 1e-9 * np.eye(6)
     for b in range(6):
@@ -176,4 +187,4 @@ def image_sweep(T_camera_world, points, measured, weights, intrinsics, height_px
         for a in range(6):
             for c in range(6):
                 information[a, b] -= H[6 + a, c] * change[c, b]
-    return sweep, information * (max(count - 12.0, 1.0) / max(square_sum, 1e-9)), change
+    return information, change

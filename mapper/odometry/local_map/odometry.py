@@ -16,7 +16,6 @@ from mapper.graph.noise import inflated
 from mapper.odometry.base import (
     REPEATED,
     STEADY_NS,
-    Diagnostics,
     FeatureMatches,
     FrameOdometry,
     FrameResult,
@@ -145,19 +144,26 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         if doubt.is_wild and tracked_pose.inliers < self._config.weak_inliers:
             return self._lost(observation)
         # The motion before a gap does not predict the motion after it.
-        before_last = None if self._lost_frames else last
-        if before_last is not None and recognised is None:
+        self._before_last = None if self._lost_frames else last
+        if self._before_last is not None and recognised is None:
             self._velocity.add(tracked_pose, covariance, last, is_doubtful=bool(doubt.phrases))
         self._lost_frames = self._unknown_frames = 0
-        reference, inliers = tracked_pose.reference, tracked_pose.inliers
         is_keyframe = self._decision.is_due(tracked_pose) and recognised is None
         if doubt.repeats or (doubt.phrases and tracked_pose.inliers >= self._config.weak_inliers):
             is_keyframe = False  # tracking goes on without it
+        return self._tracked(tracked_pose, information, doubt, is_keyframe=is_keyframe)
+
+    def _tracked(
+        self, tracked_pose: TrackedPose, information: Array, doubt: Doubt, *, is_keyframe: bool
+    ) -> FrameResult:
+        """Return the result of a tracked frame with its covariance, and extend the map by a keyframe."""
+        reference, inliers = tracked_pose.reference, tracked_pose.inliers
         self._agreeing = tracked_pose.landmark_of_feature >= 0
+        links = []
         if is_keyframe:
             tracked_pose = self._add_keyframe(tracked_pose, neighbour=reference, doubt=doubt)
-        self._before_last, self._last = before_last, tracked_pose
-        links = [self._factor(reference, tracked_pose.reference)] if is_keyframe else []
+            links = [self._factor(reference, tracked_pose.reference)]
+        self._last = tracked_pose
         result = self._result(tracked_pose, inliers=inliers, is_keyframe=is_keyframe, links=links)
         if is_keyframe:
             information = links[0].information
@@ -168,8 +174,8 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
                 information = inflated(information, sigma_rad=doubt.sigma_rad, sigma_m=doubt.sigma_m)
         if doubt.repeats:
             result = replace(result, diagnostics=replace(result.diagnostics, method=REPEATED))
-        covariance = covariance_of(information) + self._shutter.pose_covariance(observation.T_body_camera)
-        return replace(result, doubts=doubt.phrases, covariance=covariance)
+        shutter = self._shutter.pose_covariance(tracked_pose.observation.T_body_camera)
+        return replace(result, doubts=doubt.phrases, covariance=covariance_of(information) + shutter)
 
     def view(self, observation: ImageObservation, twist: Twist | None = None, /) -> ImageView:
         """Return the view for place recognition, by the readout time as it is known now.
@@ -388,23 +394,13 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         """Return the result of a frame; a keyframe's landmarks are more than the ``inliers`` that it had."""
         T_world_body = tracked_pose.body_pose
         node = self._map.keyframes[tracked_pose.reference]
-        diagnostics = Diagnostics(
-            features=len(tracked_pose.observation),
-            matches=tracked_pose.matches,
-            inliers=inliers,
-            residual=tracked_pose.residual_px,
-            residual_unit="px",
-            method=tracked_pose.method,
-        )
-        if tracked_pose.depth is not None:
-            diagnostics = tracked_pose.depth.diagnostics(diagnostics)
         return FrameResult(
             stamp_ns=tracked_pose.observation.stamp_ns,
             node=tracked_pose.reference,
             T_node_body=inverse(node.body_pose) @ T_world_body,
             T_world_body=T_world_body,
             is_keyframe=is_keyframe,
-            diagnostics=diagnostics,
+            diagnostics=tracked_pose.diagnostics(inliers),
             links=links,
             twist=self._shutter.twist_body(tracked_pose.observation),
         )

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.geometry import Array, Points, Transform, apply, inverse
+from mapper.odometry.base import Diagnostics
 from mapper.odometry.local_map.depth_alignment import DepthAlignment
 from mapper.odometry.local_map.image_observation import FEW_MOVING, ImageObservation
 from mapper.odometry.local_map.landmarks import Ids
@@ -66,6 +67,18 @@ class TrackedPose:
     def inliers(self) -> int:
         """Number of features that agree with the pose."""
         return int((self.landmark_of_feature >= 0).sum())
+
+    def diagnostics(self, inliers: int) -> Diagnostics:
+        """Return the figures on its tracking, with the inliers that it had then."""
+        image = Diagnostics(
+            features=len(self.observation),
+            matches=self.matches,
+            inliers=inliers,
+            residual=self.residual_px,
+            residual_unit="px",
+            method=self.method,
+        )
+        return image if self.depth is None else self.depth.diagnostics(image)
 
     @property
     def few_move(self) -> bool:
