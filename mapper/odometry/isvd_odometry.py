@@ -43,7 +43,7 @@ _VIRTUAL_BASELINE_PX_M = 40.0
 _DEPTH_SHARE = 0.01
 """Error of depths beside the sensor's noise, as a share: its scale, and the slope where a feature lies."""
 _PAIRS_SHARING, _PAIRS_COUNTED = 4, 200
-"""Pairs of images that tell the readout time: a new image is in one, a keyframe in some 20, their geometric
+"""Pairs of images that show the readout time: a new image is in one, a keyframe in some 20, their geometric
 mean; and how many of them the estimate is from."""
 
 
@@ -70,7 +70,7 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
             detector: Replaces the configured one, so that several odometries on the same frames can share
                 the detection.
             register: Replaces the registration, so that they can share registrations as well.
-            motion_check: Rules out poses after a gap; None if nothing but the images tells of the motion.
+            motion_check: Rules out poses after a gap; None if only the images measure the motion.
         """
         self._config = config
         self._motion_check = motion_check
@@ -209,7 +209,7 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
         return candidates
 
     def _is_possible(self, found: Alignment, earlier: IsvdObservation, now: IsvdObservation) -> bool:
-        """Return whether a motion across a gap is possible, where something else tells it."""
+        """Return whether a motion across a gap is possible by another measurement of it, if any."""
         check, begin_ns, end_ns = self._motion_check, earlier.stamp_ns, now.stamp_ns
         if check is None or end_ns - begin_ns <= STEADY_NS:
             return True
@@ -265,7 +265,7 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
                 candidate.earlier.node,
                 node,
                 candidate.alignment.T_target_source,
-                self._errors.honest(candidate) / shared_by,
+                self._errors.rescaled(candidate) / shared_by,
             )
             for candidate in candidates
         )

@@ -10,7 +10,7 @@ from mapper.core.geometry import Array, Points
 from mapper.odometry.local_map.bundle_adjustment import Observations, adjust, common_parameters
 
 WINDOW_KEYFRAMES = 10
-"""Keyframes that are adjusted by themselves: neighbours outside would hold them to the parameter given."""
+"""Keyframes that are adjusted by themselves: fixed neighbours would bias the parameter to its first value."""
 _ROUNDS, _ITERATIONS = 2, 10
 _MAX_WINDOWS = 16
 _CONVERGED_SIGMAS = 0.05
@@ -71,7 +71,7 @@ def estimated(
 ) -> tuple[Array, Array]:
     """Return the (N,) values of parameters of the sensor and their (N, N) information.
 
-    Both are 0 if nothing tells one of them.
+    Both are 0 if one of them is not observable.
 
     They are more unknowns of a bundle adjustment (Triggs et al. 2000, §2.2), whose first keyframe stays where
     it is.
@@ -81,7 +81,7 @@ def estimated(
         corrected: How the parameters change the bundle.
         parameters: Their number N.
         steps: Largest number of Gauss–Newton steps, each after an adjustment.
-        max_step: Largest change of a parameter at each of them; of several, all steps are shortened alike.
+        max_step: Largest change of a parameter at each of them; all steps are scaled by the same factor.
     """
     values, nothing = np.zeros(parameters), np.zeros((parameters, parameters))
     information = nothing
@@ -106,13 +106,13 @@ def estimated(
 
 
 class WindowEstimates:
-    """Estimates of parameters in windows that share no observation, whose spread tells the uncertainty."""
+    """Estimates of parameters in windows that share no observation, whose spread gives the uncertainty."""
 
     def __init__(self, *, least: int) -> None:
         """Start without any.
 
         Args:
-            least: Fewer windows tell nothing.
+            least: With fewer windows there is no estimate.
         """
         self._least = least
         self._values: list[Array] = []

@@ -294,7 +294,7 @@ def common_parameters(poses, free, points, observations, active, slopes):
                 if f >= 0:
                     for a in range(6):
                         coupling_c[n, f, a] += ws * J_pose[i, a]
-    for n in range(count):  # the residuals' own gradient gives way to that of the coupling
+    for n in range(count):  # in place of the residuals' own gradient, that of the coupling
         blocks.bc[:], blocks.bp[:] = coupling_c[n], coupling_p[n]
         moved_c, moved_p = damped_step(free, first_edge, edges, active, blocks, 0.0)
         for m in range(n + 1):

@@ -2,7 +2,7 @@
 
 Each point is compared with the plane of the keyframe's cell that it projects to (Chen & Medioni 1992;
 Blais & Levine 1995). Planes and landmarks are weighted by their noise and minimised at once, so that a motion
-that one of them does not observe is decided by the other.
+that one of them does not observe is determined by the other.
 """
 
 from collections.abc import Sequence
@@ -49,7 +49,7 @@ _LINKS_ALIKE = 2.0
 _LEAST_OBSERVED = 1e-4
 """Eigenvalue of the surfaces' information, relative to the largest, below which a motion does not follow."""
 _OBSERVED_SIGMA_M = 0.05
-"""A motion that landmarks know this well, as a displacement of the points, is observed by them."""
+"""A motion that landmarks determine this well, as a displacement of the points, is observed by them."""
 
 
 DEPTH_ONLY = "depth"
@@ -142,11 +142,11 @@ def align_depth(
     """Return the pose of a depth image that fits surfaces, landmarks and, where neither helps, a prediction.
 
     Motions that the surfaces do not observe are found first, and are then left to the landmarks and to the
-    prediction (Zhang, Kaess & Singh 2016, "solution remapping"): the surfaces' noise must not decide them.
+    prediction (Zhang, Kaess & Singh 2016, "solution remapping"): the surfaces' noise must not determine them.
 
     Args:
         cells: The depth image.
-        points: (N, 3) of those points of it that stand still, camera frame.
+        points: (N, 3) of those points of it that are at rest, camera frame.
         reference: Surfaces of keyframes.
         T_camera_world: (4, 4) to begin with.
         prior: Prediction.
@@ -198,7 +198,7 @@ def align_depth(
 
 
 class _PlaneFit(NamedTuple):
-    """What ``compare`` returns."""
+    """Result of ``compare``."""
 
     verdict: NDArray[np.int8]
     agreeing: NDArray[np.int64]
@@ -224,7 +224,7 @@ def _minimum(
 ) -> _Minimum | None:
     """Return the minimum; None where too few points have a partner.
 
-    Where planes leave a motion open it is found once more, and planes do not decide that motion then.
+    Where planes do not observe a motion, it is found once more, and planes have no part in that motion then.
     """
     kept = np.eye(6)
     while True:
@@ -260,7 +260,7 @@ def _systematic(
         T_camera_world: (4, 4) the pose.
         cells: The depth image.
         information: (6, 6) by the surfaces.
-        others: (6, 6) by what else decides the pose.
+        others: (6, 6) of all else that determines the pose.
     """
     H, B = bent_by_distortion(T_camera_world, model, nearest, cells.rays)
     share = information @ np.linalg.pinv(information + others)

@@ -20,7 +20,7 @@ from mapper.registration.reprojection import (
 
 _MIN_DEPTH_M = 0.1
 _WIDEST = 4.0
-"""Squared tangent from the axis beyond which no camera sees, and its distortion is not defined."""
+"""Squared tangent from the axis beyond any angle of view, where distortion is not defined."""
 _GATES_M, _STRIDES = (0.3, 0.1, 0.04), (4, 4, 1)
 """Largest distances from a plane, from coarse to fine; with each, one point in so many is used."""
 _ITERATIONS = 8
@@ -260,7 +260,7 @@ def descend(T_camera_world, model, landmarks, prior, kept):  # type: ignore[no-u
         model: ``PlaneModel``.
         landmarks: ``Landmarks``.
         prior: ``PosePrior``.
-        kept: (6, 6) projection of tangents to the motions that planes may decide.
+        kept: (6, 6) projection of tangents to the motions that planes determine.
     """
     T = T_camera_world.copy()
     active = np.ones(len(landmarks.positions), np.bool_)

@@ -1,4 +1,4 @@
-"""Tracking by depth where an image has little texture: the second leg of the local map's odometry."""
+"""Tracking by depth where an image has little texture: the second tracker of the local map's odometry."""
 
 from dataclasses import dataclass, replace
 
@@ -32,16 +32,17 @@ _SPEED_SIGMA, _UNKNOWN_SPEED_SIGMA = 0.5, 2.0
 """Metres and radians per second by which a motion may err that is predicted, and one that nothing predicts:
 one sigma for a camera in a hand."""
 _SURE_S = 0.1
-"""So long a prediction is trusted: it errs by 5 cm."""
+"""Time for which a prediction alone is accepted: it errs by 5 cm."""
 _MAX_UNOBSERVED_S = 2.0
 """After so long on a prediction in any direction a frame is lost."""
 _MAX_GAP_S = 0.5
-"""After a longer gap without frames another corner may be in view that looks alike."""
+"""After a longer gap without frames another corner of the same shape may be in view."""
 _LEAST_ELAPSED_S = 0.01
 _FEW_INLIERS_RATIO = 2.0
-"""With fewer inliers, relative to the fewest, depth takes part; with more only where they tell too little."""
+"""With fewer inliers, relative to the fewest, depth takes part; with more only where ``_LOOSE_M`` is
+exceeded."""
 _LOOSE_M = 0.02
-"""Standard deviation of a translation from which landmarks tell too little."""
+"""Standard deviation of a translation from which on landmarks do not determine it."""
 _MIN_KEPT_RATIO = 0.5
 """When fewer of a pose's landmarks agree once the depth image takes part, one of both is wrong."""
 
@@ -53,7 +54,7 @@ class _Prediction:
     Attributes:
         T_camera_world: (4, 4).
         speed_sigma: Metres and radians per second by which the motion to it may err.
-        sure_s: So long it is trusted where nothing shows the motion.
+        sure_s: Time for which it is accepted where nothing shows the motion.
         gap_s: Time since the motion was last known; 0 if it is.
     """
 
@@ -82,7 +83,7 @@ class DepthTracker:
         return cells is not None and observes_all(surface_of(cells))
 
     def began(self, observation: ImageObservation) -> None:
-        """Take note of a sub-map's first frame."""
+        """Reset the tracker at a sub-map's first frame."""
         self._observed_ns, self._is_confirmed = observation.stamp_ns, False
         self._surfaces.clear()
 
@@ -93,7 +94,7 @@ class DepthTracker:
         T_predicted: Transform | None,
         found: TrackedPose | None,
     ) -> TrackedPose | None:
-        """Return a frame's pose by landmarks and depth together, where landmarks tell too little.
+        """Return a frame's pose by landmarks and depth together, where landmarks do not suffice.
 
         Args:
             observation: The frame.
@@ -137,10 +138,10 @@ class DepthTracker:
         return found if joint is None else self._by_both(observation, joint, found, predicted)
 
     def _suffices(self, found: TrackedPose) -> bool:
-        """Return whether landmarks alone give a pose: many, or some that tell the translation.
+        """Return whether landmarks alone give a pose: many, or some that determine the translation.
 
         Where something moves by itself some suffice: depth images show passers-by as well, and along a
-        corridor nothing else in them tells how far the camera moved.
+        corridor nothing else in them shows how far the camera moved.
         """
         if found.inliers < _FEW_INLIERS_RATIO * self._config.min_inliers:
             return False
@@ -192,8 +193,8 @@ class DepthTracker:
             if keyframes[k].origin == origin and _of_one_camera(self._map.observation(k).depth_cells, cells)
         ]
         models = [(self._map.observation(k), keyframes[k].T_camera_world, k) for k in self._keyframes]
-        blind = last.doubts or (last.depth is not None and last.depth.unobservable)
-        if not blind and all(earlier.stamp_ns != last.observation.stamp_ns for earlier, _, _ in models):
+        unobserved = last.doubts or (last.depth is not None and last.depth.unobservable)
+        if not unobserved and all(earlier.stamp_ns != last.observation.stamp_ns for earlier, _, _ in models):
             models.append((last.observation, last.T_camera_world, last.reference))
         models = [model for model in models if _of_one_camera(model[0].depth_cells, cells)]
         self._surfaces = {
@@ -226,7 +227,7 @@ class DepthTracker:
         expected = min(self._visible(alignment.T_camera_world, reference, observation), len(observation))
         doubts = self._doubts(observation, alignment, predicted)
         if not self._is_confirmed and expected >= 2 * self._config.min_inliers:
-            # What moves with the camera, such as a hand before the lens, agrees with itself.
+            # What moves with the camera, such as a hand before the lens, is consistent from frame to frame.
             doubts = (*doubts, f"{expected} features, but none where the depth image has them")
         if predicted.gap_s > _MAX_GAP_S:
             doubts = (*doubts, f"found by depth alone after {predicted.gap_s:.1f} s")
@@ -271,7 +272,7 @@ class DepthTracker:
     def _doubts(
         self, observation: ImageObservation, alignment: DepthAlignment, predicted: _Prediction
     ) -> tuple[str, ...]:
-        """Return which motions were not observed and for how long, and take note when all were."""
+        """Return which motions were not observed and for how long, and record when all were."""
         if not alignment.unobservable:
             self._observed_ns = observation.stamp_ns
             return ()

@@ -1,7 +1,7 @@
 """Comparison of a depth image with those of earlier keyframes: what has moved since, and what lies elsewhere.
 
 What stands where an earlier image saw through has moved there, whatever its features show. And the surfaces
-of a scene that stands still lie where they lay: if many do not, the pose is that of something that moves.
+of a scene that stands still lie where they lay: if many do not, the pose is that of a moving object.
 """
 
 from dataclasses import dataclass
@@ -21,10 +21,10 @@ from mapper.odometry.local_map.landmarks import LandmarkMap
 from mapper.sensing.config import KINECT_NOISE, DepthNoiseConfig
 
 _APART_S, _OLDER, _MOST = 0.4, 1.5, 10
-"""Age of the first keyframe that is compared: someone who walks moves on by his own width in it. Each further
-one is so many times as old, up to 15 s: someone who came and stands has moved."""
+"""Age of the first keyframe that is compared: a pedestrian moves on by their own width in it. Each further
+one is so many times as old, up to 15 s: someone who has stopped is found as well."""
 _MARGIN_M, _MARGIN_SIGMAS, _MARGIN_RATIO = 0.1, 4.0, 0.02
-"""What has moved stands so far in front of a surface: more than the errors of poses, noise and scale."""
+"""Least distance in front of a surface of what has moved: more than the errors of poses, noise and scale."""
 _MOST_MOVED_RATIO = 0.6
 """When more of the surfaces has moved it was the camera, and the pose is wrong."""
 _SAME_M, _SAME_SIGMAS, _SAME_RATIO = 0.02, 3.0, 0.01
@@ -77,7 +77,7 @@ class EarlierDepth:
         Args:
             observation: The frame.
             T_camera_world: (4, 4) its pose, good to a few centimetres.
-            reference: Keyframe that sees the place; it and those before it are compared.
+            reference: Keyframe of the same place; it and those before it are compared.
             points_camera: (N, 3) metres, camera frame; None are the frame's features.
         """
         points = observation.points_camera if points_camera is None else points_camera
@@ -92,7 +92,7 @@ class EarlierDepth:
         moved: NDArray[np.bool_] = _in_free_space(points, T_camera_world, *before)
         if moved.sum() <= _MOST_MOVED_RATIO * (~np.isnan(points[:, 2])).sum():
             return moved
-        # Most features may be on one person with a patterned shirt, so the surfaces decide.
+        # Most features may be on one person with a patterned shirt, so the surfaces are tested.
         if _in_free_space(cells.points(), T_camera_world, *before).mean() > _MOST_MOVED_RATIO:
             moved[:] = False
         return moved
@@ -109,7 +109,7 @@ class EarlierDepth:
         Args:
             observation: The frame.
             T_camera_world: (4, 4) its pose.
-            reference: Keyframe that sees the place; the newest up to it that is old enough is compared.
+            reference: Keyframe of the same place; the newest up to it that is old enough is compared.
             twist_camera: (6,) velocity of the camera in its own axes, rad/s and m/s; None if it is unknown.
         """
         earlier = self._earlier(observation, reference, most=1)

@@ -1,4 +1,4 @@
-"""Doubts of RGB-D frames: what speaks against a tracked pose, measured against what is usual in this log."""
+"""Doubts of RGB-D frames: figures of tracking that deviate from their median over the log."""
 
 import math
 from collections import deque
@@ -16,7 +16,7 @@ from mapper.odometry.local_map.pose_tracker import TrackedPose
 _MEMORY = 100
 """Undoubted frames whose medians are the usual."""
 _FEWEST = 10
-"""With fewer of them nothing is known to be usual."""
+"""With fewer of them there is no usual value."""
 _LOOSE_M = 0.025
 """A translation this uncertain is doubtful where the usual is far better: 1 % of a view 2 to 3 m deep."""
 _LOOSE_RATIO = 4.0
@@ -28,7 +28,7 @@ _JUMP_RATIO = 8.0
 """Deviation from constant velocity, relative to the usual per second, that is a jump. The 99th percentile of
 right poses is 3 to 6."""
 _SUPPORT_AGREEMENT, _SUPPORT_RATIO = 0.85, 2.0
-"""A jump is believed if the agreement is at least this share of the usual, and the uncertainty at most this
+"""A jump is accepted if the agreement is at least this share of the usual, and the uncertainty at most this
 multiple, and nothing in view moves by itself: fast motions are real."""
 _MIN_EXCESS, _APART = 4.0, 2.0
 """When the image fits the predicted motion better than the one found by so many standard errors of the mean
@@ -89,12 +89,13 @@ class FrameDoubts:
     def _of_depth(self, tracked_pose: TrackedPose, last: TrackedPose, motion: "_FrameMotion") -> Doubt:
         """Return the doubts of a pose by depth: landmarks were few, so their usual figures do not apply."""
         phrases = tracked_pose.doubts
-        is_blind = _is_blind(tracked_pose) or _is_blind(last)  # a predicted motion predicts no other
-        if not is_blind and (jumps := self._jumps(motion)):
+        # A motion that is predicted alone predicts no other.
+        is_unobserved = _is_unobserved(tracked_pose) or _is_unobserved(last)
+        if not is_unobserved and (jumps := self._jumps(motion)):
             return Doubt((*phrases, *jumps), motion.off_rad, motion.off_m)
         if phrases:
             return Doubt(phrases, motion.sigma_rad, motion.sigma_m)
-        if not is_blind:
+        if not is_unobserved:
             self._add_motion(motion)
         return NO_DOUBT
 
@@ -121,7 +122,7 @@ class FrameDoubts:
         )
         jumps = [] if is_supported else self._jumps(motion)
         phrases += jumps
-        if elsewhere := self._surfaces.speak_against(tracked_pose, displaced):
+        if elsewhere := self._surfaces.doubt_of(tracked_pose, displaced):
             phrases.append(elsewhere)
             sigma_m = max(sigma_m, displaced.distance_m)
         if excess_error > _MIN_EXCESS and self._is_apart(motion):
@@ -130,14 +131,18 @@ class FrameDoubts:
                 f"the image fits the predicted motion better by {excess_error:.0f} standard errors"
             )
         if phrases:
-            is_wild = is_loose and is_contradicted and bool(jumps)
-            return Doubt(tuple(phrases), motion.off_rad, max(motion.off_m, sigma_m), is_wild=is_wild)
+            return Doubt(
+                tuple(phrases),
+                motion.off_rad,
+                max(motion.off_m, sigma_m),
+                is_implausible=is_loose and is_contradicted and bool(jumps),
+            )
         self._add(sigma_m=sigma_m, agreement=agreement)
         self._add_motion(motion)
         return NO_DOUBT
 
     def in_hindsight(self, stamp_ns: int) -> Doubt:
-        """Return what later frames say against an earlier one."""
+        """Return the doubt that later frames add to an earlier one."""
         return self._surfaces.doubt_of_earlier(stamp_ns)
 
     def _is_apart(self, motion: "_FrameMotion") -> bool:
@@ -227,7 +232,7 @@ class _FrameMotion:
         return max(self.jump[1], self.sigma_m)
 
 
-def _is_blind(tracked_pose: TrackedPose) -> bool:
+def _is_unobserved(tracked_pose: TrackedPose) -> bool:
     """Return whether a part of the motion is predicted alone."""
     return tracked_pose.depth is not None and bool(tracked_pose.depth.unobservable)
 

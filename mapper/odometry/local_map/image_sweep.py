@@ -11,7 +11,7 @@ from mapper.registration.reprojection import HUBER_2DOF, pose_jacobian, projecti
 
 _ITERATIONS = 3
 _WIDE = np.repeat([0.1, 0.05], 3)
-"""Standard deviation (rad, m) of the motion about 0: that of a fast hand, so that the image decides."""
+"""Standard deviation (rad, m) of the motion about 0: that of a fast hand, so that the image determines it."""
 _KEPT = 0.95
 """Of the mean square of what is left of the motion, from image to image: some 20 images count."""
 _PRIOR_S = 0.01
@@ -32,9 +32,9 @@ class _Sweep:
 class SweepErrors:
     """Errors of poses by motion within images that was not taken out of them.
 
-    Images of a camera that is shaken faster than frames follow show more of it than their velocities tell.
+    Images of a camera that is shaken faster than frames follow show more of it than their velocities.
     Its mean square is measured against the motion that was taken out. It counts once the motion within images
-    follows the velocity, as with a rolling shutter: from image to image both must change alike, since errors
+    follows the velocity, as with a rolling shutter: their changes from image to image must agree, as errors
     of depth or lens follow the distance from a keyframe, and so the velocity itself. Errors of landmarks that
     both images share cancel.
     """
@@ -46,7 +46,7 @@ class SweepErrors:
         self.restart()
 
     def restart(self) -> None:
-        """Forget the last images, but not what they told, after a gap."""
+        """Reset the last images, but not their statistics, after a gap."""
         self._last: _Sweep | None = None
         self._before: _Sweep | None = None
         self._pose_per_motion: Array | None = None

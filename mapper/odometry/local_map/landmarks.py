@@ -23,7 +23,7 @@ Ids = NDArray[np.int32]
 MIN_SHARED_LANDMARKS = 15
 """Keyframes that share fewer are not covisible (Mur-Artal, Montiel & Tardós 2015, §III-D)."""
 _MIN_FOUND_RATIO = 0.25
-"""Young landmarks found in a smaller share of the frames that should show them are removed (ibid., §VI-B)."""
+"""New landmarks found in a smaller share of the frames that should show them are removed (ibid., §VI-B)."""
 _ROUNDS, _ITERATIONS = 2, 5
 _MOST_WIDENED = 3
 """A window is widened to at most this many times its size."""
@@ -393,7 +393,7 @@ class LandmarkMap:
         self._observations["landmark"][observations] = -1
         self._observations["keyframe"][observations] = -1
         self.landmarks["observers"][ids] -= times.astype(np.int32)
-        # Nobody reads them any more: zeros, as most landmarks become, make checkpoints small.
+        # They are not read any more: zeros, as most landmarks become, make checkpoints small.
         for name in ("measured", "weights", "slope"):
             self._observations[name][observations] = 0.0
         removed = ids[self.landmarks["observers"][ids] == 0]
@@ -401,7 +401,7 @@ class LandmarkMap:
             self.landmarks[name][removed] = 0
 
     def cull(self) -> None:
-        """Remove young landmarks that no further keyframe observes or that tracking rarely finds.
+        """Remove new landmarks that no further keyframe observes or that tracking rarely finds.
 
         Two keyframes after its creation a landmark must have another observer than the one that it was made
         from, or the two if it was triangulated; mismatches and depth errors at object edges rarely get one

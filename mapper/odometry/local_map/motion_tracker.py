@@ -18,9 +18,9 @@ from mapper.odometry.local_map.triangulation import weights_with_landmarks
 
 _MAX_RATIO = 0.9
 _LEAST_STILL_RATIO = 0.2
-"""When fewer matches stand still, it is the prediction that is wrong."""
+"""When fewer matches are at rest, the prediction is wrong."""
 _RIVAL_RATIO = 0.5
-"""A pose of fewer inliers, relative to the better one, does not cast doubt on it."""
+"""A pose of fewer inliers, relative to the better one, does not make it doubtful."""
 _SAME_RATIO = 0.5
 """Of two poses that are the same, each has more of the other's inliers."""
 
@@ -42,7 +42,7 @@ class MotionPoseTracker:
         by_motion = self._by_motion(observation, last, T_predicted)
         if by_motion is not None and by_motion.inliers >= self._config.weak_inliers:
             return by_motion
-        # A pose with few inliers may be wrong, so a pose that does not depend on the prediction competes.
+        # A pose with few inliers may be wrong: it is compared with one that needs no prediction.
         known, points_world, landmarks = self._known_points(last)
         by_last = self._relocalizer.match_points(
             observation,

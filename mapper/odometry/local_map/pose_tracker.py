@@ -29,14 +29,14 @@ class TrackedPose:
         T_camera_world: (4, 4).
         landmark_of_feature: (N,) int32 landmark of each feature, −1 for none; inliers only.
         reference: Keyframe that observes most of these landmarks.
-        matches: Number of proposed pairs.
+        matches: Number of matched pairs, inliers or not.
         agreement: Share of the first matches, before the local map is searched, that agree with the pose.
         visible: Number of the map's landmarks that should be in view.
         residual_px: Root mean square image residual of the inliers.
         method: Step that found the pose, e.g. "map", "fallback" or "relocalised".
         depth: Alignment of the depth image that took part in the pose; None if landmarks alone gave it.
         doubts: Why the pose may be wrong, a phrase each.
-        moving: (M,) int32 features that stand where earlier depth images saw through, or that contradict the
+        moving: (M,) int32 features in the free space of earlier depth images, or that contradict the
             pose while something else moves in view.
     """
 

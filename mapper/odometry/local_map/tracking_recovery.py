@@ -23,7 +23,7 @@ _SINCE_NS = 5 * NS_PER_S
 class TrackingRecovery:
     """Search for another pose where surfaces lie elsewhere, or where a doubtful keyframe began another map.
 
-    What follows from a wrong pose agrees with itself, so that tracking alone does not come back.
+    The map that a wrong pose has extended is consistent with it, so that tracking alone does not recover.
     """
 
     def __init__(
@@ -38,7 +38,7 @@ class TrackingRecovery:
         self._relocalizer = relocalizer
         self._earlier_depth = earlier_depth
 
-    def instead_of(
+    def relocalised(
         self, tracked_pose: TrackedPose, displaced: Displacement, twist_camera: Array | None
     ) -> tuple[TrackedPose, Displacement] | None:
         """Return another pose of a frame, which is doubtful, and what it displaces; None if there is none.

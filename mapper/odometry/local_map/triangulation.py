@@ -25,7 +25,7 @@ what is seen changes with the view."""
 _MOST_KEYFRAMES = 10
 _MAX_RATIO = 0.8
 _MAX_DEPTH_ERROR = 0.5
-"""Standard deviation of a triangulated depth, as a share of it: with less parallax it tells little. A limit
+"""Standard deviation of a triangulated depth, as a share of it: with less parallax it is useless. A limit
 that many points are near to keeps those that noise has brought closer, and the scale shrinks."""
 _ENOUGH_MEASURED = 20
 """Matched features with measured depth that give a pose its scale."""
@@ -71,7 +71,7 @@ def weights_with_landmarks(
 
     Triangulated landmarks can share an error of scale. Where enough features measure the scale, the variances
     along the rays are multiplied as if that part of them were common to all: as many as they are, they do not
-    outvote those.
+    outweigh those.
 
     Args:
         landmark_map: The map.
