@@ -1,18 +1,17 @@
 """Matching of predicted pixels to features in a search window around them, compiled."""
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from mapper.features.hamming import hamming
+from mapper.features.hamming import Bits, hamming
 
 CELL_PX = 16
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class FeatureGrid:
+class FeatureGrid(NamedTuple):
     """Index of features sorted by square cell, so that the candidates of a search are adjacent in memory.
 
     Attributes:
@@ -24,6 +23,38 @@ class FeatureGrid:
     start: NDArray[np.int32]
     columns: int
     rows: int
+
+
+class SearchWindows(NamedTuple):
+    """Windows of an image in which features are searched.
+
+    Attributes:
+        pixels: (M, 2) float64 predicted pixels, their centres.
+        radius_px: (M,) float64 half of their edge.
+        octave: (M,) int32 predicted octaves.
+        bits: (M, 4) uint64 descriptors.
+    """
+
+    pixels: NDArray[np.float64]
+    radius_px: NDArray[np.float64]
+    octave: NDArray[np.int32]
+    bits: Bits
+
+
+class GridFeatures(NamedTuple):
+    """Features of an image, sorted by cell.
+
+    Attributes:
+        pixels: (N, 2) float64.
+        octave: (N,) int32.
+        bits: (N, 4) uint64 descriptors.
+        grid: Their index.
+    """
+
+    pixels: NDArray[np.float64]
+    octave: NDArray[np.int32]
+    bits: Bits
+    grid: FeatureGrid
 
 
 def sort_into_grid(
@@ -42,46 +73,26 @@ def sort_into_grid(
 
 
 @njit(cache=True, nogil=True)
-def match_windows(
-    predicted,
-    predicted_octave,
-    radius_px,
-    predicted_bits,
-    pixels,
-    octave,
-    bits,
-    taken,
-    start,
-    columns,
-    rows,
-    max_hamming,
-    max_ratio,
-):
-    """Return (M,) int32, per prediction the matching feature or −1; no feature matches two predictions.
+def match_windows(windows, features, taken, max_hamming, max_ratio):
+    """Return (M,) int32, per window the matching feature or −1; no feature matches two windows.
 
-    The best candidate within ``radius_px`` and ±1 octave matches if its distance is at most ``max_hamming``
-    and, if the second best is of the same octave, at most ``max_ratio`` of that distance (Lowe 2004, §7.1).
+    The best candidate within a window and ±1 octave matches if its distance is at most ``max_hamming`` and,
+    if the second best is of the same octave, at most ``max_ratio`` of that distance (Lowe 2004, §7.1).
 
     Args:
-        predicted: (M, 2) float64 pixels.
-        predicted_octave: (M,) int32.
-        radius_px: (M,) float64 search radius.
-        predicted_bits: (M, 4) uint64 descriptors.
-        pixels: (N, 2) float64 features' pixels, sorted by cell.
-        octave: (N,) int32 features' octaves.
-        bits: (N, 4) uint64 features' descriptors.
+        windows: ``SearchWindows``.
+        features: ``GridFeatures``.
         taken: (N,) bool: features to leave out.
-        start: As in ``FeatureGrid``, likewise the next two.
-        columns: Number of cells in a row.
-        rows: Number of rows of cells.
         max_hamming: Largest distance in bits.
         max_ratio: Largest ratio of best to second-best distance.
     """
-    matched = np.full(len(predicted), -1, np.int32)
+    centre, radius_px, predicted_octave, predicted_bits = windows
+    pixels, octave, bits, (start, columns, rows) = features
+    matched = np.full(len(centre), -1, np.int32)
     owner = np.full(len(pixels), -1, np.int32)
     distance_of = np.full(len(pixels), 257, np.int32)
-    for m in range(len(predicted)):
-        u, v, r = predicted[m, 0], predicted[m, 1], radius_px[m]
+    for m in range(len(centre)):
+        u, v, r = centre[m, 0], centre[m, 1], radius_px[m]
         left = max(int((u - r) // CELL_PX), 0)
         right = min(int((u + r) // CELL_PX), columns - 1)
         top = max(int((v - r) // CELL_PX), 0)
@@ -104,9 +115,14 @@ def match_windows(
         if best > max_hamming or (second_octave == best_octave and best > max_ratio * second):
             continue
         if best < distance_of[best_feature]:
-            if owner[best_feature] >= 0:
-                matched[owner[best_feature]] = -1
-            owner[best_feature] = m
-            distance_of[best_feature] = best
-            matched[m] = best_feature
+            assign(m, best_feature, best, matched, owner, distance_of)
     return matched
+
+
+@njit(cache=True, nogil=True)
+def assign(m, feature, distance, matched, owner, distance_of):
+    """Match a feature to query m, and no longer to the one whose descriptor is farther from its own."""
+    if owner[feature] >= 0:
+        matched[owner[feature]] = -1
+    owner[feature], distance_of[feature] = m, distance
+    matched[m] = feature

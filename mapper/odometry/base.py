@@ -59,7 +59,7 @@ class FrameResult:
             be more accurate; until then these connect the node to the path.
         twist: Assumed motion of the body during a scan's sweep; None if nothing was deskewed.
         is_sharp: False if the frame is unfit for place recognition: a scan swept in unknown motion.
-        doubts: Why the pose may be wrong, a phrase each; empty if nothing speaks against it.
+        doubts: Why the pose may be wrong, a phrase each; empty if there is no reason.
         covariance: (6, 6) of the pose in the body's tangent (rotation, translation), rad² and m²: relative to
             ``node``, or for a keyframe to the keyframe before it. None if nothing measured it.
     """
@@ -117,7 +117,7 @@ SEE_MORE = (
 """What to try then."""
 
 STEADY_NS = NS_PER_S
-"""After a longer gap the frame before says little about where this one was taken."""
+"""After a longer gap the frame before does not predict the pose of this one."""
 
 
 class MotionCheck(Protocol):
@@ -189,10 +189,10 @@ class SensorCheck(Protocol):
 
 @runtime_checkable
 class HindsightOdometry(Protocol):
-    """Odometry whose later frames may cast doubt on earlier ones."""
+    """Odometry in which later frames can make the poses of earlier ones doubtful."""
 
     def in_hindsight(self, result: FrameResult, /) -> FrameResult:
-        """Return the result of a frame with what later ones say against it, once the log has ended."""
+        """Return the result of a frame with the doubts that later ones add to it, once the log has ended."""
         ...
 
 

@@ -43,7 +43,7 @@ _VIRTUAL_BASELINE_PX_M = 40.0
 _DEPTH_SHARE = 0.01
 """Error of depths beside the sensor's noise, as a share: its scale, and the slope where a feature lies."""
 _PAIRS_SHARING, _PAIRS_COUNTED = 4, 200
-"""Pairs of images that tell the readout time: a new image is in one, a keyframe in some 20, their geometric
+"""Pairs of images that show the readout time: a new image is in one, a keyframe in some 20, their geometric
 mean; and how many of them the estimate is from."""
 
 
@@ -70,7 +70,7 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
             detector: Replaces the configured one, so that several odometries on the same frames can share
                 the detection.
             register: Replaces the registration, so that they can share registrations as well.
-            motion_check: Rules out poses after a gap; None if nothing but the images tells of the motion.
+            motion_check: Rules out poses after a gap; None if only the images measure the motion.
         """
         self._config = config
         self._motion_check = motion_check
@@ -209,7 +209,7 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
         return candidates
 
     def _is_possible(self, found: Alignment, earlier: IsvdObservation, now: IsvdObservation) -> bool:
-        """Return whether a motion across a gap is possible, where something else tells it."""
+        """Return whether a motion across a gap is possible by another measurement of it, if any."""
         check, begin_ns, end_ns = self._motion_check, earlier.stamp_ns, now.stamp_ns
         if check is None or end_ns - begin_ns <= STEADY_NS:
             return True
@@ -239,37 +239,35 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
         if candidates:
             self._nearest_match = self._corrected(tracked), candidates[0]
         self._earlier.add(tracked)
-        nearest = candidates[0].alignment if candidates else None
         self._errors.add(observation.stamp_ns, candidates)
-        # All rest on this frame's features. Were the earlier ones' the same, too, each factor would have its
-        # share of the information, were they others, all: it has the geometric mean.
-        shared_by = math.sqrt(max(len(candidates), 1))
-        factors = tuple(
-            BetweenFactor(
-                candidate.earlier.node,
-                node,
-                candidate.alignment.T_target_source,
-                self._errors.honest(candidate) / shared_by,
-            )
-            for candidate in candidates
-        )
+        factors = self._factors(node, candidates)
         return FrameResult(
             stamp_ns=observation.stamp_ns,
             node=node,
             T_node_body=np.eye(4),
             T_world_body=T_world_body,
             is_keyframe=True,
-            diagnostics=Diagnostics(
-                features=len(observation.features),
-                matches=len(candidates[0].pairs) if candidates else 0,
-                inliers=nearest.pairs if nearest else 0,
-                residual=nearest.inlier_rmse_m if nearest else 0.0,
-                residual_unit="m",
-                method=method,
-            ),
+            diagnostics=_diagnostics(observation, candidates, method),
             factors=factors,
             links=factors,
             twist=twist,
+        )
+
+    def _factors(self, node: int, candidates: Sequence[PoseCandidate]) -> tuple[BetweenFactor, ...]:
+        """Return a factor from each candidate's earlier frame.
+
+        All rest on this frame's features. Were the earlier ones' the same, too, each factor would have its
+        share of the information, were they others, all: it has the geometric mean.
+        """
+        shared_by = math.sqrt(max(len(candidates), 1))
+        return tuple(
+            BetweenFactor(
+                candidate.earlier.node,
+                node,
+                candidate.alignment.T_target_source,
+                self._errors.rescaled(candidate) / shared_by,
+            )
+            for candidate in candidates
         )
 
     def _follow(self, observation: IsvdObservation, T_world_body: Transform) -> Twist:
@@ -296,3 +294,17 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
                 twists_body=(candidate.earlier.twist, tracked.twist),
             )
         )
+
+
+def _diagnostics(
+    observation: IsvdObservation, candidates: Sequence[PoseCandidate], method: str
+) -> Diagnostics:
+    nearest = candidates[0].alignment if candidates else None
+    return Diagnostics(
+        features=len(observation.features),
+        matches=len(candidates[0].pairs) if candidates else 0,
+        inliers=nearest.pairs if nearest else 0,
+        residual=nearest.inlier_rmse_m if nearest else 0.0,
+        residual_unit="m",
+        method=method,
+    )

@@ -6,7 +6,7 @@ from mapper.core.deskew import Twist
 from mapper.core.geometry import Array, Transform, apply, inverse
 from mapper.features.matching import Pairs
 from mapper.odometry.isvd_registration import IsvdObservation
-from mapper.odometry.local_map.bundle_adjustment import adjust, common_parameter
+from mapper.odometry.local_map.bundle_adjustment import Observations, adjust, common_parameter
 from mapper.odometry.local_map.pixel_motion import row_shift
 from mapper.odometry.local_map.rolling_shutter import camera_twist
 
@@ -56,7 +56,6 @@ def readout_in_pair(
             seen.camera.height_px,
             camera_twist(twist, seen.T_body_camera),
         )
-    seen_by = edges, measured, weights, source.intrinsics
-    poses, points, agree = adjust(poses, free, points, first_edge, *seen_by, _NO_LINKS, _ROUNDS, _ITERATIONS)
-    found: tuple[float, float] = common_parameter(poses, free, points, first_edge, *seen_by, agree, slopes)
-    return found
+    observed = Observations(first_edge, edges, measured, weights, source.intrinsics)
+    poses, points, agree = adjust(poses, free, points, observed, _NO_LINKS, _ROUNDS, _ITERATIONS)
+    return common_parameter(poses, free, points, observed, agree, slopes)

@@ -35,7 +35,7 @@ class NodeOffset(Generic[Observation]):
         return self._odometry.matches()
 
     def in_hindsight(self, result: FrameResult, /) -> FrameResult:
-        """Return the result of a frame with what later ones say against it."""
+        """Return the result of a frame with the doubts that later ones add to it."""
         if not isinstance(self._odometry, HindsightOdometry):
             return result
         own = _numbered(result, -self._first_node)

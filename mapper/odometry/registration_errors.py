@@ -1,4 +1,4 @@
-"""Errors of a log's registrations, which tell how certain its poses are."""
+"""Errors of a log's registrations, which give the uncertainty of its poses."""
 
 import math
 from bisect import insort
@@ -62,7 +62,7 @@ class RegistrationErrors:
                 self._repeated += float((scores * earlier).sum())
                 self._sums[node] = scores + earlier
 
-    def honest(self, candidate: PoseCandidate) -> Array:
+    def rescaled(self, candidate: PoseCandidate) -> Array:
         """Return the (6, 6) information of a registration by what the log's residuals show.
 
         All registrations are scaled alike. What their weights are relative to each other decides the path,
@@ -85,6 +85,6 @@ class RegistrationErrors:
         assert alignment.information is not None  # it converged
         self._residuals.add(alignment.residuals)
         by_weights = alignment.information * alignment.residuals.variance_factor
-        shown = self._residuals.honest(by_weights, alignment.T_target_source)
+        shown = self._residuals.rescaled(by_weights, alignment.T_target_source)
         (_, before), (_, after) = np.linalg.slogdet(candidate.information), np.linalg.slogdet(shown)
         insort(self._scales, math.exp((before - after) / len(shown)))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mapper.features.hamming import hamming, match_mutual_bits, pack
-from mapper.features.window_matching import match_windows, sort_into_grid
+from mapper.features.window_matching import GridFeatures, SearchWindows, match_windows, sort_into_grid
 
 WIDTH, HEIGHT = 320, 240
 
@@ -23,10 +23,10 @@ def search(scene, predicted, octave, words, *, radius_px=5.0, taken=None, max_ha
     pixels, octaves, features, grid = scene
     taken = np.zeros(len(pixels), bool) if taken is None else taken
     radii = np.full(len(predicted), radius_px)
+    windows = SearchWindows(predicted, radii, octave, words)
     return match_windows(
-        predicted, octave, radii, words, pixels, octaves, features, taken,
-        grid.start, grid.columns, grid.rows, max_hamming, max_ratio,
-    )  # fmt: skip
+        windows, GridFeatures(pixels, octaves, features, grid), taken, max_hamming, max_ratio
+    )
 
 
 def flipped(words, bits, rng):
@@ -109,8 +109,7 @@ def test_exhaustive_matching_refuses_what_is_not_there():
 def test_what_is_predicted_far_outside_the_image_reads_nothing(scene, place):
     """Interpreted, as compiled code would read out of bounds without a word."""
     pixels, octave, words, grid = scene
-    matched = match_windows.py_func(
-        np.array([place]), octave[:1], np.array([30.0]), words[:1], pixels, octave, words,
-        np.zeros(len(pixels), bool), grid.start, grid.columns, grid.rows, 64, 0.9,
-    )  # fmt: skip
+    windows = SearchWindows(np.array([place]), np.array([30.0]), octave[:1], words[:1])
+    features = GridFeatures(pixels, octave, words, grid)
+    matched = match_windows.py_func(windows, features, np.zeros(len(pixels), bool), 64, 0.9)
     assert matched.tolist() == [-1]

@@ -5,7 +5,8 @@ import pytest
 
 from mapper.core.frames import ray_table
 from mapper.core.geometry import angle_between, apply, exp, inverse, log
-from mapper.odometry.local_map.depth_alignment import Landmarks, align_depth, observes_all
+from mapper.odometry.local_map.depth_alignment import ReferenceSurfaces, align_depth, observes_all
+from mapper.odometry.local_map.depth_kernels import Landmarks, PosePrior
 from mapper.odometry.local_map.depth_surfaces import depth_cells, surface_of
 from tests.support.depth_rooms import CAMERA, CORNER, box_depth
 
@@ -28,12 +29,9 @@ def aligned(target, T_target, source, *, guess, landmarks=NO_LANDMARKS, sigma=0.
     return align_depth(
         source,
         source.points(),
-        [surface_of(target)],
-        [inverse(T_target)],
-        keyframes=1,
+        ReferenceSurfaces([surface_of(target)], [inverse(T_target)], keyframes=1),
         T_camera_world=inverse(guess),
-        T_prior=inverse(guess),
-        prior=np.eye(6) / sigma**2,
+        prior=PosePrior(inverse(guess), np.eye(6) / sigma**2),
         landmarks=landmarks,
         noise=None,
     )

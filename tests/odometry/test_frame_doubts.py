@@ -154,7 +154,7 @@ def test_where_much_moves_the_farther_surfaces_decide_also_of_frames_shortly_bef
             observation=replace(pose.observation, stamp_ns=round(time_s * 1e9)),
             moving=np.arange(moving * len(pose.observation)),
         )
-        return surfaces.speak_against(now, Displacement(ratio, 0.15, 0.4, far_ratio))
+        return surfaces.doubt_of(now, Displacement(ratio, 0.15, 0.4, far_ratio))
 
     assert not doubt(1.0, moving=0.0, ratio=0.3, far_ratio=0.6)
     assert not doubt(2.5, moving=0.0, ratio=0.3, far_ratio=0.6)

@@ -124,7 +124,7 @@ def test_a_view_that_is_mostly_new_becomes_a_keyframe(frames):
     assert sum(step.is_keyframe for step in few) < sum(step.is_keyframe for step in many)
 
 
-def test_a_keyframe_is_young_for_a_time_and_not_only_for_frames(frames):
+def test_a_keyframe_is_recent_for_a_time_and_not_only_for_frames(frames):
     """At 5 Hz the view changes within a few frames, which must not wait for the next keyframe."""
     odometry = build_frame_odometry(LocalMapConfig(mapped_ratio=0.0))
     odometry.track(odometry.observe(frames[0]))

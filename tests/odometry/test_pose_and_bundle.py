@@ -5,7 +5,7 @@ import pytest
 
 from mapper.core.geometry import angle_between, apply, exp, inverse
 from mapper.core.linear import twist_exp
-from mapper.odometry.local_map.bundle_adjustment import adjust
+from mapper.odometry.local_map.bundle_adjustment import Observations, adjust
 from mapper.registration.reprojection import normal_matrix, refine_pose
 
 INTRINSICS = np.array([525.0, 525.0, 319.5, 239.5, 40.0])
@@ -98,11 +98,7 @@ def test_bundle_moves_poses_and_points_back_to_the_truth():
         start,
         free,
         start_points,
-        first,
-        edges,
-        measured,
-        np.full((len(edges), 3), 4.0),
-        INTRINSICS,
+        Observations(first, edges, measured, np.full((len(edges), 3), 4.0), INTRINSICS),
         NO_LINKS,
         2,
         8,
@@ -121,9 +117,8 @@ def test_bundle_of_exact_measurements_stays_where_it_is():
     rng = np.random.default_rng(5)
     truth, points, first, edges, measured = bundle(rng, noise_px=0.0)
     free = np.array([-1, 0, 1, 2, 3], np.int32)
-    poses, refined, agree = adjust(
-        truth, free, points, first, edges, measured, np.ones((len(edges), 3)), INTRINSICS, NO_LINKS, 2, 5
-    )
+    observed = Observations(first, edges, measured, np.ones((len(edges), 3)), INTRINSICS)
+    poses, refined, agree = adjust(truth, free, points, observed, NO_LINKS, 2, 5)
     assert np.allclose(poses, truth, atol=1e-9)
     assert np.allclose(refined, points, atol=1e-9)
     assert agree.all()
@@ -138,10 +133,11 @@ def test_a_measured_relative_pose_holds_a_camera_that_points_hardly_do():
     start = truth.copy()
     start[4] = random_pose(rng, translation_m=0.03, rotation_rad=0.02) @ truth[4]
     free = np.array([-1, 0, 1, 2, 3], np.int32)
+    observed = Observations(first, edges, measured, weights, INTRINSICS)
     for pair in ((3, 4), (4, 3)):
         T_to_from = truth[pair[1]] @ inverse(truth[pair[0]])
         links = np.array([pair], np.int32), T_to_from[None], 1e8 * np.eye(6)[None]
-        held, _, _ = adjust(start, free, points, first, edges, measured, weights, INTRINSICS, links, 2, 12)
-        left, _, _ = adjust(start, free, points, first, edges, measured, weights, INTRINSICS, NO_LINKS, 2, 12)
+        held, _, _ = adjust(start, free, points, observed, links, 2, 12)
+        left, _, _ = adjust(start, free, points, observed, NO_LINKS, 2, 12)
         assert np.linalg.norm((inverse(truth[4]) @ held[4])[:3, 3]) < 0.002
         assert np.linalg.norm((inverse(truth[4]) @ left[4])[:3, 3]) > 0.005

@@ -68,7 +68,7 @@ def test_repeated_errors_lower_the_information():
     same = independent(1)[0]
     for n in range(100):
         errors.add(n * FRAME_NS, [candidate(same)])
-    found = errors.honest(candidate(same)) * errors.repetition
+    found = errors.rescaled(candidate(same)) * errors.repetition
     shown = with_model_error(INFORMATION, T_EARLIER_NEW, scale=0.125)
     assert np.linalg.slogdet(found)[1] == pytest.approx(np.linalg.slogdet(shown)[1])
 
@@ -79,9 +79,9 @@ def test_registrations_keep_their_weights_relative_to_each_other():
     other = replace(other, information=np.diag([1e4, 1e5, 1e6, 1e3, 1e4, 1e5]))  # of things that move
     errors.add(0, [one, other])
     np.testing.assert_allclose(
-        errors.honest(one) / errors.honest(one)[0, 0], one.information / one.information[0, 0]
+        errors.rescaled(one) / errors.rescaled(one)[0, 0], one.information / one.information[0, 0]
     )
-    ratio = errors.honest(one)[0, 0] / errors.honest(other)[0, 0]
+    ratio = errors.rescaled(one)[0, 0] / errors.rescaled(other)[0, 0]
     assert ratio == pytest.approx(one.information[0, 0] / other.information[0, 0])
 
 
@@ -89,4 +89,4 @@ def test_registrations_without_residuals_count_as_they_are():
     errors = RegistrationErrors()
     plain = candidate(residuals=False)
     errors.add(0, [plain])
-    np.testing.assert_array_equal(errors.honest(plain), plain.information)
+    np.testing.assert_array_equal(errors.rescaled(plain), plain.information)

@@ -10,7 +10,7 @@ from mapper.core.timebase import NS_PER_S
 from mapper.odometry.base import SensorCheck
 from mapper.odometry.config import LocalMapConfig
 from mapper.odometry.factory import build_frame_odometry
-from mapper.odometry.local_map.bundle_adjustment import adjust, common_parameter
+from mapper.odometry.local_map.bundle_adjustment import Observations, adjust, common_parameter
 from mapper.odometry.local_map.pixel_motion import depth_velocity, pixel_velocity, row_phase
 from mapper.odometry.local_map.readout_time import ReadoutTime
 from mapper.odometry.local_map.rolling_shutter import RollingShutter, _refine
@@ -91,10 +91,10 @@ def test_bundle_shows_the_readout_time(readout_s):
     first = np.arange(0, len(edges) + 1, 5).astype(np.int32)
     weights = np.full((len(edges), 3), 0.3**-2)
     no_links = np.empty((0, 2), np.int32), np.empty((0, 4, 4)), np.empty((0, 6, 6))
-    arrays = np.array(edges, np.int32), np.array(measured), weights, INTRINSICS
-    poses, points, _ = adjust(poses, free, points, first, *arrays, no_links, 1, 10)
+    observed = Observations(first, np.array(edges, np.int32), np.array(measured), weights, INTRINSICS)
+    poses, points, _ = adjust(poses, free, points, observed, no_links, 1, 10)
     active = np.ones(len(edges), np.bool_)
-    information, gradient = common_parameter(poses, free, points, first, *arrays, active, np.array(slopes))
+    information, gradient = common_parameter(poses, free, points, observed, active, np.array(slopes))
     sigma_s = information**-0.5
     assert sigma_s < 0.001
     second_order_s = 0.05 * readout_s

@@ -1,4 +1,4 @@
-"""Frames that followed something else are recognised among keyframes without doubt; wild poses are lost."""
+"""Frames that followed something else are relocalised; implausible poses are lost."""
 
 from dataclasses import replace
 from unittest.mock import Mock
@@ -46,7 +46,7 @@ def test_a_pose_that_displaces_most_surfaces_is_recognised_where_it_is(odometry)
         right.observation, wrong.T_camera_world, right.reference, STILL
     )
     assert max(displaced.ratio, displaced.far_ratio) > 0.5
-    found, then = odometry._recovery.instead_of(wrong, displaced, STILL)
+    found, then = odometry._recovery.relocalised(wrong, displaced, STILL)
     assert miss_m(found, right) < 0.02
     assert max(then.ratio, then.far_ratio) < 0.25
     assert "recognised 0.3" in found.doubts[-1]
@@ -54,11 +54,11 @@ def test_a_pose_that_displaces_most_surfaces_is_recognised_where_it_is(odometry)
 
 def test_what_follows_from_a_doubtful_keyframe_is_recognised_until_it_is_linked(odometry):
     right, nothing = odometry._last, Displacement()
-    assert odometry._recovery.instead_of(astray(right), nothing, STILL) is None
+    assert odometry._recovery.relocalised(astray(right), nothing, STILL) is None
     odometry._map.keyframes[-1].doubt_m = 0.3
-    found, _ = odometry._recovery.instead_of(astray(right), nothing, STILL)
+    found, _ = odometry._recovery.relocalised(astray(right), nothing, STILL)
     assert miss_m(found, right) < 0.02
-    assert odometry._recovery.instead_of(found, nothing, STILL) is None  # rests on landmarks of before
+    assert odometry._recovery.relocalised(found, nothing, STILL) is None  # rests on landmarks of before
 
 
 def test_a_recognised_frame_is_doubtful_no_keyframe_and_where_it_is(odometry, frames, monkeypatch):
@@ -77,7 +77,7 @@ def test_a_recognised_frame_is_doubtful_no_keyframe_and_where_it_is(odometry, fr
 
 
 @pytest.mark.parametrize(("inliers", "outcome"), [(40, "lost"), (400, "doubtful")])
-def test_a_wild_pose_of_few_features_is_lost(odometry, frames, monkeypatch, inliers, outcome):
+def test_an_implausible_pose_of_few_features_is_lost(odometry, frames, monkeypatch, inliers, outcome):
     track = odometry._tracker.track
 
     def with_inliers(*arguments):
@@ -88,7 +88,9 @@ def test_a_wild_pose_of_few_features_is_lost(odometry, frames, monkeypatch, inli
 
     monkeypatch.setattr(odometry._tracker, "track", with_inliers)
     monkeypatch.setattr(odometry._depth, "supported", lambda *arguments: arguments[-1])
-    monkeypatch.setattr(odometry._doubts, "assess", lambda *_: Doubt(("jump",), 0.1, 0.5, is_wild=True))
+    monkeypatch.setattr(
+        odometry._doubts, "assess", lambda *_: Doubt(("jump",), 0.1, 0.5, is_implausible=True)
+    )
     before = odometry._last
     result = odometry.track(odometry.observe(frames[NOW]))
     assert (result.node is None) == (outcome == "lost")

@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.geometry import Array, Points
-from mapper.odometry.local_map.bundle_adjustment import adjust, common_parameters
+from mapper.odometry.local_map.bundle_adjustment import Observations, adjust, common_parameters
 
 WINDOW_KEYFRAMES = 10
-"""Keyframes that are adjusted by themselves: neighbours outside would hold them to the parameter given."""
+"""Keyframes that are adjusted by themselves: fixed neighbours would bias the parameter to its first value."""
 _ROUNDS, _ITERATIONS = 2, 10
 _MAX_WINDOWS = 16
 _CONVERGED_SIGMAS = 0.05
@@ -26,9 +26,9 @@ class Bundle:
         points: (P, 3) metres, world.
         edges: (E, 2) int32 keyframe and point of each observation, grouped by point.
         features: (E,) feature of each observation among those of its keyframe.
-        measured: (E, 3) as for ``adjust``.
-        weights: (E, 3) as for ``adjust``.
-        intrinsics: (5,) as for ``adjust``.
+        measured: (E, 3) as in ``Observations``.
+        weights: (E, 3) as in ``Observations``.
+        intrinsics: (5,) as in ``Observations``.
     """
 
     poses: Array
@@ -71,7 +71,7 @@ def estimated(
 ) -> tuple[Array, Array]:
     """Return the (N,) values of parameters of the sensor and their (N, N) information.
 
-    Both are 0 if nothing tells one of them.
+    Both are 0 if one of them is not observable.
 
     They are more unknowns of a bundle adjustment (Triggs et al. 2000, §2.2), whose first keyframe stays where
     it is.
@@ -81,7 +81,7 @@ def estimated(
         corrected: How the parameters change the bundle.
         parameters: Their number N.
         steps: Largest number of Gauss–Newton steps, each after an adjustment.
-        max_step: Largest change of a parameter at each of them; of several, all steps are shortened alike.
+        max_step: Largest change of a parameter at each of them; all steps are scaled by the same factor.
     """
     values, nothing = np.zeros(parameters), np.zeros((parameters, parameters))
     information = nothing
@@ -91,10 +91,10 @@ def estimated(
     free = np.arange(-1, len(bundle.poses) - 1, dtype=np.int32)
     for _ in range(steps):
         at, slopes = corrected(bundle, values)
-        observed = first_edge, at.edges, at.measured, at.weights, at.intrinsics
-        poses, points, agree = adjust(at.poses, free, at.points, *observed, _NO_LINKS, _ROUNDS, _ITERATIONS)
+        observed = Observations(first_edge, at.edges, at.measured, at.weights, at.intrinsics)
+        poses, points, agree = adjust(at.poses, free, at.points, observed, _NO_LINKS, _ROUNDS, _ITERATIONS)
         bundle = replace(bundle, poses=poses, points=points)
-        information, gradient = common_parameters(poses, free, points, *observed, agree, slopes)
+        information, gradient = common_parameters(poses, free, points, observed, agree, slopes)
         if np.linalg.eigvalsh(information)[0] <= 0.0:
             return np.zeros(parameters), nothing
         step = -np.linalg.solve(information, gradient)
@@ -106,13 +106,13 @@ def estimated(
 
 
 class WindowEstimates:
-    """Estimates of parameters in windows that share no observation, whose spread tells the uncertainty."""
+    """Estimates of parameters in windows that share no observation, whose spread gives the uncertainty."""
 
     def __init__(self, *, least: int) -> None:
         """Start without any.
 
         Args:
-            least: Fewer windows tell nothing.
+            least: With fewer windows there is no estimate.
         """
         self._least = least
         self._values: list[Array] = []

@@ -1,9 +1,14 @@
 """Local bundle adjustment: compiled Levenberg–Marquardt with points eliminated (Triggs et al. 2000, §6.1)."""
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
-from mapper.core.linear import product, solve_positive, turned, twist_exp
+from mapper.core.geometry import Array, Points
+from mapper.core.linear import product, turned, twist_exp
+from mapper.odometry.local_map.schur_complement import damped_step, empty_blocks
 from mapper.registration.reprojection import (
     CHI2_2DOF,
     CHI2_3DOF,
@@ -14,6 +19,24 @@ from mapper.registration.reprojection import (
     projection_jacobian,
     residual,
 )
+
+
+class Observations(NamedTuple):
+    """Observations of points in keyframes, grouped by point.
+
+    Attributes:
+        first_edge: (P + 1,) int32 first observation of each point.
+        edges: (E, 2) int32 keyframe and point of each.
+        measured: (E, 3) u, v, bf/z in pixels; NaN in the third column without depth.
+        weights: (E, 3) inverse variances, px⁻².
+        intrinsics: (5,) fx, fy, cx, cy, bf.
+    """
+
+    first_edge: NDArray[np.int32]
+    edges: NDArray[np.int32]
+    measured: Array
+    weights: Array
+    intrinsics: Array
 
 
 @njit(cache=True, nogil=True)
@@ -73,7 +96,8 @@ def _link_cost(poses, links):
 
 
 @njit(cache=True, nogil=True)
-def _cost(poses, points, edges, measured, weights, intrinsics, active, robust):
+def _cost(poses, points, observations, active, robust):
+    _, edges, measured, weights, intrinsics = observations
     r = np.empty(3)
     total = 0.0
     for e in range(len(edges)):
@@ -90,8 +114,9 @@ def _cost(poses, points, edges, measured, weights, intrinsics, active, robust):
 
 
 @njit(cache=True, nogil=True)
-def _linearise(poses, free, points, edges, measured, weights, intrinsics, active, robust, blocks):
-    """Write the blocks of the normal equations: cameras (6, 6), points (3, 3), and one (6, 3) per edge."""
+def _linearise(poses, free, points, observations, active, robust, blocks):
+    """Write the blocks of the normal equations."""
+    _, edges, measured, weights, intrinsics = observations
     Hcc, bc, Hpp, bp, W = blocks
     Hcc[:] = 0.0
     bc[:] = 0.0
@@ -141,177 +166,92 @@ def _linearise(poses, free, points, edges, measured, weights, intrinsics, active
 
 
 @njit(cache=True, nogil=True)
-def _inverse3(M, out):
-    """Write the inverse of a symmetric positive definite (3, 3) matrix by its adjugate."""
-    a = M[1, 1] * M[2, 2] - M[1, 2] * M[2, 1]
-    b = M[0, 2] * M[2, 1] - M[0, 1] * M[2, 2]
-    c = M[0, 1] * M[1, 2] - M[0, 2] * M[1, 1]
-    inverse_determinant = 1.0 / (M[0, 0] * a + M[1, 0] * b + M[2, 0] * c)
-    out[0, 0] = a * inverse_determinant
-    out[0, 1] = out[1, 0] = b * inverse_determinant
-    out[0, 2] = out[2, 0] = c * inverse_determinant
-    out[1, 1] = (M[0, 0] * M[2, 2] - M[0, 2] * M[2, 0]) * inverse_determinant
-    out[1, 2] = out[2, 1] = (M[0, 2] * M[1, 0] - M[0, 0] * M[1, 2]) * inverse_determinant
-    out[2, 2] = (M[0, 0] * M[1, 1] - M[0, 1] * M[1, 0]) * inverse_determinant
+def _moved(poses, free, step_cameras):
+    """Return (K, 4, 4) poses of which the free ones took their step."""
+    moved = poses.copy()
+    for c in range(len(poses)):
+        if free[c] >= 0:
+            moved[c] = twist_exp(step_cameras[free[c]], poses[c])
+    return moved
 
 
 @njit(cache=True, nogil=True)
-def _step(free, first_edge, edges, active, blocks, damping, pairs=None, across=None):
-    """Return the damped step of cameras (C, 6) and points (P, 3) through the Schur complement.
-
-    ``across`` (Q, 6, 6) are the blocks between linked cameras, ``pairs`` (Q, 2) their keyframes.
-    """
-    Hcc, bc, Hpp, bp, W = blocks
-    cameras, points = len(Hcc), len(Hpp)
-    S = np.zeros((6 * cameras, 6 * cameras))
-    rhs = np.empty(6 * cameras)
-    for f in range(cameras):
-        for a in range(6):
-            rhs[6 * f + a] = bc[f, a]
-            for b in range(6):
-                S[6 * f + a, 6 * f + b] = Hcc[f, a, b]
-            S[6 * f + a, 6 * f + a] += damping * Hcc[f, a, a] + 1e-6
-    if across is not None:
-        for q in range(len(across)):
-            f, g = free[pairs[q, 0]], free[pairs[q, 1]]
-            if f >= 0 and g >= 0:
-                for a in range(6):
-                    for b in range(6):  # the upper triangle is copied to the lower
-                        if f < g:
-                            S[6 * f + b, 6 * g + a] += across[q, a, b]
-                        else:
-                            S[6 * g + a, 6 * f + b] += across[q, a, b]
-    inverses = np.empty((points, 3, 3))
-    damped = np.empty((3, 3))
-    WV = np.empty((6, 3))
-    for p in range(points):
-        damped[:] = Hpp[p]
-        for a in range(3):
-            damped[a, a] += damping * Hpp[p, a, a] + 1e-6
-        _inverse3(damped, inverses[p])
-        V = inverses[p]
-        for e in range(first_edge[p], first_edge[p + 1]):
-            f = free[edges[e, 0]]
-            if f < 0 or not active[e]:
-                continue
-            for a in range(6):
-                for b in range(3):
-                    WV[a, b] = W[e, a, 0] * V[0, b] + W[e, a, 1] * V[1, b] + W[e, a, 2] * V[2, b]
-                rhs[6 * f + a] -= WV[a, 0] * bp[p, 0] + WV[a, 1] * bp[p, 1] + WV[a, 2] * bp[p, 2]
-            for other in range(first_edge[p], first_edge[p + 1]):
-                g = free[edges[other, 0]]
-                if g < f or not active[other]:
-                    continue
-                for a in range(6):
-                    for b in range(6):
-                        S[6 * f + a, 6 * g + b] -= (
-                            WV[a, 0] * W[other, b, 0] + WV[a, 1] * W[other, b, 1] + WV[a, 2] * W[other, b, 2]
-                        )
-    for i in range(6 * cameras):
-        for j in range(i):
-            S[i, j] = S[j, i]
-    step_cameras = solve_positive(S, rhs).reshape(cameras, 6)
-    step_points = np.empty((points, 3))
-    residue = np.empty(3)
-    for p in range(points):
-        residue[:] = bp[p]
-        for e in range(first_edge[p], first_edge[p + 1]):
-            f = free[edges[e, 0]]
-            if f < 0 or not active[e]:
-                continue
-            for a in range(6):
-                for b in range(3):
-                    residue[b] -= W[e, a, b] * step_cameras[f, a]
-        step_points[p] = turned(inverses[p], residue)
-    return step_cameras, step_points
+def _classify(poses, points, observations, active):
+    """Write which edges pass the χ² test."""
+    _, edges, measured, weights, intrinsics = observations
+    r = np.empty(3)
+    for e in range(len(edges)):
+        _, _, z = residual(poses[edges[e, 0]], points[edges[e, 1]], measured[e], intrinsics, r)
+        limit = CHI2_2DOF if np.isnan(measured[e, 2]) else CHI2_3DOF
+        active[e] = z > 0.05 and chi2(r, weights[e]) <= limit
 
 
 @njit(cache=True, nogil=True)
-def adjust(poses, free, points, first_edge, edges, measured, weights, intrinsics, links, rounds, iterations):
+def adjust(poses, free, points, observations, links, rounds, iterations):
     """Return refined poses and points, and which edges pass the last χ² test.
 
     Args:
         poses: (K, 4, 4) T_camera_world of free and fixed keyframes.
         free: (K,) int32: rank among the free keyframes, −1 for a fixed one.
         points: (P, 3) metres, world.
-        first_edge: (P + 1,) int32: first edge of each point; edges are grouped by point.
-        edges: (E, 2) int32 keyframe and point of each observation.
-        measured: (E, 3) u, v, bf/z in pixels; NaN in the third column without depth.
-        weights: (E, 3) inverse variances, px⁻².
-        intrinsics: (5,) fx, fy, cx, cy, bf.
+        observations: ``Observations`` of the points, the edges of the graph.
         links: Measured relative poses, as by depth: (Q, 2) int32 keyframes i and j, (Q, 4, 4) T_j_i, and the
             (6, 6) information of each in j's tangent.
         rounds: How often outliers are classified; only the first round is robust.
         iterations: Largest number of steps per round.
     """
     poses, points = poses.copy(), points.copy()
-    cameras = int(free.max()) + 1
-    Hcc, bc = np.empty((cameras, 6, 6)), np.empty((cameras, 6))
-    Hpp, bp = np.empty((len(points), 3, 3)), np.empty((len(points), 3))
-    W = np.zeros((len(edges), 6, 3))
-    blocks = Hcc, bc, Hpp, bp, W
+    first_edge, edges = observations.first_edge, observations.edges
+    blocks = empty_blocks(int(free.max()) + 1, len(points), len(edges))
     across = np.zeros((len(links[0]), 6, 6))
     active = np.ones(len(edges), np.bool_)
-    r = np.empty(3)
     for k in range(rounds):
         robust = k == 0
         damping = 1e-4
-        cost = _cost(poses, points, edges, measured, weights, intrinsics, active, robust)
+        cost = _cost(poses, points, observations, active, robust)
         cost += _link_cost(poses, links)
-        _linearise(poses, free, points, edges, measured, weights, intrinsics, active, robust, blocks)
-        _add_links(poses, free, links, Hcc, bc, across)
+        _linearise(poses, free, points, observations, active, robust, blocks)
+        _add_links(poses, free, links, blocks.Hcc, blocks.bc, across)
         for _ in range(iterations):
-            step_cameras, step_points = _step(
+            step_cameras, step_points = damped_step(
                 free, first_edge, edges, active, blocks, damping, links[0], across
             )
-            trial_poses = poses.copy()
-            for c in range(len(poses)):
-                if free[c] >= 0:
-                    trial_poses[c] = twist_exp(step_cameras[free[c]], poses[c])
-            trial_points = points + step_points
-            trial = _cost(trial_poses, trial_points, edges, measured, weights, intrinsics, active, robust)
+            trial_poses, trial_points = _moved(poses, free, step_cameras), points + step_points
+            trial = _cost(trial_poses, trial_points, observations, active, robust)
             trial += _link_cost(trial_poses, links)
             if trial <= cost:
                 converged = cost - trial < 1e-4 * cost
                 poses, points, cost, damping = trial_poses, trial_points, trial, damping * 0.2
                 if converged:
                     break
-                _linearise(poses, free, points, edges, measured, weights, intrinsics, active, robust, blocks)
-                _add_links(poses, free, links, Hcc, bc, across)
+                _linearise(poses, free, points, observations, active, robust, blocks)
+                _add_links(poses, free, links, blocks.Hcc, blocks.bc, across)
             else:
                 damping *= 10.0
                 if damping > 1e3:
                     break
-        for e in range(len(edges)):
-            _, _, z = residual(poses[edges[e, 0]], points[edges[e, 1]], measured[e], intrinsics, r)
-            limit = CHI2_2DOF if np.isnan(measured[e, 2]) else CHI2_3DOF
-            active[e] = z > 0.05 and chi2(r, weights[e]) <= limit
+        _classify(poses, points, observations, active)
     return poses, points, active
 
 
-@njit(cache=True, nogil=True)
-def common_parameter(poses, free, points, first_edge, edges, measured, weights, intrinsics, active, slopes):
+def common_parameter(
+    poses: Array,
+    free: NDArray[np.int32],
+    points: Points,
+    observations: Observations,
+    active: NDArray[np.bool_],
+    slopes: Array,
+) -> tuple[float, float]:
     """Return the information on a parameter common to all edges, and the gradient of half their χ².
 
     As ``common_parameters`` of one parameter, whose slopes are (E, 2 or 3).
     """
-    information, gradient = common_parameters(
-        poses,
-        free,
-        points,
-        first_edge,
-        edges,
-        measured,
-        weights,
-        intrinsics,
-        active,
-        slopes.reshape((1, slopes.shape[0], slopes.shape[1])),
-    )
-    return information[0, 0], gradient[0]
+    information, gradient = common_parameters(poses, free, points, observations, active, slopes[np.newaxis])
+    return float(information[0, 0]), float(gradient[0])
 
 
 @njit(cache=True, nogil=True)
-def common_parameters(poses, free, points, first_edge, edges, measured, weights, intrinsics, active, slopes):
+def common_parameters(poses, free, points, observations, active, slopes):
     """Return the information on parameters common to all edges, and the gradient of half their χ².
 
     Poses and points are eliminated, so the parameters' Gauss–Newton step is −information⁻¹ · gradient.
@@ -320,21 +260,15 @@ def common_parameters(poses, free, points, first_edge, edges, measured, weights,
         poses: As for ``adjust``, at its solution, likewise all but the last two.
         free: As for ``adjust``.
         points: As for ``adjust``.
-        first_edge: As for ``adjust``.
-        edges: As for ``adjust``.
-        measured: As for ``adjust``.
-        weights: As for ``adjust``.
-        intrinsics: As for ``adjust``.
+        observations: As for ``adjust``.
         active: (E,) edges that take part.
         slopes: (N, E, 2) change of the residuals of u and v with each of N parameters, or (N, E, 3) with that
             of bf/z.
     """
+    first_edge, edges, measured, weights, intrinsics = observations
     cameras, count = int(free.max()) + 1, len(slopes)
-    Hcc, bc = np.empty((cameras, 6, 6)), np.empty((cameras, 6))
-    Hpp, bp = np.empty((len(points), 3, 3)), np.empty((len(points), 3))
-    W = np.zeros((len(edges), 6, 3))
-    blocks = Hcc, bc, Hpp, bp, W
-    _linearise(poses, free, points, edges, measured, weights, intrinsics, active, False, blocks)
+    blocks = empty_blocks(cameras, len(points), len(edges))
+    _linearise(poses, free, points, observations, active, False, blocks)
     coupling_c, coupling_p = np.zeros((count, cameras, 6)), np.zeros((count, len(points), 3))
     r = np.empty(3)
     J = np.empty((3, 3))
@@ -360,9 +294,9 @@ def common_parameters(poses, free, points, first_edge, edges, measured, weights,
                 if f >= 0:
                     for a in range(6):
                         coupling_c[n, f, a] += ws * J_pose[i, a]
-    for n in range(count):  # the residuals' own gradient gives way to that of the coupling
-        bc[:], bp[:] = coupling_c[n], coupling_p[n]
-        moved_c, moved_p = _step(free, first_edge, edges, active, blocks, 0.0)
+    for n in range(count):  # in place of the residuals' own gradient, that of the coupling
+        blocks.bc[:], blocks.bp[:] = coupling_c[n], coupling_p[n]
+        moved_c, moved_p = damped_step(free, first_edge, edges, active, blocks, 0.0)
         for m in range(n + 1):
             information[n, m] -= (coupling_c[m] * moved_c).sum() + (coupling_p[m] * moved_p).sum()
             information[m, n] = information[n, m]

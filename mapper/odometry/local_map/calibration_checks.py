@@ -21,7 +21,7 @@ class CalibrationChecks:
         self._depth_offset = DepthOffsetCheck()
 
     def pass_frame(self, before: TrackedPose | None, last: TrackedPose, now: TrackedPose) -> None:
-        """Learn the velocity of a keyframe from the frames about it, unless something moves by itself."""
+        """Estimate the velocity of a keyframe from the frames about it, unless something moves by itself."""
         if before is None or self._map.keyframes[last.reference].stamp_ns != last.stamp_ns:
             return
         if all(pose.few_move for pose in (before, last, now)):

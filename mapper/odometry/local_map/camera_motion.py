@@ -1,4 +1,4 @@
-"""Which of several motions in an image is the camera's: people who walk by take their features along."""
+"""Motion of the camera among several motions in an image, such as those of passers-by."""
 
 from dataclasses import dataclass
 
@@ -11,9 +11,9 @@ from mapper.odometry.local_map.pose_tracker import refined
 from mapper.registration.reprojection import classify
 
 _ENOUGH_ESTABLISHED = 30
-"""So many landmarks decide which motion is the camera's."""
+"""Landmarks that determine which motion is the camera's."""
 _LEAST_OBSERVERS, _MOST_OBSERVERS = 2, 6
-"""Keyframes that observe an established landmark, and from how many on all count alike."""
+"""Keyframes that observe an established landmark, and from how many on all count the same."""
 _MIN_KEPT_RATIO = 0.5
 """When fewer of them agree, the established landmarks show no motion."""
 _LEAST_OTHERS, _LEAST_OTHER_RATIO = 20, 0.12
@@ -64,7 +64,7 @@ def camera_motion(
         features: (M,) the feature of each point.
         observers: (M,) number of keyframes that observe each point, 0 for those that are no landmarks.
         weights: (N, 3) inverse variances of the frame's features by which pairs agree.
-        variance: Usual square of residuals, relative to what the weights say. Features are found better than
+        variance: Usual square of residuals, relative to that of the weights. Features are found better than
             that, so that a compromise between still walls and someone near by, whose features all pass the
             test, has residuals that are too large.
     """
@@ -100,11 +100,11 @@ def refined_by_established(
     weights: Array,
     variance: float = 1.0,
 ) -> tuple[Transform, NDArray[np.bool_]]:
-    """Return the refined T_camera_world and which pairs agree with it, as established landmarks see it.
+    """Return the refined T_camera_world and which pairs agree with it, by established landmarks first.
 
     What moves soon contradicts the keyframes that saw it, so landmarks that most keyframes observe stand
     still. The pose is theirs first, and is then refined by all pairs that agree with it: however many
-    features a passer-by adds to the view, they have no vote. Arguments as for ``camera_motion``; by default
+    features a passer-by adds to the view, they have no weight. Arguments as for ``camera_motion``; by default
     the weights are taken as they are.
     """
     is_established = _established(observers)

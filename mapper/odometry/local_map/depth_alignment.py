@@ -2,7 +2,7 @@
 
 Each point is compared with the plane of the keyframe's cell that it projects to (Chen & Medioni 1992;
 Blais & Levine 1995). Planes and landmarks are weighted by their noise and minimised at once, so that a motion
-that one of them does not observe is decided by the other.
+that one of them does not observe is determined by the other.
 """
 
 from collections.abc import Sequence
@@ -15,7 +15,15 @@ from numpy.typing import NDArray
 
 from mapper.core.geometry import Array, Points, Transform, is_rigid
 from mapper.odometry.base import Diagnostics
-from mapper.odometry.local_map.depth_kernels import bent_by_distortion, compare, descend, seen_through
+from mapper.odometry.local_map.depth_kernels import (
+    Landmarks,
+    PlaneModel,
+    PosePrior,
+    bent_by_distortion,
+    compare,
+    descend,
+    seen_through,
+)
 from mapper.odometry.local_map.depth_surfaces import (
     DepthCells,
     DepthSurface,
@@ -26,10 +34,6 @@ from mapper.registration.degeneracy import Degeneracy, degeneracy_of, projected
 from mapper.registration.reprojection import normal_matrix
 from mapper.sensing.config import KINECT_NOISE, DepthNoiseConfig
 
-_GATES_M = (0.3, 0.1, 0.04)
-_EVERY = (4, 4, 1)
-"""One point in so many is used with each of these gates."""
-_ITERATIONS = 8
 _MIN_POINTS = 300
 _MIN_SHARE, _NOISE_SHARES = 0.004, 2.5
 """A motion is observed by a larger share of its displacements along the normals: a plane's bow in a Kinect's
@@ -45,7 +49,7 @@ _LINKS_ALIKE = 2.0
 _LEAST_OBSERVED = 1e-4
 """Eigenvalue of the surfaces' information, relative to the largest, below which a motion does not follow."""
 _OBSERVED_SIGMA_M = 0.05
-"""A motion that landmarks know this well, as a displacement of the points, is observed by them."""
+"""A motion that landmarks determine this well, as a displacement of the points, is observed by them."""
 
 
 DEPTH_ONLY = "depth"
@@ -53,20 +57,18 @@ DEPTH_ONLY = "depth"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Landmarks:
-    """Landmarks that a frame's features were matched to.
+class ReferenceSurfaces:
+    """Surfaces of earlier depth images of one camera, which another one is aligned to.
 
     Attributes:
-        positions: (L, 3) metres, world.
-        measured: (L, 3) u, v, bf / z in pixels.
-        weights: (L, 3) inverse variances of these, px⁻².
-        intrinsics: (5,) fx, fy, cx, cy, bf.
+        surfaces: Those of at least one keyframe, and then of other frames.
+        T_surfaces_world: (4, 4) T_camera_world of each.
+        keyframes: Number of keyframes.
     """
 
-    positions: Points
-    measured: Array
-    weights: Array
-    intrinsics: Array
+    surfaces: Sequence[DepthSurface]
+    T_surfaces_world: Sequence[Transform]
+    keyframes: int
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -130,30 +132,24 @@ class DepthAlignment:
 def align_depth(
     cells: DepthCells,
     points: Points,
-    surfaces: Sequence[DepthSurface],
-    T_surfaces_world: Sequence[Transform],
+    reference: ReferenceSurfaces,
     *,
-    keyframes: int,
     T_camera_world: Transform,
-    T_prior: Transform,
-    prior: Array,
+    prior: PosePrior,
     landmarks: Landmarks,
     noise: DepthNoiseConfig | None,
 ) -> DepthAlignment | None:
     """Return the pose of a depth image that fits surfaces, landmarks and, where neither helps, a prediction.
 
     Motions that the surfaces do not observe are found first, and are then left to the landmarks and to the
-    prediction (Zhang, Kaess & Singh 2016, "solution remapping"): the surfaces' noise must not decide them.
+    prediction (Zhang, Kaess & Singh 2016, "solution remapping"): the surfaces' noise must not determine them.
 
     Args:
         cells: The depth image.
-        points: (N, 3) of those points of it that stand still, camera frame.
-        surfaces: Those of at least one keyframe and of other frames, of the same camera.
-        T_surfaces_world: (4, 4) of each.
-        keyframes: Number of keyframes, which are the first of them.
+        points: (N, 3) of those points of it that are at rest, camera frame.
+        reference: Surfaces of keyframes.
         T_camera_world: (4, 4) to begin with.
-        T_prior: (4, 4) predicted T_camera_world.
-        prior: (6, 6) information of the prediction, camera tangent.
+        prior: Prediction.
         landmarks: The frame's, if any.
         noise: Depth noise of the sensor; None is a Kinect's.
 
@@ -162,59 +158,47 @@ def align_depth(
     """
     if len(points) < _MIN_POINTS:
         return None
-    model = _PlaneModel(
+    model = PlaneModel(
         points,
         point_sigmas(cells, points, noise),
-        np.array([surface.planes for surface in surfaces]),
-        np.array(T_surfaces_world),
+        np.array([surface.planes for surface in reference.surfaces]),
+        np.array(reference.T_surfaces_world),
         cells.camera.parameters,
         cells.cell_px,
     )
-    minimum = _minimum(model, _min_share(surfaces), T_camera_world, T_prior, prior, landmarks)
+    minimum = _minimum(model, landmarks, prior, T_camera_world, _min_share(reference.surfaces))
     if minimum is None:
         return None
-    T_found, is_inlier, fit, degeneracy = minimum
-    agrees, contradicts = fit.verdict == 1, fit.verdict == -1
+    fit, keyframes = minimum.fit, reference.keyframes
     pairs, seen = int(fit.agreeing.sum()), int((fit.verdict != 0).sum())
     scale = max(fit.squares / pairs, _LEAST_SCALE**2)
     plane_counts = np.maximum((model.planes[..., 3] > 0.0).sum(axis=(1, 2)), 1)
-    known = _known_by(landmarks, is_inlier, T_found)
-    information = projected(fit.information / scale, degeneracy)
+    known = _known_by(landmarks, minimum.is_landmark_inlier, minimum.T_camera_world)
+    information = projected(fit.information / scale, minimum.degeneracy)
+    nearest = int(fit.agreeing[:keyframes].argmax())
+    seen_through_ratio = _seen_through_ratio(minimum.T_camera_world, cells, model, noise or KINECT_NOISE)
     return DepthAlignment(
-        T_camera_world=T_found,
-        information=information + prior,
+        T_camera_world=minimum.T_camera_world,
+        information=information + prior.information,
         systematic=_systematic(
-            model, int(fit.agreeing[:keyframes].argmax()), T_found, cells, information, known + prior
+            model, nearest, minimum.T_camera_world, cells, information, known + prior.information
         ),
-        is_landmark_inlier=is_inlier,
+        is_landmark_inlier=minimum.is_landmark_inlier,
         points=seen,
         agreeing=fit.agreeing[:keyframes],
         overlap=float((fit.agreeing / plane_counts)[:keyframes].max()),
-        agreeing_ratio=float(agrees.sum()) / seen,
+        agreeing_ratio=float((fit.verdict == 1).sum()) / seen,
         weakest_ratio=_weakest(fit.facing, fit.facing_agreeing),
-        contradicting_ratio=max(
-            float(contradicts.sum()) / seen, _seen_through_ratio(T_found, cells, model, noise or KINECT_NOISE)
-        ),
+        contradicting_ratio=max(float((fit.verdict == -1).sum()) / seen, seen_through_ratio),
         visible_ratio=seen / len(points),
         rmse_m=float(np.sqrt(fit.squares_m / pairs)),
-        unobservable=_unobserved(degeneracy, known),
-        observes_next=observes_all(surface_of(cells)) if degeneracy.unobservable_count else True,
+        unobservable=_unobserved(minimum.degeneracy, known),
+        observes_next=minimum.degeneracy.unobservable_count == 0 or observes_all(surface_of(cells)),
     )
 
 
-class _PlaneModel(NamedTuple):
-    """Points of a depth image and planes of keyframes, as the kernels take them."""
-
-    points: Points
-    sigmas: Array
-    planes: Array
-    T_surfaces_world: Array
-    optics: Array
-    cell_px: int
-
-
 class _PlaneFit(NamedTuple):
-    """What ``compare`` returns."""
+    """Result of ``compare``."""
 
     verdict: NDArray[np.int8]
     agreeing: NDArray[np.int64]
@@ -226,49 +210,39 @@ class _PlaneFit(NamedTuple):
     squares_m: float
 
 
-def _minimum(
-    model: _PlaneModel,
-    min_share: float,
-    T_camera_world: Transform,
-    T_prior: Transform,
-    prior: Array,
-    landmarks: Landmarks,
-) -> tuple[Transform, NDArray[np.bool_], _PlaneFit, Degeneracy] | None:
-    """Return the pose, which landmarks agree with it, its fit, and the motions that planes do not observe.
+class _Minimum(NamedTuple):
+    """Pose of least squares, its landmarks and planes, and the motions that planes do not observe."""
 
-    None where too few points have a partner. Where planes leave a motion open it is found once more, and
-    planes do not decide that motion then.
+    T_camera_world: Transform
+    is_landmark_inlier: NDArray[np.bool_]
+    fit: _PlaneFit
+    degeneracy: Degeneracy
+
+
+def _minimum(
+    model: PlaneModel, landmarks: Landmarks, prior: PosePrior, T_camera_world: Transform, min_share: float
+) -> _Minimum | None:
+    """Return the minimum; None where too few points have a partner.
+
+    Where planes do not observe a motion, it is found once more, and planes have no part in that motion then.
     """
     kept = np.eye(6)
     while True:
-        T_found, is_inlier = descend(
-            T_camera_world,
-            T_prior,
-            prior,
-            *model,
-            kept,
-            np.array(_GATES_M),
-            np.array(_EVERY),
-            _ITERATIONS,
-            landmarks.positions,
-            landmarks.measured,
-            landmarks.weights,
-            landmarks.intrinsics,
-        )
+        T_found, is_inlier = descend(T_camera_world, model, landmarks, prior, kept)
         if not is_rigid(T_found):
             return None
-        fit = _PlaneFit(*compare(T_found, *model))
+        fit = _PlaneFit(*compare(T_found, model))
         agrees = fit.verdict == 1
         if agrees.sum() < _MIN_POINTS:
             return None
         degeneracy = degeneracy_of(fit.unit_information, points=model.points[agrees], min_share=min_share)
         if degeneracy.unobservable_count == 0 or kept.trace() < 6.0:
-            return T_found, is_inlier, fit, degeneracy
+            return _Minimum(T_found, is_inlier, fit, degeneracy)
         kept = _observable(degeneracy)
 
 
 def _systematic(
-    model: _PlaneModel,
+    model: PlaneModel,
     nearest: int,
     T_camera_world: Transform,
     cells: DepthCells,
@@ -286,18 +260,9 @@ def _systematic(
         T_camera_world: (4, 4) the pose.
         cells: The depth image.
         information: (6, 6) by the surfaces.
-        others: (6, 6) by what else decides the pose.
+        others: (6, 6) of all else that determines the pose.
     """
-    H, B = bent_by_distortion(
-        T_camera_world,
-        model.points,
-        model.sigmas,
-        model.planes[nearest],
-        model.T_surfaces_world[nearest],
-        cells.rays,
-        model.optics,
-        model.cell_px,
-    )
+    H, B = bent_by_distortion(T_camera_world, model, nearest, cells.rays)
     share = information @ np.linalg.pinv(information + others)
     moved: Array = np.linalg.pinv(H, rcond=_LEAST_OBSERVED) @ B
     spread = np.append(cells.rays.reshape(-1, 2).std(axis=0), 1.0)
@@ -307,17 +272,14 @@ def _systematic(
 
 
 def _seen_through_ratio(
-    T_camera_world: Transform, cells: DepthCells, model: _PlaneModel, noise: DepthNoiseConfig
+    T_camera_world: Transform, cells: DepthCells, model: PlaneModel, noise: DepthNoiseConfig
 ) -> float:
     """Return the share of the keyframes' planes that the depth image sees through."""
     through, seen = seen_through(
         T_camera_world,
         cells.inverse_depth,
-        model.planes,
+        model,
         cells.rays,
-        model.T_surfaces_world,
-        model.optics,
-        model.cell_px,
         np.array([noise.constant_m, noise.linear, noise.quadratic_per_m]),
     )
     return float(through / max(seen, 1))

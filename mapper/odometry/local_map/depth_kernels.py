@@ -1,8 +1,11 @@
 """Compiled Gauss–Newton of a camera pose on planes of other depth images and on landmarks together."""
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
 
+from mapper.core.geometry import Array, Points, Transform
 from mapper.core.linear import product, solve_positive, turned, twist_exp
 from mapper.registration.reprojection import (
     CHI2_2DOF,
@@ -17,13 +20,64 @@ from mapper.registration.reprojection import (
 
 _MIN_DEPTH_M = 0.1
 _WIDEST = 4.0
-"""Squared tangent from the axis beyond which no camera sees, and its distortion is not defined."""
+"""Squared tangent from the axis beyond any angle of view, where distortion is not defined."""
+_GATES_M, _STRIDES = (0.3, 0.1, 0.04), (4, 4, 1)
+"""Largest distances from a plane, from coarse to fine; with each, one point in so many is used."""
+_ITERATIONS = 8
 _HUBER = 1.5
 _MARGIN_M = 0.01
 _MARGIN_SIGMAS = 4.0
 _STEP = 1e-5
 _INDEPENDENT = 0.25
 """Share of the pairs that count: neighbouring cells have planes and errors in common."""
+
+
+class PlaneModel(NamedTuple):
+    """Points of a depth image and planes of keyframes.
+
+    Attributes:
+        points: (N, 3) of the depth image, camera frame.
+        sigmas: (N, 2) standard deviations of their depth and across their ray, metres.
+        planes: (K, R, C, 4) of keyframes' depth images.
+        T_keyframes_world: (K, 4, 4).
+        optics: (9,) fx, fy, cx, cy, k1, k2, p1, p2, k3 of all depth images.
+        cell_px: Edge of their cells.
+    """
+
+    points: Points
+    sigmas: Array
+    planes: Array
+    T_keyframes_world: Array
+    optics: Array
+    cell_px: int
+
+
+class Landmarks(NamedTuple):
+    """Landmarks that a frame's features were matched to.
+
+    Attributes:
+        positions: (L, 3) metres, world.
+        measured: (L, 3) u, v, bf / z in pixels.
+        weights: (L, 3) inverse variances of these, px⁻².
+        intrinsics: (5,) fx, fy, cx, cy, bf.
+    """
+
+    positions: Points
+    measured: Array
+    weights: Array
+    intrinsics: Array
+
+
+class PosePrior(NamedTuple):
+    """Predicted pose.
+
+    Attributes:
+        T_camera_world: (4, 4).
+        information: (6, 6) of the camera's tangent (rotation, translation).
+    """
+
+    T_camera_world: Transform
+    information: Array
 
 
 @njit(cache=True, nogil=True)
@@ -108,8 +162,9 @@ def _sigma_m(row, p, sigmas):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _add_landmarks(T, points, measured, weights, intrinsics, active, H, g):  # type: ignore[no-untyped-def]
+def _add_landmarks(T, landmarks, active, H, g):  # type: ignore[no-untyped-def]
     """Add the normal equations of landmarks with Huber's kernel."""
+    points, measured, weights, intrinsics = landmarks
     r, J, J_pose = np.empty(3), np.empty((3, 3)), np.empty((3, 6))
     for n in range(len(points)):
         if not active[n]:
@@ -143,93 +198,88 @@ def _projected(kept, H, g):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def descend(  # type: ignore[no-untyped-def]
-    T_camera_world,
-    T_prior,
-    prior,
-    points,
-    sigmas,
-    planes,
-    T_keyframes_world,
-    optics,
-    cell_px,
-    kept,
-    gates_m,
-    every,
-    iterations,
-    landmarks,
-    measured,
-    weights,
-    intrinsics,
-):
+def _add_prior(T, prior, H, g):  # type: ignore[no-untyped-def]
+    """Add the normal equations of a prediction; small-angle in the rotation."""
+    D = between(prior.T_camera_world, T)
+    to_prior = np.empty(6)
+    to_prior[0], to_prior[1] = 0.5 * (D[2, 1] - D[1, 2]), 0.5 * (D[0, 2] - D[2, 0])
+    to_prior[2] = 0.5 * (D[1, 0] - D[0, 1])
+    to_prior[3:] = D[:3, 3]
+    for a in range(6):
+        for b in range(6):
+            H[a, b] += prior.information[a, b]
+            g[a] += prior.information[a, b] * to_prior[b]
+
+
+@njit(cache=True, nogil=True)
+def _plane_equations(T, model, gate_m, stride):  # type: ignore[no-untyped-def]
+    """Return the (6, 6) and (6,) normal equations of the points' distances from planes with Huber's kernel.
+
+    One point in ``stride`` is used, where its distance is at most ``gate_m``.
+    """
+    points, sigmas, planes, T_keyframes_world, optics, cell_px = model
+    H, g = np.zeros((6, 6)), np.zeros(6)
+    row = np.empty(6)
+    shared = _INDEPENDENT / (len(planes) + 1.0)
+    for k in range(len(planes)):
+        T_k_c = between(T_keyframes_world[k], T)
+        for i in range(0, len(points), stride):
+            distance = _plane_row(planes[k], optics, cell_px, T_k_c, points[i], row)
+            if not abs(distance) <= gate_m:
+                continue
+            sigma = _sigma_m(row, points[i], sigmas[i])
+            w = shared / (sigma * max(sigma, abs(distance) / _HUBER))
+            for a in range(6):
+                wa = w * row[a]
+                g[a] -= wa * distance
+                for b in range(a, 6):
+                    H[a, b] += wa * row[b]
+    for a in range(6):
+        for b in range(a):
+            H[a, b] = H[b, a]
+    return H, g
+
+
+@njit(cache=True, nogil=True)
+def _classify(T, landmarks, active):  # type: ignore[no-untyped-def]
+    """Write which landmarks pass the χ² test."""
+    points, measured, weights, intrinsics = landmarks
+    r = np.empty(3)
+    for n in range(len(points)):
+        _, _, z = residual(T, points[n], measured[n], intrinsics, r)
+        limit = CHI2_2DOF if np.isnan(measured[n, 2]) else CHI2_3DOF
+        active[n] = z > 0.05 and chi2(r, weights[n]) <= limit
+
+
+@njit(cache=True, nogil=True)
+def descend(T_camera_world, model, landmarks, prior, kept):  # type: ignore[no-untyped-def]
     """Return T_camera_world that fits planes, landmarks and a prediction, and which landmarks agree with it.
 
     Args:
         T_camera_world: (4, 4) to begin with.
-        T_prior: (4, 4) the prediction.
-        prior: (6, 6) its information.
-        points: (N, 3) of the depth image, camera frame.
-        sigmas: (N, 2) standard deviations of their depth and across their ray, metres.
-        planes: (K, R, C, 4) of keyframes' depth images.
-        T_keyframes_world: (K, 4, 4).
-        optics: (9,) fx, fy, cx, cy, k1, k2, p1, p2, k3 of all depth images.
-        cell_px: Edge of their cells.
-        kept: (6, 6) projection of tangents to the motions that planes may decide.
-        gates_m: (G,) largest distances from a plane, from coarse to fine.
-        every: (G,) with each of these, one point in so many is used.
-        iterations: Largest number of steps at each of these.
-        landmarks: (L, 3) world.
-        measured: (L, 3) u, v, bf/z.
-        weights: (L, 3) inverse variances of these.
-        intrinsics: (5,) fx, fy, cx, cy, bf.
+        model: ``PlaneModel``.
+        landmarks: ``Landmarks``.
+        prior: ``PosePrior``.
+        kept: (6, 6) projection of tangents to the motions that planes determine.
     """
     T = T_camera_world.copy()
-    active = np.ones(len(landmarks), np.bool_)
-    row, r = np.empty(6), np.empty(3)
-    shared = _INDEPENDENT / (len(planes) + 1.0)
-    for gate_m, stride in zip(gates_m, every):  # noqa: B905 – numba
-        for _ in range(iterations):
-            H, g = np.zeros((6, 6)), np.zeros(6)
-            for k in range(len(planes)):
-                T_k_c = between(T_keyframes_world[k], T)
-                for i in range(0, len(points), stride):
-                    distance = _plane_row(planes[k], optics, cell_px, T_k_c, points[i], row)
-                    if not abs(distance) <= gate_m:
-                        continue
-                    sigma = _sigma_m(row, points[i], sigmas[i])
-                    w = shared / (sigma * max(sigma, abs(distance) / _HUBER))
-                    for a in range(6):
-                        wa = w * row[a]
-                        g[a] -= wa * distance
-                        for b in range(a, 6):
-                            H[a, b] += wa * row[b]
-            for a in range(6):
-                for b in range(a):
-                    H[a, b] = H[b, a]
+    active = np.ones(len(landmarks.positions), np.bool_)
+    for gate_m, stride in zip(_GATES_M, _STRIDES):  # noqa: B905 – numba
+        for _ in range(_ITERATIONS):
+            H, g = _plane_equations(T, model, gate_m, stride)
             H, g = _projected(kept, H, g)
-            _add_landmarks(T, landmarks, measured, weights, intrinsics, active, H, g)
-            D = between(T_prior, T)
-            to_prior = np.empty(6)
-            to_prior[0], to_prior[1] = 0.5 * (D[2, 1] - D[1, 2]), 0.5 * (D[0, 2] - D[2, 0])
-            to_prior[2] = 0.5 * (D[1, 0] - D[0, 1])
-            to_prior[3:] = D[:3, 3]
-            for a in range(6):
-                for b in range(6):
-                    H[a, b] += prior[a, b]
-                    g[a] += prior[a, b] * to_prior[b]
+            _add_landmarks(T, landmarks, active, H, g)
+            _add_prior(T, prior, H, g)
             step = solve_positive(H, g)
             T = twist_exp(step, T)
             if np.abs(step).max() < _STEP:
                 break
-        for n in range(len(landmarks)):
-            _, _, z = residual(T, landmarks[n], measured[n], intrinsics, r)
-            limit = CHI2_2DOF if np.isnan(measured[n, 2]) else CHI2_3DOF
-            active[n] = z > 0.05 and chi2(r, weights[n]) <= limit
+        _classify(T, landmarks, active)
     return T, active
 
 
 @njit(cache=True, nogil=True)
-def compare(T_camera_world, points, sigmas, planes, T_keyframes_world, optics, cell_px):  # type: ignore[no-untyped-def]
+def compare(T_camera_world, model):  # type: ignore[no-untyped-def]
     """Return how a depth image fits keyframes' planes; arguments as for ``descend``.
 
     Returns:
@@ -240,6 +290,7 @@ def compare(T_camera_world, points, sigmas, planes, T_keyframes_world, optics, c
         (3, 3) sums of m·mᵀ over the normals m of all pairs, and of those that agree, camera frame.
         Sum of the squares of the agreeing distances in standard deviations, and in metres.
     """
+    points, sigmas, planes, T_keyframes_world, optics, cell_px = model
     verdict = np.zeros(len(points), np.int8)
     agreeing = np.zeros(len(planes), np.int64)
     U, H = np.zeros((6, 6)), np.zeros((6, 6))
@@ -283,22 +334,20 @@ def compare(T_camera_world, points, sigmas, planes, T_keyframes_world, optics, c
 
 
 @njit(cache=True, nogil=True)
-def bent_by_distortion(T_camera_world, points, sigmas, planes, T_keyframe_world, rays, optics, cell_px):  # type: ignore[no-untyped-def]
+def bent_by_distortion(T_camera_world, model, keyframe, rays):  # type: ignore[no-untyped-def]
     """Return what an error of all inverse depths that is affine in the ray (x, y, 1) does to an alignment.
 
     Args:
         T_camera_world: (4, 4) of the depth image.
-        points: (N, 3) of it, camera frame.
-        sigmas: (N, 2) as for ``descend``.
-        planes: (R, C, 4) of one keyframe.
-        T_keyframe_world: (4, 4).
+        model: ``PlaneModel``.
+        keyframe: The one of its keyframes that the pose is relative to.
         rays: (R, C, 2) of all cells.
-        optics: As for ``descend``.
-        cell_px: As for ``descend``.
 
     Returns:
         (6, 6) information of the agreeing distances, and (6, 3) Σ w · Jᵀ · ∂ distance / ∂ error.
     """
+    points, sigmas, optics, cell_px = model.points, model.sigmas, model.optics, model.cell_px
+    planes, T_keyframe_world = model.planes[keyframe], model.T_keyframes_world[keyframe]
     H, B = np.zeros((6, 6)), np.zeros((6, 3))
     row, change = np.empty(6), np.empty(3)
     T = between(T_keyframe_world, T_camera_world)
@@ -324,21 +373,17 @@ def bent_by_distortion(T_camera_world, points, sigmas, planes, T_keyframe_world,
 
 
 @njit(cache=True, nogil=True)
-def seen_through(  # type: ignore[no-untyped-def]
-    T_camera_world, inverse_depth, planes, rays, T_keyframes_world, optics, cell_px, noise
-):
+def seen_through(T_camera_world, inverse_depth, model, rays, noise):  # type: ignore[no-untyped-def]
     """Return how many cells of keyframes a depth image sees through, and how many it sees at all.
 
     Args:
         T_camera_world: (4, 4) of the depth image.
         inverse_depth: (R, C) of its cells, 0 where there is none.
-        planes: (K, R, C, 4) of the keyframes.
+        model: ``PlaneModel``, with the keyframes' planes.
         rays: (R, C, 2) of all cells.
-        T_keyframes_world: (K, 4, 4).
-        optics: As for ``descend``.
-        cell_px: Edge of the cells.
         noise: (3,) a, b, c of σ_z = a + b·z + c·z².
     """
+    _, _, planes, T_keyframes_world, optics, cell_px = model
     rows, columns = inverse_depth.shape
     through = seen = 0
     for k in range(len(planes)):

@@ -21,7 +21,7 @@ _MOST_UNKNOWN = 5
 """Keyframes without a known velocity, as where something moves by itself, of the ten of a window. Where depth
 is two frames late, many points seem to move by themselves."""
 _MAX_APART_S = 0.3
-"""Poses farther apart tell no velocity in between."""
+"""Poses farther apart do not determine the velocity in between."""
 
 
 class DepthOffsetCheck:
@@ -30,7 +30,7 @@ class DepthOffsetCheck:
     While the camera moves, a depth image that is measured later shows a point elsewhere and nearer or farther
     off. The velocity of each keyframe is known, and planes are fitted to its depth image, so that the offset
     is one more unknown of a bundle adjustment, as that of other sensors is (Furgale, Rehder & Siegwart 2013).
-    Constant velocity hardly tells it: all surfaces are then displaced alike.
+    Constant velocity hardly shows it: all surfaces then have the same displacement.
     """
 
     def __init__(self) -> None:
@@ -45,7 +45,7 @@ class DepthOffsetCheck:
     def pass_keyframe(
         self, keyframe: int, before: tuple[int, Transform], after: tuple[int, Transform]
     ) -> None:
-        """Learn the velocity of a keyframe from the frames before and after it.
+        """Estimate the velocity of a keyframe from the frames before and after it.
 
         Args:
             keyframe: Its index.
@@ -58,7 +58,7 @@ class DepthOffsetCheck:
             self._twists[keyframe] = np.concatenate(moved) / elapsed_s
 
     def add(self, bundle: Bundle, keyframes: Sequence[int], observed: Iterable[ImageObservation]) -> None:
-        """Add a window of keyframes with what was observed in them, which is asked for only if it tells."""
+        """Add a window of keyframes with what was observed in them, which is computed only if it is used."""
         twists = [self._twists.get(keyframe) for keyframe in keyframes]
         self._twists.clear()
         if sum(twist is None for twist in twists) > _MOST_UNKNOWN:
@@ -75,7 +75,7 @@ class DepthOffsetCheck:
         return (0.0, math.inf) if found is None else (float(found[0][0]), float(found[1][0]))
 
     def contradiction(self) -> str:
-        """Return in words that depth images show another time than their stamps say; empty if they do not."""
+        """Return in words that depth images were taken at another time than their stamps; empty if not."""
         offset_s, sigma_s = self.estimate()
         if abs(offset_s) < max(_MIN_OFFSET_S, _MIN_SIGMAS * sigma_s):
             return ""
@@ -115,7 +115,7 @@ class ShiftedDepth:
 
         Args:
             bundle: The one of the beginning, perhaps adjusted.
-            offset_s: (1,) by how much depth was measured later than its stamps tell.
+            offset_s: (1,) by how much depth was measured later than its stamps.
 
         Returns:
             The bundle, and the (1, E, 3) change of its residuals with the offset, px/s.

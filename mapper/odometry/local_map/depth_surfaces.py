@@ -108,7 +108,7 @@ def surface_of(cells: DepthCells) -> DepthSurface:
     """Return the planes that fit the 5 × 5 cells about each cell, as far as these lie on one surface.
 
     The inverse depth of a plane is linear in x/z and y/z, and the noise of a triangulating sensor is the same
-    everywhere in it (Khoshelham & Elberink 2012, eq. 10), so that least squares weigh every cell alike.
+    everywhere in it (Khoshelham & Elberink 2012, eq. 10), so that least squares weigh all cells the same.
     """
     planes, variances = np.zeros((*cells.inverse_depth.shape, 4)), np.zeros((*cells.inverse_depth.shape, 2))
     _fit_planes(

@@ -1,4 +1,4 @@
-"""Tracking by depth where an image has little texture: the second leg of the local map's odometry."""
+"""Tracking by depth where an image has little texture: the second tracker of the local map's odometry."""
 
 from dataclasses import dataclass, replace
 
@@ -10,10 +10,11 @@ from mapper.odometry.config import KeyframeOdometryConfig
 from mapper.odometry.local_map.depth_alignment import (
     DEPTH_ONLY,
     DepthAlignment,
-    Landmarks,
+    ReferenceSurfaces,
     align_depth,
     observes_all,
 )
+from mapper.odometry.local_map.depth_kernels import Landmarks, PosePrior
 from mapper.odometry.local_map.depth_surfaces import DepthCells, DepthSurface, surface_of
 from mapper.odometry.local_map.earlier_depth import EarlierDepth
 from mapper.odometry.local_map.image_observation import ImageObservation
@@ -31,16 +32,17 @@ _SPEED_SIGMA, _UNKNOWN_SPEED_SIGMA = 0.5, 2.0
 """Metres and radians per second by which a motion may err that is predicted, and one that nothing predicts:
 one sigma for a camera in a hand."""
 _SURE_S = 0.1
-"""So long a prediction is trusted: it errs by 5 cm."""
+"""Time for which a prediction alone is accepted: it errs by 5 cm."""
 _MAX_UNOBSERVED_S = 2.0
 """After so long on a prediction in any direction a frame is lost."""
 _MAX_GAP_S = 0.5
-"""After a longer gap without frames another corner may be in view that looks alike."""
+"""After a longer gap without frames another corner of the same shape may be in view."""
 _LEAST_ELAPSED_S = 0.01
 _FEW_INLIERS_RATIO = 2.0
-"""With fewer inliers, relative to the fewest, depth takes part; with more only where they tell too little."""
+"""With fewer inliers, relative to the fewest, depth takes part; with more only where ``_LOOSE_M`` is
+exceeded."""
 _LOOSE_M = 0.02
-"""Standard deviation of a translation from which landmarks tell too little."""
+"""Standard deviation of a translation from which on landmarks do not determine it."""
 _MIN_KEPT_RATIO = 0.5
 """When fewer of a pose's landmarks agree once the depth image takes part, one of both is wrong."""
 
@@ -52,7 +54,7 @@ class _Prediction:
     Attributes:
         T_camera_world: (4, 4).
         speed_sigma: Metres and radians per second by which the motion to it may err.
-        sure_s: So long it is trusted where nothing shows the motion.
+        sure_s: Time for which it is accepted where nothing shows the motion.
         gap_s: Time since the motion was last known; 0 if it is.
     """
 
@@ -81,7 +83,7 @@ class DepthTracker:
         return cells is not None and observes_all(surface_of(cells))
 
     def began(self, observation: ImageObservation) -> None:
-        """Take note of a sub-map's first frame."""
+        """Reset the tracker at a sub-map's first frame."""
         self._observed_ns, self._is_confirmed = observation.stamp_ns, False
         self._surfaces.clear()
 
@@ -92,7 +94,7 @@ class DepthTracker:
         T_predicted: Transform | None,
         found: TrackedPose | None,
     ) -> TrackedPose | None:
-        """Return a frame's pose by landmarks and depth together, where landmarks tell too little.
+        """Return a frame's pose by landmarks and depth together, where landmarks do not suffice.
 
         Args:
             observation: The frame.
@@ -109,15 +111,11 @@ class DepthTracker:
             return found
         if found is None and self._unobserved_s(observation) > _MAX_UNOBSERVED_S:
             return None
-        if T_predicted is None:
-            gap_s = (observation.stamp_ns - last.observation.stamp_ns) / NS_PER_S
-            predicted = _Prediction(last.T_camera_world, _UNKNOWN_SPEED_SIGMA, 0.0, gap_s)
-        else:
-            predicted = _Prediction(T_predicted, _SPEED_SIGMA, _SURE_S, 0.0)
+        predicted = _predicted(observation, last, T_predicted)
         starts = [] if found is None else [found.T_camera_world]
         for T_camera_world in (*starts, predicted.T_camera_world):
             alignment = self._aligned(observation, T_camera_world, predicted, last, found)
-            if alignment is not None and _agrees(alignment):
+            if alignment is not None:
                 break
         else:
             if found is not None:
@@ -137,15 +135,13 @@ class DepthTracker:
         if found is None:
             return self._by_depth(observation, alignment, reference, predicted)
         joint = self._aligned(observation, found.T_camera_world, predicted, last, found)
-        if joint is None or not _agrees(joint):
-            return found
-        return self._by_both(observation, joint, found, predicted)
+        return found if joint is None else self._by_both(observation, joint, found, predicted)
 
     def _suffices(self, found: TrackedPose) -> bool:
-        """Return whether landmarks alone give a pose: many, or some that tell the translation.
+        """Return whether landmarks alone give a pose: many, or some that determine the translation.
 
         Where something moves by itself some suffice: depth images show passers-by as well, and along a
-        corridor nothing else in them tells how far the camera moved.
+        corridor nothing else in them shows how far the camera moved.
         """
         if found.inliers < _FEW_INLIERS_RATIO * self._config.min_inliers:
             return False
@@ -162,23 +158,21 @@ class DepthTracker:
         last: TrackedPose,
         found: TrackedPose | None,
     ) -> DepthAlignment | None:
-        surfaces, T_surfaces_world = self._models(observation, last)
-        if observation.depth_cells is None or not surfaces:
+        """Return the alignment to the latest keyframes; None if it fails or disagrees with them."""
+        reference = self._reference(observation, last)
+        if observation.depth_cells is None or not reference.surfaces:
             return None
         unsure_s = max(self._unobserved_s(observation), _LEAST_ELAPSED_S)
         ids = unmatched(observation) if found is None else found.landmark_of_feature
         features = np.flatnonzero(ids >= 0)
         points = observation.depth_cells.points()
         moved = self._earlier_depth.moved(observation, T_camera_world, last.reference, points)
-        return align_depth(
+        alignment = align_depth(
             observation.depth_cells,
             points[~moved],
-            surfaces,
-            T_surfaces_world,
-            keyframes=len(self._keyframes),
+            reference,
             T_camera_world=T_camera_world,
-            T_prior=predicted.T_camera_world,
-            prior=np.eye(6) / (predicted.speed_sigma * unsure_s) ** 2,
+            prior=PosePrior(predicted.T_camera_world, np.eye(6) / (predicted.speed_sigma * unsure_s) ** 2),
             landmarks=Landmarks(
                 self._map.landmarks["position"][ids[features]],
                 observation.measured[features],
@@ -187,28 +181,28 @@ class DepthTracker:
             ),
             noise=self._config.depth_noise,
         )
+        return alignment if alignment is not None and _agrees(alignment) else None
 
-    def _models(
-        self, observation: ImageObservation, last: TrackedPose
-    ) -> tuple[list[DepthSurface], list[Transform]]:
-        """Return the surfaces of the latest keyframes and of the last frame, and their T_camera_world."""
+    def _reference(self, observation: ImageObservation, last: TrackedPose) -> ReferenceSurfaces:
+        """Return the surfaces of the latest keyframes and of the last frame."""
         keyframes, cells = self._map.keyframes, observation.depth_cells
         origin = keyframes[last.reference].origin
         self._keyframes = [
             k
             for k in self._map.latest(last.reference)
-            if keyframes[k].origin == origin and _alike(self._map.observation(k).depth_cells, cells)
+            if keyframes[k].origin == origin and _of_one_camera(self._map.observation(k).depth_cells, cells)
         ]
         models = [(self._map.observation(k), keyframes[k].T_camera_world, k) for k in self._keyframes]
-        blind = last.doubts or (last.depth is not None and last.depth.unobservable)
-        if not blind and all(earlier.stamp_ns != last.observation.stamp_ns for earlier, _, _ in models):
+        unobserved = last.doubts or (last.depth is not None and last.depth.unobservable)
+        if not unobserved and all(earlier.stamp_ns != last.observation.stamp_ns for earlier, _, _ in models):
             models.append((last.observation, last.T_camera_world, last.reference))
-        models = [model for model in models if _alike(model[0].depth_cells, cells)]
+        models = [model for model in models if _of_one_camera(model[0].depth_cells, cells)]
         self._surfaces = {
             earlier.stamp_ns: self._surfaces.get(earlier.stamp_ns) or self._still_surface(earlier, T, k)
             for earlier, T, k in models
         }
-        return [self._surfaces[earlier.stamp_ns] for earlier, _, _ in models], [T for _, T, _ in models]
+        surfaces = [self._surfaces[earlier.stamp_ns] for earlier, _, _ in models]
+        return ReferenceSurfaces(surfaces, [T for _, T, _ in models], len(self._keyframes))
 
     def _still_surface(
         self, observation: ImageObservation, T_camera_world: Transform, reference: int
@@ -233,7 +227,7 @@ class DepthTracker:
         expected = min(self._visible(alignment.T_camera_world, reference, observation), len(observation))
         doubts = self._doubts(observation, alignment, predicted)
         if not self._is_confirmed and expected >= 2 * self._config.min_inliers:
-            # What moves with the camera, such as a hand before the lens, agrees with itself.
+            # What moves with the camera, such as a hand before the lens, is consistent from frame to frame.
             doubts = (*doubts, f"{expected} features, but none where the depth image has them")
         if predicted.gap_s > _MAX_GAP_S:
             doubts = (*doubts, f"found by depth alone after {predicted.gap_s:.1f} s")
@@ -278,7 +272,7 @@ class DepthTracker:
     def _doubts(
         self, observation: ImageObservation, alignment: DepthAlignment, predicted: _Prediction
     ) -> tuple[str, ...]:
-        """Return which motions were not observed and for how long, and take note when all were."""
+        """Return which motions were not observed and for how long, and record when all were."""
         if not alignment.unobservable:
             self._observed_ns = observation.stamp_ns
             return ()
@@ -297,7 +291,17 @@ class DepthTracker:
         return int(((pixels >= 0.0) & (pixels < observation.size_px)).all(axis=1).sum())
 
 
-def _alike(cells: DepthCells | None, others: DepthCells | None) -> bool:
+def _predicted(
+    observation: ImageObservation, last: TrackedPose, T_predicted: Transform | None
+) -> _Prediction:
+    """Return the predicted pose, or the last frame's if nothing predicts it."""
+    if T_predicted is not None:
+        return _Prediction(T_predicted, _SPEED_SIGMA, _SURE_S, 0.0)
+    gap_s = (observation.stamp_ns - last.observation.stamp_ns) / NS_PER_S
+    return _Prediction(last.T_camera_world, _UNKNOWN_SPEED_SIGMA, 0.0, gap_s)
+
+
+def _of_one_camera(cells: DepthCells | None, others: DepthCells | None) -> bool:
     """Return whether there are two depth images, of the same camera."""
     return cells is not None and others is not None and cells.camera == others.camera
 

@@ -34,10 +34,10 @@ class DisplacedSurfaces:
     """
 
     def __init__(self) -> None:
-        self._earlier: dict[int, Displacement] = {}  # that speak against frames, as much moved after them
+        self._earlier: dict[int, Displacement] = {}  # of frames made doubtful, as much moved after them
         self._frames: deque[_Frame] = deque()
 
-    def speak_against(self, tracked_pose: TrackedPose, displaced: Displacement) -> str:
+    def doubt_of(self, tracked_pose: TrackedPose, displaced: Displacement) -> str:
         """Return that surfaces lie elsewhere by the next frame's pose; empty if they may."""
         moving_ratio = len(tracked_pose.moving) / max(len(tracked_pose.observation), 1)
         frame = _Frame(tracked_pose.stamp_ns, moving_ratio, displaced)
@@ -54,7 +54,7 @@ class DisplacedSurfaces:
         return _phrase(displaced.ratio, "", displaced) if displaced.ratio > _MOST else ""
 
     def doubt_of_earlier(self, stamp_ns: int) -> Doubt:
-        """Return what later frames say against an earlier one."""
+        """Return the doubt that later frames add to an earlier one."""
         displaced = self._earlier.get(stamp_ns)
         if displaced is None:
             return NO_DOUBT

@@ -1,10 +1,11 @@
 """Comparison of a depth image with those of earlier keyframes: what has moved since, and what lies elsewhere.
 
 What stands where an earlier image saw through has moved there, whatever its features show. And the surfaces
-of a scene that stands still lie where they lay: if many do not, the pose is that of something that moves.
+of a scene that stands still lie where they lay: if many do not, the pose is that of a moving object.
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -20,10 +21,10 @@ from mapper.odometry.local_map.landmarks import LandmarkMap
 from mapper.sensing.config import KINECT_NOISE, DepthNoiseConfig
 
 _APART_S, _OLDER, _MOST = 0.4, 1.5, 10
-"""Age of the first keyframe that is compared: someone who walks moves on by his own width in it. Each further
-one is so many times as old, up to 15 s: someone who came and stands has moved."""
+"""Age of the first keyframe that is compared: a pedestrian moves on by their own width in it. Each further
+one is so many times as old, up to 15 s: someone who has stopped is found as well."""
 _MARGIN_M, _MARGIN_SIGMAS, _MARGIN_RATIO = 0.1, 4.0, 0.02
-"""What has moved stands so far in front of a surface: more than the errors of poses, noise and scale."""
+"""Least distance in front of a surface of what has moved: more than the errors of poses, noise and scale."""
 _MOST_MOVED_RATIO = 0.6
 """When more of the surfaces has moved it was the camera, and the pose is wrong."""
 _SAME_M, _SAME_SIGMAS, _SAME_RATIO = 0.02, 3.0, 0.01
@@ -76,7 +77,7 @@ class EarlierDepth:
         Args:
             observation: The frame.
             T_camera_world: (4, 4) its pose, good to a few centimetres.
-            reference: Keyframe that sees the place; it and those before it are compared.
+            reference: Keyframe of the same place; it and those before it are compared.
             points_camera: (N, 3) metres, camera frame; None are the frame's features.
         """
         points = observation.points_camera if points_camera is None else points_camera
@@ -86,14 +87,12 @@ class EarlierDepth:
         before = (
             np.array([_cells_of(self._map, k).inverse_depth for k in earlier]),
             np.array([self._map.keyframes[k].T_camera_world for k in earlier]),
-            cells.camera.parameters,
-            cells.cell_px,
-            self._noise,
+            _DepthCamera(cells.camera.parameters, cells.cell_px, self._noise),
         )
         moved: NDArray[np.bool_] = _in_free_space(points, T_camera_world, *before)
         if moved.sum() <= _MOST_MOVED_RATIO * (~np.isnan(points[:, 2])).sum():
             return moved
-        # Most features may be on one person with a patterned shirt, so the surfaces decide.
+        # Most features may be on one person with a patterned shirt, so the surfaces are tested.
         if _in_free_space(cells.points(), T_camera_world, *before).mean() > _MOST_MOVED_RATIO:
             moved[:] = False
         return moved
@@ -110,7 +109,7 @@ class EarlierDepth:
         Args:
             observation: The frame.
             T_camera_world: (4, 4) its pose.
-            reference: Keyframe that sees the place; the newest up to it that is old enough is compared.
+            reference: Keyframe of the same place; the newest up to it that is old enough is compared.
             twist_camera: (6,) velocity of the camera in its own axes, rad/s and m/s; None if it is unknown.
         """
         earlier = self._earlier(observation, reference, most=1)
@@ -124,9 +123,7 @@ class EarlierDepth:
             T_camera_world,
             _cells_of(self._map, earlier[0]).inverse_depth,
             keyframe.T_camera_world,
-            cells.camera.parameters,
-            cells.cell_px,
-            self._noise,
+            _DepthCamera(cells.camera.parameters, cells.cell_px, self._noise),
             *(_UNSYNCHRONISED_S * twist for twist in twists),
         )
         is_beside = beside_m > 0.0
@@ -168,11 +165,18 @@ def _cells_of(landmark_map: LandmarkMap, keyframe: int) -> DepthCells:
     return cells
 
 
+class _DepthCamera(NamedTuple):
+    """Camera of depth images: (9,) as ``PlaneModel.optics``, cells' edge, (3,) a, b, c of a + b·z + c·z²."""
+
+    optics: Array
+    cell_px: int
+    noise: Array
+
+
 @njit(cache=True, nogil=True)
-def _in_free_space(  # type: ignore[no-untyped-def]
-    points, T_camera_world, inverse_depth, T_keyframes_world, optics, cell_px, noise
-):
+def _in_free_space(points, T_camera_world, inverse_depth, T_keyframes_world, camera):  # type: ignore[no-untyped-def]
     """Return (N,) which points lie in front of all nine cells about the one that a keyframe sees them in."""
+    optics, cell_px, noise = camera
     moved = np.zeros(len(points), np.bool_)
     shape = inverse_depth.shape[1:]
     for k in range(len(inverse_depth)):
@@ -197,13 +201,14 @@ def _in_free_space(  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _apart(  # type: ignore[no-untyped-def]
-    points, T_camera_world, inverse_depth, T_keyframe_world, optics, cell_px, noise, motion, keyframe_motion
+    points, T_camera_world, inverse_depth, T_keyframe_world, camera, motion, keyframe_motion
 ):
     """Return (M,) which points lie on a keyframe's surfaces or beside them, and how far beside; 0 is on them.
 
     The inverse depth of a plane is linear in the image, so it is interpolated between the cells' middles.
     ``motion`` and ``keyframe_motion`` (6,) are the cameras' own in the time by which their depth may be late.
     """
+    optics, cell_px, noise = camera
     T = between(T_keyframe_world, T_camera_world)
     rows, columns = inverse_depth.shape
     compared = np.empty(len(points), np.intp)

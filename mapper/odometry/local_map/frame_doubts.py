@@ -1,7 +1,8 @@
-"""Doubts of RGB-D frames: what speaks against a tracked pose, measured against what is usual in this log."""
+"""Doubts of RGB-D frames: figures of tracking that deviate from their median over the log."""
 
 import math
 from collections import deque
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -15,7 +16,7 @@ from mapper.odometry.local_map.pose_tracker import TrackedPose
 _MEMORY = 100
 """Undoubted frames whose medians are the usual."""
 _FEWEST = 10
-"""With fewer of them nothing is known to be usual."""
+"""With fewer of them there is no usual value."""
 _LOOSE_M = 0.025
 """A translation this uncertain is doubtful where the usual is far better: 1 % of a view 2 to 3 m deep."""
 _LOOSE_RATIO = 4.0
@@ -27,7 +28,7 @@ _JUMP_RATIO = 8.0
 """Deviation from constant velocity, relative to the usual per second, that is a jump. The 99th percentile of
 right poses is 3 to 6."""
 _SUPPORT_AGREEMENT, _SUPPORT_RATIO = 0.85, 2.0
-"""A jump is believed if the agreement is at least this share of the usual, and the uncertainty at most this
+"""A jump is accepted if the agreement is at least this share of the usual, and the uncertainty at most this
 multiple, and nothing in view moves by itself: fast motions are real."""
 _MIN_EXCESS, _APART = 4.0, 2.0
 """When the image fits the predicted motion better than the one found by so many standard errors of the mean
@@ -63,35 +64,48 @@ class FrameDoubts:
             displaced: Surfaces that lie elsewhere by this pose than in an earlier frame.
             excess_error: Photometric error beyond that of the predicted motion, in standard errors.
         """
-        stamp_ns = tracked_pose.observation.stamp_ns
-        elapsed_s = 1e-9 * (stamp_ns - last.observation.stamp_ns)
-        sigma_rad, sigma_m = (largest_sigma(covariance[k : k + 3, k : k + 3]) for k in (0, 3))
-        speed = _motion(tracked_pose.T_camera_world, last.T_camera_world)
-        jump = (-math.inf, -math.inf)
-        if T_camera_world_predicted is not None:
-            jump = _motion(tracked_pose.T_camera_world, T_camera_world_predicted)
-        checksum = tracked_pose.observation.image_checksum
-        if checksum is None or checksum != last.observation.image_checksum:
-            self._shown_since_ns = stamp_ns
-        shown_s = 1e-9 * (stamp_ns - self._shown_since_ns)
+        motion = _FrameMotion.of(tracked_pose, covariance, last, T_camera_world_predicted)
+        if shown_s := self._shown_s(tracked_pose, last):
+            return self._of_repeated_image(tracked_pose, motion, shown_s)
+        if tracked_pose.depth is not None:
+            return self._of_depth(tracked_pose, last, motion)
+        return self._of_landmarks(tracked_pose, motion, displaced, excess_error)
 
-        phrases = list(tracked_pose.doubts)
-        off_rad, off_m = max(jump[0], sigma_rad), max(jump[1], sigma_m)
-        if shown_s > 0.0:
-            moved_rad, moved_m = (self._usual(name) * shown_s for name in ("speed_rad_s", "speed_m_s"))
-            phrases.append(f"the image has been the same for {shown_s:.2f} s")
-            return Doubt(tuple(phrases), max(moved_rad, off_rad), max(moved_m, off_m), repeats=True)
-        if tracked_pose.depth is not None:  # landmarks were few, so what is usual of them says nothing
-            if _is_blind(tracked_pose) or _is_blind(last):  # a motion that is predicted alone predicts none
-                return Doubt(tuple(phrases), sigma_rad, sigma_m) if phrases else NO_DOUBT
-            if jumps := self._jumps(jump, elapsed_s):
-                return Doubt((*phrases, *jumps), off_rad, off_m)
-            if phrases:
-                return Doubt(tuple(phrases), sigma_rad, sigma_m)
-            self._learn_motion(speed, jump, elapsed_s)
-            return NO_DOUBT
+    def _shown_s(self, tracked_pose: TrackedPose, last: TrackedPose) -> float:
+        """Return for how long the image has been the same; 0 if it is a new one."""
+        observation = tracked_pose.observation
+        checksum = observation.image_checksum
+        if checksum is None or checksum != last.observation.image_checksum:
+            self._shown_since_ns = observation.stamp_ns
+        return 1e-9 * (observation.stamp_ns - self._shown_since_ns)
+
+    def _of_repeated_image(self, tracked_pose: TrackedPose, motion: "_FrameMotion", shown_s: float) -> Doubt:
+        """Return the doubt of a frame that shows an earlier image: the camera moved on as usual."""
+        moved_rad, moved_m = (self._usual(name) * shown_s for name in ("speed_rad_s", "speed_m_s"))
+        phrase = f"the image has been the same for {shown_s:.2f} s"
+        sigma_rad, sigma_m = max(moved_rad, motion.off_rad), max(moved_m, motion.off_m)
+        return Doubt((*tracked_pose.doubts, phrase), sigma_rad, sigma_m, repeats=True)
+
+    def _of_depth(self, tracked_pose: TrackedPose, last: TrackedPose, motion: "_FrameMotion") -> Doubt:
+        """Return the doubts of a pose by depth: landmarks were few, so their usual figures do not apply."""
+        phrases = tracked_pose.doubts
+        # A motion that is predicted alone predicts no other.
+        is_unobserved = _is_unobserved(tracked_pose) or _is_unobserved(last)
+        if not is_unobserved and (jumps := self._jumps(motion)):
+            return Doubt((*phrases, *jumps), motion.off_rad, motion.off_m)
+        if phrases:
+            return Doubt(phrases, motion.sigma_rad, motion.sigma_m)
+        if not is_unobserved:
+            self._add_motion(motion)
+        return NO_DOUBT
+
+    def _of_landmarks(
+        self, tracked_pose: TrackedPose, motion: "_FrameMotion", displaced: Displacement, excess_error: float
+    ) -> Doubt:
+        """Return the doubts of a pose by landmarks."""
         usual_m, usual_agreement = self._usual("sigma_m"), self._usual("agreement")
-        agreement = tracked_pose.agreement
+        agreement, sigma_m = tracked_pose.agreement, motion.sigma_m
+        phrases = list(tracked_pose.doubts)
         is_loose = sigma_m > max(_LOOSE_M, _LOOSE_RATIO * usual_m)
         if is_loose:
             phrases.append(
@@ -106,35 +120,39 @@ class FrameDoubts:
             and sigma_m <= _SUPPORT_RATIO * usual_m
             and tracked_pose.few_move
         )
-        jumps = [] if is_supported else self._jumps(jump, elapsed_s)
+        jumps = [] if is_supported else self._jumps(motion)
         phrases += jumps
-        if elsewhere := self._surfaces.speak_against(tracked_pose, displaced):
+        if elsewhere := self._surfaces.doubt_of(tracked_pose, displaced):
             phrases.append(elsewhere)
             sigma_m = max(sigma_m, displaced.distance_m)
-        is_apart = jump[0] > _LOOSE_RAD or jump[1] > _LOOSE_M
-        if excess_error > _MIN_EXCESS and is_apart and self._exceeds_usual(jump, elapsed_s, _APART):
+        if excess_error > _MIN_EXCESS and self._is_apart(motion):
             is_contradicted = True
             phrases.append(
                 f"the image fits the predicted motion better by {excess_error:.0f} standard errors"
             )
         if phrases:
-            is_wild = is_loose and is_contradicted and bool(jumps)
-            return Doubt(tuple(phrases), off_rad, max(off_m, sigma_m), is_wild=is_wild)
-        self._learn(sigma_m=sigma_m, agreement=agreement)
-        self._learn_motion(speed, jump, elapsed_s)
+            return Doubt(
+                tuple(phrases),
+                motion.off_rad,
+                max(motion.off_m, sigma_m),
+                is_implausible=is_loose and is_contradicted and bool(jumps),
+            )
+        self._add(sigma_m=sigma_m, agreement=agreement)
+        self._add_motion(motion)
         return NO_DOUBT
 
     def in_hindsight(self, stamp_ns: int) -> Doubt:
-        """Return what later frames say against an earlier one."""
+        """Return the doubt that later frames add to an earlier one."""
         return self._surfaces.doubt_of_earlier(stamp_ns)
 
-    def _exceeds_usual(self, jump: tuple[float, float], elapsed_s: float, ratio: float) -> bool:
-        """Return whether the angle or the distance to the predicted pose is so many times the usual."""
-        usual = self._usual_jump(elapsed_s)
-        return any(miss > ratio * expected > 0.0 for miss, expected in zip(jump, usual, strict=True))
+    def _is_apart(self, motion: "_FrameMotion") -> bool:
+        """Return whether a pose is so far from the predicted one that the two are distinct."""
+        jump, usual = motion.jump, self._usual_jump(motion.elapsed_s)
+        exceeds = any(miss > _APART * expected > 0.0 for miss, expected in zip(jump, usual, strict=True))
+        return exceeds and (jump[0] > _LOOSE_RAD or jump[1] > _LOOSE_M)
 
-    def _jumps(self, jump: tuple[float, float], elapsed_s: float) -> list[str]:
-        usual_rad, usual_m = self._usual_jump(elapsed_s)
+    def _jumps(self, motion: "_FrameMotion") -> list[str]:
+        jump, (usual_rad, usual_m) = motion.jump, self._usual_jump(motion.elapsed_s)
         phrases = []
         if usual_rad and jump[0] > _JUMP_RATIO * usual_rad:
             phrases.append(
@@ -154,23 +172,72 @@ class FrameDoubts:
         figures = self._figures[name]
         return float(np.median(figures)) if len(figures) >= _FEWEST else 0.0
 
-    def _learn_motion(self, speed: tuple[float, float], jump: tuple[float, float], elapsed_s: float) -> None:
+    def _add_motion(self, motion: "_FrameMotion") -> None:
+        elapsed_s = motion.elapsed_s
         if elapsed_s > 0.0:
-            self._learn(speed_rad_s=speed[0] / elapsed_s, speed_m_s=speed[1] / elapsed_s)
-            if math.isfinite(jump[0]):
-                self._learn(jump_rad_s=jump[0] / elapsed_s, jump_m_s=jump[1] / elapsed_s)
+            self._add(speed_rad_s=motion.shift[0] / elapsed_s, speed_m_s=motion.shift[1] / elapsed_s)
+            if math.isfinite(motion.jump[0]):
+                self._add(jump_rad_s=motion.jump[0] / elapsed_s, jump_m_s=motion.jump[1] / elapsed_s)
 
-    def _learn(self, **figures: float) -> None:
+    def _add(self, **figures: float) -> None:
         for name, figure in figures.items():
             self._figures[name].append(figure)
 
 
-def _is_blind(tracked_pose: TrackedPose) -> bool:
+@dataclass(frozen=True, slots=True)
+class _FrameMotion:
+    """Motion to a frame, and its uncertainty.
+
+    Attributes:
+        elapsed_s: Time since the last tracked frame.
+        shift: Angle and distance to the last pose.
+        jump: Angle and distance to the predicted pose; −∞ if nothing predicts it.
+        sigma_rad: Largest standard deviation of the rotation.
+        sigma_m: Largest standard deviation of the translation.
+    """
+
+    elapsed_s: float
+    shift: tuple[float, float]
+    jump: tuple[float, float]
+    sigma_rad: float
+    sigma_m: float
+
+    @classmethod
+    def of(
+        cls,
+        tracked_pose: TrackedPose,
+        covariance: Array,
+        last: TrackedPose,
+        T_camera_world_predicted: Transform | None,
+    ) -> "_FrameMotion":
+        """Return the motion to a tracked pose with its (6, 6) covariance."""
+        T_camera_world, jump = tracked_pose.T_camera_world, (-math.inf, -math.inf)
+        if T_camera_world_predicted is not None:
+            jump = _angle_and_distance(T_camera_world, T_camera_world_predicted)
+        return cls(
+            1e-9 * (tracked_pose.stamp_ns - last.stamp_ns),
+            _angle_and_distance(T_camera_world, last.T_camera_world),
+            jump,
+            *(largest_sigma(covariance[k : k + 3, k : k + 3]) for k in (0, 3)),
+        )
+
+    @property
+    def off_rad(self) -> float:
+        """Angle by which the pose may be wrong: to the predicted one, or its standard deviation."""
+        return max(self.jump[0], self.sigma_rad)
+
+    @property
+    def off_m(self) -> float:
+        """Distance by which the pose may be wrong, likewise."""
+        return max(self.jump[1], self.sigma_m)
+
+
+def _is_unobserved(tracked_pose: TrackedPose) -> bool:
     """Return whether a part of the motion is predicted alone."""
     return tracked_pose.depth is not None and bool(tracked_pose.depth.unobservable)
 
 
-def _motion(T_camera_world: Transform, T_before_world: Transform) -> tuple[float, float]:
+def _angle_and_distance(T_camera_world: Transform, T_before_world: Transform) -> tuple[float, float]:
     """Return the angle and the distance between two poses of the camera."""
     rotation_rad, translation_m = log(T_camera_world @ inverse(T_before_world))
     return float(np.linalg.norm(rotation_rad)), float(np.linalg.norm(translation_m))

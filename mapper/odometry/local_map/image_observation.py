@@ -23,7 +23,7 @@ from mapper.sensing.config import KINECT_NOISE
 from mapper.sensing.depth_noise import depth_sigma_m, feature_depth_m, feature_depth_sigma_m
 
 FEW_MOVING = 0.05
-"""Share of the features below which nothing moves by itself: depths at edges look like it."""
+"""Share of the features below which nothing moves by itself: depths at edges are mistaken for it."""
 _SCALE_ERROR = 0.02
 """Error of depths beside the sensor's noise, as a share: its scale, and the slope where a feature lies."""
 
@@ -45,7 +45,7 @@ class ImageObservation(Archivable):
             when the middle row was read; NaN in the third column without depth or if it is not used.
         weights: (N, 3) inverse variances of the three, px⁻².
         sensor_weights: (N, 3) likewise, by the depth sensor's noise where that is smaller than the virtual
-            disparity's: they tell which features move alike, and leave errors of its calibration out.
+            disparity's: for tests of a common motion, without errors of its calibration.
         points_camera: (N, 3) metres, of ``measured``; NaN without depth.
         grid: Index of the features, which are sorted by its cells.
         intrinsics: (5,) fx, fy, cx, cy, bf in pixels (bf in pixel metres).
@@ -99,10 +99,10 @@ class ImageObservation(Archivable):
         return _unswept, (measured, not np.isnan(self.measured[:, 2]).all())
 
     def weights_among(self, moved: NDArray[np.bool_]) -> Array:
-        """Return the (N, 3) inverse variances that tell which features agree on a motion.
+        """Return the (N, 3) inverse variances for the test which features agree on a motion.
 
         Args:
-            moved: (N,) features that move by themselves. Among many of them the depth tells still ones apart.
+            moved: (N,) features that move by themselves. If there are many, depth separates those at rest.
         """
         return self.sensor_weights if moved.sum() > FEW_MOVING * len(self) else self.weights
 
@@ -191,16 +191,7 @@ def observe_image(
     )
     bits = pack(features.descriptors[order])
     sigma_px = detector.scale_factor ** octave.astype(np.float64)
-    disparity_sigma_px = sigma_px * config.disparity_sigma_px
-    if config.depth_noise is not None:
-        sigma_m = feature_depth_sigma_m(
-            frame.depth_m, column, row, sigma_px=sigma_px, noise=config.depth_noise
-        )
-        # Without depth the weight is not used, but it is a factor in sums.
-        known_px = config.virtual_baseline_px_m / depth_m**2 * sigma_m
-        disparity_sigma_px = np.where(np.isnan(depth_m), disparity_sigma_px, known_px)
-    sensor_m = np.hypot(depth_sigma_m(config.depth_noise or KINECT_NOISE, depth_m), _SCALE_ERROR * depth_m)
-    sensor_px = np.fmin(config.virtual_baseline_px_m / depth_m**2 * sensor_m, disparity_sigma_px)
+    disparity_sigma_px, sensor_px = _disparity_sigmas_px(frame, depth_m, (column, row), sigma_px, config)
     cells = None
     if config.align_depth:
         cells = depth_cells(frame.depth_m, camera, distortion_per_m=frame.removed_distortion_per_m)
@@ -225,8 +216,26 @@ def observe_image(
     return _unswept(measured, config.depth_residual)
 
 
+def _disparity_sigmas_px(
+    frame: RgbdFrame,
+    depth_m: Array,
+    at: tuple[NDArray[np.intp], NDArray[np.intp]],
+    sigma_px: Array,
+    config: KeyframeOdometryConfig,
+) -> tuple[Array, Array]:
+    """Return the (N,) standard deviations of virtual disparities, and by the sensor's noise where smaller."""
+    px_per_m, noise = config.virtual_baseline_px_m / depth_m**2, config.depth_noise
+    disparity_px = sigma_px * config.disparity_sigma_px
+    if noise is not None:
+        sigma_m = feature_depth_sigma_m(frame.depth_m, *at, sigma_px=sigma_px, noise=noise)
+        # Without depth the weight is not used, but it is a factor in sums.
+        disparity_px = np.where(np.isnan(depth_m), disparity_px, px_per_m * sigma_m)
+    sensor_m = np.hypot(depth_sigma_m(noise or KINECT_NOISE, depth_m), _SCALE_ERROR * depth_m)
+    return disparity_px, np.fmin(px_per_m * sensor_m, disparity_px)
+
+
 def _unswept(measured: Mapping[str, Any], has_disparity: bool) -> ImageObservation:
-    """Return the observation of a camera that stands still, with what follows from its measurements."""
+    """Return the observation of a camera at rest, with what follows from its measurements."""
     pixels, depth_m, intrinsics = measured["pixels"], measured["depth_m"], measured["intrinsics"]
     disparity_px = intrinsics[4] / depth_m if has_disparity else np.full(len(pixels), np.nan)
     return ImageObservation(

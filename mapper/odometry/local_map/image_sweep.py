@@ -11,7 +11,7 @@ from mapper.registration.reprojection import HUBER_2DOF, pose_jacobian, projecti
 
 _ITERATIONS = 3
 _WIDE = np.repeat([0.1, 0.05], 3)
-"""Standard deviation (rad, m) of the motion about 0: that of a fast hand, so that the image decides."""
+"""Standard deviation (rad, m) of the motion about 0: that of a fast hand, so that the image determines it."""
 _KEPT = 0.95
 """Of the mean square of what is left of the motion, from image to image: some 20 images count."""
 _PRIOR_S = 0.01
@@ -32,9 +32,9 @@ class _Sweep:
 class SweepErrors:
     """Errors of poses by motion within images that was not taken out of them.
 
-    Images of a camera that is shaken faster than frames follow show more of it than their velocities tell.
+    Images of a camera that is shaken faster than frames follow show more of it than their velocities.
     Its mean square is measured against the motion that was taken out. It counts once the motion within images
-    follows the velocity, as with a rolling shutter: from image to image both must change alike, since errors
+    follows the velocity, as with a rolling shutter: their changes from image to image must agree, as errors
     of depth or lens follow the distance from a keyframe, and so the velocity itself. Errors of landmarks that
     both images share cancel.
     """
@@ -46,7 +46,7 @@ class SweepErrors:
         self.restart()
 
     def restart(self) -> None:
-        """Forget the last images, but not what they told, after a gap."""
+        """Reset the last images, but not their statistics, after a gap."""
         self._last: _Sweep | None = None
         self._before: _Sweep | None = None
         self._pose_per_motion: Array | None = None
@@ -139,27 +139,8 @@ def image_sweep(T_camera_world, points, measured, weights, intrinsics, height_px
         height_px: Number of rows.
     """
     T, sweep = T_camera_world.copy(), np.zeros(6)
-    r, J_both, scratch = np.empty(3), np.zeros((3, 12)), (np.empty((3, 3)), np.empty((3, 6)))
-    H, g = np.empty((12, 12)), np.empty(12)
-    square_sum = count = 0.0
     for _ in range(_ITERATIONS):
-        H[:, :] = 0.0
-        g[:] = 0.0
-        square_sum = count = 0.0
-        for n in range(len(points)):
-            swept_rows(T, points[n], measured[n], sweep, intrinsics, height_px, scratch, r, J_both)
-            for i in range(2 if np.isnan(measured[n, 2]) else 3):
-                row, error = J_both[i], r[i]
-                w = weights[n, i]
-                sigmas = np.sqrt(w) * abs(error)
-                if sigmas > HUBER_2DOF:
-                    w *= HUBER_2DOF / sigmas
-                square_sum += w * error * error
-                count += 1.0
-                for a in range(12):
-                    g[a] += w * row[a] * error
-                    for b in range(12):
-                        H[a, b] += w * row[a] * row[b]
+        H, g, precision = _normal_equations(T, sweep, points, measured, weights, intrinsics, height_px)
         with_prior = H.copy()
         for a in range(6):
             with_prior[6 + a, 6 + a] += _WIDE[a] ** -2
@@ -169,6 +150,36 @@ def image_sweep(T_camera_world, points, measured, weights, intrinsics, height_px
         step = solve_positive(with_prior, g)
         T = twist_exp(step[:6], T)
         sweep += step[6:]
+    information, change = _marginal(H)
+    return sweep, information * precision, change
+
+
+@njit(cache=True, nogil=True)
+def _normal_equations(T, sweep, points, measured, weights, intrinsics, height_px):  # type: ignore[no-untyped-def]
+    """Return the (12, 12) and (12,) equations of pose and motion, and the inverse variance of residuals."""
+    r, J_both, scratch = np.empty(3), np.zeros((3, 12)), (np.empty((3, 3)), np.empty((3, 6)))
+    H, g = np.zeros((12, 12)), np.zeros(12)
+    square_sum = count = 0.0
+    for n in range(len(points)):
+        swept_rows(T, points[n], measured[n], sweep, intrinsics, height_px, scratch, r, J_both)
+        for i in range(2 if np.isnan(measured[n, 2]) else 3):
+            row, error = J_both[i], r[i]
+            w = weights[n, i]
+            sigmas = np.sqrt(w) * abs(error)
+            if sigmas > HUBER_2DOF:
+                w *= HUBER_2DOF / sigmas
+            square_sum += w * error * error
+            count += 1.0
+            for a in range(12):
+                g[a] += w * row[a] * error
+                for b in range(12):
+                    H[a, b] += w * row[a] * row[b]
+    return H, g, max(count - 12.0, 1.0) / max(square_sum, 1e-9)
+
+
+@njit(cache=True, nogil=True)
+def _marginal(H):  # type: ignore[no-untyped-def]
+    """Return the motion's (6, 6) information with the pose eliminated, and the pose's change by it (6, 6)."""
     information, change = H[6:, 6:].copy(), np.empty((6, 6))
     H_pose = H[:6, :6] + 1e-9 * np.eye(6)
     for b in range(6):
@@ -176,4 +187,4 @@ def image_sweep(T_camera_world, points, measured, weights, intrinsics, height_px
         for a in range(6):
             for c in range(6):
                 information[a, b] -= H[6 + a, c] * change[c, b]
-    return sweep, information * (max(count - 12.0, 1.0) / max(square_sum, 1e-9)), change
+    return information, change

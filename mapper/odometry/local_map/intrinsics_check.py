@@ -22,7 +22,7 @@ class IntrinsicsCheck:
     """Estimate of the intrinsics that a log's images and depth fit, relative to those that are given.
 
     Rotations shift pixels by the focal length, and translations by its share of the inverse depth, which the
-    depth images measure. A principal point that is off shears the space that a camera sees, so that views of
+    depth images measure. A wrong principal point shears the reconstruction, so that views of
     the same things from other directions do not fit each other. All four are estimated together: one that is
     held at a wrong value falsifies the others.
     """

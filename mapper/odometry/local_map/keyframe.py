@@ -43,7 +43,7 @@ class Keyframe:
         origin: First keyframe of its sub-map; sub-maps are not connected to each other.
         twist_camera: (6,) velocity of the camera in its own axes, rad/s and m/s; 0 if it is unknown.
         depth_link: Pose relative to an earlier keyframe by depth; None if the landmarks were many.
-        doubt_rad: Error of its rotation that speaks against it; 0 if its pose is not doubtful.
+        doubt_rad: Error of its rotation that its doubts suggest; 0 if its pose is not doubtful.
         doubt_m: Error of its translation.
     """
 
@@ -85,7 +85,7 @@ def unpacked(columns: Mapping[str, Any]) -> list[Keyframe]:
 
 
 class RecentObservations:
-    """What was observed in the last keyframes that were used, by the readout time as it is known now."""
+    """Observations of the last keyframes that were used, by the current readout time."""
 
     def __init__(self) -> None:
         self._ready: OrderedDict[int, ImageObservation] = OrderedDict()
@@ -115,5 +115,5 @@ class RecentObservations:
             self._ready.popitem(last=False)
 
     def clear(self) -> None:
-        """Forget all, as where the readout time has changed."""
+        """Remove all, as where the readout time has changed."""
         self._ready.clear()

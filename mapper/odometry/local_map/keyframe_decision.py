@@ -5,15 +5,15 @@ from mapper.odometry.local_map.landmarks import LandmarkMap
 from mapper.odometry.local_map.pose_tracker import TrackedPose
 
 _MIN_GAP = 4
-"""Frames for which the last keyframe is young."""
-_YOUNG_NS = 150_000_000
-"""Time for which it is young at most: four frames at 30 Hz. At 5 Hz four frames may show a whole turn, and
+"""Frames for which the last keyframe is recent."""
+_RECENT_NS = 150_000_000
+"""Time for which it is recent at most: four frames at 30 Hz. At 5 Hz four frames may show a whole turn, and
 the landmarks of one keyframe place the last of them badly."""
 _DEPTH_OVERLAP = 0.9
 """With less overlap of the surfaces a frame without landmarks becomes a keyframe: what is left may not show
 every motion."""
-_YOUNG_SHARE = 2.0 / 3.0
-"""Share of ``keyframe_ratio`` that counts while the last keyframe is young and the inliers are not weak."""
+_RECENT_SHARE = 2.0 / 3.0
+"""Share of ``keyframe_ratio`` that counts while the last keyframe is recent and the inliers are not weak."""
 
 
 class KeyframeDecision:
@@ -35,10 +35,10 @@ class KeyframeDecision:
         self._frames += 1
         self._most_inliers = max(self._most_inliers, inliers)
         # A motion that was not observed is uncertain in the factor too; other doubts have no measure.
-        blind = tracked_pose.depth is not None and bool(tracked_pose.depth.unobservable)
-        if len(tracked_pose.doubts) > blind:
+        unobserved = tracked_pose.depth is not None and bool(tracked_pose.depth.unobservable)
+        if len(tracked_pose.doubts) > unobserved:
             return False
-        if blind and tracked_pose.depth is not None and tracked_pose.depth.observes_next:
+        if unobserved and tracked_pose.depth is not None and tracked_pose.depth.observes_next:
             return True
         if self._frames >= config.max_keyframe_gap:
             return True
@@ -49,12 +49,12 @@ class KeyframeDecision:
             return textured or tracked_pose.depth.overlap < _DEPTH_OVERLAP
         kept_ratio = inliers / self._most_inliers
         age_ns = tracked_pose.stamp_ns - self._map.keyframes[-1].stamp_ns
-        young = self._frames < _MIN_GAP and age_ns < _YOUNG_NS and inliers >= config.weak_inliers
-        share = _YOUNG_SHARE if young else 1.0
+        is_recent = self._frames < _MIN_GAP and age_ns < _RECENT_NS and inliers >= config.weak_inliers
+        share = _RECENT_SHARE if is_recent else 1.0
         # Landmarks at one edge of the image constrain the pose badly, however many they are.
         ids = tracked_pose.landmark_of_feature
         triangulated = (ids >= 0) & (self._map.landmarks["ray_sigma_m"][ids] > 0.0)
         mapped_ratio = inliers / max(int((tracked_pose.observation.has_depth | triangulated).sum()), 1)
         # Unless the map is searched, features without a landmark are not new.
-        is_new = mapped_ratio < config.mapped_ratio and (config.local_keyframes > 0 or not young)
+        is_new = mapped_ratio < config.mapped_ratio and (config.local_keyframes > 0 or not is_recent)
         return is_new or kept_ratio < share * config.keyframe_ratio

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from mapper.core.geometry import Array, Points, Transform, apply, inverse
 from mapper.odometry.local_map.bundle import Bundle
-from mapper.odometry.local_map.bundle_adjustment import adjust, common_parameter
+from mapper.odometry.local_map.bundle_adjustment import Observations, adjust, common_parameter
 from mapper.odometry.local_map.image_observation import ImageObservation
 from mapper.odometry.local_map.keyframe import DepthLink, Keyframe, RecentObservations, packed, unpacked
 from mapper.odometry.local_map.landmark_kernels import count_observers, observations_of
@@ -23,8 +23,8 @@ Ids = NDArray[np.int32]
 MIN_SHARED_LANDMARKS = 15
 """Keyframes that share fewer are not covisible (Mur-Artal, Montiel & Tardós 2015, §III-D)."""
 _MIN_FOUND_RATIO = 0.25
-"""Young landmarks found in a smaller share of the frames that should show them are removed (ibid., §VI-B)."""
-_BUNDLE_ROUNDS, _BUNDLE_ITERATIONS = 2, 5
+"""New landmarks found in a smaller share of the frames that should show them are removed (ibid., §VI-B)."""
+_ROUNDS, _ITERATIONS = 2, 5
 _MOST_WIDENED = 3
 """A window is widened to at most this many times its size."""
 _NEWEST = 3
@@ -118,11 +118,6 @@ class LandmarkMap:
         """
         index = len(self.keyframes)
         self._first_landmark.append(self.landmarks.size)
-        origin = index if neighbour is None else self.keyframes[neighbour].origin
-        link = None
-        if neighbour is not None and depth_information is not None:
-            T_camera_reference = T_camera_world @ inverse(self.keyframes[neighbour].T_camera_world)
-            link = DepthLink(neighbour, T_camera_reference, depth_information)
         self.keyframes.append(
             Keyframe(
                 stamp_ns=observation.stamp_ns,
@@ -130,9 +125,9 @@ class LandmarkMap:
                 unswept=archived(observation if observation.unswept is None else observation.unswept),
                 sweep_camera=observation.sweep_camera,
                 T_camera_world=T_camera_world,
-                origin=origin,
+                origin=index if neighbour is None else self.keyframes[neighbour].origin,
                 twist_camera=twist_camera,
-                depth_link=link,
+                depth_link=self._depth_link(neighbour, T_camera_world, depth_information),
             )
         )
         self._recent.keep(index, observation)
@@ -153,6 +148,14 @@ class LandmarkMap:
         points_world = apply(inverse(T_camera_world), observation.points_camera[features])
         self.add_landmarks(points_world, [(index, features)])
         return index
+
+    def _depth_link(
+        self, neighbour: int | None, T_camera_world: Transform, information: Array | None
+    ) -> DepthLink | None:
+        if neighbour is None or information is None:
+            return None
+        T_camera_reference = T_camera_world @ inverse(self.keyframes[neighbour].T_camera_world)
+        return DepthLink(neighbour, T_camera_reference, information)
 
     def add_landmarks(
         self,
@@ -277,17 +280,9 @@ class LandmarkMap:
         """Adjust a keyframe, its most covisible ones and their landmarks; drop observations that disagree.
 
         Keyframes outside the window that observe these landmarks take part but stay fixed, as does the first
-        of a sub-map. Depth links hold keyframes of few landmarks. Those that share triangulated landmarks
-        with the keyframe widen the window: their positions give these landmarks' depths, and held fixed with
-        their errors they shrink the scale from window to window.
+        of a sub-map. Depth links constrain keyframes of few landmarks.
         """
-        covisible = [k for k, _ in self.covisible(index, min_shared=MIN_SHARED_LANDMARKS)]
-        members = [index, *covisible[: window - 1]]
-        if len(covisible) >= window:
-            ids = self.landmarks_of(index)
-            shared = self.shared_counts(ids[self.landmarks["ray_sigma_m"][ids] > 0.0])
-            members += [k for k in covisible[window - 1 :] if shared[k] >= MIN_SHARED_LANDMARKS]
-            members = members[: _MOST_WIDENED * window]
+        members = self._window(index, window)
         movable = sorted(k for k in members if k != self.keyframes[k].origin)
         if not movable:
             return
@@ -303,30 +298,19 @@ class LandmarkMap:
         edges = np.column_stack([local, rows]).astype(np.int32)
         measured, weights = self._measured(observations), self._observations["weights"][observations]
         intrinsics = self.observation(index).intrinsics
+        observed = Observations(first, edges, measured, weights, intrinsics)
         links = np.searchsorted(keyframe_ids, linked).astype(np.int32), T_links, link_information
+        start = np.array([self.keyframes[k].T_camera_world for k in keyframe_ids])
         poses, points, agree = adjust(
-            np.array([self.keyframes[k].T_camera_world for k in keyframe_ids]),
-            free,
-            self.landmarks["position"][landmarks],
-            first,
-            edges,
-            measured,
-            weights,
-            intrinsics,
-            links,
-            _BUNDLE_ROUNDS,
-            _BUNDLE_ITERATIONS,
+            start, free, self.landmarks["position"][landmarks], observed, links, _ROUNDS, _ITERATIONS
         )
         if self.readout.is_estimated and len(linked) == 0:
             slopes = self._observations["slope"][observations]
-            information, gradient = common_parameter(
-                poses, free, points, first, edges, measured, weights, intrinsics, agree, slopes
-            )
+            information, gradient = common_parameter(poses, free, points, observed, agree, slopes)
             share = min(window / len(members), 1.0)  # an observation is in as many windows as one has members
             self.readout.learn(share * information, share * gradient)
-        for k, f in zip(keyframe_ids, free, strict=True):
-            if f >= 0:
-                self.keyframes[k].T_camera_world = poses[np.searchsorted(keyframe_ids, k)].copy()
+        for k in movable:
+            self.keyframes[k].T_camera_world = poses[np.searchsorted(keyframe_ids, k)].copy()
         self.landmarks["position"][landmarks] = points
         self.landmarks["ray_sigma_m"][landmarks] = updated_ray_sigma_m(
             self.landmarks["ray_sigma_m"][landmarks],
@@ -334,6 +318,20 @@ class LandmarkMap:
             *(poses, points, edges[agree], measured[agree], weights[agree], intrinsics),
         )
         self._unlink(observations[~agree])
+
+    def _window(self, index: int, window: int) -> list[int]:
+        """Return a keyframe and its most covisible ones, and all that share triangulated landmarks with it.
+
+        The positions of these give the landmarks' depths: held fixed, their errors shrink the scale from
+        window to window.
+        """
+        covisible = [k for k, _ in self.covisible(index, min_shared=MIN_SHARED_LANDMARKS)]
+        members = [index, *covisible[: window - 1]]
+        if len(covisible) >= window:
+            ids = self.landmarks_of(index)
+            shared = self.shared_counts(ids[self.landmarks["ray_sigma_m"][ids] > 0.0])
+            members += [k for k in covisible[window - 1 :] if shared[k] >= MIN_SHARED_LANDMARKS]
+        return members[: _MOST_WIDENED * window]
 
     def bundle(self, keyframes: Sequence[int]) -> Bundle:
         """Return keyframes, given in increasing order, with all their observations and landmarks."""
@@ -395,7 +393,7 @@ class LandmarkMap:
         self._observations["landmark"][observations] = -1
         self._observations["keyframe"][observations] = -1
         self.landmarks["observers"][ids] -= times.astype(np.int32)
-        # Nobody reads them any more: zeros, as most landmarks become, make checkpoints small.
+        # They are not read any more: zeros, as most landmarks become, make checkpoints small.
         for name in ("measured", "weights", "slope"):
             self._observations[name][observations] = 0.0
         removed = ids[self.landmarks["observers"][ids] == 0]
@@ -403,7 +401,7 @@ class LandmarkMap:
             self.landmarks[name][removed] = 0
 
     def cull(self) -> None:
-        """Remove young landmarks that no further keyframe observes or that tracking rarely finds.
+        """Remove new landmarks that no further keyframe observes or that tracking rarely finds.
 
         Two keyframes after its creation a landmark must have another observer than the one that it was made
         from, or the two if it was triangulated; mismatches and depth errors at object edges rarely get one

@@ -1,13 +1,15 @@
 """Local map search: landmarks of covisible keyframes are matched near their projections."""
 
 import math
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.geometry import Array, Transform, apply
 from mapper.features.hamming import Bits
-from mapper.features.window_matching import match_windows
+from mapper.features.window_matching import GridFeatures, SearchWindows, match_windows
 from mapper.odometry.config import KeyframeOdometryConfig
 from mapper.odometry.local_map.camera_motion import refined_by_established
 from mapper.odometry.local_map.earlier_depth import EarlierDepth
@@ -27,6 +29,22 @@ def least_by_chance(visible: int) -> int:
     """Return how many inliers a wrong pose hardly has: the binomial's mean and five standard deviations."""
     mean = _CHANCE * visible
     return math.ceil(mean + _CHANCE_SIGMAS * math.sqrt(mean * (1.0 - _CHANCE)))
+
+
+class PredictedFeatures(NamedTuple):
+    """Features that are predicted in a frame.
+
+    Attributes:
+        pixels: (M, 2) when the middle row is read.
+        depth_m: (M,).
+        octave: (M,) int32.
+        bits: (M, 4) uint64 descriptors.
+    """
+
+    pixels: Array
+    depth_m: Array
+    octave: NDArray[np.int32]
+    bits: Bits
 
 
 class LocalSearch:
@@ -60,14 +78,64 @@ class LocalSearch:
         Returns:
             The refined pose; None if too few landmarks agree.
         """
-        config, landmarks = self._config, self._map.landmarks
+        landmarks = self._map.landmarks
         moved = self._earlier_depth.moved(observation, T_camera_world, reference)
         landmark_of_feature = np.where(moved, -1, landmark_of_feature).astype(np.int32)
         matched = landmark_of_feature[landmark_of_feature >= 0]
-        counts = self._map.shared_counts(matched)
+        keyframes = self._covisible(matched) or [reference]
+        visible, predicted = self._visible(observation, T_camera_world, keyframes, except_for=matched)
+        feature = self.match_near(
+            observation,
+            predicted,
+            search_px=self._config.local_search_px,
+            taken=moved | (landmark_of_feature >= 0),
+            max_ratio=_MAX_RATIO,
+        )
+        hits = np.flatnonzero(feature >= 0)
+        landmark_of_feature[feature[hits]] = visible[hits]
+        features = np.flatnonzero(landmark_of_feature >= 0)
+        ids = landmark_of_feature[features]
+        if len(features) < self._config.min_inliers:
+            return None
+        T_camera_world, agree = self._refined_pose(observation, T_camera_world, features, ids, moved)
+        in_view = len(visible) + len(matched)
+        if agree.sum() < max(self._config.min_inliers, least_by_chance(in_view)):
+            return None
+        landmark_of_feature[features[~agree]] = -1
+        landmarks["visible"][visible] += 1
+        landmarks["visible"][matched] += 1
+        landmarks["found"][ids[agree]] += 1
+        return TrackedPose(
+            observation,
+            T_camera_world,
+            landmark_of_feature,
+            keyframes[0],
+            len(features),
+            agreement,
+            in_view,
+            rms_px(T_camera_world, landmarks["position"][ids[agree]], observation, features[agree]),
+            method,
+            moving=np.flatnonzero(moved).astype(np.int32),
+        )
+
+    def _covisible(self, landmarks: Ids) -> list[int]:
+        """Return the keyframes that observe any of the landmarks, in decreasing order of how many."""
+        counts = self._map.shared_counts(landmarks)
         observing = np.flatnonzero(counts)
-        order = observing[np.argsort(-counts[observing], kind="stable")].tolist() or [reference]
-        nearby = self._map.landmarks_of_any(order[: config.local_keyframes], except_for=matched)
+        order: list[int] = observing[np.argsort(-counts[observing], kind="stable")].tolist()
+        return order
+
+    def _visible(
+        self,
+        observation: ImageObservation,
+        T_camera_world: Transform,
+        keyframes: Sequence[int],
+        *,
+        except_for: Ids,
+    ) -> tuple[Ids, PredictedFeatures]:
+        """Return the (M,) landmarks of the first keyframes that a pose has in the image, as it has them."""
+        config, landmarks = self._config, self._map.landmarks
+        nearby = self._map.landmarks_of_any(keyframes[: config.local_keyframes], except_for=except_for)
         rows, pixels, octave = project_visible(
             landmarks["position"][nearby],
             landmarks["direction"][nearby],
@@ -79,23 +147,19 @@ class LocalSearch:
             config.detector.levels,
         )
         visible = nearby[rows]
-        feature = self.match_near(
-            observation,
-            pixels,
-            apply(T_camera_world, landmarks["position"][visible])[:, 2],
-            octave,
-            landmarks["bits"][visible],
-            search_px=config.local_search_px,
-            taken=moved | (landmark_of_feature >= 0),
-            max_ratio=_MAX_RATIO,
-        )
-        hits = np.flatnonzero(feature >= 0)
-        landmark_of_feature[feature[hits]] = visible[hits]
-        features = np.flatnonzero(landmark_of_feature >= 0)
-        ids = landmark_of_feature[features]
-        if len(features) < config.min_inliers:
-            return None
-        found = T_camera_world, observation, features, ids
+        depth_m = apply(T_camera_world, landmarks["position"][visible])[:, 2]
+        return visible, PredictedFeatures(pixels, depth_m, octave, landmarks["bits"][visible])
+
+    def _refined_pose(
+        self,
+        observation: ImageObservation,
+        T_camera_world: Transform,
+        features: NDArray[np.integer],
+        ids: Ids,
+        moved: NDArray[np.bool_],
+    ) -> tuple[Transform, NDArray[np.bool_]]:
+        """Return the T_camera_world that most matches agree on, refined by these, and which they are."""
+        landmarks, found = self._map.landmarks, (T_camera_world, observation, features, ids)
         T_camera_world, agree = refined_by_established(
             T_camera_world,
             landmarks["position"][ids],
@@ -111,56 +175,26 @@ class LocalSearch:
             features[agree],
             weights_with_landmarks(self._map, *found, observation.weights),
         )
-        if agree.sum() < max(config.min_inliers, least_by_chance(len(visible) + len(matched))):
-            return None
-        landmark_of_feature[features[~agree]] = -1
-        landmarks["visible"][visible] += 1
-        landmarks["visible"][matched] += 1
-        landmarks["found"][ids[agree]] += 1
-        return TrackedPose(
-            observation,
-            T_camera_world,
-            landmark_of_feature,
-            order[0],
-            len(features),
-            agreement,
-            len(visible) + len(matched),
-            rms_px(T_camera_world, landmarks["position"][ids[agree]], observation, features[agree]),
-            method,
-            moving=np.flatnonzero(moved).astype(np.int32),
-        )
+        return T_camera_world, agree
 
     def match_near(
         self,
         observation: ImageObservation,
-        pixels: Array,
-        depth_m: Array,
-        octave: NDArray[np.int32],
-        bits: Bits,
+        predicted: PredictedFeatures,
         *,
         search_px: float,
         taken: NDArray[np.bool_],
         max_ratio: float,
     ) -> Ids:
-        """Return, per pixel and depth predicted for the middle row's time, the matching feature or −1.
-
-        The radius grows with the octave.
-        """
-        grid = observation.grid
+        """Return, per predicted feature, the matching one or −1. The radius grows with the octave."""
+        pixels, depth_m, octave, bits = predicted
         if observation.sweep_camera.any():
             pixels = pixels + observation.row_shift(pixels, depth_m)
+        radius_px = search_px * self._map.scale_factor ** octave.astype(np.float64)
         matched: Ids = match_windows(
-            pixels,
-            octave,
-            search_px * self._map.scale_factor ** octave.astype(np.float64),
-            bits,
-            observation.pixels,
-            observation.octave,
-            observation.bits,
+            SearchWindows(pixels, radius_px, octave, bits),
+            GridFeatures(observation.pixels, observation.octave, observation.bits, observation.grid),
             taken,
-            grid.start,
-            grid.columns,
-            grid.rows,
             MAX_HAMMING,
             max_ratio,
         )

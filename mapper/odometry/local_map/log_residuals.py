@@ -1,4 +1,4 @@
-"""Residuals of a log's keyframes, which tell how certain its poses are."""
+"""Residuals of a log's keyframes, which give the uncertainty of its poses."""
 
 from bisect import insort
 from statistics import median
@@ -10,14 +10,14 @@ from mapper.graph.noise import with_model_error
 from mapper.registration.variance_factor import ResidualStatistics
 
 _FEWEST = 5
-"""With fewer keyframes, features count as their weights say, with the whole model error."""
+"""With fewer keyframes, features have their own weights, with the whole model error."""
 _NONE, _WHOLE = 1.0, 1.5
 """Design effects at which residuals show no model error, and all of it. Synthetic logs without errors of
 calibration have 0.75 to 1.0, real and uncalibrated ones 1.5 to 2.3."""
 _LEAST = 0.125
 """Share of the model error that is always added."""
 USUAL_VARIANCE = 0.25
-"""Variance of features as long as too few keyframes tell it: real and synthetic logs have 0.1 to 0.35."""
+"""Variance of features as long as too few keyframes show it: real and synthetic logs have 0.1 to 0.35."""
 _LEAST_VARIANCE = 0.15
 """Landmarks err as well, while a keyframe's residuals are those to its own."""
 
@@ -51,7 +51,7 @@ class LogResiduals:
             return USUAL_VARIANCE
         return float(np.clip(median(self._variances), _LEAST_VARIANCE, 1.0))
 
-    def honest(self, information: Array, T_i_j: Transform) -> Array:
+    def rescaled(self, information: Array, T_i_j: Transform) -> Array:
         """Return the (6, 6) information of a relative pose by what the residuals show.
 
         Args:

@@ -11,16 +11,16 @@ from mapper.odometry.local_map.camera_motion import agreeing, camera_motion
 from mapper.odometry.local_map.earlier_depth import EarlierDepth
 from mapper.odometry.local_map.image_observation import ImageObservation
 from mapper.odometry.local_map.landmarks import Ids, LandmarkMap
-from mapper.odometry.local_map.local_search import LocalSearch
+from mapper.odometry.local_map.local_search import LocalSearch, PredictedFeatures
 from mapper.odometry.local_map.pose_tracker import TrackedPose, project, unmatched
 from mapper.odometry.local_map.relocalizer import Relocalizer
 from mapper.odometry.local_map.triangulation import weights_with_landmarks
 
 _MAX_RATIO = 0.9
 _LEAST_STILL_RATIO = 0.2
-"""When fewer matches stand still, it is the prediction that is wrong."""
+"""When fewer matches are at rest, the prediction is wrong."""
 _RIVAL_RATIO = 0.5
-"""A pose of fewer inliers, relative to the better one, does not cast doubt on it."""
+"""A pose of fewer inliers, relative to the better one, does not make it doubtful."""
 _SAME_RATIO = 0.5
 """Of two poses that are the same, each has more of the other's inliers."""
 
@@ -42,7 +42,7 @@ class MotionPoseTracker:
         by_motion = self._by_motion(observation, last, T_predicted)
         if by_motion is not None and by_motion.inliers >= self._config.weak_inliers:
             return by_motion
-        # A pose with few inliers may be wrong, so a pose that does not depend on the prediction competes.
+        # A pose with few inliers may be wrong: it is compared with one that needs no prediction.
         known, points_world, landmarks = self._known_points(last)
         by_last = self._relocalizer.match_points(
             observation,
@@ -86,41 +86,23 @@ class MotionPoseTracker:
         """Search the last frame's points near the pixels where the prediction has them."""
         T_camera_world = last.T_camera_world if T_predicted is None else T_predicted
         known, points_world, landmark = self._known_points(last)
-        pixels = project(T_camera_world, points_world, observation.intrinsics)
-        depth_m = apply(T_camera_world, points_world)[:, 2]
-        for search_px in (self._config.search_px, 2.0 * self._config.search_px):
-            feature = self._search.match_near(
-                observation,
-                pixels,
-                depth_m,
-                last.observation.octave[known],
-                last.observation.bits[known],
-                search_px=search_px,
-                taken=np.zeros(len(observation), np.bool_),
-                max_ratio=_MAX_RATIO,
-            )
-            hits = np.flatnonzero(feature >= 0)
-            if len(hits) >= self._config.min_matches:
-                break
-        else:
+        feature = self._matched(observation, last, known, points_world, T_camera_world)
+        hits = np.flatnonzero(feature >= 0)
+        if len(hits) < self._config.min_matches:
             return None
         moved = self._earlier_depth.moved(observation, T_camera_world, last.reference)
         still = ~moved[feature[hits]]
         if still.sum() >= max(self._config.min_matches, _LEAST_STILL_RATIO * len(hits)):
             hits = hits[still]
+        features, ids = feature[hits], landmark[hits]
         motion = camera_motion(
             T_camera_world,
             points_world[hits],
             observation,
-            feature[hits],
-            np.where(landmark[hits] >= 0, self._map.landmarks["observers"][landmark[hits]], 0),
+            features,
+            np.where(ids >= 0, self._map.landmarks["observers"][ids], 0),
             weights_with_landmarks(
-                self._map,
-                T_camera_world,
-                observation,
-                feature[hits],
-                landmark[hits],
-                observation.weights_among(moved),
+                self._map, T_camera_world, observation, features, ids, observation.weights_among(moved)
             ),
             self._map.residual_variance,
         )
@@ -128,7 +110,7 @@ class MotionPoseTracker:
         if agree.sum() < self._config.min_matches // 2:
             return None
         landmark_of_feature = unmatched(observation)
-        landmark_of_feature[feature[hits[agree]]] = landmark[hits[agree]]
+        landmark_of_feature[features[agree]] = ids[agree]
         found = self._search.refine(
             observation,
             motion.T_camera_world,
@@ -142,8 +124,32 @@ class MotionPoseTracker:
         return replace(
             found,
             doubts=motion.doubts,
-            moving=np.union1d(feature[hits[motion.moving]], found.moving).astype(np.int32),
+            moving=np.union1d(features[motion.moving], found.moving).astype(np.int32),
         )
+
+    def _matched(
+        self,
+        observation: ImageObservation,
+        last: TrackedPose,
+        known: NDArray[np.intp],
+        points_world: Points,
+        T_camera_world: Transform,
+    ) -> Ids:
+        """Return the feature of each of the last frame's points, −1 for none; with too few, twice as far."""
+        predicted = PredictedFeatures(
+            project(T_camera_world, points_world, observation.intrinsics),
+            apply(T_camera_world, points_world)[:, 2],
+            last.observation.octave[known],
+            last.observation.bits[known],
+        )
+        free = np.zeros(len(observation), np.bool_)
+        for search_px in (self._config.search_px, 2.0 * self._config.search_px):
+            feature = self._search.match_near(
+                observation, predicted, search_px=search_px, taken=free, max_ratio=_MAX_RATIO
+            )
+            if (feature >= 0).sum() >= self._config.min_matches:
+                break
+        return feature
 
     def _known_points(self, tracked_pose: TrackedPose) -> tuple[NDArray[np.intp], Points, Ids]:
         """Return the features with a known 3D point: indices, (M, 3) world points, landmark or −1.

@@ -16,7 +16,6 @@ from mapper.graph.noise import inflated
 from mapper.odometry.base import (
     REPEATED,
     STEADY_NS,
-    Diagnostics,
     FeatureMatches,
     FrameOdometry,
     FrameResult,
@@ -78,7 +77,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         Args:
             config: Settings.
             make_tracker: Makes the pose tracker.
-            motion_check: Rules out poses after a gap; None if nothing but the images tells of the motion.
+            motion_check: Rules out poses after a gap; None if only the images measure the motion.
         """
         self._config = config
         self._motion_check = motion_check
@@ -133,7 +132,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         displaced = self._earlier_depth.displacement(
             observation, tracked_pose.T_camera_world, tracked_pose.reference, self._shutter.known_twist
         )
-        recognised = self._recovery.instead_of(tracked_pose, displaced, self._shutter.known_twist)
+        recognised = self._recovery.relocalised(tracked_pose, displaced, self._shutter.known_twist)
         if recognised is not None:
             (tracked_pose, displaced), expected = recognised, None
             self._velocity.restart()
@@ -142,34 +141,41 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         doubt = self._doubts.assess(
             tracked_pose, covariance, last, expected, displaced, excess_error(tracked_pose, last, expected)
         )
-        if doubt.is_wild and tracked_pose.inliers < self._config.weak_inliers:
+        if doubt.is_implausible and tracked_pose.inliers < self._config.weak_inliers:
             return self._lost(observation)
         # The motion before a gap does not predict the motion after it.
-        before_last = None if self._lost_frames else last
-        if before_last is not None and recognised is None:
+        self._before_last = None if self._lost_frames else last
+        if self._before_last is not None and recognised is None:
             self._velocity.add(tracked_pose, covariance, last, is_doubtful=bool(doubt.phrases))
         self._lost_frames = self._unknown_frames = 0
-        reference, inliers = tracked_pose.reference, tracked_pose.inliers
         is_keyframe = self._decision.is_due(tracked_pose) and recognised is None
         if doubt.repeats or (doubt.phrases and tracked_pose.inliers >= self._config.weak_inliers):
             is_keyframe = False  # tracking goes on without it
+        return self._tracked(tracked_pose, information, doubt, is_keyframe=is_keyframe)
+
+    def _tracked(
+        self, tracked_pose: TrackedPose, information: Array, doubt: Doubt, *, is_keyframe: bool
+    ) -> FrameResult:
+        """Return the result of a tracked frame with its covariance, and extend the map by a keyframe."""
+        reference, inliers = tracked_pose.reference, tracked_pose.inliers
         self._agreeing = tracked_pose.landmark_of_feature >= 0
+        links = []
         if is_keyframe:
             tracked_pose = self._add_keyframe(tracked_pose, neighbour=reference, doubt=doubt)
-        self._before_last, self._last = before_last, tracked_pose
-        links = [self._factor(reference, tracked_pose.reference)] if is_keyframe else []
+            links = [self._factor(reference, tracked_pose.reference)]
+        self._last = tracked_pose
         result = self._result(tracked_pose, inliers=inliers, is_keyframe=is_keyframe, links=links)
         if is_keyframe:
             information = links[0].information
         else:
-            information = self._residuals.honest(_OWN_SHARE * information, result.T_node_body)
+            information = self._residuals.rescaled(_OWN_SHARE * information, result.T_node_body)
             information = with_systematic(information, tracked_pose)
             if doubt.phrases:
                 information = inflated(information, sigma_rad=doubt.sigma_rad, sigma_m=doubt.sigma_m)
         if doubt.repeats:
             result = replace(result, diagnostics=replace(result.diagnostics, method=REPEATED))
-        covariance = covariance_of(information) + self._shutter.pose_covariance(observation.T_body_camera)
-        return replace(result, doubts=doubt.phrases, covariance=covariance)
+        shutter = self._shutter.pose_covariance(tracked_pose.observation.T_body_camera)
+        return replace(result, doubts=doubt.phrases, covariance=covariance_of(information) + shutter)
 
     def view(self, observation: ImageObservation, twist: Twist | None = None, /) -> ImageView:
         """Return the view for place recognition, by the readout time as it is known now.
@@ -213,7 +219,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         return self._calibration.contradictions()
 
     def in_hindsight(self, result: FrameResult) -> FrameResult:
-        """Return the result of an earlier frame with what later ones say against it."""
+        """Return the result of an earlier frame with the doubts that later ones add to it."""
         doubt = self._doubts.in_hindsight(result.stamp_ns)
         if not doubt.phrases or result.covariance is None:
             return result
@@ -248,7 +254,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         keyframes = self._map.keyframes
         T_i_j = inverse(keyframes[i].body_pose) @ keyframes[j].body_pose
         information = relative_information(self._map, i, j)
-        information = self._residuals.honest(information, T_i_j) / math.sqrt(shared_by)
+        information = self._residuals.rescaled(information, T_i_j) / math.sqrt(shared_by)
         if (doubt_m := keyframes[j].doubt_m) > 0.0:
             information = inflated(information, sigma_rad=keyframes[j].doubt_rad, sigma_m=doubt_m)
         return BetweenFactor(i, j, T_i_j, information)
@@ -306,9 +312,9 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         return tracked_pose.stamp_ns - last.stamp_ns <= STEADY_NS and one_map
 
     def _is_possible(self, tracked_pose: TrackedPose) -> bool:
-        """Return whether a pose after a gap is possible by the motion since, where something else tells it.
+        """Return whether a pose after a gap is possible by another measurement of the motion since, if any.
 
-        Looks alone cannot tell two rooms apart that are furnished alike. The motion is that since the last
+        Images alone do not distinguish two rooms with the same furniture. The motion is that since the last
         tracked frame, and that since the keyframe that was recognised, if it is of another sub-map.
         """
         check, last = self._motion_check, self._last
@@ -356,7 +362,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
             twist_camera=self._shutter.twist_camera,
             depth_information=None if tracked_pose.depth is None else tracked_pose.depth.lasting_information,
         )
-        if config.triangulate and tracked_pose.few_move:  # without depth nothing tells what moves
+        if config.triangulate and tracked_pose.few_move:  # without depth nothing shows what moves
             add_triangulated(self._map, index, except_for=tracked_pose.moving)
         self._relocalizer.add(index)
         self._map.refine(index, window=config.bundle_keyframes)
@@ -388,23 +394,13 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         """Return the result of a frame; a keyframe's landmarks are more than the ``inliers`` that it had."""
         T_world_body = tracked_pose.body_pose
         node = self._map.keyframes[tracked_pose.reference]
-        diagnostics = Diagnostics(
-            features=len(tracked_pose.observation),
-            matches=tracked_pose.matches,
-            inliers=inliers,
-            residual=tracked_pose.residual_px,
-            residual_unit="px",
-            method=tracked_pose.method,
-        )
-        if tracked_pose.depth is not None:
-            diagnostics = tracked_pose.depth.diagnostics(diagnostics)
         return FrameResult(
             stamp_ns=tracked_pose.observation.stamp_ns,
             node=tracked_pose.reference,
             T_node_body=inverse(node.body_pose) @ T_world_body,
             T_world_body=T_world_body,
             is_keyframe=is_keyframe,
-            diagnostics=diagnostics,
+            diagnostics=tracked_pose.diagnostics(inliers),
             links=links,
             twist=self._shutter.twist_body(tracked_pose.observation),
         )

@@ -14,7 +14,7 @@ from mapper.odometry.local_map.pose_tracker import TrackedPose
 _LOCAL_CELLS = 2.0
 """Standard deviation of the window whose mean is taken out: exposures and shading change between images."""
 _LIMIT_RATIO = 2.0
-"""Larger errors, relative to the median of the least, count alike: what moves by itself fits no motion."""
+"""Limit of errors, relative to the median of the least: what moves by itself fits no motion."""
 _MIN_COMPARED = 200
 """Cells that both images have to show."""
 

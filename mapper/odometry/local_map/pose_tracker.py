@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.geometry import Array, Points, Transform, apply, inverse
+from mapper.odometry.base import Diagnostics
 from mapper.odometry.local_map.depth_alignment import DepthAlignment
 from mapper.odometry.local_map.image_observation import FEW_MOVING, ImageObservation
 from mapper.odometry.local_map.landmarks import Ids
@@ -28,14 +29,14 @@ class TrackedPose:
         T_camera_world: (4, 4).
         landmark_of_feature: (N,) int32 landmark of each feature, −1 for none; inliers only.
         reference: Keyframe that observes most of these landmarks.
-        matches: Number of proposed pairs.
+        matches: Number of matched pairs, inliers or not.
         agreement: Share of the first matches, before the local map is searched, that agree with the pose.
         visible: Number of the map's landmarks that should be in view.
         residual_px: Root mean square image residual of the inliers.
         method: Step that found the pose, e.g. "map", "fallback" or "relocalised".
         depth: Alignment of the depth image that took part in the pose; None if landmarks alone gave it.
         doubts: Why the pose may be wrong, a phrase each.
-        moving: (M,) int32 features that stand where earlier depth images saw through, or that contradict the
+        moving: (M,) int32 features in the free space of earlier depth images, or that contradict the
             pose while something else moves in view.
     """
 
@@ -66,6 +67,18 @@ class TrackedPose:
     def inliers(self) -> int:
         """Number of features that agree with the pose."""
         return int((self.landmark_of_feature >= 0).sum())
+
+    def diagnostics(self, inliers: int) -> Diagnostics:
+        """Return the figures on its tracking, with the inliers that it had then."""
+        image = Diagnostics(
+            features=len(self.observation),
+            matches=self.matches,
+            inliers=inliers,
+            residual=self.residual_px,
+            residual_unit="px",
+            method=self.method,
+        )
+        return image if self.depth is None else self.depth.diagnostics(image)
 
     @property
     def few_move(self) -> bool:

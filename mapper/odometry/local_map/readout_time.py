@@ -50,7 +50,7 @@ class ReadoutTime:
         """Add a window's measurement.
 
         Args:
-            information: s⁻² that its observations hold, poses and points eliminated.
+            information: s⁻² of its observations, poses and points eliminated.
             gradient: Of half their χ² with respect to the readout time, s⁻¹, at ``seconds``.
         """
         if not self.is_estimated or information <= 0.0:

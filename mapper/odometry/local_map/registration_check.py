@@ -22,7 +22,7 @@ class RegistrationCheck:
 
     A camera of its own with another focal length takes the depth of a point from beside it, so that points
     that several keyframes see are nearer here and farther there. By how much depth images are magnified, and
-    shifted, are unknowns of a bundle adjustment whose depth is read where they say.
+    shifted, are unknowns of a bundle adjustment that reads depth at the pixels so moved.
     """
 
     def __init__(self) -> None:

@@ -117,7 +117,7 @@ class Relocalizer:
         return list(dict.fromkeys([*similar, *map(int, nearest)]))
 
     def similar(self, observation: ImageObservation, *, limit: int) -> list[int]:
-        """Return the keyframes that look most like a frame, best first."""
+        """Return the keyframes whose visual words are most similar to a frame's, best first."""
         words = self._vocabulary.vector(observation.words)
         return [k for k, _ in self._index.query(words, min_similarity=0.0, limit=limit)]
 

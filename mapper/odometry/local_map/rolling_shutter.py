@@ -22,7 +22,7 @@ _FIRST_SPREAD = np.repeat([0.1, 0.05], 3)
 _LEAST_SPREAD = np.full(6, 0.01)
 _SPREAD_KEPT = 0.95
 _MAX_APART_S = 0.3
-"""Poses farther apart tell no velocity at the time of an image."""
+"""Poses farther apart do not determine the velocity at the time of an image."""
 
 
 class ReadByRows(Protocol):
@@ -59,14 +59,14 @@ class RollingShutter:
         """Velocity of the camera in the last image, in its own axes: rotation rad/s, translation m/s."""
 
     def restart(self) -> None:
-        """Forget the velocity, after a gap."""
+        """Reset the velocity, after a gap."""
         self._velocity, self._elapsed_s = None, np.inf
         self.twist_camera = np.zeros(6)
         self._errors.restart()
 
     @property
     def known_twist(self) -> Array | None:
-        """``twist_camera``; None where the last images are too far apart to tell it."""
+        """``twist_camera``; None where the last images are too far apart to measure it."""
         return self.twist_camera if self._elapsed_s <= _MAX_APART_S else None
 
     def predicted(self, observation: Observed) -> Observed:

@@ -23,7 +23,7 @@ _SINCE_NS = 5 * NS_PER_S
 class TrackingRecovery:
     """Search for another pose where surfaces lie elsewhere, or where a doubtful keyframe began another map.
 
-    What follows from a wrong pose agrees with itself, so that tracking alone does not come back.
+    The map that a wrong pose has extended is consistent with it, so that tracking alone does not recover.
     """
 
     def __init__(
@@ -38,7 +38,7 @@ class TrackingRecovery:
         self._relocalizer = relocalizer
         self._earlier_depth = earlier_depth
 
-    def instead_of(
+    def relocalised(
         self, tracked_pose: TrackedPose, displaced: Displacement, twist_camera: Array | None
     ) -> tuple[TrackedPose, Displacement] | None:
         """Return another pose of a frame, which is doubtful, and what it displaces; None if there is none.
@@ -52,8 +52,7 @@ class TrackingRecovery:
         before = self._first_doubtful(tracked_pose)
         if not is_displaced and (before is None or self._is_linked(tracked_pose, before)):
             return None
-        observation, keyframes = tracked_pose.observation, self._map.keyframes
-        origin = keyframes[tracked_pose.reference].origin
+        observation = tracked_pose.observation
 
         def displacement(pose: TrackedPose) -> Displacement:
             compared_with = tracked_pose if is_displaced else pose
@@ -72,18 +71,8 @@ class TrackingRecovery:
             enough = 2 * pose.inliers >= self._config.weak_inliers
             return enough and max(there.ratio, there.far_ratio) <= _MOST
 
-        known = [
-            k
-            for k in self._relocalizer.similar(observation, limit=len(keyframes))
-            if keyframes[k].origin == origin
-            and keyframes[k].doubt_m == 0.0
-            and (before is None or k < before)
-        ]
         found = self._relocalizer.best_among(
-            known[: self._config.relocalisation_keyframes],
-            observation,
-            method="relocalised",
-            is_possible=is_possible,
+            self._undoubted(tracked_pose, before), observation, method="relocalised", is_possible=is_possible
         )
         if found is None:
             return None
@@ -93,6 +82,16 @@ class TrackingRecovery:
             observation, found.T_camera_world, found.reference, twist_camera
         )
         return replace(found, doubts=(*found.doubts, doubt)), displaced
+
+    def _undoubted(self, tracked_pose: TrackedPose, before: int | None) -> list[int]:
+        """Return the sub-map's most similar keyframes without doubt, if given only those before another."""
+        keyframes = self._map.keyframes
+        origin, end = keyframes[tracked_pose.reference].origin, len(keyframes) if before is None else before
+        similar = self._relocalizer.similar(tracked_pose.observation, limit=len(keyframes))
+        undoubted = [
+            k for k in similar if keyframes[k].origin == origin and keyframes[k].doubt_m == 0.0 and k < end
+        ]
+        return undoubted[: self._config.relocalisation_keyframes]
 
     def _first_doubtful(self, tracked_pose: TrackedPose) -> int | None:
         """Return the first doubtful keyframe of the sub-map in the last seconds; None if there is none."""

@@ -1,12 +1,15 @@
 """Triangulation: landmarks from features without depth that keyframes share."""
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from mapper.core.geometry import Array, Points, Transform, apply, inverse
 from mapper.core.linear import turned
-from mapper.features.hamming import hamming
+from mapper.features.hamming import Bits, hamming
+from mapper.features.window_matching import assign
 from mapper.odometry.local_map.image_observation import ImageObservation
 from mapper.odometry.local_map.landmark_kernels import MIN_DEPTH_M
 from mapper.odometry.local_map.landmarks import MIN_SHARED_LANDMARKS, Ids, LandmarkMap
@@ -22,7 +25,7 @@ what is seen changes with the view."""
 _MOST_KEYFRAMES = 10
 _MAX_RATIO = 0.8
 _MAX_DEPTH_ERROR = 0.5
-"""Standard deviation of a triangulated depth, as a share of it: with less parallax it tells little. A limit
+"""Standard deviation of a triangulated depth, as a share of it: with less parallax it is useless. A limit
 that many points are near to keeps those that noise has brought closer, and the scale shrinks."""
 _ENOUGH_MEASURED = 20
 """Matched features with measured depth that give a pose its scale."""
@@ -68,7 +71,7 @@ def weights_with_landmarks(
 
     Triangulated landmarks can share an error of scale. Where enough features measure the scale, the variances
     along the rays are multiplied as if that part of them were common to all: as many as they are, they do not
-    outvote those.
+    outweigh those.
 
     Args:
         landmark_map: The map.
@@ -116,40 +119,45 @@ def triangulated(
         features_b: (K,) features to match.
         T_b_a: (4, 4) from camera a to camera b.
     """
-    matched, depth_m, sigma_m = _triangulated(
-        _rays(a, features_a),
-        _variances(a, features_a),
-        a.octave[features_a],
-        a.bits[features_a],
-        _rays(b, features_b),
-        _variances(b, features_b),
-        b.octave[features_b],
-        b.bits[features_b],
-        np.ascontiguousarray(T_b_a),
-    )
+    rays_a, rays_b = _rays(a, features_a), _rays(b, features_b)
+    matched, depth_m, sigma_m = _triangulated(rays_a, rays_b, np.ascontiguousarray(T_b_a))
     hits = np.flatnonzero(matched >= 0)
-    rays = np.column_stack([_rays(a, features_a[hits]), np.ones(len(hits))])
+    rays = np.column_stack([rays_a.rays[hits], np.ones(len(hits))])
     pairs = np.column_stack([features_a[hits], features_b[matched[hits]]]).astype(np.int32)
     return pairs, rays * depth_m[hits, np.newaxis], sigma_m[hits]
 
 
-def _rays(observation: ImageObservation, features: NDArray[np.intp]) -> Array:
-    """Return (N, 2) x/z and y/z of features."""
-    rays: Array = (observation.measured[features, :2] - observation.intrinsics[2:4]) / observation.intrinsics[
-        :2
-    ]
-    return rays
+class _Rays(NamedTuple):
+    """Features of an image as rays of its camera.
+
+    Attributes:
+        rays: (N, 2) x/z and y/z.
+        variances: (N,) of these.
+        octave: (N,) int32.
+        bits: (N, 4) uint64 descriptors.
+    """
+
+    rays: Array
+    variances: Array
+    octave: NDArray[np.int32]
+    bits: Bits
 
 
-def _variances(observation: ImageObservation, features: NDArray[np.intp]) -> Array:
-    """Return the (N,) variances of ``_rays``."""
-    variances: Array = 1.0 / (observation.weights[features, 0] * observation.intrinsics[0] ** 2)
-    return variances
+def _rays(observation: ImageObservation, features: NDArray[np.intp]) -> _Rays:
+    focal_px, centre_px = observation.intrinsics[:2], observation.intrinsics[2:4]
+    return _Rays(
+        (observation.measured[features, :2] - centre_px) / focal_px,
+        1.0 / (observation.weights[features, 0] * focal_px[0] ** 2),
+        observation.octave[features],
+        observation.bits[features],
+    )
 
 
 @njit(cache=True, nogil=True)
-def _triangulated(rays_a, variances_a, octave_a, bits_a, rays_b, variances_b, octave_b, bits_b, T_b_a):  # type: ignore[no-untyped-def]
-    """Return for each ray of a the matching one of b, −1 for none, and its depth in a."""
+def _triangulated(a, b, T_b_a):  # type: ignore[no-untyped-def]
+    """Return for each ray of a the matching one of b, −1 for none, its depth in a, and this depth's sigma."""
+    rays_a, variances_a, octave_a, bits_a = a
+    rays_b, variances_b, octave_b, bits_b = b
     matched = np.full(len(rays_a), -1, np.int32)
     depth_m, sigma_m = np.zeros(len(rays_a)), np.zeros(len(rays_a))
     owner = np.full(len(rays_b), -1, np.int32)
@@ -179,26 +187,31 @@ def _triangulated(rays_a, variances_a, octave_a, bits_a, rays_b, variances_b, oc
             continue
         if best >= distance_of[best_j]:
             continue
-        x, y = rays_b[best_j, 0], rays_b[best_j, 1]
         variance = variances_a[i] + variances_b[best_j]
-        # b sees z p + t along its ray: (x p2 − p0) z = t0 − x t2, and so for y.
-        g0, g1 = x * p[2] - p[0], y * p[2] - p[1]
-        slope2 = g0 * g0 + g1 * g1
-        if slope2 == 0.0:
-            continue
-        z = (g0 * (t[0] - x * t[2]) + g1 * (t[1] - y * t[2])) / slope2
-        z_b = z * p[2] + t[2]
-        if (
-            z < MIN_DEPTH_M
-            or z_b < MIN_DEPTH_M
-            or variance * z_b * z_b > _MAX_DEPTH_ERROR**2 * slope2 * z * z
-        ):
-            continue
-        e0, e1 = x - (z * p[0] + t[0]) / z_b, y - (z * p[1] + t[1]) / z_b
-        if e0 * e0 + e1 * e1 > CHI2_2DOF * variance:
-            continue
-        if owner[best_j] >= 0:
-            matched[owner[best_j]] = -1
-        owner[best_j], distance_of[best_j] = i, best
-        matched[i], depth_m[i], sigma_m[i] = best_j, z, np.sqrt(variance / slope2) * z_b
+        z, sigma = _depth(p, t, rays_b[best_j], variance)
+        if z > 0.0:
+            assign(i, best_j, best, matched, owner, distance_of)
+            depth_m[i], sigma_m[i] = z, sigma
     return matched, depth_m, sigma_m
+
+
+@njit(cache=True, nogil=True)
+def _depth(p, t, ray, variance):  # type: ignore[no-untyped-def]
+    """Return the depth z at which z p + t lies on a ray, (2,) x/z and y/z, and its standard deviation.
+
+    Both are 0 if the point reprojects badly, lies behind a camera or has little parallax.
+    """
+    x, y = ray[0], ray[1]
+    # b sees z p + t along its ray: (x p2 − p0) z = t0 − x t2, and so for y.
+    g0, g1 = x * p[2] - p[0], y * p[2] - p[1]
+    slope2 = g0 * g0 + g1 * g1
+    if slope2 == 0.0:
+        return 0.0, 0.0
+    z = (g0 * (t[0] - x * t[2]) + g1 * (t[1] - y * t[2])) / slope2
+    z_b = z * p[2] + t[2]
+    if z < MIN_DEPTH_M or z_b < MIN_DEPTH_M or variance * z_b * z_b > _MAX_DEPTH_ERROR**2 * slope2 * z * z:
+        return 0.0, 0.0
+    e0, e1 = x - (z * p[0] + t[0]) / z_b, y - (z * p[1] + t[1]) / z_b
+    if e0 * e0 + e1 * e1 > CHI2_2DOF * variance:
+        return 0.0, 0.0
+    return z, np.sqrt(variance / slope2) * z_b

@@ -24,7 +24,7 @@ class VelocityFilter:
 
     A motion is as uncertain as the poses that it connects. Along a direction that an image hardly shows the
     velocity is thus that of many frames, while elsewhere it is that of the last. One doubtful motion is left
-    out: who walks by may have caused it.
+    out: a passer-by may have caused it.
     """
 
     def __init__(self) -> None:
@@ -32,7 +32,7 @@ class VelocityFilter:
         self.restart()
 
     def restart(self) -> None:
-        """Forget the velocity, as after a gap."""
+        """Reset the velocity, as after a gap."""
         self._velocity: Array | None = None
         self._covariance = np.zeros((6, 6))
         self._pose_covariance: Array | None = None
