@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 
 from mapper.core.frames import Scan
-from mapper.core.geometry import angle_between, apply, exp, inverse
+from mapper.core.geometry import apply, exp, inverse
 from mapper.odometry.scan_to_map.config import GicpOdometryConfig
 from mapper.odometry.scan_to_map.gicp import GicpMatcher
 from mapper.odometry.scan_to_map.motion_model import MotionModel, Spread
 from mapper.odometry.scan_to_map.observed_part import MEASURED, observed_part
 from mapper.odometry.scan_to_map.odometry import ScanOdometry
-from mapper.odometry.scan_to_map.pose_candidate import Answers, PoseCandidate, best_of
+from mapper.odometry.scan_to_map.pose_candidate import PoseCandidate
 from mapper.odometry.scan_to_map.pose_search import PoseSearch
 from mapper.odometry.scan_to_map.scan_fit import contradiction, described, fit_of
 from mapper.odometry.scan_to_map.usual_fit import Shares, UsualFit, jump_between
-from tests.support.room_scans import OFF, keyframe, room_scan
+from tests.support.room_scans import CRATES, INDOOR, OFF, keyframe, room_scan
 
 
 def tunnel_scan(stamp_ns, x_m, *, seed=0):
@@ -29,88 +29,6 @@ def tunnel_scan(stamp_ns, x_m, *, seed=0):
             pier = rng.uniform([0.0, 0.8, -1.5], [0.0, 2.0, 1.5], (400, 3)) + rng.normal(0.0, 0.01, (400, 3))
             points = np.concatenate([points, pier + np.array([pier_m - x_m, 0.0, 0.0])])
     return Scan(stamp_ns, points.astype(np.float32))
-
-
-class MisledMatcher(GicpMatcher):
-    """GICP that is off by 15° and 0.58 m when the predicted pose is used as it is."""
-
-    misled = False
-
-    def match(self, deskewed, T_world_body, *, reach):
-        found = super().match(deskewed, T_world_body, reach=reach)
-        return found if found is None or not self.misled else found @ OFF
-
-
-INDOOR = GicpOdometryConfig(voxel_m=0.2, cell_m=0.25, coarse_cell_m=1.0, min_range_m=0.3, rescue=None)
-CRATES = (
-    np.array([[-2.5, -1.2], [0.6, 2.0], [-1.2, 1.0]]),
-    np.array([[-1.0, 0.8], [-1.8, -0.8], [-1.2, 1.6]]),
-)
-
-
-def test_a_wrong_pose_of_the_matcher_is_replaced_by_one_that_fits():
-    matcher = MisledMatcher(INDOOR)
-    odometry = ScanOdometry(INDOOR, matcher)
-    poses = [exp(np.array([0.0, 0.0, 0.02 * k]), np.array([0.1 * k, 0.0, 0.0])) for k in range(12)]
-    for k, pose in enumerate(poses):
-        matcher.misled = k == 11
-        track = odometry.track(odometry.observe(room_scan(k * 500_000_000, pose, seed=k)))
-
-    miss = inverse(poses[-1]) @ track.T_world_body
-    assert track.diagnostics.method != "map"
-    assert track.doubts == ()
-    assert np.linalg.norm(miss[:3, 3]) < 0.05
-    assert angle_between(np.eye(3), miss[:3, :3]) < 0.02
-
-
-@pytest.mark.parametrize("turn_rad", [3.0, -2.8])
-def test_a_scan_that_is_turned_and_tilted_beyond_the_other_guesses_is_found(turn_rad):
-    odometry = ScanOdometry(INDOOR, GicpMatcher(INDOOR))
-    for k in range(8):
-        odometry.track(odometry.observe(room_scan(k * 500_000_000, seed=k, more=CRATES)))
-    turned = exp(np.array([0.25, 0.0, turn_rad]), np.array([0.7, 0.3, 0.0]))
-
-    track = odometry.track(odometry.observe(room_scan(4_000_000_000, turned, seed=8, more=CRATES)))
-
-    assert track.diagnostics.method == "rescued"
-    miss = inverse(turned) @ track.T_world_body
-    assert np.linalg.norm(miss[:3, 3]) < 0.05
-    assert angle_between(np.eye(3), miss[:3, :3]) < 0.02
-
-
-class CountingMatcher(GicpMatcher):
-    """GICP that counts the guesses it is given."""
-
-    count = 0
-
-    def match(self, deskewed, T_world_body, *, reach):
-        self.count += 1
-        return super().match(deskewed, T_world_body, reach=reach)
-
-
-def test_a_search_ends_when_several_guesses_lead_to_one_pose(monkeypatch):
-    matcher = CountingMatcher(INDOOR)
-    odometry = ScanOdometry(INDOOR, matcher)
-    for k in range(8):
-        odometry.track(odometry.observe(room_scan(k * 500_000_000, seed=k)))
-    monkeypatch.setattr(UsualFit, "agrees_little", lambda *_: True)
-    matcher.count = 0
-    track = odometry.track(odometry.observe(room_scan(4_000_000_000, seed=8)))
-
-    assert 3 <= matcher.count <= 10  # of 8 guesses, each to the map and to two scans
-    assert np.linalg.norm(track.T_world_body[:3, 3]) < 0.02
-
-
-def test_answers_count_the_guesses_that_led_to_them():
-    answers = Answers(0.2, [np.eye(4)])
-    close, far = (exp(np.zeros(3), np.array([x_m, 0.0, 0.0])) for x_m in (0.02, 0.2))
-    turned = exp(np.array([0.0, 0.0, 0.05]), np.zeros(3))
-
-    assert not answers.add(close, 1)
-    assert answers.add(far, 1)
-    assert answers.add(turned, 2)
-    assert not answers.add(close, 1)
-    assert [answers.guesses_of(pose) for pose in (np.eye(4), far, turned)] == [2, 1, 1]
 
 
 def test_scans_that_fit_are_not_doubted_and_all_have_a_covariance():
@@ -372,33 +290,6 @@ def test_a_direction_that_disagrees_is_a_doubt_where_the_motion_was_predicted(is
     )
 
     assert doubts == (() if is_shown else ("30% agree in the weakest direction, 90% is usual",))
-
-
-@pytest.mark.parametrize(
-    ("method", "agreement", "is_doubted"),
-    [
-        ("rescued", 0.45, True),
-        ("rescued", 0.2, False),
-        ("map", 0.45, False),
-    ],
-)
-def test_a_pose_that_was_searched_is_a_doubt_if_another_fits_as_well(method, agreement, is_doubted):
-    key = keyframe(room_scan(0, seed=1))
-    fit = fit_of(key, key.deskewed, np.eye(4), max_pair_distance_m=0.5)
-    search = PoseSearch(GicpOdometryConfig(), GicpMatcher(GicpOdometryConfig()))
-
-    def candidate(T_world_middle, share):
-        jump = jump_between(np.eye(4), T_world_middle, None)
-        return PoseCandidate(key, T_world_middle, fit, Shares(0.6, share, 0.0), jump, MEASURED, method)
-
-    there = exp(np.zeros(3), np.array([3.0, 0.0, 0.0]))
-    nearly = exp(np.zeros(3), np.array([0.02, 0.0, 0.0]))
-    best = best_of(
-        [candidate(np.eye(4), 0.5), candidate(nearly, 0.49), candidate(there, agreement)], other_m=0.5
-    )
-
-    assert best.rival_score == agreement
-    assert search.doubts(best) == (("another pose fits as well",) if is_doubted else ())
 
 
 def test_less_than_a_part_of_the_usual_fit_is_unusual_however_much_scans_differ():

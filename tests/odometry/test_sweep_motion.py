@@ -8,7 +8,6 @@ import pytest
 from mapper.core.deskew import STILL, Twist, deskewed
 from mapper.core.frames import Scan
 from mapper.core.geometry import angle_between, apply, exp, inverse
-from mapper.odometry.scan_to_map.config import GicpOdometryConfig
 from mapper.odometry.scan_to_map.gicp import GicpMatcher
 from mapper.odometry.scan_to_map.motion_model import MotionModel
 from mapper.odometry.scan_to_map.odometry import ScanOdometry
@@ -16,11 +15,11 @@ from mapper.odometry.scan_to_map.scan_fit import ScanKeyframe
 from mapper.odometry.scan_to_map.scan_matcher import DeskewedScan
 from mapper.odometry.scan_to_map.sweep_motion import sweep_motion
 from mapper.registration.surfaces import prepared
+from tests.support.room_scans import INDOOR
 
 TURNING = Twist(np.array([0.1, -0.2, 2.0]), np.array([0.6, 0.2, 0.0]))
 SWEEP_S = 0.1
 WIDE = np.diag([4.0] * 3 + [1.0] * 3)
-INDOOR = GicpOdometryConfig(voxel_m=0.2, cell_m=0.25, coarse_cell_m=1.0, min_range_m=0.3, rescue=None)
 
 
 def swept_room(T_world_middle, twist, *, stamp_ns=0, seed=0, points=9000):

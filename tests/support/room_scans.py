@@ -4,11 +4,17 @@ import numpy as np
 
 from mapper.core.frames import Scan
 from mapper.core.geometry import exp
+from mapper.odometry.scan_to_map.config import GicpOdometryConfig
 from mapper.odometry.scan_to_map.scan_fit import ScanKeyframe
 from mapper.odometry.scan_to_map.scan_matcher import DeskewedScan
 from mapper.registration.surfaces import prepared
 
+INDOOR = GicpOdometryConfig(voxel_m=0.2, cell_m=0.25, coarse_cell_m=1.0, min_range_m=0.3, rescue=None)
 ROOM = np.array([[-4.0, 4.0], [-3.0, 3.0], [-1.2, 1.6]])
+CRATES = (
+    np.array([[-2.5, -1.2], [0.6, 2.0], [-1.2, 1.0]]),
+    np.array([[-1.0, 0.8], [-1.8, -0.8], [-1.2, 1.6]]),
+)
 OFF = exp(np.array([0.0, 0.0, np.radians(15.0)]), np.array([0.5, 0.3, 0.0]))
 
 
