@@ -218,7 +218,7 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
         """Return a scan's pose after the scan before it was tracked again, if its velocity was off.
 
         Three poses tell the velocity at the one between better than the sweep does. What it leads to counts
-        if nothing speaks against it and both scans fit no less than before. At a corner neither is sure:
+        if no evidence is against it and both scans fit no less than before. At a corner neither is sure:
         poses stay, and the difference of both is an error of the way to the stamp.
         """
         state, time_ns = before.state, before.observation.middle_ns

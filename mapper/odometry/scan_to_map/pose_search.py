@@ -100,13 +100,13 @@ class PoseSearch:
             scan: The scan.
             T_world_guess: (4, 4) where the matcher begins; None is the predicted pose.
         """
-        is_believed = self._config.usual_ratio == 0.0
+        accepts_all = self._config.usual_ratio == 0.0
         T_world_begin = scan.prediction if T_world_guess is None else T_world_guess
         T_world_near = self._matcher.match(scan.deskewed, T_world_begin, reach="near")
         best: PoseCandidate | None = None
         for key in scan.keyframes:
             near = self._assessed(scan, T_world_near, key, "map")
-            if near is not None and (is_believed or (not self.is_suspect(near) and near.is_measured)):
+            if near is not None and (accepts_all or (not self.is_suspect(near) and near.is_measured)):
                 return near
             best = self._preferred(best, near)
         if best is not None and not self.is_suspect(best):
@@ -221,7 +221,7 @@ class PoseSearch:
         )
 
     def is_lost(self, candidate: PoseCandidate) -> bool:
-        """Return whether next to nothing agrees, or too much speaks against the pose.
+        """Return whether next to nothing agrees, or too much contradicts the pose.
 
         Little overlap without contradictions is a doubt where the pose was predicted: the rings of a sensor
         that rolls soon leave those of the keyframe.
@@ -238,8 +238,8 @@ class PoseSearch:
             return share < 0.5 * self._config.lost_ratio
         if little and usual.excludes(shares):
             return True
-        speaks_against = contradicts or disagrees
-        return share < (self._config.lost_ratio if speaks_against else 0.5 * self._config.lost_ratio)
+        is_contradicted = contradicts or disagrees
+        return share < (self._config.lost_ratio if is_contradicted else 0.5 * self._config.lost_ratio)
 
     def _is_where_predicted(self, candidate: PoseCandidate) -> bool:
         """Return whether a pose is no surprise, and nearer to the predicted one than keyframes are."""
@@ -250,10 +250,11 @@ class PoseSearch:
         return is_near and bool(np.isfinite(jump.limit_m)) and not jump.is_unusual
 
     def doubts(self, candidate: PoseCandidate) -> tuple[str, ...]:
-        """Return what speaks against a pose, a phrase each; empty if it is believed.
+        """Return the evidence against a pose, a phrase each; empty if there is too little.
 
         Little overlap alone is a new room, and a jump alone a sudden turn. A direction that disagrees alone
-        is a doubt where part of the motion was predicted.
+        is a doubt where part of the motion was predicted, and another pose that fits as well where the pose
+        was searched.
         """
         if self._config.usual_ratio == 0.0:
             return ()
@@ -264,12 +265,12 @@ class PoseSearch:
         if not usual.is_known:
             little = disagrees = False
         is_alone = not contradicts and little + disagrees + jumps < 2
-        tells_alone = (
+        suffices_alone = (
             candidate.is_one_of_two
             or (jumps and candidate.method == "rescued")
             or (disagrees and not candidate.is_measured)
         )
-        if is_alone and not tells_alone:
+        if is_alone and not suffices_alone:
             return ()
         phrases = []
         if little:

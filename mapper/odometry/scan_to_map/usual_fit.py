@@ -1,4 +1,4 @@
-"""Fit that scans of this log usually have, and what speaks against a pose that fits less."""
+"""Fit that scans of this log usually have, and the evidence against a pose that fits less."""
 
 from collections import deque
 from dataclasses import dataclass, replace
