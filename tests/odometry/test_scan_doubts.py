@@ -292,13 +292,11 @@ def test_a_direction_that_disagrees_is_a_doubt_where_the_motion_was_predicted(is
     assert doubts == (() if is_shown else ("30% agree in the weakest direction, 90% is usual",))
 
 
-def test_less_than_a_part_of_the_usual_fit_is_unusual_however_much_scans_differ():
+def test_less_than_a_part_of_the_usual_agreement_is_unusual_however_much_scans_differ():
     usual = UsualFit()
     for overlap, agreement in [(0.3, 0.1), (0.9, 0.9), (0.6, 0.5), (0.4, 0.2), (0.8, 0.8)]:
         usual.add(Shares(overlap, agreement, 0.0))
 
-    assert usual.has_little_overlap(Shares(0.3, 0.5, 0.0), usual_ratio=0.8)
-    assert not usual.has_little_overlap(Shares(0.4, 0.5, 0.0), usual_ratio=0.8)
     assert usual.disagrees(Shares(0.6, 0.1, 0.0))
     assert not usual.disagrees(Shares(0.6, 0.2, 0.0))
     assert usual.agrees_little(Shares(0.6, 0.25, 0.0))

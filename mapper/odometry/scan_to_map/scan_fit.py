@@ -36,9 +36,6 @@ _FACING = 0.3
 """Share of one point's displacement along its normals, from which on its pair shows the motion: more than
 the errors of normals make."""
 _OFF_VOXELS = 1.0  # nearer to the keyframe rings lie on the same places, and so errors of normals are alike
-_LEAST_BREADTH = 7.0
-"""Breadth of the surface of a point that counts there: rings far apart on a flat road have normals that lean
-along it, in every scan alike. 5 and 10 serve as well."""
 _FEW_PAIRS, _ENOUGH_PAIRS = 8, 24
 """Pairs that face a motion and agree: a bare tunnel has up to 11 by chance, a field with two trees 13 to 60.
 They measure it to σ/√pairs, with the 0.1 m that a point agrees within to 0.02 m."""
@@ -192,11 +189,7 @@ def fit_of(
     own = own * np.sign(np.einsum("ni,ni->n", own, normals))[:, None]
     rows = np.hstack([np.cross(points, normals), normals])
     own_rows = np.hstack([np.cross(points, own), own])
-    is_near = bool(np.linalg.norm(T_key_scan[:3, 3]) < _OFF_VOXELS * source.voxel_m)
-    telling = np.ones(len(near), np.bool_)
-    if is_near:
-        telling = np.minimum(target.breadth[indices[near]], source.breadth[near]) > _LEAST_BREADTH
-    shown = np.einsum("ni,nj->ij", rows[telling], own_rows[telling])
+    shown = np.einsum("ni,nj->ij", rows, own_rows)
     if np.trace(shown[3:, 3:]) <= 0.0:
         return None
     agree = (distances_m <= _ALONG * max_pair_distance_m) & normals_key.any(axis=1)
@@ -204,9 +197,9 @@ def fit_of(
     agreement, _ = weakest_direction(source.normals, agree)
     counts = FreeSpaceCheck(_MARGIN_M).count(keyframe.description, _checked(deskewed), T_key_scan)
     degeneracy = degeneracy_of(0.5 * (shown + shown.T), points=source.points, min_share=_SMALL_SHARE)
-    observability, weights = _observability(degeneracy, points, rows, own_rows, agree[near] & telling)
+    observability, weights = _observability(degeneracy, points, rows, own_rows, agree[near])
     shown_m = _PAIR_VOXELS * source.voxel_m / np.sqrt(weights)
-    if is_near:
+    if np.linalg.norm(T_key_scan[:3, 3]) < _OFF_VOXELS * source.voxel_m:
         observability[: degeneracy.unobservable_count] = 0.0
     unobservable = ""
     if observability.min() < 0.5:

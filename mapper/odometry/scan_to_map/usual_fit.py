@@ -13,8 +13,8 @@ _SPREADS = 4.0  # so many standard deviations below its median a share is unusua
 _FEW_SPREADS, _LITTLE = 2.0, 0.75  # and so many, of this part of it, make a search worth its time
 _NORMAL = 1.4826  # standard deviations in a median absolute deviation
 _FEWEST = 5
-_LEAST_OVERLAP, _LEAST_AGREEMENT, _SEARCHED_AGREEMENT = 0.6, 0.3, 0.6
-"""Less than these parts of the usual ones is unusual, and makes a search worth its time, however much the
+_LEAST_AGREEMENT, _SEARCHED_AGREEMENT = 0.3, 0.6
+"""Less than these parts of the usual one is unusual, and makes a search worth its time, however much the
 scans of a log differ."""
 _LEAST_OVERLAP_SPREAD = 0.04
 _LEAST_AGREEMENT_SPREAD = 0.06
@@ -134,8 +134,7 @@ class UsualFit:
 
     def has_little_overlap(self, shares: Shares, *, usual_ratio: float) -> bool:
         """Return whether the overlap is below the log's spread, and this share of the usual one."""
-        usual = self.usual.overlap
-        least = max(usual - _SPREADS * self._overlap_spread, _LEAST_OVERLAP * usual)
+        least = self.usual.overlap - _SPREADS * self._overlap_spread
         return shares.overlap < min(least, usual_ratio * self.usual.overlap)
 
     def disagrees(self, shares: Shares) -> bool:
