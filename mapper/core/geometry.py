@@ -91,6 +91,14 @@ def rotation_exp(rotation_rad: Array) -> Array:
     return R
 
 
+def turn_to_z(up: Array) -> Array:
+    """Return the (3, 3) rotation that takes a unit vector to z without turning about z (Rodrigues 1840)."""
+    x, y, z = up
+    K = np.array([[0.0, 0.0, -x], [0.0, 0.0, -y], [x, y, 0.0]])
+    R: Array = np.eye(3) + K + K @ K / (1.0 + z)
+    return R
+
+
 def rotation_log(R: Array) -> Array:
     """Return the (3,) rotation vector, at most π long, of a (3, 3) rotation."""
     w = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])

@@ -156,14 +156,6 @@ def up_of(cloud: Prepared) -> Array | None:
     return vertical.up_world if vertical.determined and vertical.is_agreed else None
 
 
-def turn_to_z(up: Array) -> Array:
-    """Return the (3, 3) rotation that takes a unit vector to z without turning about z (Rodrigues 1840)."""
-    x, y, z = up
-    K = np.array([[0.0, 0.0, -x], [0.0, 0.0, -y], [x, y, 0.0]])
-    R: Array = np.eye(3) + K + K @ K / (1.0 + z)
-    return R
-
-
 def levels_of(heights_m: Array, *, tolerance_m: float, least: int) -> list[NDArray[np.intp]]:
     """Return the indices of the heights of every level surface, the best supported first.
 

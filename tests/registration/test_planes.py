@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from mapper.core.geometry import apply, exp
-from mapper.registration.planes import turn_to_z, up_of
+from mapper.core.geometry import apply, exp, turn_to_z
+from mapper.registration.planes import up_of
 from mapper.registration.surfaces import prepared
 from tests.support.room_scans import room_scan
 

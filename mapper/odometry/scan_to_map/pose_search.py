@@ -6,7 +6,7 @@ from functools import cached_property
 
 import numpy as np
 
-from mapper.core.geometry import Transform, exp, inverse, transform
+from mapper.core.geometry import Array, Transform, exp, inverse, rotation_exp, transform, turn_to_z
 from mapper.odometry.scan_to_map.config import ScanOdometryConfig
 from mapper.odometry.scan_to_map.motion_model import MotionModel, Spread
 from mapper.odometry.scan_to_map.observed_part import MEASURED, observed_part
@@ -23,7 +23,7 @@ from mapper.odometry.scan_to_map.usual_fit import Shares, UsualFit, jump_between
 from mapper.registration.base import Aligner
 from mapper.registration.factory import build_registration
 from mapper.registration.free_space import ScanDescription
-from mapper.registration.planes import turn_to_z, up_of
+from mapper.registration.planes import up_of
 from mapper.registration.refining import refined_motion
 
 _TURNS_RAD = (0.3, -0.3, 0.6, -0.6, 1.0, -1.0)  # about the vertical, from the predicted pose
@@ -77,6 +77,11 @@ class UnplacedScan:
     def description(self) -> ScanDescription:
         """Points and rays for the free-space check."""
         return described(self.deskewed)
+
+    @cached_property
+    def up(self) -> Array | None:
+        """(3,) up by the planes in the scan, body frame; None if they leave it open."""
+        return up_of(self.deskewed.prepared)
 
 
 class PoseSearch:
@@ -309,15 +314,13 @@ class PoseSearch:
 
         In each the scan is as upright as the keyframe, by the planes in both.
         """
-        up, up_of_key = up_of(scan.deskewed.prepared), keyframe.up
-        if up is None or up_of_key is None:
+        if scan.up is None or keyframe.up is None:
             return
-        R_world_level = keyframe.T_world_middle[:3, :3] @ turn_to_z(up_of_key).T
+        R_world_level = keyframe.T_world_middle[:3, :3] @ turn_to_z(keyframe.up).T
         for k in range(_HEADINGS):
-            heading = exp(np.array([0.0, 0.0, 2.0 * np.pi * k / _HEADINGS]), np.zeros(3))[:3, :3]
-            T_world_guess = transform(
-                R_world_level @ heading @ turn_to_z(up), scan.motion.T_world_last[:3, 3]
-            )
+            heading = rotation_exp(np.array([0.0, 0.0, 2.0 * np.pi * k / _HEADINGS]))
+            R_world_body = R_world_level @ heading @ turn_to_z(scan.up)
+            T_world_guess = transform(R_world_body, scan.motion.T_world_last[:3, 3])
             for T_world_found in self._registered(scan, keyframe, T_world_guess):
                 yield len(_TURNS_RAD) + 2 + k, T_world_found, "rescued"
 

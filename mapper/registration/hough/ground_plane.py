@@ -5,10 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from mapper.core.frames import Points32
-from mapper.core.geometry import Array, Points, Transform, transform
+from mapper.core.geometry import Array, Points, Transform, transform, turn_to_z
 from mapper.registration.hough.config import LevellingConfig
 from mapper.registration.hough.ground_kernels import score_planes, thin
-from mapper.registration.planes import turn_to_z
 
 LEVEL_ABOVE_RAD = 0.09
 """A smaller tilt stays: on a sloping street the plane would tilt what gravity has levelled."""
