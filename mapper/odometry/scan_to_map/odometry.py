@@ -118,12 +118,31 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
     def _place(self, observation: ScanObservation, guess: PlacedScan | None = None) -> PlacedScan | None:
         """Return where a scan fits best; None if next to nothing agrees with any pose.
 
+        A sensor that turned may have stopped meanwhile: where the sweep fits badly when it is deskewed by the
+        predicted velocity, it is placed without one, too.
+        """
+        twist = self._motion.twist
+        placed = self._placed_by(observation, guess, twist)
+        if placed is not None and not self._search.doubts(placed.found):
+            return placed
+        if observation.displacement(float(np.linalg.norm(twist.rotation_radps))) <= _NEGLIGIBLE:
+            return placed
+        at_rest = self._placed_by(observation, guess, STILL)
+        if placed is None or at_rest is None or at_rest.found.score <= placed.found.score:
+            return placed or at_rest
+        return at_rest
+
+    def _placed_by(
+        self, observation: ScanObservation, guess: PlacedScan | None, twist: Twist
+    ) -> PlacedScan | None:
+        """Return where a scan fits best if its velocity is about the one given.
+
         Where the velocity may have changed so much that it displaces the points of the sweep, it is found
         together with the pose; not before the errors of a few predictions are known, as two scans, each with
         a velocity of its own, fit under wrong ones, too.
         """
         motion, time_ns = self._motion, observation.middle_ns
-        deskewed, sigmas = observation.deskew(motion.twist), motion.velocity_sigmas(time_ns)
+        deskewed, sigmas = observation.deskew(twist), motion.velocity_sigmas(time_ns)
         if motion.turning_change(time_ns) is None or not self._may_be_bent(observation):
             found = self._find_pose(deskewed, time_ns)
             if found is None:
@@ -131,11 +150,11 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
             changes = np.maximum(sigmas, motion.change(time_ns, found.T_world_middle))
             return PlacedScan(deskewed, found, None, np.diag((_CHANGED * changes) ** 2))
         if guess is None:
-            T_world_predicted, start = motion.predicted(time_ns), motion.twist
+            T_world_predicted, start = motion.predicted(time_ns), twist
             matched = self._matcher.match(deskewed, T_world_predicted, reach="near")
             T_world_middle = T_world_predicted if matched is None else matched
         else:
-            T_world_middle, start = guess.found.T_world_middle, guess.twist or motion.twist
+            T_world_middle, start = guess.found.T_world_middle, guess.twist or twist
         found = None
         sweep: SweepMotion | None = None
         sweep_of_middle, settled = observation.sweep(observation.middle_s), np.zeros(3)
@@ -166,7 +185,7 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
             if measured is not None and observation.displacement(float(np.linalg.norm(settled))) < _SETTLED:
                 break
         if found is None:
-            deskewed, sweep = observation.deskew(motion.twist), None
+            deskewed, sweep = observation.deskew(twist), None
             found = self._find_pose(deskewed, time_ns)
         if found is None:
             return None
