@@ -128,9 +128,9 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
         if observation.displacement(float(np.linalg.norm(twist.rotation_radps))) <= _NEGLIGIBLE:
             return placed
         at_rest = self._placed_by(observation, guess, STILL)
-        if placed is None or at_rest is None or at_rest.found.score <= placed.found.score:
-            return placed or at_rest
-        return at_rest
+        if placed is None or (at_rest is not None and not self._search.doubts(at_rest.found)):
+            return at_rest
+        return placed
 
     def _placed_by(
         self, observation: ScanObservation, guess: PlacedScan | None, twist: Twist
