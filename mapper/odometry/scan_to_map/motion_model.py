@@ -15,6 +15,7 @@ _ERRORS, _FEWEST_ERRORS = 50, 5  # of recent predictions: of so many the median 
 _MEDIAN_LENGTH = 1.538  # of a vector of three independent normal errors, in standard deviations
 _LEAST_M, _LEAST_RAD, _LEAST_SHARE = 2e-3, 1e-3, 0.02
 _NO_VARIANCE = 1e-12  # (rad/s)² and (m/s)²: keeps a covariance of nothing invertible
+_UNMEASURED = 0.25  # of what a velocity may change, where it is not measured
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,6 +192,12 @@ def velocities_at(
     step = (after - before) * elapsed_s[0] / sum(elapsed_s)
     at_first, at_second = before - step, before + step
     return Twist(at_first[:3], at_first[3:]), Twist(at_second[:3], at_second[3:]), _lengths(after - before)
+
+
+def covariance_unmeasured(changes: Array) -> Array:
+    """Return the (6, 6) covariance of a velocity that is not measured, by (6,) what it may change."""
+    covariance: Array = np.diag((_UNMEASURED * changes) ** 2)
+    return covariance
 
 
 def _time_s2(elapsed_s: float, before_s: float) -> float:

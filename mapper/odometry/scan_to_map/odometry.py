@@ -15,23 +15,16 @@ from mapper.odometry.base import Diagnostics, FrameOdometry, FrameResult, lost_f
 from mapper.odometry.keyframe_distance import is_far
 from mapper.odometry.scan_to_map.config import ScanOdometryConfig
 from mapper.odometry.scan_to_map.keyframe_tree import KeyframeTree
-from mapper.odometry.scan_to_map.motion_model import MotionModel, velocities_at
-from mapper.odometry.scan_to_map.pose_candidate import PoseCandidate
-from mapper.odometry.scan_to_map.pose_search import PoseSearch, UnplacedScan
+from mapper.odometry.scan_to_map.motion_model import MotionModel, covariance_unmeasured, velocities_at
+from mapper.odometry.scan_to_map.pose_search import PoseSearch
 from mapper.odometry.scan_to_map.scan_fit import ScanKeyframe
 from mapper.odometry.scan_to_map.scan_matcher import DeskewedScan, ScanMatcher
-from mapper.odometry.scan_to_map.scan_noise import ScanNoise, independent_covariance
+from mapper.odometry.scan_to_map.scan_noise import ScanNoise
 from mapper.odometry.scan_to_map.scan_observation import ScanObservation, observe_scan
-from mapper.odometry.scan_to_map.sweep_motion import SweepMotion, sweep_motion
+from mapper.odometry.scan_to_map.scan_placement import ScanPlacement
 from mapper.odometry.scan_to_map.tracked_scan import PlacedScan, ScanState, TrackedScan
 
 _KEYFRAMES = 5  # so many last ones are compared with
-_NEGLIGIBLE, _SETTLED = 0.2, 0.05
-"""Displacement of a sweep's outer points, in voxels, by a change of the velocity: less is not looked for,
-less ends the search for the velocity."""
-_ROUNDS = 3
-_WIDENED = 2.0  # expected changes of the velocity, for turns begin and end suddenly
-_CHANGED = 0.25  # of what the velocity may change, where it is not measured
 
 
 class ScanOdometry(FrameOdometry[ScanObservation]):
@@ -51,20 +44,21 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
 
     def __init__(self, config: ScanOdometryConfig, matcher: ScanMatcher) -> None:
         self._config = config
-        self._matcher = matcher
         self._search = PoseSearch(config, matcher)
-        self._noise = ScanNoise()
-        self._motion = MotionModel(0, np.eye(4))
-        self._keyframes: deque[ScanKeyframe] = deque(maxlen=_KEYFRAMES)  # the newest first
-        self._tree = KeyframeTree(4 * _KEYFRAMES)  # of all keyframes, doubtful ones too
-        self._doubtful: ScanKeyframe | None = None
-        self._last: ScanKeyframe | None = None
+        self._placement = ScanPlacement(config, self._search)
+        self._state = ScanState(
+            matcher,
+            self._search.usual,
+            ScanNoise(),
+            MotionModel(0, np.eye(4)),
+            KeyframeTree(4 * _KEYFRAMES),
+            deque(maxlen=_KEYFRAMES),
+        )
         self._first: ScanObservation | None = None
         self._before: TrackedScan | None = None
         self._waiting: tuple[BetweenFactor, ...] = ()
         self._again: dict[int, FrameResult] = {}  # of scans that were tracked again, by their stamps
         self._lost_scans = 0
-        self._next_node = 0
 
     def observe(self, frame: Frame) -> ScanObservation:
         """Return a frame's points in range, thinned. Pure.
@@ -76,16 +70,16 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
 
     def track(self, observation: ScanObservation) -> FrameResult:
         """Track the next frame, in time order."""
-        if not self._keyframes:
+        if not self._state.keyframes:
             return self._start(observation, np.eye(4), method="start")
-        placed = self._place(observation)
+        placed = self._placement.place(self._state, observation)
         if placed is not None and self._first is not None and self._first.scan.times_s is not None:
             placed = self._begin_again(self._first, observation, placed.found.T_world_middle)
         elif placed is not None and self._before is not None:
             placed = self._after_correction(self._before, observation, placed)
         if placed is None:
             return self._not_found(observation)
-        state = self._state().copy() if self._may_be_bent(observation) else None
+        state = self._state.copy() if self._placement.may_be_bent(self._state, observation) else None
         first, self._first, self._lost_scans = self._first, None, 0
         result = self._placed(observation, placed)
         waiting, self._waiting, self._before = self._waiting, (), None
@@ -115,121 +109,24 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
     def matches(self) -> None:
         """Return None: the pose is not from features."""
 
-    def _place(self, observation: ScanObservation, guess: PlacedScan | None = None) -> PlacedScan | None:
-        """Return where a scan fits best; None if next to nothing agrees with any pose.
-
-        A sensor that turned may have stopped meanwhile: where the sweep fits badly when it is deskewed by the
-        predicted velocity, it is placed without one, too.
-        """
-        twist = self._motion.twist
-        placed = self._placed_by(observation, guess, twist)
-        if placed is not None and not self._search.doubts(placed.found):
-            return placed
-        if observation.displacement(float(np.linalg.norm(twist.rotation_radps))) <= _NEGLIGIBLE:
-            return placed
-        at_rest = self._placed_by(observation, guess, STILL)
-        if placed is None or (at_rest is not None and not self._search.doubts(at_rest.found)):
-            return at_rest
-        return placed
-
-    def _placed_by(
-        self, observation: ScanObservation, guess: PlacedScan | None, twist: Twist
-    ) -> PlacedScan | None:
-        """Return where a scan fits best if its velocity is about the one given.
-
-        Where the velocity may have changed so much that it displaces the points of the sweep, it is found
-        together with the pose; not before the errors of a few predictions are known, as two scans, each with
-        a velocity of its own, fit under wrong ones, too.
-        """
-        motion, time_ns = self._motion, observation.middle_ns
-        deskewed, sigmas = observation.deskew(twist), motion.velocity_sigmas(time_ns)
-        if motion.turning_change(time_ns) is None or not self._may_be_bent(observation):
-            found = self._find_pose(deskewed, time_ns)
-            if found is None:
-                return None
-            changes = np.maximum(sigmas, motion.change(time_ns, found.T_world_middle))
-            return PlacedScan(deskewed, found, None, np.diag((_CHANGED * changes) ** 2))
-        if guess is None:
-            T_world_predicted, start = motion.predicted(time_ns), twist
-            matched = self._matcher.match(deskewed, T_world_predicted, reach="near")
-            T_world_middle = T_world_predicted if matched is None else matched
-        else:
-            T_world_middle, start = guess.found.T_world_middle, guess.twist or twist
-        found = None
-        sweep: SweepMotion | None = None
-        sweep_of_middle, settled = observation.sweep(observation.middle_s), np.zeros(3)
-        for _ in range(_ROUNDS):
-            of_pose = (
-                motion.pose_covariance if found is None else independent_covariance(found.fit, found.blend)
-            )
-            expected, covariance = motion.velocity(time_ns, T_world_middle, of_pose)
-            before = start if sweep is None else sweep.twist
-            measured = sweep_motion(
-                self._keyframes,
-                sweep_of_middle,
-                T_world_middle,
-                expected,
-                _WIDENED**2 * covariance,
-                start=before,
-                max_pair_distance_m=self._config.max_pair_distance_m,
-            )
-            if measured is None and found is not None:
-                break
-            if measured is not None:
-                sweep, deskewed = measured, observation.deskew(measured.twist)
-                settled = measured.twist.rotation_radps - before.rotation_radps
-            found = self._find_pose(deskewed, time_ns, None if measured is None else measured.T_world_middle)
-            if found is None:
-                break
-            T_world_middle = found.T_world_middle
-            if measured is not None and observation.displacement(float(np.linalg.norm(settled))) < _SETTLED:
-                break
-        if found is None:
-            deskewed, sweep = observation.deskew(twist), None
-            found = self._find_pose(deskewed, time_ns)
-        if found is None:
-            return None
-        of_pose = independent_covariance(found.fit, found.blend)
-        covariance = motion.velocity(time_ns, found.T_world_middle, of_pose)[1]
-        if sweep is not None:
-            accelerated = motion.acceleration(time_ns, found.T_world_middle, sweep.twist)
-            bent = accelerated * observation.half_s / 3.0
-            covariance = sweep.covariance + np.diag([*(settled**2 + bent**2), 0.0, 0.0, 0.0])
-        return PlacedScan(deskewed, found, None if sweep is None else sweep.twist, covariance)
-
-    def _find_pose(
-        self, deskewed: DeskewedScan, time_ns: int, T_world_guess: Transform | None = None
-    ) -> PoseCandidate | None:
-        """Return the pose that fits best; None if next to nothing agrees with any."""
-        scan = UnplacedScan(deskewed, self._keyframes, self._doubtful, self._last, self._motion, time_ns)
-        found = self._search.find(scan, T_world_guess)
-        return None if found is None or self._search.is_lost(found) else found
-
     def _begin_again(
         self, first: ScanObservation, second: ScanObservation, T_world_second: Transform
     ) -> PlacedScan | None:
         """Track a map's first two scans again, now that the motion during their sweeps is known."""
-        twist = self._motion.mean_twist(second.middle_ns, T_world_second)
+        twist = self._state.motion.mean_twist(second.middle_ns, T_world_second)
         turning_radps = float(np.linalg.norm(twist.rotation_radps))
         self._begin(first, twist, turning_radps)  # it may just have begun to turn
-        return self._place(second)
+        return self._placement.place(self._state, second)
 
     def _begin(self, first: ScanObservation, twist: Twist, sigma_radps: float) -> None:
         """Begin a map with its first scan again, by a velocity whose rotation has a standard deviation."""
-        keyframe = self._keyframes[0]
-        self._matcher.clear()
-        self._next_node = keyframe.node
+        keyframe = self._state.keyframes[0]
+        self._state.matcher.clear()
+        self._state.next_node = keyframe.node
         T_world_middle = keyframe.T_world_body @ twist.over(first.middle_s)
-        self._motion = MotionModel(first.middle_ns, T_world_middle)
-        self._motion.twist = twist
+        self._state.motion = MotionModel(first.middle_ns, T_world_middle)
+        self._state.motion.twist = twist
         self._add_keyframe(first, first.deskew(twist), T_world_middle, sigma_radps)
-
-    def _may_be_bent(self, observation: ScanObservation) -> bool:
-        """Return whether the velocity may have changed so much that it displaces the points of the sweep."""
-        if observation.scan.times_s is None:
-            return False
-        change_radps = self._motion.turning_change(observation.middle_ns)
-        return change_radps is None or observation.displacement(change_radps) > _NEGLIGIBLE
 
     def _after_correction(
         self, before: TrackedScan, observation: ScanObservation, placed: PlacedScan
@@ -241,35 +138,42 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
         poses stay, and the difference of both is an error of the way to the stamp.
         """
         state, time_ns = before.state, before.observation.middle_ns
-        T_world_before = self._motion.T_world_last
-        elapsed_s = state.motion.elapsed_s(time_ns), self._motion.elapsed_s(observation.middle_ns)
+        T_world_before = self._state.motion.T_world_last
+        elapsed_s = state.motion.elapsed_s(time_ns), self._state.motion.elapsed_s(observation.middle_ns)
         velocities = velocities_at(
             (state.motion.T_world_last, T_world_before, placed.found.T_world_middle), elapsed_s
         )
         if velocities is None:
             return placed
         at_first, twist, change = velocities
-        off_radps = float(np.linalg.norm(twist.rotation_radps - self._motion.twist.rotation_radps))
+        off_radps = float(np.linalg.norm(twist.rotation_radps - self._state.motion.twist.rotation_radps))
         changes = np.maximum(state.motion.velocity_sigmas(time_ns), change)
-        again = replace(before.placed, twist=twist, velocity_covariance=np.diag((_CHANGED * changes) ** 2))
-        if before.observation.displacement(off_radps) <= _NEGLIGIBLE:
+        again = replace(before.placed, twist=twist, velocity_covariance=covariance_unmeasured(changes))
+        if not before.observation.is_bent_by(off_radps):
             return placed
-        now = self._state()
+        now = self._state
         self._restore(state)
         if before.placed.turns_otherwise(again):
             result = self._placed(before.observation, replace(before.placed, contradiction_radps=off_radps))
             self._again[result.stamp_ns], self._waiting = result, tuple(result.factors)
-            keyframes = [*self._keyframes, *([] if self._doubtful is None else [self._doubtful])]
+            keyframes = [
+                *self._state.keyframes,
+                *([] if self._state.doubtful is None else [self._state.doubtful]),
+            ]
             keyframe = next(key for key in keyframes if key.node == placed.found.keyframe.node)
             return replace(placed, found=replace(placed.found, keyframe=keyframe))
         if before.first is not None:
             self._begin(before.first, at_first, float(np.linalg.norm(change[:3])))
         deskewed = before.observation.deskew(twist)
-        found = self._find_pose(deskewed, time_ns, T_world_before)
+        found = self._placement.pose_of(self._state, deskewed, time_ns, T_world_before)
         if found is not None:
             result = self._placed(before.observation, replace(again, deskewed=deskewed, found=found))
             is_same = (result.node, result.is_keyframe) == (before.result.node, before.result.is_keyframe)
-            corrected = self._place(observation, placed) if is_same and not result.doubts else None
+            corrected = (
+                self._placement.place(self._state, observation, placed)
+                if is_same and not result.doubts
+                else None
+            )
             score = before.placed.found.score + placed.found.score
             if corrected is not None and found.score + corrected.found.score >= score:
                 self._again[result.stamp_ns], self._waiting = result, tuple(result.factors)
@@ -277,25 +181,9 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
         self._restore(now)
         return placed
 
-    def _state(self) -> ScanState:
-        """Return what tracking a scan changes."""
-        return ScanState(
-            self._matcher,
-            self._search.usual,
-            self._noise,
-            self._motion,
-            self._tree,
-            self._keyframes,
-            self._doubtful,
-            self._last,
-            self._next_node,
-        )
-
     def _restore(self, state: ScanState) -> None:
         """Go on from a state."""
-        self._matcher, self._noise, self._motion = state.matcher, state.noise, state.motion
-        self._tree, self._keyframes = state.tree, state.keyframes
-        self._doubtful, self._last, self._next_node = state.doubtful, state.last, state.next_node
+        self._state = state
         self._search.go_on(state.matcher, state.usual)
 
     def _placed(self, observation: ScanObservation, placed: PlacedScan) -> FrameResult:
@@ -305,31 +193,31 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
         T_key_scan = inverse(keyframe.T_world_middle) @ found.T_world_middle
         at_stamp = observation.middle_s**2 * placed.covariance_to_stamp
         Ad = adjoint(inverse(T_key_scan))
-        noise = self._noise.of(
+        noise = self._state.noise.of(
             found.fit,
             found.blend,
             T_key_scan,
-            inverse(self._motion.T_world_last) @ found.T_world_middle,
-            self._motion.elapsed_s(time_ns),
+            inverse(self._state.motion.T_world_last) @ found.T_world_middle,
+            self._state.motion.elapsed_s(time_ns),
             at_stamp + Ad @ keyframe.covariance_at_stamp @ Ad.T,
         )
         of_sweep = () if self._config.usual_ratio == 0.0 else observation.doubts(placed.velocity_covariance)
         doubts = (*self._search.doubts(found), *of_sweep)
         fits = not doubts
         covariance = noise.covariance if fits else noise.inflated(found.jump)
-        if fits and keyframe is self._doubtful:
-            self._matcher.clear()
-            self._matcher.add(keyframe.deskewed, keyframe.T_world_middle, is_keyframe=True)
-            self._keyframes.clear()
-            self._keyframes.appendleft(keyframe)
-        self._motion.follow(
+        if fits and keyframe is self._state.doubtful:
+            self._state.matcher.clear()
+            self._state.matcher.add(keyframe.deskewed, keyframe.T_world_middle, is_keyframe=True)
+            self._state.keyframes.clear()
+            self._state.keyframes.appendleft(keyframe)
+        self._state.motion.follow(
             time_ns,
             found.T_world_middle,
             is_certain=fits and found.is_measured,
             pose_covariance=noise.independent,
             measured=None if placed.twist is None else (placed.twist, placed.velocity_covariance),
         )
-        T_world_body = found.T_world_middle @ self._motion.twist.over(-observation.middle_s)
+        T_world_body = found.T_world_middle @ self._state.motion.twist.over(-observation.middle_s)
         T_key_body = inverse(keyframe.T_world_body) @ T_world_body
         is_keyframe = is_far(
             T_key_body,
@@ -338,25 +226,25 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
         )
         node = keyframe.node
         factors: tuple[BetweenFactor, ...] = ()
-        scan = ScanKeyframe(self._next_node, deskewed, found.T_world_middle, T_world_body, at_stamp)
+        scan = ScanKeyframe(self._state.next_node, deskewed, found.T_world_middle, T_world_body, at_stamp)
         if fits:
-            self._doubtful = None
+            self._state.doubtful = None
             self._search.usual.add(found.shares)
-            self._matcher.add(deskewed, found.T_world_middle, is_keyframe=is_keyframe)
+            self._state.matcher.add(deskewed, found.T_world_middle, is_keyframe=is_keyframe)
         else:
             self._search.usual.add_doubtful(found.shares)
         if is_keyframe:
-            node = self._next_node
-            self._next_node += 1
-            self._noise.restart()
+            node = self._state.next_node
+            self._state.next_node += 1
+            self._state.noise.restart()
             information = np.linalg.inv(covariance)
             factors = (BetweenFactor(keyframe.node, node, T_key_body, 0.5 * (information + information.T)),)
-            covariance = self._tree.add(node, keyframe.node, T_world_body, covariance)
+            covariance = self._state.tree.add(node, keyframe.node, T_world_body, covariance)
             if fits:
-                self._keyframes.appendleft(scan)
+                self._state.keyframes.appendleft(scan)
             else:
-                self._doubtful = scan
-        self._last = scan
+                self._state.doubtful = scan
+        self._state.last = scan
         points = len(deskewed.prepared.points)
         return FrameResult(
             stamp_ns=observation.scan.stamp_ns,
@@ -375,20 +263,20 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
             ),
             factors=factors,
             links=factors,
-            twist=self._motion.twist,
+            twist=self._state.motion.twist,
             doubts=(*doubts, *noise.doubts),
             covariance=covariance,
         )
 
     def _start(self, observation: ScanObservation, T_world_body: Transform, *, method: str) -> FrameResult:
         """Make a scan the first keyframe of a map, unconnected to earlier maps."""
-        self._matcher.clear()
+        self._state.matcher.clear()
         self._search.usual.clear()
-        self._noise.restart()
+        self._state.noise.restart()
         self._lost_scans, self._first, self._before = 0, observation, None
         waiting, self._waiting = self._waiting, ()
         deskewed = observation.deskew(STILL)
-        self._motion = MotionModel(observation.middle_ns, T_world_body)
+        self._state.motion = MotionModel(observation.middle_ns, T_world_body)
         node = self._add_keyframe(observation, deskewed, T_world_body, 0.0)
         return FrameResult(
             stamp_ns=observation.scan.stamp_ns,
@@ -405,9 +293,9 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
         """Return a lost scan, or begin a new map with it once enough in a row were lost."""
         self._lost_scans += 1
         if 0 < self._config.max_lost_scans < self._lost_scans:
-            return self._start(observation, self._motion.T_world_last, method="new sub-map")
+            return self._start(observation, self._state.motion.T_world_last, method="new sub-map")
         scan = observation.scan
-        return lost_frame(scan.stamp_ns, self._motion.T_world_last, features=len(scan.points_body))
+        return lost_frame(scan.stamp_ns, self._state.motion.T_world_last, features=len(scan.points_body))
 
     def _add_keyframe(
         self,
@@ -417,15 +305,15 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
         sigma_radps: float,
     ) -> int:
         """Make a scan a keyframe without a factor; return its node."""
-        self._matcher.add(deskewed, T_world_middle, is_keyframe=True)
-        twist = self._motion.twist
+        self._state.matcher.add(deskewed, T_world_middle, is_keyframe=True)
+        twist = self._state.motion.twist
         T_world_body = T_world_middle @ twist.over(-observation.middle_s)
         covariance = np.diag([(observation.middle_s * sigma_radps) ** 2] * 3 + [0.0] * 3)
-        self._keyframes.clear()
-        self._keyframes.append(
-            ScanKeyframe(self._next_node, deskewed, T_world_middle, T_world_body, covariance)
+        self._state.keyframes.clear()
+        self._state.keyframes.append(
+            ScanKeyframe(self._state.next_node, deskewed, T_world_middle, T_world_body, covariance)
         )
-        self._doubtful = self._last = None
-        self._tree.clear()
-        self._next_node += 1
-        return self._keyframes[0].node
+        self._state.doubtful = self._state.last = None
+        self._state.tree.clear()
+        self._state.next_node += 1
+        return self._state.keyframes[0].node

@@ -18,6 +18,8 @@ from mapper.registration.surfaces import prepared
 _MIN_POINTS = 100
 """Fewer points left after thinning do not constrain a pose."""
 _FINER = 0.5  # voxel size of the first thinning, of whose points each prepared point is the mean
+_NEGLIGIBLE = 0.2
+"""Displacement of a sweep's outer points, in voxels: velocities that make less are not told apart."""
 _DISPLACED = 0.5  # displacement of a sweep's outer points, in voxels: more makes a pose doubtful
 
 
@@ -57,6 +59,10 @@ class ScanObservation:
     def displacement(self, turning_radps: float) -> float:
         """Return how far a change of the rotation, rad/s, displaces the sweep's outer points, in voxels."""
         return turning_radps * self.half_s * self.range_m / self.voxel_m
+
+    def is_bent_by(self, turning_radps: float) -> bool:
+        """Return whether a change of the rotation, rad/s, displaces the sweep's points noticeably."""
+        return self.displacement(turning_radps) > _NEGLIGIBLE
 
     def doubts(self, velocity_covariance: Array) -> tuple[str, ...]:
         """Return that the points may be displaced, if they may, by the (6, 6) covariance of the velocity."""

@@ -2,7 +2,7 @@
 
 import copy
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -21,7 +21,7 @@ from mapper.odometry.scan_to_map.usual_fit import UsualFit
 _MOST_SIGMAS = 3.0  # of two velocities that are one
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(slots=True, eq=False)
 class ScanState:
     """What tracking a scan changes.
 
@@ -43,24 +43,27 @@ class ScanState:
     motion: MotionModel
     tree: KeyframeTree
     keyframes: deque[ScanKeyframe]
-    doubtful: ScanKeyframe | None
-    last: ScanKeyframe | None
-    next_node: int
+    doubtful: ScanKeyframe | None = None
+    last: ScanKeyframe | None = None
+    next_node: int = 0
+
+    def keyframe_of(self, node: int) -> ScanKeyframe:
+        """Return the keyframe of a node, one of the last or the doubtful one."""
+        known = self.keyframes if self.doubtful is None else (*self.keyframes, self.doubtful)
+        return next(keyframe for keyframe in known if keyframe.node == node)
 
     def copy(self) -> "ScanState":
         """Return a copy; scans, which do not change, are shared."""
         changing = (self.matcher, self.usual, self.noise, self.motion, self.tree)
         matcher, usual, noise, motion, tree = copy.deepcopy(changing)
-        return ScanState(
-            matcher,
-            usual,
-            noise,
-            motion,
-            tree,
-            self.keyframes.copy(),
-            self.doubtful,
-            self.last,
-            self.next_node,
+        return replace(
+            self,
+            matcher=matcher,
+            usual=usual,
+            noise=noise,
+            motion=motion,
+            tree=tree,
+            keyframes=self.keyframes.copy(),
         )
 
 
