@@ -22,9 +22,9 @@ from mapper.sources.base import Log
 from mapper.sources.calibration import PRIMESENSE, SEVEN_SCENES
 from mapper.sources.calibration_file import calibration_file
 from mapper.sources.config import SourceConfig
-from mapper.sources.image_folders.pairing import apply_depth_offset
+from mapper.sources.image_folders.pairing import apply_depth_offset, ordered_pairs
 from mapper.sources.image_folders.rgbd import FramePair, find_calibration, rgbd_log
-from mapper.sources.text import parse_count, parse_numbers, rows, time_order, truth_from
+from mapper.sources.text import parse_count, parse_numbers, rows, truth_from
 
 DEPTH_UNITS_PER_M = 1000.0
 RATE_HZ = 30.0
@@ -112,8 +112,8 @@ def read_log(path: Path, config: SourceConfig) -> Log:
         )
     pairs, stamp_notes = stamped(images.pairs, rate_hz=config.rate_hz or RATE_HZ)
     truth, truth_notes = _read_truth(path, pairs)
-    order, order_notes = time_order(np.array([pair.stamp_ns for pair in pairs]), what="image names")
-    pairs_used, offset_notes = apply_depth_offset([pairs[i] for i in order], config, path=path)
+    ordered, order_notes = ordered_pairs(pairs, what="image names")
+    pairs_used, offset_notes = apply_depth_offset(ordered, config, path=path)
     return rgbd_log(
         pairs_used,
         calibration,
