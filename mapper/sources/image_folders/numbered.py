@@ -35,9 +35,8 @@ _DEPTH_FOLDER = re.compile(r"(?:^|[^a-z])depth", re.IGNORECASE)
 _IMAGE_ENDINGS = frozenset({".png", ".jpg", ".jpeg", ".pgm", ".ppm", ".tif", ".tiff", ".bmp"})
 _NUMBERED = re.compile(r"\D*(?P<number>\d{1,18})(?:-(?P<microseconds>\d+))?\D*")
 _SEVEN_SCENES = re.compile(r"frame-\d+\.color\.\w+")
-_LEAST_STEP_US = (
-    2000  # of numbers that are microseconds: 500 images a second; nobody keeps every 2000th image
-)
+_LEAST_STEP_US = 2000
+"""Numbers that advance by less count images: 500 images a second are the most that cameras take."""
 _ROUGHLY_RIGID = 1e-2  # text of a few digits; anything further off is no rotation
 
 
