@@ -74,7 +74,7 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
         self._config = config
         self._motion_check = motion_check
         self._detector = detector or build_detector(config.detector)
-        self._registration = PairRegistration(config.registration, by_pixels=config.residual == "pixels")
+        self._registration = PairRegistration(config)
         self._register_pair = register or self._registration
         self._earlier = EarlierFrames(config)
         self._next_node = 0
@@ -197,13 +197,16 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
         """Return the registrations that succeeded, in the order of the earlier frames."""
         candidates = []
         for frame in earlier:
-            alignment, weight, pairs = self._register_pair(self._corrected(frame), observation, match)
+            found = self._register_pair(self._corrected(frame), observation, match)
+            alignment = found.alignment
             if alignment.converged and self._is_possible(alignment, frame.observation, observation):
                 T = alignment.T_target_source
                 assert alignment.information is not None  # it converged
                 information = with_model_error(alignment.information, T)
                 candidates.append(
-                    PoseCandidate(frame, alignment, information, weight, pairs, frame.T_world_body @ T)
+                    PoseCandidate(
+                        frame, alignment, information, found.weight, found.pairs, frame.T_world_body @ T
+                    )
                 )
         return candidates
 
