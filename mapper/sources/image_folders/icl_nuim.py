@@ -16,7 +16,7 @@ from mapper.sources.calibration import ICL_NUIM
 from mapper.sources.config import SourceConfig
 from mapper.sources.image_folders.numbered import RATE_HZ, find_images, stamp_at
 from mapper.sources.image_folders.pairing import apply_depth_offset, ordered_pairs, usable_pairs
-from mapper.sources.image_folders.rgbd import FramePair, find_calibration, rgbd_log
+from mapper.sources.image_folders.rgbd import FramePair, assumed_camera_note, find_calibration, rgbd_log
 from mapper.sources.listed_files import within
 from mapper.sources.text import (
     parse_count,
@@ -54,9 +54,7 @@ def read_log(path: Path, config: SourceConfig) -> Log:
         path, config.camera, known=ICL_NUIM, depth_units_per_m=DEPTH_UNITS_PER_M
     )
     if calibration.origin == ICL_NUIM.origin and not _has_truth(path):
-        notes.append(
-            f"camera assumed to be the {ICL_NUIM.origin}; if not, put a calibration.toml beside the log"
-        )
+        notes.append(assumed_camera_note(ICL_NUIM))
     truth, truth_notes = _read_truth(path, rate_hz)
     pairs_used, offset_notes = apply_depth_offset(pairs, config, path=path)
     return rgbd_log(

@@ -23,7 +23,7 @@ from mapper.sources.calibration import PRIMESENSE, SEVEN_SCENES
 from mapper.sources.calibration_file import calibration_file
 from mapper.sources.config import SourceConfig
 from mapper.sources.image_folders.pairing import apply_depth_offset, ordered_pairs
-from mapper.sources.image_folders.rgbd import FramePair, find_calibration, rgbd_log
+from mapper.sources.image_folders.rgbd import FramePair, assumed_camera_note, find_calibration, rgbd_log
 from mapper.sources.text import parse_count, parse_numbers, rows, truth_from
 
 DEPTH_UNITS_PER_M = 1000.0
@@ -106,9 +106,7 @@ def read_log(path: Path, config: SourceConfig) -> Log:
     )
     notes = list(images.notes)
     if calibration.origin == known.origin:
-        notes.append(
-            f"camera assumed to be the {known.origin}; if not, put a calibration.toml beside the log"
-        )
+        notes.append(assumed_camera_note(known))
     pairs, stamp_notes = stamped(images.pairs, rate_hz=config.rate_hz or RATE_HZ)
     truth, truth_notes = _read_truth(path, pairs)
     ordered, order_notes = ordered_pairs(pairs, what="image names")
