@@ -10,16 +10,19 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, is_dataclass
 from enum import Enum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from mapper.cli.console import progress_for
 from mapper.cli.option_rules import refuse_several
 from mapper.cli.terminal import print_text
-from mapper.core.errors import MapperError
+from mapper.core.errors import MapperError, UntrustedError
 from mapper.runtime.atomic import MANIFEST_NAME
 from mapper.runtime.progress import SILENT, Progress
+
+if TYPE_CHECKING:
+    from mapper.run.manifest import Verdict
 
 _LINE_WIDTH = 110
 
@@ -67,6 +70,13 @@ class Answer:
     text: str = ""
     details: str = ""
     error: MapperError | None = None
+
+
+def untrusted(path: Path, verdict: "Verdict") -> UntrustedError | None:
+    """Return the error of ``--strict`` about what a verb has written; None if its verdict is "trusted"."""
+    if verdict.state == "trusted":
+        return None
+    return UntrustedError(f"{path}: {verdict.state}: {verdict.sentences[0]}")
 
 
 def made(path: Path, **more: object) -> Answer:

@@ -9,22 +9,23 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mapper.cli.answer import Answer, Output
+from mapper.cli.answer import Answer, Output, untrusted
 from mapper.cli.completion import run_folders
-from mapper.cli.environment import has_compiled_code
+from mapper.cli.environment import note_compilation
 from mapper.cli.option_rules import refuse_with, refuse_without
 from mapper.cli.options import (
     ConfigFile,
     First,
     Last,
     Overrides,
+    Overwrite,
     RequireTruth,
     Stride,
     merged,
     selection,
 )
 from mapper.cli.stepping import Stepping
-from mapper.core.errors import UntrustedError, ViewerError
+from mapper.core.errors import ViewerError
 from mapper.runtime.result_paths import RUNS, name_of, place_of
 
 if TYPE_CHECKING:
@@ -63,9 +64,7 @@ def build(
             help="Append the log to this run of the same place; OUT then holds both, by RUN's own settings.",
         ),
     ] = None,
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace OUT, once the new run is complete.")
-    ] = False,
+    overwrite: Overwrite = False,
     fresh: Annotated[
         bool, typer.Option("--fresh", help="Start again; otherwise a stopped build is resumed.")
     ] = False,
@@ -111,15 +110,8 @@ def build(
         run, metrics = appended(log, onto, overrides, out, overwrite=overwrite, output=output)
     from mapper.cli.summary import summary_of  # a build begins without what its end needs
 
-    error = _untrusted(run) if strict else None
+    error = untrusted(run.path, run.verdict) if strict else None
     return replace(summary_of(run, metrics), error=error)
-
-
-def _untrusted(run: "Run") -> "UntrustedError | None":
-    verdict = run.verdict
-    if verdict.state == "trusted":
-        return None
-    return UntrustedError(f"{run.path}: {verdict.state}: {verdict.sentences[0]}")
 
 
 def built(
@@ -143,8 +135,7 @@ def built(
     source = open_source(log, load_source_config(config_file, overrides))
     config = load_config(config_file, overrides, sensor=source.sensor)
     progress = output.progress(prompts=prompts)
-    if not has_compiled_code():
-        progress.note("first run here: the kernels are compiled once, which takes about a minute")
+    note_compilation(progress)
     for note in source.notes:
         progress.note(note)
     preview = _preview(source, out, progress)

@@ -7,7 +7,7 @@ import typer
 
 from mapper.cli.answer import Answer, Output, record_in
 from mapper.cli.console import files_text
-from mapper.cli.options import First, Last, Overrides, Stride, assignments, merged, selection
+from mapper.cli.options import First, Last, Overrides, Overwrite, Stride, assignments, merged, selection
 
 
 def compare(
@@ -25,9 +25,7 @@ def compare(
     last: Last = None,
     stride: Stride = None,
     set_: Overrides = None,
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace OUT, once the new comparison is complete.")
-    ] = False,
+    overwrite: Overwrite = False,
     *,
     output: Output,
 ) -> Answer:

@@ -2,6 +2,10 @@
 
 import os
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from mapper.runtime.progress import Progress
 
 
 def prepare_environment() -> None:
@@ -17,9 +21,10 @@ def prepare_environment() -> None:
         os.environ.setdefault("NUMBA_CACHE_DIR", str(cache))
 
 
-def has_compiled_code() -> bool:
-    """Return whether numba has compiled our kernels before; else the first verb takes a minute longer."""
+def note_compilation(progress: "Progress") -> None:
+    """Say that a verb takes longer this time, if numba has not compiled our kernels before."""
     import mapper
 
     cache = os.environ.get("NUMBA_CACHE_DIR") or Path(mapper.__file__).parent
-    return next(Path(cache).rglob("*.nbi"), None) is not None
+    if next(Path(cache).rglob("*.nbi"), None) is None:
+        progress.note("first run here: the kernels are compiled once, which takes about a minute")

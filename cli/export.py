@@ -8,7 +8,7 @@ import typer
 from mapper.cli.answer import Answer, Output, made
 from mapper.cli.completion import export_kinds
 from mapper.cli.option_rules import refuse_with
-from mapper.cli.options import MovedLogs, Overrides, RunFolder, assignments, merged
+from mapper.cli.options import MovedLogs, Overrides, Overwrite, RunFolder, assignments, merged
 from mapper.export.exporters import EXPORTERS
 
 _KINDS = "; ".join(f"{kind}: {exporter.summary}" for kind, exporter in EXPORTERS.items())
@@ -23,7 +23,7 @@ def export(
     out: Annotated[
         Path | None, typer.Option(help="File to write; omit to keep it in RUN under its usual name.")
     ] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace OUT.")] = False,
+    overwrite: Overwrite = False,
     level: Annotated[
         int | None,
         typer.Option(help="With --as octomap: levels of the tree to drop; each doubles the voxel size."),

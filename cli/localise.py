@@ -5,10 +5,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from mapper.cli.answer import Answer, Output, rows_text
+from mapper.cli.answer import Answer, Output, rows_text, untrusted
 from mapper.cli.completion import run_folders
-from mapper.cli.options import First, Last, Overrides, Stride, merged, selection
-from mapper.core.errors import UntrustedError
+from mapper.cli.options import First, Last, Overrides, Overwrite, Stride, merged, selection
 from mapper.runtime.result_paths import RUNS, name_of, place_of
 
 if TYPE_CHECKING:
@@ -35,9 +34,7 @@ def localise(
     first: First = None,
     last: Last = None,
     stride: Stride = None,
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace OUT, once the new folder is complete.")
-    ] = False,
+    overwrite: Overwrite = False,
     strict: Annotated[
         bool,
         typer.Option(
@@ -68,9 +65,7 @@ def localise(
     for note in source.notes:
         progress.note(note)
     manifest = localise_log(source, known, config, out, progress=progress, overwrite=overwrite)
-    verdict, error = manifest.verdict, None
-    if strict and verdict is not None and verdict.state != "trusted":
-        error = UntrustedError(f"{out}: {verdict.state}: {verdict.sentences[0]}")
+    error = untrusted(out, manifest.verdict) if strict and manifest.verdict is not None else None
     return Answer(_document(manifest, out), _text(manifest, out), error=error)
 
 

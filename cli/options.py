@@ -49,6 +49,7 @@ MovedLogs = Annotated[
         help="Path of the log, if it has moved since the build; for several logs, once each in order.",
     ),
 ]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace OUT, once the new one is complete.")]
 First = Annotated[int | None, typer.Option("--first", help="Index of the first frame to use.")]
 Last = Annotated[int | None, typer.Option("--last", help="Index of the last frame to use.")]
 Stride = Annotated[int | None, typer.Option("--stride", help="Use every n-th frame.")]

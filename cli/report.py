@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from mapper.cli.answer import Answer, Output, made
-from mapper.cli.options import RunFolders
+from mapper.cli.options import Overwrite, RunFolders
 
 if TYPE_CHECKING:
     from mapper.export.report.data import Figure, Question
@@ -32,7 +32,7 @@ def report(
     out: Annotated[
         Path | None, typer.Option(help="HTML file to write.  [default: report.html, or with a number]")
     ] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace OUT.")] = False,
+    overwrite: Overwrite = False,
     *,
     output: Output,
 ) -> Answer:

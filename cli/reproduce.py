@@ -10,7 +10,7 @@ import typer
 
 from mapper.cli.answer import Answer, Output
 from mapper.cli.console import files_text
-from mapper.cli.environment import has_compiled_code
+from mapper.cli.environment import note_compilation
 from mapper.cli.options import First, Last, workers_for
 from mapper.core.errors import ConfigError
 
@@ -81,8 +81,7 @@ def reproduce(
         cut=Cut(first or 0, last),
     )
     progress = output.progress()
-    if not has_compiled_code():
-        progress.note("first run here: the kernels are compiled once, which takes about a minute")
+    note_compilation(progress)
     out = out or Path(paper.value)
     reproduction = reproduce_tables(
         request,

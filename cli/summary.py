@@ -13,7 +13,7 @@ from typing import Any
 from mapper.cli.answer import Answer, rows_text
 from mapper.evaluators.metrics.evaluate import CLOCK_OFFSET
 from mapper.evaluators.metrics.metric import Metric
-from mapper.loops.closure import LoopClosure, accepted_loops
+from mapper.loops.closure import LoopClosure, accepted_loops, rejections
 from mapper.run.folder import Run
 from mapper.run.frame_outcomes import FrameRecord
 from mapper.run.manifest import Counts, Timing
@@ -165,9 +165,7 @@ def _loop_counts(loops: Sequence[LoopClosure]) -> Mapping[str, Any]:
     return {
         "candidates": len(loops),
         "accepted": len(held),
-        "refused": dict(
-            Counter(loop.reason.split(":")[0] for loop in loops if loop.verdict == "rejected").most_common()
-        ),
+        "refused": rejections(loops),
         "median_residual_before_m": before_m,
         "median_residual_after_m": after_m,
     }

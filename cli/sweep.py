@@ -8,7 +8,7 @@ import typer
 
 from mapper.cli.answer import Answer, Output
 from mapper.cli.console import files_text
-from mapper.cli.environment import has_compiled_code
+from mapper.cli.environment import note_compilation
 from mapper.cli.options import workers_for
 
 
@@ -47,8 +47,7 @@ def sweep(
     progress = output.progress()
     out = out or Path("sweeps") / file.stem
     plan = plan_sweep(file, out)
-    if not has_compiled_code():
-        progress.note("first run here: the kernels are compiled once, which takes about a minute")
+    note_compilation(progress)
     results = run_sweep(
         plan,
         workers=workers,

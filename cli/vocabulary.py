@@ -7,7 +7,7 @@ import typer
 
 from mapper.cli.answer import Answer, Output, verb
 from mapper.cli.groups import Verb, VerbGroup
-from mapper.cli.options import assignments, merged
+from mapper.cli.options import Overwrite, assignments, merged
 from mapper.runtime.atomic import refuse_existing
 from mapper.runtime.result_paths import name_of, place_of
 
@@ -29,7 +29,7 @@ def train(
         list[str] | None,
         typer.Option("--set", metavar="KEY.PATH=VALUE", help="branching, levels, detector.max_features, …"),
     ] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace OUT.")] = False,
+    overwrite: Overwrite = False,
     *,
     output: Output,
 ) -> Answer:

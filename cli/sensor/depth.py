@@ -10,7 +10,7 @@ import typer
 
 from mapper.cli.answer import Answer, Output
 from mapper.cli.option_rules import refuse_with
-from mapper.cli.options import AS_RECORDED, First, Last, Overrides, Stride, merged, selection
+from mapper.cli.options import AS_RECORDED, First, Last, Overrides, Overwrite, Stride, merged, selection
 from mapper.core.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -51,9 +51,7 @@ def depth(
     last: Last = None,
     stride: Stride = None,
     set_: Overrides = None,
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace OUT, once the new one is complete.")
-    ] = False,
+    overwrite: Overwrite = False,
     *,
     output: Output,
 ) -> Answer:

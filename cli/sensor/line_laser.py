@@ -7,7 +7,7 @@ import typer
 
 from mapper.cli.answer import Answer, Output
 from mapper.cli.console import files_text
-from mapper.cli.options import assignments
+from mapper.cli.options import Overwrite, assignments
 from mapper.core.errors import RunError
 from mapper.runtime.result_paths import RUNS, name_of, place_of
 
@@ -50,7 +50,7 @@ def line_laser(
         Path | None, typer.Option(help="Stamps, one per line and image; otherwise from names or times.txt.")
     ] = None,
     set_: Knobs = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace OUT.")] = False,
+    overwrite: Overwrite = False,
     *,
     output: Output,
 ) -> Answer:
@@ -114,7 +114,7 @@ def calibrate(
         float, typer.Option(help="Distance from the rear axle ahead to the origin of ranges, m.")
     ] = 0.0,
     set_: Knobs = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace OUT.")] = False,
+    overwrite: Overwrite = False,
     *,
     output: Output,
 ) -> Answer:
@@ -157,7 +157,7 @@ def accuracy(
     seeds: Annotated[int, typer.Option(min=1, help="How many rooms to render.")] = 3,
     out: Annotated[Path | None, typer.Option(help="Folder to create for both tables as CSV.")] = None,
     set_: Knobs = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace OUT.")] = False,
+    overwrite: Overwrite = False,
     *,
     output: Output,
 ) -> Answer:

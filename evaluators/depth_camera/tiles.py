@@ -22,20 +22,23 @@ from mapper.evaluators.depth_camera.accuracy import (
 from mapper.runtime.ordered_map import ordered_map
 from mapper.runtime.progress import SILENT, Progress
 from mapper.sensing.depth_filter import dif
-from mapper.sensing.planes import MAX_NOISE_RATIO, Planes, cut_tiles, fit_planes
+from mapper.sensing.planes import (
+    MAX_NOISE_RATIO,
+    MIN_FRAMES,
+    MIN_TILES,
+    TILES_ACROSS,
+    Planes,
+    cut_tiles,
+    distance_levels,
+    fit_planes,
+)
 from mapper.sources.base import FrameRef, Log
 
-_TILES_ACROSS = 16
 _BLOCKS = 5
 """A tile is so many blocks wide and high; what moves whole blocks is shape, not noise."""
 _MIN_MEASURED_RATIO = 0.95
-_MIN_PLANE_RATIO = 0.98
-_MAX_TILT_RAD = np.radians(60.0)
-"""Up to here a Kinect's axial noise does not depend on the angle (Nguyen et al. 2012, §4)."""
 _MAX_SHAPE_RATIO = 0.6
 _MAX_SHAPE_STEPS = 0.5
-_BIN_RATIO = 1.1
-_MIN_TILES, _MIN_FRAMES = 30, 3
 _DECODERS = 2
 
 
@@ -67,7 +70,7 @@ def depth_of_planes(
         SourceError: The log has no depth images that can be read.
     """
     first = first_frame(source)
-    side = max(first.camera.width_px // (_TILES_ACROSS * _BLOCKS), 1) * _BLOCKS
+    side = max(first.camera.width_px // (TILES_ACROSS * _BLOCKS), 1) * _BLOCKS
     where = patch or Patch(0, 0, first.camera.width_px, first.camera.height_px)
     where.check_inside(first.camera)
     if min(where.width, where.height) < side:
@@ -101,7 +104,7 @@ def depth_of_planes(
     if best is None or not levels:
         raise DataError(
             f"{source.path}: {len(planes)} tiles of {chosen} frames show a plane, and no distance has "
-            f"{_MIN_TILES} of {_MIN_FRAMES} frames; want walls, floors or tables in view"
+            f"{MIN_TILES} of {MIN_FRAMES} frames; want walls, floors or tables in view"
         )
     return levels, best
 
@@ -141,13 +144,10 @@ def _joined(tiles: Array, side: int, *, across: int) -> Array:
 
 def _are_planes(planes: Planes, depth_m: Array, steps_m: list[float | None]) -> NDArray[np.bool_]:
     """Return (T,) which tiles a plane explains up to noise."""
-    measured = depth_m > 0.0
-    share = planes.used.sum(axis=1) / np.maximum(measured.sum(axis=1), 1)
     shape_m = _shape_m(np.where(planes.used, depth_m - planes.depth_m, np.nan))
     step_m = np.array([0.0 if step is None else step for step in steps_m])
     flat: NDArray[np.bool_] = (
-        (share >= _MIN_PLANE_RATIO)
-        & (planes.tilt_rad <= _MAX_TILT_RAD)
+        planes.explain(depth_m > 0.0)
         & (planes.sigma_m <= MAX_NOISE_RATIO * np.abs(planes.distance_m))
         & (shape_m <= np.maximum(_MAX_SHAPE_RATIO * planes.sigma_m, _MAX_SHAPE_STEPS * step_m))
     )
@@ -167,13 +167,11 @@ def _shape_m(error_m: Array) -> Array:
 
 def _levels(name: str, planes: list[tuple[int, SeenPlane]]) -> list[DepthLevel]:
     """Return the distances at which enough frames show enough planes."""
-    bins: dict[int, list[tuple[int, SeenPlane]]] = {}
-    for numbered in planes:
-        step = int(np.floor(np.log(numbered[1].distance_m) / np.log(_BIN_RATIO)))
-        bins.setdefault(step, []).append(numbered)
-    levels = []
-    for _, inside in sorted(bins.items()):
-        frames = len({number for number, _ in inside})
-        if len(inside) >= _MIN_TILES and frames >= _MIN_FRAMES:
-            levels.append(DepthLevel(name, frames, len(inside), typical_of([plane for _, plane in inside])))
-    return levels
+    frame_of = np.array([number for number, _ in planes], np.intp)
+    distance_m = np.array([plane.distance_m for _, plane in planes])
+    return [
+        DepthLevel(
+            name, len(np.unique(frame_of[level])), len(level), typical_of([planes[k][1] for k in level])
+        )
+        for level in distance_levels(distance_m, frame_of)
+    ]

@@ -18,10 +18,15 @@ from mapper.loops.factory import build_loop_detector
 from mapper.odometry.base import FrameResult
 from mapper.odometry.config import IsvdOdometryConfig, MatchConfig
 from mapper.odometry.isvd_odometry import IsvdOdometry
-from mapper.odometry.isvd_registration import IsvdObservation, PairRegistration, RegisterPair, matched_pairs
+from mapper.odometry.isvd_registration import (
+    IsvdObservation,
+    PairAlignment,
+    PairRegistration,
+    RegisterPair,
+    matched_pairs,
+)
 from mapper.pipeline.solve import solve
 from mapper.pipeline.tracking_result import TrackingResult, refuse_a_fragment
-from mapper.registration.base import Alignment
 from mapper.sources.base import Log
 
 
@@ -81,7 +86,7 @@ class _SharedDetector:
         self._detector = build_detector(config)
         self._gray: Image | None = None
         self._pairs: dict[tuple[int, MatchConfig], Pairs] = {}
-        self._compared: dict[tuple[int, MatchConfig, Hashable], tuple[Alignment, float, Pairs]] = {}
+        self._compared: dict[tuple[int, MatchConfig, Hashable], PairAlignment] = {}
 
     @property
     def scale_factor(self) -> float:
@@ -98,7 +103,7 @@ class _SharedDetector:
 
     def comparing(self, config: IsvdOdometryConfig) -> RegisterPair:
         """Return the comparison of an earlier frame with the newest by an odometry's settings."""
-        register = PairRegistration(config.registration, by_pixels=config.residual == "pixels")
+        register = PairRegistration(config)
         how = (
             config.registration,
             config.residual,
@@ -109,13 +114,10 @@ class _SharedDetector:
             config.max_depth_m,
         )
 
-        def compare(
-            target: IsvdObservation, source: IsvdObservation, match: MatchConfig
-        ) -> tuple[Alignment, float, Pairs]:
+        def compare(target: IsvdObservation, source: IsvdObservation, match: MatchConfig) -> PairAlignment:
             key = (target.stamp_ns, match, how)
             if key not in self._compared:
-                pairs = self._match(target, source, match)
-                self._compared[key] = (*register.fit(target, source, pairs), pairs)
+                self._compared[key] = register.fit(target, source, self._match(target, source, match))
             return self._compared[key]
 
         return compare
@@ -133,7 +135,7 @@ class _VariantRun:
     def __init__(self, config: BuildConfig, odometry: IsvdOdometryConfig, shared: _SharedDetector) -> None:
         self._config = config
         self._odometry = IsvdOdometry(odometry, detector=shared, register=shared.comparing(odometry))
-        self._closer = build_loop_detector(config.loops, config.graph.solve)
+        self._loop_detector = build_loop_detector(config.loops, config.graph.solve)
         self._graph = PoseGraph()
         self._tracks: list[FrameResult] = []
 
@@ -146,11 +148,11 @@ class _VariantRun:
             return
         self._graph.add_node(track.node, track.stamp_ns, track.T_world_body)
         self._graph.add_factors(track.factors)
-        self._closer.add(track.node, track, partial(self._odometry.view, observation))
+        self._loop_detector.add(track.node, track, partial(self._odometry.view, observation))
 
     def result(self) -> VariantResult:
         """Return the poses with the loops' correction."""
-        loops = tuple(self._closer.closures())
+        loops = tuple(self._loop_detector.closures())
         self._graph.add_factors(loop.factor for loop in accepted_loops(loops))
         tracking = TrackingResult(tuple(self._tracks), (), self._graph, loops, {})
         try:

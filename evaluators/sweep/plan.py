@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from glob import glob, has_magic
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -91,19 +92,18 @@ def plan_sweep(path: Path, out: Path) -> Plan:
     for name, log in _logs(path, config).items():
         sources: dict[SourceConfig, Log] = {}
         mark = fingerprint(log)
-        for method in config.method:
-            for configuration in config.configuration:
-                build = BuildName(name, method.name, configuration.name)
-                build_config, source = _resolved(path, log, method, configuration, sources)
-                if misfit := _misfit(build_config, source):
-                    entries[build] = misfit
-                    continue
-                for seed, seeded_config in _repeats(build_config, config.seeds):
-                    build = replace(build, seed=seed)
-                    key = _key(mark, seeded_config, config.keep)
-                    kept = None if config.keep == "nothing" else out / RUNS / key
-                    work = BuildJob(log.resolve(), seeded_config, out / SCRATCH, kept, config.keep)
-                    entries[build] = Job(key, build.label, work)
+        for method, configuration in product(config.method, config.configuration):
+            build = BuildName(name, method.name, configuration.name)
+            build_config, source = _resolved(path, log, method, configuration, sources)
+            if misfit := _misfit(build_config, source):
+                entries[build] = misfit
+                continue
+            for seed, seeded_config in _repeats(build_config, config.seeds):
+                build = replace(build, seed=seed)
+                key = _key(mark, seeded_config, config.keep)
+                kept = None if config.keep == "nothing" else out / RUNS / key
+                work = BuildJob(log.resolve(), seeded_config, out / SCRATCH, kept, config.keep)
+                entries[build] = Job(key, build.label, work)
     return Plan(config, out, entries)
 
 

@@ -32,6 +32,13 @@ def transform(R_a_b: Array, t_a_b: Array) -> Transform:
     return T_a_b
 
 
+def planar_motion(dx_m: float, dy_m: float, alpha_rad: float) -> Transform:
+    """Return the (4, 4) motion that turns by α about z and then moves by (dx, dy)."""
+    cosine, sine = np.cos(alpha_rad), np.sin(alpha_rad)
+    R = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+    return transform(R, np.array([dx_m, dy_m, 0.0]))
+
+
 def inverse(T_a_b: Transform) -> Transform:
     """Return T_b_a, using R⁻¹ = Rᵀ rather than a general matrix inverse."""
     R_b_a = T_a_b[:3, :3].T

@@ -293,20 +293,14 @@ class McapLog:
     def grid(self, stamp_ns: int, grid: OccupancyGrid, *, name: str = "slice") -> None:
         """Log a 2D grid on /map/NAME, in the world's z = 0 plane."""
         check_stamp(stamp_ns)
-        topic = f"/map/{name}"
-        if topic not in self._channels:
-            text = definition(OCCUPANCY_GRID).encode()
-            self._register(topic, OCCUPANCY_GRID, encoding="ros2msg", text=text)
-        self._write(topic, encode_occupancy_grid(grid, stamp_ns=stamp_ns, frame_id=WORLD), stamp_ns)
+        data = encode_occupancy_grid(grid, stamp_ns=stamp_ns, frame_id=WORLD)
+        self._publish_ros(f"/map/{name}", OCCUPANCY_GRID, data, stamp_ns)
 
     def pose(self, stamp_ns: int, T_world_body: Transform, covariance: Array) -> None:
         """Log a pose with its (6, 6) covariance in the body's tangent (rotation, translation) on /pose."""
         check_stamp(stamp_ns)
-        if "/pose" not in self._channels:
-            text = definition(UNCERTAIN_POSE).encode()
-            self._register("/pose", UNCERTAIN_POSE, encoding="ros2msg", text=text)
         data = encode_uncertain_pose(T_world_body, covariance, stamp_ns=stamp_ns, frame_id=WORLD)
-        self._write("/pose", data, stamp_ns)
+        self._publish_ros("/pose", UNCERTAIN_POSE, data, stamp_ns)
 
     def diagnostics(self, stamp_ns: int, record: Mapping[str, Value]) -> None:
         """Log one frame's numbers and words on /diagnostics."""
@@ -378,6 +372,11 @@ class McapLog:
             schema = message.get_schema()
             self._register(topic, schema.name, encoding=schema.encoding, text=schema.data)
         self._write(topic, message.encode(), stamp_ns)
+
+    def _publish_ros(self, topic: str, type_: str, data: bytes, stamp_ns: int) -> None:
+        if topic not in self._channels:
+            self._register(topic, type_, encoding="ros2msg", text=definition(type_).encode())
+        self._write(topic, data, stamp_ns)
 
     def _register(self, topic: str, schema: str, *, encoding: str, text: bytes) -> None:
         if schema not in self._schemas:

@@ -1,42 +1,28 @@
-"""A coloured surface from depth images at their final poses, fused by Open3D (Zhou, Park & Koltun 2018).
+"""A coloured surface from depth images at their final poses, fused by Open3D (Zhou, Park & Koltun 2018)."""
 
-Depth counts as in the octree: up to the same limit, and not where something moved, which the octree lacks.
-"""
-
-import math
 import re
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
-from functools import lru_cache
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from mapper.config.export import MeshConfig
-from mapper.core.back_projection import back_project
-from mapper.core.errors import DependencyError, FrameError, RunError
-from mapper.core.frames import NO_DISTORTION, DepthImage, PinholeCamera, Points32, RgbdFrame, ray_table
-from mapper.core.geometry import Transform, inverse
+from mapper.core.errors import DependencyError, RunError
+from mapper.core.frames import Points32
+from mapper.core.geometry import inverse
 from mapper.export.mesh_files import Triangles, write_mesh
+from mapper.export.mesh_views import MeshView, mesh_views
 from mapper.mapping.cloud import Colors
-from mapper.mapping.config import edits_of
-from mapper.mapping.edits import MapEditor
 from mapper.octree.blocks import check_memory
 from mapper.octree.map import OctreeMap
 from mapper.run.folder import Run
 from mapper.runtime.extras import extra
-from mapper.runtime.ordered_map import ordered_map
 from mapper.runtime.progress import Progress
-from mapper.sources.base import FrameRef
 
 _BLOCK_VOXELS = 8
 """Edge of a block. Of Open3D's usual 16 two thirds would lie beyond the truncation, and be computed."""
 _VOXEL_BYTES = 4 + 4 + 12  # distance, weight and colour, all float32: integers would round at every frame
-_NEAR_VOXELS = math.sqrt(3.0)
-"""Noise scatters depth over voxels beside the octree's occupied ones: those that share a corner with one."""
 _LIBRARIES = "libgl1 libegl1 libx11-6 libudev1 libusb-1.0-0 libidn2-0 libgomp1"
 
 
@@ -55,16 +41,6 @@ class Surface:
     triangles: Triangles
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _View:
-    """One frame as Open3D takes it: no lens distortion, colours as float32."""
-
-    depth_m: DepthImage
-    colors: NDArray[np.float32]
-    camera: PinholeCamera
-    T_world_camera: Transform
-
-
 def surface(run: Run, path: Path, progress: Progress) -> None:
     """Fuse every ``mesh.frame_stride``-th tracked frame of the log and write the surface.
 
@@ -80,8 +56,8 @@ def surface(run: Run, path: Path, progress: Progress) -> None:
     o3d = _open3d()
     config = run.config.mesh
     octree, max_depth_m = run.octree, _max_depth_m(run)
-    volume = _Volume(o3d, config, max_depth_m=max_depth_m, blocks=_expected_blocks(octree, config))
-    for view in _views(run, octree, progress):
+    volume = Volume(o3d, config, max_depth_m=max_depth_m, blocks=_expected_blocks(octree, config))
+    for view in mesh_views(run, octree, progress):
         volume.add(view)
     found = volume.surface()
     if not len(found.triangles):
@@ -92,10 +68,18 @@ def surface(run: Run, path: Path, progress: Progress) -> None:
     write_mesh(path, found.points_world, found.colors, found.triangles)
 
 
-class _Volume:
-    """Open3D's hash of voxel blocks."""
+class Volume:
+    """Truncated signed distances in Open3D's hash of voxel blocks (Curless & Levoy 1996)."""
 
     def __init__(self, o3d: Any, config: MeshConfig, *, max_depth_m: float, blocks: int) -> None:
+        """Start empty.
+
+        Args:
+            o3d: The module of Open3D.
+            config: Settings of the mesh.
+            max_depth_m: Deeper measurements are left out.
+            blocks: Number of blocks that room is made for.
+        """
         self._o3d = o3d
         self._config = config
         self._max_depth_m = max_depth_m
@@ -109,7 +93,7 @@ class _Volume:
             block_count=blocks,  # growing means copying everything, and triples the time
         )
 
-    def add(self, view: _View) -> None:
+    def add(self, view: MeshView) -> None:
         """Fuse one view."""
         tensor, image = self._o3d.core.Tensor, self._o3d.t.geometry.Image
         depth, color = image(tensor(view.depth_m)), image(tensor(view.colors))
@@ -127,11 +111,17 @@ class _Volume:
                 np.empty((0, 3), np.float32), np.empty((0, 3), np.uint8), np.empty((0, 3), np.int32)
             )
         colors = np.rint(np.clip(mesh.vertex.colors.numpy(), 0.0, 1.0) * 255.0).astype(np.uint8)
-        return _in_order(mesh.vertex.positions.numpy(), colors, mesh.triangle.indices.numpy())
+        return in_order(mesh.vertex.positions.numpy(), colors, mesh.triangle.indices.numpy())
 
 
-def _in_order(points: Points32, colors: Colors, triangles: Triangles) -> Surface:
-    """Sort vertices and triangles: Open3D gives them in the order of its threads."""
+def in_order(points: Points32, colors: Colors, triangles: Triangles) -> Surface:
+    """Return a surface with sorted vertices and triangles: Open3D gives them in the order of its threads.
+
+    Args:
+        points: (V, 3) float32 metres.
+        colors: (V, 3) uint8 RGB.
+        triangles: (T, 3) int32 indices of points.
+    """
     order = np.lexsort((*colors.T, *points.T))
     points, colors = points[order], colors[order]
     is_new = np.ones(len(order), np.bool_)  # equal vertices have no order, so they become one
@@ -151,76 +141,6 @@ def _max_depth_m(run: Run) -> float:
         return run.config.mesh.max_depth_m
     depth = run.manifest.depth
     return run.config.octree.range_limit_m if depth is None else depth.limit_m
-
-
-def _views(run: Run, octree: OctreeMap, progress: Progress) -> Iterator[_View]:
-    """Yield the frames to fuse, read and rectified ahead in threads."""
-    trajectory = run.tracked_trajectory
-    stride = run.config.mesh.frame_stride
-    editor = MapEditor(edits_of(run.manifest.edits), trajectory.positions_world, room_m=0.0)
-    T_world_body = dict(trajectory[::stride].items())
-    source = run.open_log()
-    entries = (entry for entry in source.entries() if entry.stamp_ns in T_world_body)
-
-    def prepare(entry: FrameRef) -> _View | str:
-        try:
-            frame = entry.load()
-        except FrameError as error:
-            return str(error)
-        if not isinstance(frame, RgbdFrame):
-            raise RunError(f"{source.path}: a mesh needs depth images, and this log has none")
-        T = T_world_body[entry.stamp_ns]
-        return _rectified(_as_mapped(frame, T, octree, editor), T)
-
-    with progress.stage("mesh") as report:
-        for done, view in enumerate(ordered_map(prepare, entries, workers=run.config.workers), start=1):
-            report(done, len(T_world_body))
-            if isinstance(view, str):
-                progress.note(f"not fused: {view}")
-            else:
-                yield view
-
-
-def _rectified(frame: RgbdFrame, T_world_body: Transform) -> _View:
-    """Resample a frame as an ideal pinhole camera would have seen it; depths are not mixed."""
-    depth_m, image = frame.depth_m, frame.rgb
-    if frame.camera.distortion != NO_DISTORTION:
-        columns, rows = _undistortion(frame.camera)
-        depth_m = cv2.remap(depth_m, columns, rows, cv2.INTER_NEAREST)
-        image = cv2.remap(image, columns, rows, cv2.INTER_LINEAR)
-    return _View(
-        np.ascontiguousarray(depth_m, np.float32),
-        np.asarray(image, np.float32) / np.float32(255.0),
-        frame.camera,
-        T_world_body @ frame.T_body_camera,
-    )
-
-
-def _as_mapped(frame: RgbdFrame, T_world_body: Transform, octree: OctreeMap, editor: MapEditor) -> RgbdFrame:
-    """Return a frame without depth that is edited away, or far from all that is occupied in the octree."""
-    measured = (frame.depth_m > 0.0) & np.isfinite(frame.depth_m)
-    depth_m = np.where(measured, frame.depth_m, np.float32(0.0))
-    points_world = back_project(depth_m, ray_table(frame.camera), T_world_body @ frame.T_body_camera)
-    max_distance_m = _NEAR_VOXELS * octree.resolution_m
-    is_mapped = octree.are_near_occupied(points_world, max_distance_m=max_distance_m)
-    if editor.edits.erase or editor.edits.keep:
-        is_mapped &= editor.leave(points_world)
-    depth_m[measured] *= is_mapped
-    return replace(frame, depth_m=depth_m)
-
-
-@lru_cache(maxsize=8)
-def _undistortion(camera: PinholeCamera) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return where every pixel of the ideal image lies in the real one."""
-    columns, rows = cv2.initUndistortRectifyMap(
-        camera.matrix,
-        np.array(camera.distortion),
-        np.eye(3),
-        camera.matrix,
-        (camera.width_px, camera.height_px),
-        cv2.CV_32FC1,
-    )
-    return columns, rows
 
 
 def _expected_blocks(octree: OctreeMap, config: MeshConfig) -> int:

@@ -17,6 +17,7 @@ from mapper.runtime.progress import Report
 if TYPE_CHECKING:
     import gtsam
 
+    from mapper.core.geometry import Array
     from mapper.graph.model import BetweenFactor
 
 # χ² has no unit: once a step gains less than this, only rounding is left.
@@ -53,6 +54,21 @@ class Part:
     held: Sequence[gtsam.NonlinearFactor]
     start: gtsam.Values
     fixed: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PartSolution:
+    """Solution of one connected part.
+
+    Attributes:
+        poses: Poses of its nodes.
+        loop_weights: (L,) weight of each of its loops, 0 … 1.
+        iterations: Iterations that it took.
+    """
+
+    poses: gtsam.Values
+    loop_weights: Array
+    iterations: int
 
 
 def solve(

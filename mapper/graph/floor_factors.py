@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from mapper.core.geometry import Array, Transform, adjoint, inverse, transform
+from mapper.core.geometry import Array, Transform, adjoint, inverse, planar_motion, transform
 from mapper.graph.drift import innovations
 from mapper.graph.model import BetweenFactor, PoseGraph
 
@@ -168,10 +168,7 @@ def _open() -> Array:
 
 def _planar(T: Transform) -> Transform:
     """Return a motion's turn about z and its x and y."""
-    yaw_rad = np.arctan2(T[1, 0] - T[0, 1], T[0, 0] + T[1, 1])
-    cosine, sine = np.cos(yaw_rad), np.sin(yaw_rad)
-    R = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
-    return transform(R, np.array([T[0, 3], T[1, 3], 0.0]))
+    return planar_motion(T[0, 3], T[1, 3], np.arctan2(T[1, 0] - T[0, 1], T[0, 0] + T[1, 1]))
 
 
 def _common_plane(T_world_floor: Array) -> tuple[Array, float, Array]:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from mapper.core.clusters import cluster_numbers
 from mapper.core.geometry import Array
 from mapper.graph.batch import Effort, Part, solve
 from mapper.graph.drift import innovations
@@ -139,17 +140,5 @@ def _cost(part: Part, now: Graduated, limit: float) -> float:
 def _clusters(loops: Sequence[BetweenFactor]) -> list[NDArray[np.bool_]]:
     """Return clusters of loops as masks: loops are connected where both ends are close."""
     ends = np.sort([(loop.i, loop.j) for loop in loops], axis=1)
-    left = np.ones(len(loops), dtype=np.bool_)
-    clusters = []
-    while left.any():
-        cluster = np.zeros_like(left)
-        rim = [int(np.argmax(left))]
-        while rim:
-            k = rim.pop()
-            if not left[k]:
-                continue
-            left[k], cluster[k] = False, True
-            close = left & (np.abs(ends - ends[k]) <= _CLUSTER_NODES).all(axis=1)
-            rim += np.flatnonzero(close).tolist()
-        clusters.append(cluster)
-    return clusters
+    numbers = cluster_numbers(ends, _CLUSTER_NODES, norm=np.inf)
+    return [numbers == number for number in range(numbers.max() + 1)]

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mapper.core.errors import GraphError
-from mapper.core.geometry import Array, is_rigid
-from mapper.graph.batch import Part
+from mapper.core.geometry import is_rigid
+from mapper.graph.batch import Part, PartSolution
 from mapper.graph.chordal_initialization import start_of
 from mapper.graph.components import components_with_factors
 from mapper.graph.config import GraphConfig
@@ -48,7 +48,7 @@ def optimize(graph: PoseGraph, config: GraphConfig, *, progress: Progress = SILE
     terms = [between(factor) for factor in graph.factors]
     given = values_of(graph.T_world_node, graph.T_world_node)
     before = _errors(terms, given)
-    weights, iterations = [1.0] * len(terms), 0
+    weights, iterations = np.ones(len(terms)), 0
     match config.solve:
         case "none":
             T_world_node = dict(graph.T_world_node)
@@ -57,9 +57,9 @@ def optimize(graph: PoseGraph, config: GraphConfig, *, progress: Progress = SILE
         case "batch":
             T_world_node = dict(graph.T_world_node)
             for nodes, factors in components_with_factors(graph):
-                fixed = _fixed_node(graph, nodes, progress)
                 loops = [k for k in factors if graph.factors[k].origin == "loop"]
                 known = [k for k in factors if graph.factors[k].origin != "loop"]
+                fixed = _fixed_node(graph, nodes, progress)
                 part = Part(
                     known=[graph.factors[k] for k in known],
                     loops=[graph.factors[k] for k in loops],
@@ -67,18 +67,15 @@ def optimize(graph: PoseGraph, config: GraphConfig, *, progress: Progress = SILE
                     start=given if len(nodes) == given.size() else values_of(graph.T_world_node, nodes),
                     fixed=fixed,
                 )
-                solved, loop_weights, more = _solve_component(part, config, progress)
-                T_world_node |= poses_of(solved)
-                iterations += more
-                for k, weight in zip(loops, loop_weights, strict=True):
-                    weights[k] = float(weight)
+                solved = _solve_component(part, config, progress)
+                T_world_node |= poses_of(solved.poses)
+                iterations += solved.iterations
+                weights[loops] = solved.loop_weights
     after = _errors(terms, values_of(T_world_node, T_world_node))
-    return Solution(T_world_node, iterations, before, after, tuple(weights))
+    return Solution(T_world_node, iterations, before, after, tuple(weights.tolist()))
 
 
-def _solve_component(
-    part: Part, config: GraphConfig, progress: Progress
-) -> tuple["gtsam.Values", Array, int]:
+def _solve_component(part: Part, config: GraphConfig, progress: Progress) -> PartSolution:
     """Return what ``solve_part`` does from the configured start, with a note if it did not converge."""
     part, last = replace(part, start=start_of(part, config)), 0
     with progress.stage("solve") as report:

@@ -1,32 +1,21 @@
 """Robust solving of one component: graduated non-convexity or a robust kernel on its loops."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 import numpy as np
 
-from mapper.core.geometry import Array
-from mapper.graph.batch import Effort, Part, solve
+from mapper.graph.batch import Effort, Part, PartSolution, solve
 from mapper.graph.config import GraphConfig
 from mapper.graph.graduated_non_convexity import chi2_of, graduate, weighted
 from mapper.graph.terms import Kernel, between
 from mapper.runtime.progress import Report
 
-if TYPE_CHECKING:
-    import gtsam
 
-
-def solve_part(part: Part, config: GraphConfig, *, report: Report) -> tuple[gtsam.Values, Array, int]:
+def solve_part(part: Part, config: GraphConfig, *, report: Report) -> PartSolution:
     """Solve a component with outlier rejection of its loops.
 
     Args:
         part: The component.
         config: Kernel and termination criteria.
         report: Receives the iterations of the last solve.
-
-    Returns:
-        The solution, the weight of each loop in [0, 1], and the iterations.
 
     Raises:
         GraphError: The solver fails.
@@ -37,11 +26,11 @@ def solve_part(part: Part, config: GraphConfig, *, report: Report) -> tuple[gtsa
         case "gnc" if part.loops:
             weights, near = graduate(part, config.robust_width)
             inliers = weighted(part.loops, weights)
-            solved, iterations = solve(part.held, inliers, near.poses, effort=effort)
-            return solved, weights, near.iterations + iterations
+            poses, iterations = solve(part.held, inliers, near.poses, effort=effort)
+            return PartSolution(poses, weights, near.iterations + iterations)
         case "cauchy" | "huber" | "dcs" as kind:
             kernel = Kernel(kind, config.robust_width)
     terms = [between(loop, kernel=kernel) for loop in part.loops]
-    solved, iterations = solve(part.held, terms, part.start, effort=effort)
-    chi2 = chi2_of([between(loop) for loop in part.loops], solved)
-    return solved, kernel.weights(chi2) if kernel else np.ones_like(chi2), iterations
+    poses, iterations = solve(part.held, terms, part.start, effort=effort)
+    chi2 = chi2_of([between(loop) for loop in part.loops], poses)
+    return PartSolution(poses, kernel.weights(chi2) if kernel else np.ones_like(chi2), iterations)

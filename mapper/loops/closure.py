@@ -20,6 +20,9 @@ from mapper.runtime.regular_files import read_text
 ProposedBy = Literal["places", "scans", "nearby", "hand"]
 Verdict = Literal["accepted", "rejected"]
 
+SOLVER = "solver"
+"""``LoopClosure.rejected_by`` of a loop that the rest of the graph contradicts."""
+
 MIN_WEIGHT = 0.5
 """A loop with less weight in the solution is rejected, and is no factor of the solved graph."""
 
@@ -51,7 +54,7 @@ class LoopClosure:
         T_i_j: (4, 4) measured pose of j in i; None if there is no measurement.
         information: (6, 6) of j's tangent (rotation, translation); None if there is no measurement.
         verdict: Whether it is a constraint of the graph.
-        reason: Why it was rejected; empty when accepted.
+        reason: Why it was rejected: the step that did it, a colon, and what it found; empty when accepted.
         before: Discrepancy before the solve; None unless it was accepted until then.
         after: Discrepancy after the solve.
         weight: Weight that the solver gave it, 0 … 1.
@@ -83,6 +86,11 @@ class LoopClosure:
             )
         if self.verdict == "accepted" and (self.T_i_j is None or self.information is None):
             raise DataError(f"loop {self.i} → {self.j}: accepted without a measurement")
+
+    @property
+    def rejected_by(self) -> str:
+        """Step that rejected it, e.g. "isvd", "gate" or ``SOLVER``; empty when accepted."""
+        return self.reason.partition(":")[0]
 
     @property
     def factor(self) -> BetweenFactor:
@@ -118,12 +126,17 @@ def accepted_loops(loops: Iterable[LoopClosure]) -> list[LoopClosure]:
     return [loop for loop in loops if loop.verdict == "accepted"]
 
 
+def rejections(loops: Iterable[LoopClosure]) -> dict[str, int]:
+    """Return how many candidates each step rejected, the most first."""
+    return dict(Counter(loop.rejected_by for loop in loops if loop.verdict == "rejected").most_common())
+
+
 def why_none_accepted(loops: Sequence[LoopClosure]) -> str:
     """Return why no loop of some candidates is accepted: none looked alike, or which steps rejected them."""
     if not loops:
         return "nothing in it looks like a known place (min_similarity of loops.places or loops.context)"
-    steps = Counter(loop.reason.split(":")[0] for loop in loops).most_common()
-    return f"{len(loops)} candidates compared, none held: {', '.join(f'{step} {n}' for step, n in steps)}"
+    counts = ", ".join(f"{step} {count}" for step, count in rejections(loops).items())
+    return f"{len(loops)} candidates compared, none held: {counts}"
 
 
 def apply_solution(
@@ -167,7 +180,7 @@ def _apply_solution(
     if weight >= min_weight:
         return solved
     return replace(
-        solved, verdict="rejected", reason=f"solver: contradicts the rest of the graph, weight {weight:.2f}"
+        solved, verdict="rejected", reason=f"{SOLVER}: contradicts the rest of the graph, weight {weight:.2f}"
     )
 
 

@@ -14,11 +14,9 @@ from mapper.loops.config import ImageVerificationConfig
 from mapper.registration.base import Alignment
 from mapper.registration.isvd import Isvd
 from mapper.registration.p3p import ransac_p3p
-from mapper.registration.reprojection import normal_matrix, refine_pose
+from mapper.registration.reprojection import VIRTUAL_BASELINE_PX_M, normal_matrix, refine_pose
 from mapper.registration.variance_factor import residual_statistics
 
-VIRTUAL_BASELINE_PX_M = 40.0
-"""bf: depth z counts as the disparity bf / z (Mur-Artal & Tardós 2017)."""
 MAX_SIGMA_M = 0.05
 """A motion whose translation is less certain in any direction is no loop: far scenes leave it uncertain."""
 _LM_ROUNDS, _LM_ITERATIONS = 4, 10

@@ -23,6 +23,9 @@ from mapper.loops.proposers import NodePoses, PoseProposer
 from mapper.loops.scan_context_proposer import MAX_SIMILAR
 from mapper.odometry.base import FrameResult
 
+_MAX_FAILED = 2
+"""Searches in a row that fail next to the estimate before the whole map is searched."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KnownPlaces(Generic[Place]):
@@ -40,10 +43,6 @@ class KnownPlaces(Generic[Place]):
     def map_node(self) -> int:
         """Number of the node that stands for the map's frame: all of the map's own come before it."""
         return 1 + max(self.places)
-
-
-_MAX_FAILED = 2
-"""Searches in a row that fail next to the estimate before the whole map is searched."""
 
 
 class _InMap:

@@ -29,7 +29,7 @@ from mapper.octree.scan_update_file import CachedUpdate, ScanUpdateFile, ScanUpd
 from mapper.octree.slice import cut_slice, floor_below
 from mapper.runtime.ordered_map import ordered_map
 from mapper.runtime.progress import Progress
-from mapper.sources.base import Log
+from mapper.sources.base import Log, Skipped
 
 _NO_EDITS = Edits()
 
@@ -111,18 +111,23 @@ class _Job:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Fused:
-    """A frame's update, or the reason why there is none; its scan if it was read.
+class _Prepared:
+    """A frame's update, before the octree is updated with it.
 
-    ``unreached`` counts the points that were left out, for the octree's keys do not reach them.
+    Attributes:
+        job: The frame.
+        update: What it shows.
+        cached: The same, to be stored.
+        scan: The scan; None if it was not read.
+        snapshot: Its small image or thinned scan; None if it is not logged.
+        unreached: Number of points that were left out, since the octree's keys do not reach them.
     """
 
     job: _Job
-    update: ScanUpdate | None = None
-    cached: CachedUpdate | None = None
-    scan: Scan | None = None
-    snapshot: Snapshot | ScanSnapshot | None = None
-    reason: str = ""
+    update: ScanUpdate
+    cached: CachedUpdate
+    scan: Scan | None
+    snapshot: Snapshot | ScanSnapshot | None
     unreached: int = 0
 
 
@@ -248,20 +253,20 @@ def _fuse_scans(
     casters, moved, unreached = _Casters(config.octree), 0, 0
     prepared = ordered_map(lambda job: _prepared(job, config, casters.caster), jobs, workers=config.workers)
     with progress.stage("fuse") as report:
-        for done, fused in enumerate(prepared, start=1):
+        for done, one in enumerate(prepared, start=1):
             report(done, len(trajectory))
-            if fused.update is None or fused.cached is None:
-                progress.note(f"not fused: {fused.reason}")
+            if isinstance(one, Skipped):
+                progress.note(f"not fused: {one.reason}")
                 continue
-            if fused.scan is not None and config.octree.attributes:
-                octree.insert(fused.scan, fused.job.frame.T_world_body)
+            if one.scan is not None and config.octree.attributes:
+                octree.insert(one.scan, one.job.frame.T_world_body)
             else:
-                octree.merge(fused.update)
-            after.add(fused.cached)
-            moved += fused.job.cached is None
-            unreached += fused.unreached
-            if fused.snapshot is not None and on_snapshot is not None:
-                on_snapshot(fused.snapshot)
+                octree.merge(one.update)
+            after.add(one.cached)
+            moved += one.job.cached is None
+            unreached += one.unreached
+            if one.snapshot is not None and on_snapshot is not None:
+                on_snapshot(one.snapshot)
     if unreached:
         progress.note(
             f"{unreached} points lie farther than {reach_m(config.octree.resolution_m):g} m from the map's "
@@ -312,7 +317,7 @@ def _neighbours_hold(
     )
 
 
-def _prepared(job: _Job, config: FuseSettings, caster: Caster) -> _Fused:
+def _prepared(job: _Job, config: FuseSettings, caster: Caster) -> _Prepared | Skipped:
     """Read and cast one frame as far as needed: images cost most, and cached updates nothing."""
     frame, scan, snapshot = job.frame, None, None
     try:
@@ -323,9 +328,9 @@ def _prepared(job: _Job, config: FuseSettings, caster: Caster) -> _Fused:
         elif job.cached is None:
             scan = frame.scan_of(frame.entry.scan())
     except FrameError as error:  # readable in the first pass: the log has changed since
-        return _Fused(job, reason=str(error))
+        return Skipped(frame.entry.stamp_ns, str(error))
     if job.cached is not None:
-        return _Fused(job, job.cached.update(), job.cached, scan, snapshot)
+        return _Prepared(job, job.cached.update(), job.cached, scan, snapshot)
     assert scan is not None
     unreached = 0
     try:
@@ -334,7 +339,7 @@ def _prepared(job: _Job, config: FuseSettings, caster: Caster) -> _Fused:
         scan, unreached = within_reach(scan, frame.T_world_body, config.octree)
         update = pack(caster.cast(scan, frame.T_world_body))
     cached = cache_update(frame.entry.stamp_ns, frame.T_world_body, update)
-    return _Fused(job, update, cached, scan, snapshot, unreached=unreached)
+    return _Prepared(job, update, cached, scan, snapshot, unreached)
 
 
 def _snapshot(frame: Frame, scan: Scan, config: McapConfig) -> Snapshot | ScanSnapshot:

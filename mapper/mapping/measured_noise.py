@@ -9,19 +9,13 @@ from mapper.core.frames import ray_table
 from mapper.core.geometry import Array
 from mapper.runtime.ordered_map import ordered_map
 from mapper.sensing.config import KINECT_NOISE, DepthNoiseConfig
-from mapper.sensing.planes import cut_tiles, fit_planes
+from mapper.sensing.planes import TILES_ACROSS, cut_tiles, distance_levels, fit_planes
 from mapper.sources.base import FrameRef, Log, read_depth
 
 _FRAMES = 24
-_TILES_ACROSS = 16
 _STRIDE_PX = 2
 _MIN_MEASURED_RATIO = 0.9
-_MIN_PLANE_RATIO = 0.98
-_MAX_TILT_RAD = np.radians(60.0)
-"""Up to here a Kinect's axial noise does not depend on the angle (Nguyen et al. 2012, §4)."""
 _MAX_NOISE_RATIO = 0.1
-_BIN_RATIO = 1.1
-_MIN_TILES, _MIN_FRAMES = 30, 3
 _FLATTEST_PERCENT = 25.0
 """Relief only adds to the noise, so that of the flatter tiles is the sensor's."""
 _LEAST_QUADRATIC_PER_M = 1e-6
@@ -88,7 +82,7 @@ def _seen(entry: FrameRef) -> tuple[Array, Array, Array] | None:
         return None
     depth_m = frame.depth_m[::_STRIDE_PX, ::_STRIDE_PX]
     some_m = depth_m[::4, ::4][depth_m[::4, ::4] > 0.0].astype(np.float64)
-    side = max(depth_m.shape[1] // _TILES_ACROSS, 3)
+    side = max(depth_m.shape[1] // TILES_ACROSS, 3)
     tiles_m = cut_tiles(depth_m, side)
     measured = (tiles_m > 0.0).mean(axis=1) >= _MIN_MEASURED_RATIO
     if not measured.any():
@@ -97,21 +91,13 @@ def _seen(entry: FrameRef) -> tuple[Array, Array, Array] | None:
     rays = cut_tiles(ray_table(frame.camera)[::_STRIDE_PX, ::_STRIDE_PX], side)[measured]
     planes = fit_planes(tiles_m, rays)
     distance_m = np.median(planes.depth_m, axis=1)
-    flat = (
-        (planes.used.sum(axis=1) >= _MIN_PLANE_RATIO * (tiles_m > 0.0).sum(axis=1))
-        & (planes.tilt_rad <= _MAX_TILT_RAD)
-        & (planes.sigma_m <= _MAX_NOISE_RATIO * distance_m)
-    )
+    flat = planes.explain(tiles_m > 0.0) & (planes.sigma_m <= _MAX_NOISE_RATIO * distance_m)
     return some_m, distance_m[flat], planes.sigma_m[flat]
 
 
 def _levels(distance_m: Array, sigma_m: Array, frame_of: NDArray[np.intp]) -> tuple[Array, Array]:
     """Return the distances at which enough frames show enough planes, and the noise there."""
-    steps = np.floor(np.log(distance_m) / np.log(_BIN_RATIO))
-    depths, sigmas = [], []
-    for step in np.unique(steps):
-        inside = steps == step
-        if inside.sum() >= _MIN_TILES and len(np.unique(frame_of[inside])) >= _MIN_FRAMES:
-            depths.append(float(np.median(distance_m[inside])))
-            sigmas.append(float(np.percentile(sigma_m[inside], _FLATTEST_PERCENT)))
+    levels = distance_levels(distance_m, frame_of)
+    depths = [float(np.median(distance_m[level])) for level in levels]
+    sigmas = [float(np.percentile(sigma_m[level], _FLATTEST_PERCENT)) for level in levels]
     return np.array(depths), np.array(sigmas)

@@ -9,10 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
+from mapper.core.clusters import cluster_numbers
 from mapper.core.errors import ConfigError
 from mapper.core.geometry import Array, Points, Transform, apply, inverse
 from mapper.merging.placing import Placed
@@ -169,11 +167,7 @@ def _compared(centres: Points, other: OctreeMap, T_other_centres: Transform, tol
 
 def _clusters(centres: Points, resolution_m: float, min_voxels: int) -> tuple[list[Cluster], int]:
     """Return the clusters, the largest first, and how many voxels are in smaller ones."""
-    if not len(centres):
-        return [], 0
-    pairs = cKDTree(centres).query_pairs(_NEIGHBOUR_VOXELS * resolution_m, output_type="ndarray")
-    links = coo_array((np.ones(len(pairs), np.int8), pairs.T), shape=(len(centres),) * 2)
-    _, cluster_of = connected_components(links, directed=False)
+    cluster_of = cluster_numbers(centres, _NEIGHBOUR_VOXELS * resolution_m)
     sizes = np.bincount(cluster_of)
     large = np.flatnonzero(sizes >= min_voxels)
     order = large[np.argsort(-sizes[large], kind="stable")]

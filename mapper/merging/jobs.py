@@ -56,12 +56,16 @@ class Workspace:
         scratch: Folder that is removed at the end.
         tiling: Tiling of the map.
         config: Settings of the map's octree.
+        follows_ground: Whether the slice's band follows the ground.
+        has_colors: Whether the map has colours, which is known once all runs are cut into tiles.
     """
 
     folder: Path
     scratch: Path
     tiling: Tiling
     config: OctreeConfig
+    follows_ground: bool
+    has_colors: bool = False
 
     def part(self, tile: int, run: int) -> Path:
         """Return the file of a run's part of a tile."""
@@ -221,34 +225,22 @@ def _by_tile(
             yield tile, slice(start, end)
 
 
-def join_tile(
-    workspace: Workspace, tile: int, runs: Sequence[int], *, has_colors: bool, follows_ground: bool
-) -> JoinedTile:
+def join_tile(workspace: Workspace, tile: int, runs: Sequence[int]) -> JoinedTile:
     """Sum the runs' parts of a tile, and write the tile and its pieces of the OctoMap files.
 
     Args:
         workspace: Files of the merge.
         tile: Code of the tile.
         runs: Numbers of the runs with a known voxel in the tile.
-        has_colors: Whether the map has colours.
-        follows_ground: Whether the slice's band follows the ground.
     """
     octree = OctreeMap(workspace.config)
     overlaps = tuple(octree.add(read_octree(workspace.part(tile, run))) for run in runs)
     octree.clamp()
     write_map(workspace.tile(tile), octree)
-    return _described(workspace, tile, octree, overlaps, has_colors=has_colors, follows_ground=follows_ground)
+    return _described(workspace, tile, octree, overlaps)
 
 
-def keep_tile(
-    workspace: Workspace,
-    tile: int,
-    known: Path,
-    overlaps: Sequence[Overlap],
-    *,
-    has_colors: bool,
-    follows_ground: bool,
-) -> JoinedTile:
+def keep_tile(workspace: Workspace, tile: int, known: Path, overlaps: Sequence[Overlap]) -> JoinedTile:
     """Take over a tile of an earlier map, and write its pieces of the OctoMap files.
 
     Args:
@@ -256,37 +248,26 @@ def keep_tile(
         tile: Code of the tile.
         known: Its file in that map.
         overlaps: Overlaps of its runs in that map.
-        has_colors: Whether the map has colours.
-        follows_ground: Whether the slice's band follows the ground.
     """
     with atomic_file(workspace.tile(tile)) as part:
         shutil.copyfile(known, part)
-    octree = read_octree(workspace.tile(tile))
-    return _described(
-        workspace, tile, octree, tuple(overlaps), has_colors=has_colors, follows_ground=follows_ground
-    )
+    return _described(workspace, tile, read_octree(workspace.tile(tile)), tuple(overlaps))
 
 
 def _described(
-    workspace: Workspace,
-    tile: int,
-    octree: OctreeMap,
-    overlaps: tuple[Overlap, ...],
-    *,
-    has_colors: bool,
-    follows_ground: bool,
+    workspace: Workspace, tile: int, octree: OctreeMap, overlaps: tuple[Overlap, ...]
 ) -> JoinedTile:
     """Write the pieces of a finished tile."""
     depth = workspace.tiling.depth
     nodes = nodes_in_preorder(octree.blocks, root_depth=depth)
     color = (UNSET, UNSET, UNSET)
-    if has_colors and octree.attributes is not None:
+    if workspace.has_colors and octree.attributes is not None:
         nodes = colored(nodes, octree.blocks, octree.attributes, root_depth=depth, root_code=tile)
         color = tuple(nodes["rgb"][0].tolist())
     words, state = words_in_preorder(octree.blocks, octree.occupied_log_odds, root_depth=depth)
     write_bytes(workspace.piece(tile, "ot"), nodes.tobytes())
     write_bytes(workspace.piece(tile, "bt"), words.astype("<u2", copy=False).tobytes())
-    if follows_ground:
+    if workspace.follows_ground:
         first, shape = workspace.window(tile)
         save_array(workspace.piece(tile, LOWEST), lowest_occupied(octree, first=first, shape=shape))
     save_array(workspace.piece(tile, OCCUPIED), occupied_voxels(octree))

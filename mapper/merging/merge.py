@@ -125,18 +125,16 @@ def merge(
         warnings = [*placing.notes, *rigid, *warnings_about(placed)]
         for note in warnings:
             progress.note(note)
-        workspace = Workspace(folder, folder / SCRATCH, tiling, config)
+        follows_ground = manifest.slice.above == "ground"
+        workspace = Workspace(folder, folder / SCRATCH, tiling, config, follows_ground)
         stages = Stages(JobRunner(workspace.scratch / "done", progress), executor, progress)
         write_poses(folder, placing, manifest)
         octrees = fuse_runs(workspace, stages, placed, manifest)
         tiles = None if known is None else known_tiles(known, placed, manifest, tiling)
         split, untouched = _split(workspace, stages, placed, octrees, tiles)
-        has_colors = any(part.has_colors for part in split)
-        follows_ground = manifest.slice.above == "ground"
-        joined = _join(
-            workspace, stages, split, untouched, has_colors=has_colors, follows_ground=follows_ground
-        )
-        write_whole_ot(folder / files.OCTREE_OT, workspace, joined, has_colors=has_colors)
+        workspace = replace(workspace, has_colors=any(part.has_colors for part in split))
+        joined = _join(workspace, stages, split, untouched)
+        write_whole_ot(folder / files.OCTREE_OT, workspace, joined)
         write_whole_bt(folder / files.OCTREE_BT, workspace, joined)
         sliced = slice_map(workspace, stages, joined, manifest, placed)
         manifest = _completed(manifest, workspace, split, joined, sliced.columns)
@@ -278,9 +276,6 @@ def _join(
     stages: Stages,
     split: Sequence[SplitRun],
     untouched: Mapping[int, KnownTile],
-    *,
-    has_colors: bool,
-    follows_ground: bool,
 ) -> dict[int, JoinedTile]:
     """Return the result of every tile, in Morton order."""
     tiles = sorted({tile for part in split for tile in part.part_bytes})
@@ -289,13 +284,11 @@ def _join(
     jobs: dict[str, Callable[[], JoinedTile]] = {}
     for tile in tiles:
         if tile in untouched:
-            work = partial(keep_tile, workspace, tile, *untouched[tile])
+            job = partial(keep_tile, workspace, tile, *untouched[tile])
         else:
             runs = [run for run, part in enumerate(split) if tile in part.part_bytes]
-            work = partial(join_tile, workspace, tile, runs)
-        jobs[workspace.tiling.name_of(tile)] = partial(
-            work, has_colors=has_colors, follows_ground=follows_ground
-        )
+            job = partial(join_tile, workspace, tile, runs)
+        jobs[workspace.tiling.name_of(tile)] = job
     tile_of = dict(zip(jobs, tiles, strict=True))
     done = {}
     for name, joined in stages.run("join", jobs, JoinedTile):

@@ -19,19 +19,18 @@ from mapper.octree.tree import NODE, UpperNodes, children_in, preorder, upper_no
 Tiles = Mapping[int, JoinedTile]
 
 
-def write_whole_ot(path: Path, workspace: Workspace, tiles: Tiles, *, has_colors: bool) -> None:
+def write_whole_ot(path: Path, workspace: Workspace, tiles: Tiles) -> None:
     """Write the log-odds of all tiles as one ``.ot`` file; atomic.
 
     Args:
         path: File to write.
         workspace: Files of the merge, with the tiles' pieces.
         tiles: Results of the tiles, in Morton order.
-        has_colors: Whether the map has colours.
     """
     ordered = list(tiles)
     upper = _upper(workspace, tiles, [joined.top for joined in tiles.values()])
     visited = preorder(upper).tolist()
-    colors = _colors(upper, tiles) if has_colors else None
+    colors = _colors(upper, tiles) if workspace.has_colors else None
 
     def payload() -> Iterator[NDArray[np.generic]]:
         for node in visited:
@@ -51,7 +50,7 @@ def write_whole_ot(path: Path, workspace: Workspace, tiles: Tiles, *, has_colors
         binary=False,
         node_count=sum(tiles[ordered[node]].nodes if node < len(tiles) else 1 for node in visited),
         resolution_m=workspace.tiling.resolution_m,
-        tree_name="ColorOcTree" if has_colors else "OcTree",
+        tree_name="ColorOcTree" if workspace.has_colors else "OcTree",
     )
 
 
@@ -93,8 +92,6 @@ def _colors(upper: UpperNodes, tiles: Tiles) -> NDArray[np.uint8]:
     ends = [*firsts[1:], len(upper.nodes) - 1]
     for node, (first, end) in enumerate(zip(firsts, ends, strict=True), start=len(tiles)):
         children = np.full((8, 3), UNSET, np.uint8)
-        children[: end - first] = colors[
-            first:end
-        ]  # places matter to pruned ones only, and those were all there
+        children[: end - first] = colors[first:end]  # a pruned node had all eight, so places do not matter
         colors[node] = parent_color(children, pruned=upper.nodes[node]["mask"] == 0)
     return colors

@@ -93,7 +93,7 @@ def slice_map(
     floor = None if missing else _floor(workspace, joined, extent, manifest, paths_map)
     driven = None if floor is None else driven_ground(floor)
     raster = _raster(workspace, extent, driven)
-    if manifest.slice.above == "ground":
+    if workspace.follows_ground:
         _save_ground(raster, columns.values(), manifest, driven)
     done = _sliced_columns(workspace, stages, columns.values(), manifest)
     if not _is_level(placed):
@@ -159,7 +159,7 @@ def _sliced_columns(
             workspace,
             tiles,
             manifest.slice,
-            ground=workspace.piece(tiles[0], GROUND) if manifest.slice.above == "ground" else None,
+            ground=workspace.piece(tiles[0], GROUND) if workspace.follows_ground else None,
             floor_z_m=manifest.floor_z_m,
         )
         for tiles in columns

@@ -34,12 +34,11 @@ from mapper.odometry.local_map.readout_time import ReadoutTime
 from mapper.odometry.local_map.rolling_shutter import RollingShutter
 from mapper.odometry.registration_errors import RegistrationErrors
 from mapper.registration.base import Alignment
+from mapper.registration.reprojection import VIRTUAL_BASELINE_PX_M
 from mapper.sensing.config import KINECT_NOISE
 from mapper.sensing.depth_filter import dif
 from mapper.sensing.depth_noise import depth_sigma_m, feature_depth_m
 
-_VIRTUAL_BASELINE_PX_M = 40.0
-"""bf: depth z counts as the disparity bf / z (Mur-Artal & Tardós 2017)."""
 _DEPTH_SHARE = 0.01
 """Error of depths beside the sensor's noise, as a share: its scale, and the slope where a feature lies."""
 _PAIRS_SHARING, _PAIRS_COUNTED = 4, 200
@@ -75,7 +74,7 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
         self._config = config
         self._motion_check = motion_check
         self._detector = detector or build_detector(config.detector)
-        self._registration = PairRegistration(config.registration, by_pixels=config.residual == "pixels")
+        self._registration = PairRegistration(config)
         self._register_pair = register or self._registration
         self._earlier = EarlierFrames(config)
         self._next_node = 0
@@ -105,15 +104,15 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
         sigma_px = self._detector.scale_factor ** features.octave.astype(np.float64)
         sigma_m = np.hypot(depth_sigma_m(config.depth_noise or KINECT_NOISE, z), _DEPTH_SHARE * z)
         # Without depth the weight is not used, but it is a factor in sums.
-        disparity_sigma_px = np.where(np.isnan(z), 1.0, _VIRTUAL_BASELINE_PX_M / z**2 * sigma_m)
+        disparity_sigma_px = np.where(np.isnan(z), 1.0, VIRTUAL_BASELINE_PX_M / z**2 * sigma_m)
         return IsvdObservation(
             stamp_ns=frame.stamp_ns,
             features=features,
             points_body=apply(frame.T_body_camera, np.column_stack([rays * z[:, None], z])),
-            measured=np.column_stack([pixels, _VIRTUAL_BASELINE_PX_M / z]),
+            measured=np.column_stack([pixels, VIRTUAL_BASELINE_PX_M / z]),
             weights=np.column_stack([sigma_px, sigma_px, disparity_sigma_px]) ** -2.0,
             intrinsics=np.array(
-                [camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px, _VIRTUAL_BASELINE_PX_M]
+                [camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px, VIRTUAL_BASELINE_PX_M]
             ),
             camera=camera,
             T_body_camera=frame.T_body_camera,
@@ -198,13 +197,16 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
         """Return the registrations that succeeded, in the order of the earlier frames."""
         candidates = []
         for frame in earlier:
-            alignment, weight, pairs = self._register_pair(self._corrected(frame), observation, match)
+            found = self._register_pair(self._corrected(frame), observation, match)
+            alignment = found.alignment
             if alignment.converged and self._is_possible(alignment, frame.observation, observation):
                 T = alignment.T_target_source
                 assert alignment.information is not None  # it converged
                 information = with_model_error(alignment.information, T)
                 candidates.append(
-                    PoseCandidate(frame, alignment, information, weight, pairs, frame.T_world_body @ T)
+                    PoseCandidate(
+                        frame, alignment, information, found.weight, found.pairs, frame.T_world_body @ T
+                    )
                 )
         return candidates
 

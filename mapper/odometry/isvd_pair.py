@@ -30,9 +30,9 @@ def align_images(
     seen_target = odometry.observe(target)
     detected = time.perf_counter()
     seen_source = odometry.observe(source)
-    register = PairRegistration(config.registration, by_pixels=config.residual == "pixels")
+    register = PairRegistration(config)
     for match in (config.match, config.fallback):
-        alignment, _, _ = register(seen_target, seen_source, match)
+        alignment = register(seen_target, seen_source, match).alignment
         if alignment.converged:
             break
     return alignment, {"prepare": detected - began, "align": time.perf_counter() - detected}

@@ -10,10 +10,9 @@ from mapper.core.frames import PinholeCamera
 from mapper.core.geometry import Array, Points, Transform, adjoint, apply, inverse
 from mapper.features.base import Features
 from mapper.features.matching import Pairs, homography_inliers, match_mutual
-from mapper.odometry.config import MatchConfig
+from mapper.odometry.config import IsvdOdometryConfig, MatchConfig
 from mapper.odometry.local_map.pixel_motion import of_middle_row
 from mapper.registration.base import Alignment, failed
-from mapper.registration.config import IsvdConfig
 from mapper.registration.isvd import Isvd
 from mapper.registration.reprojection import classify, normal_matrix, refine_pose
 from mapper.registration.variance_factor import residual_statistics
@@ -81,37 +80,44 @@ class IsvdObservation(Archivable):
         )
 
 
-RegisterPair = Callable[[IsvdObservation, IsvdObservation, MatchConfig], tuple[Alignment, float, Pairs]]
+@dataclass(frozen=True, slots=True, eq=False)
+class PairAlignment:
+    """Alignment of two observations by their features.
+
+    Attributes:
+        alignment: Motion from the source to the target.
+        weight: Its quality W in 1/m (Somlyai, PhD thesis, eq. 4.1), 0 if it did not converge.
+        pairs: (M, 2) matched features of the target and the source, whether they agree or not.
+    """
+
+    alignment: Alignment
+    weight: float
+    pairs: Pairs
+
+
+RegisterPair = Callable[[IsvdObservation, IsvdObservation, MatchConfig], PairAlignment]
 """Registration of two observations (target, source), as ``PairRegistration``."""
 
 
 class PairRegistration:
     """Registration of one frame's features to those of an earlier one."""
 
-    def __init__(self, config: IsvdConfig, *, by_pixels: bool) -> None:
-        """Set the method.
+    def __init__(self, config: IsvdOdometryConfig) -> None:
+        """Set the method: ISVD, refined by the pixels if these are the residual, a second test of it."""
+        self._config = config.registration
+        self._isvd = Isvd(config.registration)
+        self._by_pixels = config.residual == "pixels"
 
-        Args:
-            config: Settings of ISVD.
-            by_pixels: Refine ISVD's motion by the pixels, which is also a second test of it.
-        """
-        self._config = config
-        self._isvd = Isvd(config)
-        self._by_pixels = by_pixels
+    def __call__(self, target: IsvdObservation, source: IsvdObservation, match: MatchConfig) -> PairAlignment:
+        """Match the features of two observations and align the source to the target."""
+        return self.fit(target, source, matched_pairs(target, source, match))
 
-    def __call__(
-        self, target: IsvdObservation, source: IsvdObservation, match: MatchConfig
-    ) -> tuple[Alignment, float, Pairs]:
-        """Return the source's alignment to the target, its quality W (eq. 4.1), and the matches."""
-        pairs = matched_pairs(target, source, match)
-        return *self.fit(target, source, pairs), pairs
-
-    def fit(self, target: IsvdObservation, source: IsvdObservation, pairs: Pairs) -> tuple[Alignment, float]:
-        """Return the alignment by matched features, and its quality W."""
+    def fit(self, target: IsvdObservation, source: IsvdObservation, pairs: Pairs) -> PairAlignment:
+        """Align the source to the target by matched features."""
         alignment, weight = self._isvd.fit_weighted(*shared_points(target, source, pairs))
         if self._by_pixels and alignment.converged:
             alignment = self._refined(target, source, pairs, alignment)
-        return alignment, weight
+        return PairAlignment(alignment, weight, pairs)
 
     def agreeing(
         self, target: IsvdObservation, source: IsvdObservation, pairs: Pairs, T_target_source: Transform

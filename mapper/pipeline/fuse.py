@@ -199,7 +199,6 @@ def fuse_into(
     results = Run(writer.folder, config, writer.manifest).results
     if not config.mcap.frame_times:
         results = replace(results, frame_ms={})
-    trajectory = results.trajectory
     make_writer = ScanUpdateWriter if checkpoints is None else partial(MarkedUpdates, checkpoints=checkpoints)
     with writer.clock.stage("fuse"):
         _warn_of_distortion(writer, source, progress)
@@ -224,13 +223,19 @@ def fuse_into(
             )
         with writer.clock.stage("write"):
             log_results(log, results)
-            log_maps(log, maps, stamp_ns=int(trajectory.stamps_ns[0]))
+            log_maps(log, maps, stamp_ns=int(results.trajectory.stamps_ns[0]))
             _write_maps(writer.folder, maps)
             _write_pictures(writer, maps, results, has_colors=source.sensor == "rgbd")
     others = [warning for warning in writer.manifest.warnings if warning.kind != FLOOR]
     found = floor_warnings(config.traversable, config.octree.resolution_m, has_path=maps.has_path)
     writer.update(warnings=(*others, *found), edits=maps.edits)
     _write_verdict(writer, source, config, results, progress)
+    _write_counts(writer, maps, results.trajectory)
+    observer.on_mapped(Run(writer.folder, config, writer.manifest), results, maps)
+
+
+def _write_counts(writer: RunWriter, maps: Maps, trajectory: Trajectory) -> None:
+    """Write the sizes of the maps and the time that all of it took into a run's manifest."""
     counts = writer.manifest.counts.model_copy(
         update={
             "leaves": len(maps.octree),
@@ -242,7 +247,6 @@ def fuse_into(
     writer.update(counts=counts)
     log_s = _duration_s(trajectory, [log.begins_ns for log in writer.manifest.input.appended])
     writer.record_timing(log_s=log_s, frames=counts.read)
-    observer.on_mapped(Run(writer.folder, config, writer.manifest), results, maps)
 
 
 def _write_verdict(

@@ -18,7 +18,7 @@ from mapper.graph.config import GraphConfig
 from mapper.graph.gate import MEDIAN_CHI2
 from mapper.graph.model import PoseGraph
 from mapper.graph.optimize import optimize
-from mapper.loops.closure import Discrepancy, accepted_loops, exceeds, why_none_accepted
+from mapper.loops.closure import SOLVER, Discrepancy, accepted_loops, exceeds, why_none_accepted
 from mapper.loops.config import PlaceLoopsConfig, ScanLoopsConfig
 from mapper.loops.map_constraints import build_map_constraint_detector
 from mapper.odometry.factory import odometry_for
@@ -204,7 +204,7 @@ def _doubtful_unless_confirmed(
     contradicting = {
         loop.j
         for loop in tracking.loops
-        if loop.reason.startswith("solver") and loop.after is not None and exceeds(loop.after, slack)
+        if loop.rejected_by == SOLVER and loop.after is not None and exceeds(loop.after, slack)
     } - held
     doubts |= dict.fromkeys(contradicting, "the place that was recognised here contradicts the others")
     tracks = tuple(

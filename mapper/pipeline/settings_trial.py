@@ -60,7 +60,7 @@ def try_settings(
     is_unplaced = np.isin(source.stamps_ns, unplaced_ns)
     if not is_unplaced.any() or not candidates:
         return None
-    frames = _worst_stretch(is_unplaced, _FRAMES[source.sensor])
+    frames = worst_stretch(is_unplaced, _FRAMES[source.sensor])
     stretch = source.subset(frames)
     begin_s, end_s = ((stretch.stamps_ns[[0, -1]] - source.stamps_ns[0]) / NS_PER_S).tolist()
     with progress.stage("try") as report:
@@ -91,8 +91,13 @@ def candidate_settings(config: BuildConfig) -> Iterator[tuple[str, BuildConfig]]
         yield f"odometry.kind={instead.kind}", config.model_copy(update={"odometry": instead})
 
 
-def _worst_stretch(is_unplaced: NDArray[np.bool_], length: int) -> NDArray[np.intp]:
-    """Return the indices of the frames of a trial."""
+def worst_stretch(is_unplaced: NDArray[np.bool_], length: int) -> NDArray[np.intp]:
+    """Return the indices of the frames of a trial: those among which most are lost or doubtful.
+
+    Args:
+        is_unplaced: (N,) whether each frame of the log is lost or doubtful.
+        length: Number of frames of a trial; a shorter log is tried whole.
+    """
     counts = np.concatenate([[0], np.cumsum(is_unplaced)])
     begins = np.arange(max(len(is_unplaced) - length, 0) + 1)
     lead = length // _LEAD

@@ -114,33 +114,50 @@ def track_log(
     entries = map(checks.log.entry_at, range(len(known), len(source)))
     observations = ordered_map(partial(_observe, odometry), entries, workers=config.workers)
     with progress.stage("track") as report:
-        for done, (entry, observation, observed_s) in enumerate(observations, start=len(known) + 1):
+        for done, observed in enumerate(observations, start=len(known) + 1):
             report(done, len(source))
-            ms, result = 0.0, observation
-            if isinstance(observation, Skipped):
-                first_pass.skipped.append(observation)
-                progress.note(f"skipped: {observation.reason}")
+            result: FrameResult | Skipped
+            if isinstance(observed.observation, Skipped):
+                result, ms = observed.observation, 0.0
+                first_pass.skipped.append(result)
+                progress.note(f"skipped: {result.reason}")
             else:
                 began = time.perf_counter()
-                result = odometry.track(observation)
-                view = partial(odometry.view, observation, result.twist)
+                result = odometry.track(observed.observation)
+                view = partial(odometry.view, observed.observation, result.twist)
                 first_pass.add(result, view)
-                ms = first_pass.frame_ms[result.stamp_ns] = 1e3 * (observed_s + time.perf_counter() - began)
-                observer.on_frame(Step(entry, result, view, odometry.matches, start.detector))
+                ms = 1e3 * (observed.seconds + time.perf_counter() - began)
+                first_pass.frame_ms[result.stamp_ns] = ms
+                observer.on_frame(Step(observed.entry, result, view, odometry.matches, start.detector))
             search = searches.take()
             if checkpoints is not None:
                 checkpoints.add(FrameCheckpoint(result, search, ms, checks.reading(done - 1)), odometry)
     return first_pass.result(odometry, checks, progress, sweep_warnings(source, first_pass.tracks, config))
 
 
-def _observe(odometry: Odometry[Any], entry: FrameRef) -> tuple[FrameRef, Any, float]:
-    """Return a frame with what odometry needs of it, or why it is skipped, and the seconds that took."""
+@dataclass(frozen=True, slots=True, eq=False)
+class _Observed:
+    """A frame that has been read.
+
+    Attributes:
+        entry: The frame.
+        observation: What the odometry needs of it, or why it is skipped.
+        seconds: Time that reading took.
+    """
+
+    entry: FrameRef
+    observation: Any
+    seconds: float
+
+
+def _observe(odometry: Odometry[Any], entry: FrameRef) -> _Observed:
+    """Read a frame as the odometry needs it."""
     began = time.perf_counter()
     try:
         observation = odometry.read(entry)
     except FrameError as error:
         observation = Skipped(entry.stamp_ns, str(error))
-    return entry, observation, time.perf_counter() - began
+    return _Observed(entry, observation, time.perf_counter() - began)
 
 
 class _FirstPass:

@@ -135,8 +135,6 @@ class FreeSpaceCheck:
             T_body_points,
             scan.direction_rad,
             self.margin_m,
-            MARGIN_RATIO,
-            MIN_RETURNS,
         )
         return FreeSpaceCounts(len(points), agreeing, contradicting)
 
@@ -156,17 +154,22 @@ def range_image(points, origin, direction_rad):  # type: ignore[no-untyped-def]
     ranges = np.full((rows, columns), np.inf, float32)
     for n in range(len(points)):
         x, y, z = points[n, 0] - origin[0], points[n, 1] - origin[1], points[n, 2] - origin[2]
-        across = np.sqrt(x * x + y * y)
-        row = min(int64((np.arctan2(z, across) + 0.5 * np.pi) / direction_rad), rows - 1)
-        column = min(int64((np.arctan2(y, x) + np.pi) / direction_rad), columns - 1)
-        ranges[row, column] = min(ranges[row, column], np.sqrt(across * across + z * z))
+        row, column, range_m = _pixel_of(x, y, z, ranges.shape, direction_rad)
+        ranges[row, column] = min(ranges[row, column], range_m)
     return ranges
 
 
 @njit(cache=True, nogil=True)
-def _classify(  # type: ignore[no-untyped-def]
-    ranges, origin, points, T, direction_rad, margin_m, margin_ratio, min_returns
-):
+def _pixel_of(x, y, z, shape, direction_rad):  # type: ignore[no-untyped-def]
+    """Return the row and column of a point relative to a range image's origin, and the point's range."""
+    across = np.sqrt(x * x + y * y)
+    row = min(int64((np.arctan2(z, across) + 0.5 * np.pi) / direction_rad), shape[0] - 1)
+    column = min(int64((np.arctan2(y, x) + np.pi) / direction_rad), shape[1] - 1)
+    return row, column, np.sqrt(across * across + z * z)
+
+
+@njit(cache=True, nogil=True)
+def _classify(ranges, origin, points, T, direction_rad, margin_m):  # type: ignore[no-untyped-def]
     """Return how many points, moved by T, agree with a range image, and how many contradict it."""
     rows, columns = ranges.shape
     agreeing = contradicting = 0
@@ -175,20 +178,17 @@ def _classify(  # type: ignore[no-untyped-def]
         x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3] - origin[0]
         y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3] - origin[1]
         z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3] - origin[2]
-        across = np.sqrt(x * x + y * y)
-        reach = np.sqrt(across * across + z * z)
-        row = min(int64((np.arctan2(z, across) + 0.5 * np.pi) / direction_rad), rows - 1)
-        column = min(int64((np.arctan2(y, x) + np.pi) / direction_rad), columns - 1)
+        row, column, range_m = _pixel_of(x, y, z, ranges.shape, direction_rad)
         nearest, gap, returns = np.inf, np.inf, 0
         for i in range(max(row - 1, 0), min(row + 2, rows)):
             for j in range(column - 1, column + 2):
                 surface = ranges[i, j % columns]
                 returns += surface < np.inf
                 nearest = min(nearest, surface)
-                gap = min(gap, abs(surface - reach))
-        margin = margin_m + margin_ratio * reach
+                gap = min(gap, abs(surface - range_m))
+        margin = margin_m + MARGIN_RATIO * range_m
         if gap <= margin:
             agreeing += 1
-        elif reach < nearest - margin and returns >= min_returns:
+        elif range_m < nearest - margin and returns >= MIN_RETURNS:
             contradicting += 1
     return agreeing, contradicting

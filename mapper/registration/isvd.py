@@ -40,7 +40,7 @@ class Isvd:
         config = self._config
         if len(target) < config.min_agreeing:
             return failed(f"{len(target)} pairs with depth, fewer than {config.min_agreeing}"), 0.0
-        T_target_source, used = self._trim(target, source)
+        T_target_source, used = self.trim_pairs(target, source)
         residuals = target - apply(T_target_source, source)
         distances = np.linalg.norm(residuals, axis=1)
         agreeing = distances <= config.agreement_mm / _MM_PER_M
@@ -63,8 +63,13 @@ class Isvd:
         )
         return alignment, weight
 
-    def _trim(self, target: Points, source: Points) -> tuple[Transform, NDArray[np.intp]]:
-        """Return the motion of the last iteration and the indices of the pairs it was fitted to."""
+    def trim_pairs(self, target: Points, source: Points) -> tuple[Transform, NDArray[np.intp]]:
+        """Return the (4, 4) motion of the last iteration, and the indices of the pairs it was fitted to.
+
+        Args:
+            target: (N, 3) metres, N ≥ 3.
+            source: (N, 3) their partners, metres.
+        """
         config = self._config
         enough = max(min(config.min_pairs, len(target) // 2), 3)
         if config.step == "icp":

@@ -11,6 +11,9 @@ CHI2_2DOF, CHI2_3DOF = 5.991, 7.815
 HUBER_2DOF, HUBER_3DOF = np.sqrt(CHI2_2DOF), np.sqrt(CHI2_3DOF)
 """Residual lengths at which Huber's kernel becomes linear."""
 
+VIRTUAL_BASELINE_PX_M = 40.0
+"""bf where no setting has it: depth z counts as the disparity bf / z (Mur-Artal & Tardós 2017)."""
+
 
 @njit(cache=True, nogil=True)
 def residual(T, point, measured, intrinsics, out):

@@ -8,6 +8,7 @@ from mapper.core.errors import GraphError
 from mapper.core.geometry import distances_along, inverse, log
 from mapper.graph.marginals import marginals_of
 from mapper.graph.model import PoseGraph
+from mapper.loops.closure import SOLVER
 from mapper.run.manifest import RunWarning
 from mapper.run.results import RunResults
 from mapper.run.timeline import TimeLine, counted
@@ -22,7 +23,7 @@ _MAX_STEP_M, _MAX_STEP_RAD = 0.2, np.radians(5.0)
 def loop_warnings(results: RunResults) -> Iterator[RunWarning]:
     """Yield what is suspicious about loops: far from the odometry, or against the rest of the graph."""
     held = [loop for loop in results.loops if loop.verdict == "accepted" and loop.before is not None]
-    contradicting = [loop for loop in results.loops if loop.reason.startswith("solver")]
+    contradicting = [loop for loop in results.loops if loop.rejected_by == SOLVER]
     tried = len(held) + len(contradicting)
     if len(contradicting) >= _LEAST_LOOPS_REFUSED and len(contradicting) > _MAX_REFUSED_SHARE * tried:
         yield RunWarning(

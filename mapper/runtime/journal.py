@@ -89,14 +89,9 @@ class Journal:
         try:
             file = self.open()
             file.seek(place)
-            head = file.read(_HEAD.size)
-            length, digest = _HEAD.unpack(head) if len(head) == _HEAD.size else (0, b"")
-            record = file.read(min(length, self.end - place))
+            return self._next_record(file, place, self.end)
         except OSError as error:
             raise DataError(f"{self.path}: cannot be read: {error.strerror}") from None
-        if _digest(record) != digest:
-            raise DataError(f"{self.path}: damaged at byte {place}")
-        return record
 
     def records(self, end: int) -> Iterator[tuple[int, bytes]]:
         """Yield the place and the bytes of every record before an end.
@@ -107,14 +102,18 @@ class Journal:
         try:
             with self.path.open("rb") as file:
                 while (place := file.tell()) < end:
-                    head = file.read(_HEAD.size)
-                    length, digest = _HEAD.unpack(head) if len(head) == _HEAD.size else (0, b"")
-                    record = file.read(length) if place + _HEAD.size + length <= end else b""
-                    if _digest(record) != digest:
-                        raise DataError(f"{self.path}: damaged at byte {place}")
-                    yield place, record
+                    yield place, self._next_record(file, place, end)
         except OSError as error:
             raise DataError(f"{self.path}: cannot be read: {error.strerror}") from None
+
+    def _next_record(self, file: BinaryIO, place: int, end: int) -> bytes:
+        """Return the record at the place where a file is read, which must lie before an end."""
+        head = file.read(_HEAD.size)
+        length, digest = _HEAD.unpack(head) if len(head) == _HEAD.size else (0, b"")
+        record = file.read(length) if place + _HEAD.size + length <= end else b""
+        if _digest(record) != digest:
+            raise DataError(f"{self.path}: damaged at byte {place}")
+        return record
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from mapper.core.frames import DepthImage
 from mapper.core.geometry import Array
+from mapper.sensing.planes import squares_of
 
 _COLUMNS = 80
 """Cells in a row of an image, more than twenty in the finest cosine's wavelength."""
@@ -221,11 +222,9 @@ def _homogeneous(rays: NDArray[np.floating]) -> Array:
 
 def _samples(image: NDArray[np.floating], side: int) -> Array:
     """Return (R, C, S, …) pixels of square cells, as many as are read of each."""
-    rows, columns, step = image.shape[0] // side, image.shape[1] // side, max(side // _SAMPLES, 1)
-    rest = image.shape[2:]
-    whole = image[: rows * side, : columns * side].reshape(rows, side, columns, side, *rest)
-    some = whole[:, ::step, :, ::step].swapaxes(1, 2)
-    return some.reshape(rows, columns, -1, *rest).astype(np.float64)
+    step = max(side // _SAMPLES, 1)
+    some = squares_of(image, side)[:, :, ::step, ::step]
+    return some.reshape(*some.shape[:2], -1, *image.shape[2:]).astype(np.float64)
 
 
 def _cells(depth_m: DepthImage, side: int) -> Array:

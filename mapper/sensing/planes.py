@@ -10,6 +10,15 @@ from mapper.core.geometry import Array
 MAX_NOISE_RATIO = 0.05
 """A patch whose depths scatter by a larger share of their distance is not a plane."""
 
+TILES_ACROSS = 16
+"""Number of tiles in the width of an image."""
+MIN_TILES, MIN_FRAMES = 30, 3
+"""Number of tiles, and of frames that show them, from which the noise at a distance is known."""
+
+_MIN_PLANE_RATIO = 0.98
+_MAX_TILT_RAD = np.radians(60.0)
+"""Up to here a Kinect's axial noise does not depend on the angle (Nguyen et al. 2012, §4)."""
+_LEVEL_RATIO = 1.1
 _ROUNDS = 4
 _OUTLIER_SIGMAS = 4.0
 _LEAST_SIGMA_M = 1e-6
@@ -47,13 +56,40 @@ class Planes:
         tilt: Array = np.arctan2(np.hypot(p, q), np.abs(r))
         return tilt
 
+    def explain(self, measured: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Return (T,) whether a plane of at most 60° tilt rests on 98 % of the (T, N) measured pixels."""
+        are_used = self.used.sum(axis=1) >= _MIN_PLANE_RATIO * measured.sum(axis=1)
+        explained: NDArray[np.bool_] = are_used & (self.tilt_rad <= _MAX_TILT_RAD)
+        return explained
+
+
+def squares_of(image: NDArray[np.floating], side: int) -> NDArray[np.floating]:
+    """Return the (R, C, side, side, …) squares of an (H, W, …) image; what is left at its ends is dropped."""
+    rows, columns = image.shape[0] // side, image.shape[1] // side
+    whole = image[: rows * side, : columns * side]
+    return whole.reshape(rows, side, columns, side, *image.shape[2:]).swapaxes(1, 2)
+
 
 def cut_tiles(image: NDArray[np.floating], side: int) -> Array:
-    """Return (T, side², …) tiles of an (H, W, …) image, row by row; what is left at its ends is dropped."""
-    rows, columns = image.shape[0] // side, image.shape[1] // side
-    rest = image.shape[2:]
-    whole = image[: rows * side, : columns * side].reshape(rows, side, columns, side, *rest)
-    return whole.swapaxes(1, 2).reshape(rows * columns, side * side, *rest).astype(np.float64)
+    """Return the (T, side², …) squares of an (H, W, …) image, row by row, as float64."""
+    return squares_of(image, side).reshape(-1, side * side, *image.shape[2:]).astype(np.float64)
+
+
+def distance_levels(distance_m: Array, frame_of: NDArray[np.intp]) -> list[NDArray[np.intp]]:
+    """Return the tiles at each distance, in steps of 10 %, where enough frames show enough of them.
+
+    Args:
+        distance_m: (T,) distances of tiles.
+        frame_of: (T,) number of the frame of each.
+
+    Returns:
+        Indices of the tiles of each level, from near to far.
+    """
+    steps = np.floor(np.log(distance_m) / np.log(_LEVEL_RATIO))
+    levels = [np.flatnonzero(steps == step) for step in np.unique(steps)]
+    return [
+        level for level in levels if len(level) >= MIN_TILES and len(np.unique(frame_of[level])) >= MIN_FRAMES
+    ]
 
 
 def fit_planes(depth_m: Array, rays: Array) -> Planes:

@@ -58,9 +58,8 @@ class Odometer:
         """Sum the distances and angles between consecutive poses."""
         steps_m = np.linalg.norm(np.diff(wheels.positions_world, axis=0), axis=1)
         chords = np.linalg.norm(np.diff(wheels.T_world_body[:, :3, :3], axis=0), axis=(1, 2))
-        steps_rad = 2.0 * np.arcsin(
-            np.minimum(chords / np.sqrt(8.0), 1.0)
-        )  # |R_a − R_b|_F = √8 sin(angle / 2)
+        # |R_a − R_b|_F = √8 sin(angle / 2)
+        steps_rad = 2.0 * np.arcsin(np.minimum(chords / np.sqrt(8.0), 1.0))
         self._start_ns = int(wheels.stamps_ns[0])  # nanoseconds since 1970 are too many for a float
         self._since_start_ns = (wheels.stamps_ns - self._start_ns).astype(np.float64)
         self._counts = [np.concatenate([[0.0], np.cumsum(steps)]) for steps in (steps_m, steps_rad)]

@@ -110,33 +110,58 @@ def _shake(config: SynthConfig, rng: np.random.Generator) -> Callable[[Array], A
     return shake
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Lap:
+    """A closed route by the distance along it.
+
+    Attributes:
+        route: (K, 2) points of the spline, metres.
+        length_m: Length of a lap.
+        parameters: (P,) parameters of the spline, densely, from the start to the end of a lap.
+        travelled_m: (P,) distance up to each.
+    """
+
+    route: Array
+    length_m: float
+    parameters: Array
+    travelled_m: Array
+
+    def parameter_at(self, in_lap_m: Array) -> Array:
+        """Return the (N,) parameters of the spline at (N,) distances within the lap."""
+        return np.interp(in_lap_m, self.travelled_m, self.parameters)
+
+    def heading_rad(self, along_m: Array) -> Array:
+        """Return the (N,) yaw of the route at (N,) distances."""
+        u = self.parameter_at(np.mod(along_m, self.length_m))
+        ahead = closed_spline(self.route, u + 0.15) - closed_spline(self.route, u - 0.15)
+        yaw_rad: Array = np.arctan2(ahead[:, 1], ahead[:, 0])
+        return yaw_rad
+
+    def phase_rad(self, along_m: Array, count: int) -> Array:
+        """Return the (N,) phase of a wave that repeats ``count`` times a lap."""
+        return 2.0 * np.pi * count * along_m / self.length_m
+
+
+def _lap_of(route: Array) -> _Lap:
+    parameters = np.linspace(0.0, len(route), 400 * len(route), endpoint=False)
+    points = closed_spline(route, parameters)
+    steps_m = np.linalg.norm(np.diff(points, axis=0, append=points[:1]), axis=1)
+    travelled_m = np.concatenate([[0.0], np.cumsum(steps_m)])
+    return _Lap(route, float(steps_m.sum()), np.append(parameters, len(route)), travelled_m)
+
+
 def _loop(
     config: SynthConfig, plan: Plan, rng: np.random.Generator
 ) -> tuple[float, Callable[[Array], tuple[Array, Array]]]:
     """Return the duration, and positions and gaze by time, of walking the route: both repeat every lap."""
-    parameter = np.linspace(0.0, len(plan.route), 400 * len(plan.route), endpoint=False)
-    points = closed_spline(plan.route, parameter)
-    steps_m = np.linalg.norm(np.diff(points, axis=0, append=points[:1]), axis=1)
-    lap_m = float(steps_m.sum())
-    travelled_m = np.concatenate([[0.0], np.cumsum(steps_m)])
-    closed_parameter = np.append(parameter, len(plan.route))
+    lap = _lap_of(plan.route)
+    lap_m = lap.length_m
     glances = max(round(lap_m / 4.0), 1)
     phases_rad = rng.uniform(0.0, 2.0 * np.pi, 3)
     nods = config.wheels is None
-
-    def heading(along_m: Array) -> Array:
-        u = np.interp(np.mod(along_m, lap_m), travelled_m, closed_parameter)
-        ahead = closed_spline(plan.route, u + 0.15) - closed_spline(plan.route, u - 0.15)
-        yaw_rad: Array = np.arctan2(ahead[:, 1], ahead[:, 0]) + 0.25 * np.sin(
-            turns(along_m, glances) + phases_rad[0]
-        )
-        return yaw_rad
-
-    def turns(along_m: Array, count: int) -> Array:
-        return 2.0 * np.pi * count * along_m / lap_m
-
     grid_m = np.linspace(0.0, lap_m, round(_SAMPLES_PER_M * lap_m), endpoint=False)
-    yaw = np.unwrap(heading(grid_m))
+    glance_rad = 0.25 * np.sin(lap.phase_rad(grid_m, glances) + phases_rad[0])
+    yaw = np.unwrap(lap.heading_rad(grid_m) + glance_rad)
     lap_turn = 2.0 * np.pi * round((yaw[-1] - yaw[0]) / (2.0 * np.pi))
     closed_grid_m = np.append(grid_m, lap_m)
     closed_yaw = np.append(yaw, yaw[0] + lap_turn)
@@ -151,11 +176,11 @@ def _loop(
     def steady(times_s: Array) -> tuple[Array, Array]:
         along_m = walked_m(times_s)
         laps = np.floor(along_m / lap_m)
-        u = np.interp(along_m - laps * lap_m, travelled_m, closed_parameter)
-        height_m = _EYE_HEIGHT_M + nods * 0.08 * np.sin(turns(along_m, 2) + phases_rad[1])
-        pitch = _LOOK_DOWN_RAD + nods * 0.10 * np.sin(turns(along_m, glances + 1) + phases_rad[2])
-        gaze = laps * lap_turn + np.interp(along_m - laps * lap_m, closed_grid_m, closed_yaw)
-        positions = np.column_stack([closed_spline(plan.route, u), height_m])
+        in_lap_m = along_m - laps * lap_m
+        height_m = _EYE_HEIGHT_M + nods * 0.08 * np.sin(lap.phase_rad(along_m, 2) + phases_rad[1])
+        pitch = _LOOK_DOWN_RAD + nods * 0.10 * np.sin(lap.phase_rad(along_m, glances + 1) + phases_rad[2])
+        gaze = laps * lap_turn + np.interp(in_lap_m, closed_grid_m, closed_yaw)
+        positions = np.column_stack([closed_spline(plan.route, lap.parameter_at(in_lap_m)), height_m])
         return positions, np.column_stack([gaze, pitch, np.zeros(len(pitch))])
 
     overlap_s = float(np.interp(config.overlap_m, closed_grid_m, clock_s))

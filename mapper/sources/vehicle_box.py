@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from mapper.core.clusters import cluster_numbers
 from mapper.core.errors import FrameError
 from mapper.core.frames import Sensor
 from mapper.core.geometry import Array, Points
@@ -20,6 +21,8 @@ _MIN_STANDING_RATIO, _SURE_RATIO, _MIN_SURE_CELLS = 0.6, 0.95, 2
 and in the middle. With fewer of the latter a group is a wall that the sensor happens to keep beside."""
 _MAX_STILL_WORLD_RATIO = 0.5
 """If more of the far cells stand still, so does the sensor, or it moves along a tunnel."""
+_MAX_STEP_CELLS = 2
+"""At most one empty cell lies between two members of a group."""
 _STEP_M = 0.05
 _POINTS = 60_000
 
@@ -65,7 +68,7 @@ def vehicle_box(log: Log) -> Box | None:
     world = still[far & (standing >= 2.0 / len(clouds))]
     if not far.any() or (len(world) and world.mean() > _MAX_STILL_WORLD_RATIO):
         return None
-    joined = _joined(cells[still])
+    joined = cluster_numbers(cells[still], _MAX_STEP_CELLS, norm=np.inf)
     still_range_m = range_m[still]
     own = np.array(
         [
@@ -118,15 +121,3 @@ def _counted(clouds: list[Points], scale: _Scale) -> tuple[NDArray[np.int64], Ar
         seen[tuple((np.floor(points / scale.cell_m).astype(np.int64) + reach).T)] = True
         counts += seen
     return np.argwhere(counts) - reach, counts[counts > 0] / len(clouds)
-
-
-def _joined(cells: NDArray[np.int64]) -> NDArray[np.intp]:
-    """Return the (C,) number of the group of each cell; at most one empty cell lies between its members."""
-    from scipy.sparse import coo_array  # these take half a second, and seldom does anything stand still
-    from scipy.sparse.csgraph import connected_components
-    from scipy.spatial import cKDTree
-
-    pairs = cKDTree(cells).query_pairs(2.0, p=np.inf, output_type="ndarray")
-    graph = coo_array((np.ones(len(pairs), np.bool_), pairs.T), shape=(len(cells), len(cells)))
-    _, labels = connected_components(graph, directed=False)
-    return np.asarray(labels, dtype=np.intp)

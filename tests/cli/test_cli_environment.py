@@ -3,16 +3,21 @@
 import os
 import subprocess
 import sys
+from types import SimpleNamespace
 
-from mapper.cli.environment import has_compiled_code
+from mapper.cli.environment import note_compilation
 
 
-def test_compiled_code_is_found_where_numba_keeps_it(tmp_path, monkeypatch):
+def test_compilation_is_noted_until_numba_has_kept_its_code(tmp_path, monkeypatch):
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    assert not has_compiled_code()
+    notes = []
+    progress = SimpleNamespace(note=notes.append)
+    note_compilation(progress)
+    assert notes == ["first run here: the kernels are compiled once, which takes about a minute"]
     (tmp_path / "mapper_0123").mkdir()
     (tmp_path / "mapper_0123" / "kernels.cast_rays-155.py311.nbi").touch()
-    assert has_compiled_code()
+    note_compilation(progress)
+    assert len(notes) == 1
 
 
 def test_opencv_starts_no_threads_unless_the_user_says_so():

@@ -5,7 +5,8 @@ from mapper.config.export import MeshConfig
 from mapper.core.frames import PinholeCamera, RgbdFrame, Scan, ray_table
 from mapper.core.geometry import apply, inverse, transform
 from mapper.core.rotations import rotation_from_euler
-from mapper.export.mesh import _as_mapped, _in_order, _rectified, _Volume
+from mapper.export.mesh import Volume, in_order
+from mapper.export.mesh_views import as_mapped, rectified
 from mapper.mapping.config import Edits, Region
 from mapper.mapping.edits import MapEditor
 from mapper.octree.config import OctreeConfig
@@ -34,9 +35,9 @@ def frame_of_a_plane(T_world_camera, *, distortion):
 @pytest.mark.parametrize("distortion", [(0.0, 0.0, 0.0, 0.0, 0.0), FR1], ids=["ideal", "fr1"])
 def test_the_surface_of_a_plane_is_the_plane(distortion):
     o3d = pytest.importorskip("open3d", reason="the mesh extra is not installed", exc_type=ImportError)
-    volume = _Volume(o3d, MeshConfig(voxel_m=0.02, min_observations=1), max_depth_m=4.0, blocks=100)
+    volume = Volume(o3d, MeshConfig(voxel_m=0.02, min_observations=1), max_depth_m=4.0, blocks=100)
     for T_world_camera in POSES:
-        volume.add(_rectified(frame_of_a_plane(T_world_camera, distortion=distortion), T_world_camera))
+        volume.add(rectified(frame_of_a_plane(T_world_camera, distortion=distortion), T_world_camera))
 
     surface = volume.surface()
 
@@ -54,7 +55,7 @@ def test_the_surface_of_a_plane_is_the_plane(distortion):
 
 def test_rectifying_moves_pixels_to_where_an_ideal_camera_has_them():
     frame = frame_of_a_plane(np.eye(4), distortion=FR1)
-    view = _rectified(frame, np.eye(4))
+    view = rectified(frame, np.eye(4))
     ideal = frame_of_a_plane(np.eye(4), distortion=(0.0, 0.0, 0.0, 0.0, 0.0))
 
     inner = (slice(20, -20), slice(20, -20))
@@ -71,7 +72,7 @@ def test_the_order_of_vertices_and_triangles_does_not_matter():
     shuffle = rng.permutation(40)
     turned = np.roll(np.argsort(shuffle).astype(np.int32)[rng.permutation(triangles)], 1, axis=1)
 
-    ours, theirs = _in_order(points, colors, triangles), _in_order(points[shuffle], colors[shuffle], turned)
+    ours, theirs = in_order(points, colors, triangles), in_order(points[shuffle], colors[shuffle], turned)
 
     for name in ("points_world", "colors", "triangles"):
         np.testing.assert_array_equal(getattr(ours, name), getattr(theirs, name))
@@ -83,7 +84,7 @@ def test_sorting_moves_no_triangle_and_mirrors_none():
     points = rng.normal(size=(20, 3)).astype(np.float32)
     triangles = rng.permuted(np.tile(np.arange(20, dtype=np.int32), (30, 1)), axis=1)[:, :3]
 
-    sorted_surface = _in_order(points, np.zeros((20, 3), np.uint8), triangles)
+    sorted_surface = in_order(points, np.zeros((20, 3), np.uint8), triangles)
 
     def corner_sets(points, triangles):
         a, b, c = np.moveaxis(points[triangles], 1, 0)
@@ -101,7 +102,7 @@ def test_the_pose_of_the_camera_on_the_body_counts():
     frame = frame_of_a_plane(np.eye(4), distortion=FR1)
     mounted = RgbdFrame(0, frame.image, frame.depth_m, frame.camera, T_body_camera)
 
-    view = _rectified(mounted, inverse(T_body_camera))
+    view = rectified(mounted, inverse(T_body_camera))
 
     np.testing.assert_allclose(view.T_world_camera, np.eye(4), atol=1e-12)
 
@@ -116,7 +117,7 @@ def test_depth_of_what_the_octree_does_not_have_is_left_out():
     depth_m[:20] = np.nan
     passed = RgbdFrame(0, wall.image, depth_m, wall.camera)
 
-    kept_m = _as_mapped(passed, T_world_camera, octree, editor()).depth_m
+    kept_m = as_mapped(passed, T_world_camera, octree, editor()).depth_m
 
     expected_m = wall.depth_m.copy()
     expected_m[80:120, 100:200] = expected_m[:20] = 0.0
@@ -137,7 +138,7 @@ def test_depth_that_was_edited_away_is_left_out(kind):
     x = apply(T_world_camera, (rays * frame.depth_m[..., None]).reshape(-1, 3))[:, 0].reshape(240, 320)
     region = Region(box_m=((0.1, -9.0, -9.0), (9.0, 9.0, 9.0)))
 
-    kept_m = _as_mapped(frame, T_world_camera, octree, editor(**{kind: (region,)})).depth_m
+    kept_m = as_mapped(frame, T_world_camera, octree, editor(**{kind: (region,)})).depth_m
 
     sure = np.abs(x - 0.1) > 1e-4
     left = (x > 0.1) == (kind == "keep")

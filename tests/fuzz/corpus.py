@@ -30,7 +30,7 @@ from tests.support.clouds import save_cloud
 from tests.support.desk import DESK, build_desk_run
 from tests.support.logs import MemoryEntry, log_in_memory
 from tests.support.octree_maps import COLORED, mapped
-from tests.support.recordings import CAMERA, shots, write, write_folder
+from tests.support.recordings import CAMERA, add_messages, shots, write, write_folder
 from tests.support.tum_logs import FIRST_NS, picture
 
 FRAMES = 4
@@ -100,12 +100,7 @@ def _mcap(compression: CompressionType, *, chunked: bool = True) -> Maker:
         with (folder / "log.mcap").open("wb") as file:
             writer = McapWriter(file, compression=compression, use_chunking=chunked, chunk_size=20_000)
             writer.start()
-            channels: dict[str, int] = {}
-            for message in shots(FRAMES):
-                if message.topic not in channels:
-                    schema = writer.register_schema(message.type, "ros2msg", b"")
-                    channels[message.topic] = writer.register_channel(message.topic, "cdr", schema)
-                writer.add_message(channels[message.topic], message.stamp_ns, message.cdr, message.stamp_ns)
+            add_messages(writer, shots(FRAMES))
             writer.finish()
         return folder / "log.mcap"
 

@@ -6,8 +6,9 @@ import pytest
 from mapper.core.geometry import exp, inverse, rotation_exp, transform
 from mapper.graph.config import GraphConfig
 from mapper.graph.floor_factors import floor_factors, on_one_floor, with_height_and_tilt
-from mapper.graph.model import BetweenFactor, PoseGraph, PoseSigmas
+from mapper.graph.model import PoseSigmas
 from mapper.graph.optimize import optimize
+from tests.support.noisy_graphs import drifted_chain
 
 COUNT = 40
 SIGMAS = PoseSigmas(rotation_rad=0.006, translation_m=0.01)
@@ -27,13 +28,7 @@ def walk(height_m=nowhere, tilt_rad=nowhere, drift=DRIFT):
         truth.append(transform(R, np.array([x, 0.0, 1.4 + height_m(x)])))
         seen = transform(rotation_exp(np.array([0.0, -tilt_rad(x), 0.0])), np.array([x, 0.0, height_m(x)]))
         floors[k] = inverse(truth[k]) @ seen
-    graph = PoseGraph()
-    graph.add_node(0, 0, truth[0])
-    for k in range(1, COUNT):
-        T = inverse(truth[k - 1]) @ truth[k] @ drift
-        graph.add_node(k, k, graph.T_world_node[k - 1] @ T)
-        graph.add_factors([BetweenFactor(k - 1, k, T, SIGMAS.information)])
-    return truth, graph, floors
+    return truth, drifted_chain(truth, drift, SIGMAS), floors
 
 
 def held(graph, floors, nodes):

@@ -8,7 +8,15 @@ import pytest
 from mapper.core.errors import DataError, RunError
 from mapper.core.geometry import exp, transform
 from mapper.graph.model import Solution
-from mapper.loops.closure import Discrepancy, apply_solution, discrepancy, read_closures, write_closures
+from mapper.loops.closure import (
+    SOLVER,
+    Discrepancy,
+    apply_solution,
+    discrepancy,
+    read_closures,
+    rejections,
+    write_closures,
+)
 from tests.support.loop_closures import loop
 from tests.support.planar import at
 
@@ -76,7 +84,8 @@ def test_loops_that_the_solver_lets_go_are_rejected():
     assert kept.weight == 0.9
     assert alone is loops[1]
     assert (refused.verdict, refused.weight) == ("rejected", 0.02)
-    assert refused.reason.startswith("solver: ")
+    assert [loop.rejected_by for loop in (kept, alone, refused)] == ["", "alone", SOLVER]
+    assert rejections([kept, alone, refused, refused]) == {SOLVER: 2, "alone": 1}
 
 
 def test_the_constraint_is_a_loop():

@@ -44,9 +44,9 @@ def worked(monkeypatch):
         calls["split"].append((run, rest[-1]))
         return merging_jobs.split_run(workspace, run, *rest)
 
-    def join(workspace, tile, *rest, **settings):
+    def join(workspace, tile, *rest):
         calls["join"].append(tile)
-        return merging_jobs.join_tile(workspace, tile, *rest, **settings)
+        return merging_jobs.join_tile(workspace, tile, *rest)
 
     monkeypatch.setattr(merging, "split_run", split)
     monkeypatch.setattr(merging, "join_tile", join)

@@ -128,11 +128,11 @@ def test_leaves_larger_than_a_tile_are_pruned_across_tiles(tmp_path, config):
 def test_a_merge_that_was_stopped_is_resumed(runs, merged, tmp_path, monkeypatch):
     out, joined = tmp_path / "map", []
 
-    def join(workspace, tile, *arguments, **settings):
+    def join(workspace, tile, *arguments):
         joined.append(tile)
         if len(joined) in (4, 5):
             raise OSError("the disk is gone")
-        return merging_jobs.join_tile(workspace, tile, *arguments, **settings)
+        return merging_jobs.join_tile(workspace, tile, *arguments)
 
     def jobs(some, executor, **_):
         return run_jobs(some, executor, attempts=1)

@@ -6,7 +6,7 @@ import pytest
 from mapper.core.frames import PinholeCamera
 from mapper.core.geometry import apply, exp, inverse, log
 from mapper.features.base import Features
-from mapper.odometry.config import MatchConfig
+from mapper.odometry.config import IsvdOdometryConfig, MatchConfig
 from mapper.odometry.isvd_registration import IsvdObservation, PairRegistration
 from mapper.registration.config import IsvdConfig
 
@@ -49,18 +49,22 @@ def observed(points_body: np.ndarray, descriptors: np.ndarray, rng: np.random.Ge
     )
 
 
-def registered(seed: int, *, by_pixels: bool):
-    return PairRegistration(IsvdConfig(), by_pixels=by_pixels)(*pair(seed), NO_FILTER)[0]
+def registration(residual: str) -> PairRegistration:
+    return PairRegistration(IsvdOdometryConfig(registration=IsvdConfig(), residual=residual))
 
 
-def errors(*, by_pixels: bool) -> np.ndarray:
-    found = [registered(seed, by_pixels=by_pixels) for seed in range(20)]
+def registered(seed: int, residual: str):
+    return registration(residual)(*pair(seed), NO_FILTER).alignment
+
+
+def errors(residual: str) -> np.ndarray:
+    found = [registered(seed, residual) for seed in range(20)]
     assert all(alignment.converged for alignment in found)
     return np.array([np.concatenate(log(inverse(MOTION) @ a.T_target_source)) for a in found])
 
 
 def test_pixels_are_better_than_points_with_a_kinects_depth():
-    by_points, by_pixels = (np.sqrt((errors(by_pixels=each) ** 2).mean(axis=0)) for each in (False, True))
+    by_points, by_pixels = (np.sqrt((errors(each) ** 2).mean(axis=0)) for each in ("points", "pixels"))
 
     assert np.linalg.norm(by_pixels[3:]) < 0.5 * np.linalg.norm(by_points[3:])
     assert np.linalg.norm(by_pixels[:3]) < 0.5 * np.linalg.norm(by_points[:3])
@@ -70,22 +74,21 @@ def test_pixels_are_better_than_points_with_a_kinects_depth():
 def test_the_information_is_that_of_the_errors():
     """Normalised squares of 20 draws: six degrees of freedom each, and as calibrated as halving allows."""
     squares = [
-        error @ registered(seed, by_pixels=True).information @ error
-        for seed, error in enumerate(errors(by_pixels=True))
+        error @ registered(seed, "pixels").information @ error for seed, error in enumerate(errors("pixels"))
     ]
 
     assert 2.5 < np.mean(squares) < 12.0
 
 
-@pytest.mark.parametrize(("by_pixels", "accepted"), [(False, True), (True, False)])
-def test_a_motion_that_only_the_points_agree_with_is_refused(by_pixels, accepted):
+@pytest.mark.parametrize(("residual", "accepted"), [("points", True), ("pixels", False)])
+def test_a_motion_that_only_the_points_agree_with_is_refused(residual, accepted):
     """A lens or shutter that moved the pixels: the image is the second test."""
     target, source = pair(0)
     rng = np.random.default_rng(1)
     source.measured[:, :2] += rng.normal(0.0, 40.0, (400, 2))
 
-    alignment, _, pairs = PairRegistration(IsvdConfig(), by_pixels=by_pixels)(target, source, NO_FILTER)
+    found = registration(residual)(target, source, NO_FILTER)
 
-    assert len(pairs) == 400
-    assert alignment.converged == accepted
-    assert ("agree in the image" in alignment.reason) != accepted
+    assert len(found.pairs) == 400
+    assert found.alignment.converged == accepted
+    assert ("agree in the image" in found.alignment.reason) != accepted

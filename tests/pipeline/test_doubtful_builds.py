@@ -10,7 +10,7 @@ from mapper.config.loading import load_config, overridden
 from mapper.core.errors import TrackingError
 from mapper.core.geometry import exp
 from mapper.evaluators.metrics.trajectory import align, associate, ate
-from mapper.export.mesh import _views
+from mapper.export.mesh_views import mesh_views
 from mapper.octree.reading import read_octree
 from mapper.octree.scan_update_file import open_scan_updates
 from mapper.pipeline.append import append
@@ -69,7 +69,7 @@ def test_they_are_in_no_map(doubted):
         }
     assert fused == set(range(31)) - DOUBTED.keys()
     run = replace(doubted, config=overridden(doubted.config, ["mesh.frame_stride=1"]))
-    assert len(list(_views(run, read_octree(run.file("map.octree")), SILENT))) == 28
+    assert len(list(mesh_views(run, read_octree(run.file("map.octree")), SILENT))) == 28
 
 
 def test_fusing_again_leaves_them_out_again(doubted, tmp_path):

@@ -9,8 +9,9 @@ from mapper.config.build import BuildConfig
 from mapper.core.errors import FrameError
 from mapper.core.frames import Scan
 from mapper.core.geometry import apply, exp, inverse, rotation_exp, transform
-from mapper.graph.model import BetweenFactor, PoseGraph, PoseSigmas
+from mapper.graph.model import PoseSigmas
 from mapper.pipeline.floor import UP_LEVEL, above_floor
+from tests.support.noisy_graphs import drifted_chain
 
 COUNT = 30
 _DEFAULTS = BuildConfig()
@@ -22,13 +23,7 @@ TRUTH = [transform(_LOOK, np.array([0.4 * k, 0.0, 1.4])) for k in range(COUNT)]
 
 
 def drifted():
-    graph = PoseGraph()
-    graph.add_node(0, 0, TRUTH[0])
-    for k in range(1, COUNT):
-        T = inverse(TRUTH[k - 1]) @ TRUTH[k] @ exp(np.radians([0.2, 0.0, 0.0]), np.zeros(3))
-        graph.add_node(k, k, graph.T_world_node[k - 1] @ T)
-        graph.add_factors([BetweenFactor(k - 1, k, T, _SIGMAS.information)])
-    return graph
+    return drifted_chain(TRUTH, exp(np.radians([0.2, 0.0, 0.0]), np.zeros(3)), _SIGMAS)
 
 
 def scan_at(k):

@@ -92,10 +92,10 @@ def test_a_trusted_run_passes_strictly(desk_run):
 def test_a_trial_looks_where_most_went_wrong():
     is_unplaced = np.zeros(1000, np.bool_)
     is_unplaced[[100, 103, 500, 501, 505, 507]] = True
-    frames = settings_trial._worst_stretch(is_unplaced, 40)
+    frames = settings_trial.worst_stretch(is_unplaced, 40)
     assert len(frames) == 40
     assert frames[0] + 10 <= 500 < 507 < frames[-1] + 1
-    assert settings_trial._worst_stretch(is_unplaced[:30], 40).tolist() == list(range(30))
+    assert settings_trial.worst_stretch(is_unplaced[:30], 40).tolist() == list(range(30))
 
 
 @pytest.mark.parametrize(

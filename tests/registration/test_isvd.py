@@ -105,8 +105,8 @@ def test_thresholds_are_those_of_equation_4_2():
     target[0, 0] += 0.0680
     target[1, 0] += 0.0700
 
-    _, kept_by_two = Isvd(IsvdConfig(max_iterations=3))._trim(target, source)
-    _, kept_by_three = Isvd(IsvdConfig(max_iterations=4))._trim(target, source)
+    _, kept_by_two = Isvd(IsvdConfig(max_iterations=3)).trim_pairs(target, source)
+    _, kept_by_three = Isvd(IsvdConfig(max_iterations=4)).trim_pairs(target, source)
 
     assert {0, 1} <= set(kept_by_two.tolist())  # th₂ = 1200 · 2^-2.6 = 198 mm
     assert 0 in kept_by_three  # th₃ = 1200 · 3^-2.6 = 69.0 mm
@@ -119,15 +119,15 @@ def test_the_halving_threshold_begins_at_its_start_error():
     target[0, 0] += 0.300
     for start_error_mm, is_kept in ((1000.0, True), (250.0, False)):
         config = IsvdConfig(threshold="halving", start_error_mm=start_error_mm, max_iterations=2)
-        _, kept = Isvd(config)._trim(target, source)
+        _, kept = Isvd(config).trim_pairs(target, source)
         assert (0 in kept) == is_kept
 
 
 def test_auto_stops_before_too_few_pairs_remain():
     target, source, _ = pairs_with_outliers(3, wrong=0, noise_m=0.01)
 
-    _, kept = Isvd(IsvdConfig(min_pairs=80))._trim(target, source)
-    _, kept_of_few = Isvd(IsvdConfig(min_pairs=80))._trim(target[:60], source[:60])
+    _, kept = Isvd(IsvdConfig(min_pairs=80)).trim_pairs(target, source)
+    _, kept_of_few = Isvd(IsvdConfig(min_pairs=80)).trim_pairs(target[:60], source[:60])
 
     assert 80 <= len(kept) < 200
     assert 30 <= len(kept_of_few) < 60

@@ -1,7 +1,6 @@
 """Depth in the wrong units is noticed, and the setting named, before and after a build."""
 
 import json
-import shutil
 
 import numpy as np
 import pytest
@@ -19,6 +18,7 @@ from mapper.sources.config import CameraConfig, SourceConfig
 from mapper.sources.depth_scale import depth_warnings
 from tests.support.command_line import mapper
 from tests.support.logs import MemoryEntry, log_in_memory
+from tests.support.tum_logs import copy_numbered
 
 CAMERA = PinholeCamera(40, 30, 30.0, 30.0, 19.5, 14.5)
 
@@ -124,12 +124,9 @@ def test_frames_that_cannot_be_read_and_scans_are_left_alone():
 
 def millimetres_for_redwood(desk_log, folder):
     """The desk as a Redwood log, whose depth is taken to be in millimetres, but is in units of 0.2 mm."""
-    for kind in ("rgb", "depth"):
-        (folder / kind).mkdir(parents=True)
-        for number, path in enumerate(sorted((desk_log / kind).iterdir())):
-            shutil.copy(path, folder / kind / f"{number:04d}.png")
-    lines = (desk_log / "calibration.toml").read_text().splitlines()
-    (folder / "calibration.toml").write_text("\n".join(line for line in lines if "depth_factor" not in line))
+    calibration = copy_numbered(desk_log, folder) / "calibration.toml"
+    lines = calibration.read_text().splitlines()
+    calibration.write_text("\n".join(line for line in lines if "depth_factor" not in line))
     return folder
 
 

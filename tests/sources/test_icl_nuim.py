@@ -130,6 +130,12 @@ def test_associations_by_stamp_are_not_taken_for_frame_numbers(tiny_tum_log):
             "7 depth/7.png 7 rgb/7.png\n",
             r"associations\.txt: none of its 1 pairs of images",
         ),
+        ("associations.txt", "# none\n", r"associations\.txt: empty list; want lines of number depth/number"),
+        (
+            "associations.txt",
+            "0 depth/0.png 0 rgb/0.png\n1 ../depth/1.png 1 rgb/1.png\n",
+            r"associations\.txt:2: '\.\./depth/1\.png' leads out of the log's folder",
+        ),
     ],
 )
 def test_a_malformed_file_is_named_with_its_line(tmp_path, name, text, message):

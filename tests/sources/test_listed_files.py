@@ -12,6 +12,7 @@ from mapper.sources import open_source
 from mapper.sources.config import SourceConfig
 from mapper.sources.inspection import inspect_log
 from mapper.sources.writers import write_log
+from tests.support.tum_logs import copy_numbered
 
 
 @pytest.fixture(autouse=True)
@@ -29,16 +30,6 @@ def renamed(log, name, number=1):
     lines[number] = f"{stamp} {name}"
     (log / "rgb.txt").write_text("\n".join(lines) + "\n")
     return log / old
-
-
-def numbered(log, folder):
-    """Copy a TUM log's images to a folder of numbered ones."""
-    for kind in ("rgb", "depth"):
-        (folder / kind).mkdir(parents=True)
-        for number, image in enumerate(sorted((log / kind).iterdir())):
-            shutil.copy(image, folder / kind / f"{number:06}.png")
-    shutil.copy(log / "calibration.toml", folder)
-    return folder
 
 
 @pytest.mark.parametrize("name", ["/etc/passwd", "../log/rgb/1.png", "rgb/../../x.png", "rgb/\0.png"])
@@ -64,7 +55,7 @@ def test_an_mbag_s_names_may_not_either(tiny_tum_log, tmp_path, name):
 
 def test_an_image_that_is_a_link_out_of_the_log_is_refused(tiny_tum_log, tmp_path):
     log = tiny_tum_log(3)
-    folder = numbered(log, tmp_path / "numbered")
+    folder = copy_numbered(log, tmp_path / "numbered")
     for image in (renamed(log, "rgb/link.png").with_name("link.png"), folder / "depth/000001.png"):
         image.unlink(missing_ok=True)
         image.symlink_to("/etc/passwd")
@@ -91,7 +82,7 @@ def test_pipes_and_devices_are_no_images(tiny_tum_log, tmp_path):
     os.mkfifo(log / "rgb/pipe.png")
     renamed(log, "rgb/pipe.png")
     assert len(open_source(log)) == 3
-    folder = numbered(tiny_tum_log(3, folder="other"), tmp_path / "numbered")
+    folder = copy_numbered(tiny_tum_log(3, folder="other"), tmp_path / "numbered")
     (folder / "rgb/000001.png").unlink()
     os.mkfifo(folder / "rgb/000001.png")
     with pytest.raises(FrameError, match=r"000001\.png: no regular file"):

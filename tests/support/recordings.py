@@ -4,6 +4,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
+from mcap.writer import Writer as McapWriter
 from rosbags.rosbag2 import StoragePlugin, Writer
 
 from mapper.core.frames import PinholeCamera
@@ -50,6 +51,16 @@ def write(path: Path, messages: Iterable[SerializedMessage]) -> Path:
     else:
         write_folder(Writer(path, version=9, storage_plugin=StoragePlugin.SQLITE3), messages)
     return path
+
+
+def add_messages(writer: McapWriter, messages: Iterable[SerializedMessage]) -> None:
+    """Add messages to an MCAP file of other options than ours, with a channel for each topic."""
+    channels: dict[str, int] = {}
+    for message in messages:
+        if message.topic not in channels:
+            schema = writer.register_schema(message.type, "ros2msg", b"")
+            channels[message.topic] = writer.register_channel(message.topic, "cdr", schema)
+        writer.add_message(channels[message.topic], message.stamp_ns, message.cdr, message.stamp_ns)
 
 
 def write_folder(folder: Writer, messages: Iterable[SerializedMessage]) -> None:

@@ -1,5 +1,6 @@
 """Tiny RGB-D logs as TUM folders, and their pictures."""
 
+import shutil
 from pathlib import Path
 
 import cv2
@@ -30,6 +31,16 @@ def write_picture(colour: Path, depth: Path, seed: int, **size: int) -> None:
     for path, pixels in ((colour, rgb[:, :, ::-1]), (depth, units)):
         path.parent.mkdir(parents=True, exist_ok=True)
         assert cv2.imwrite(str(path), pixels)
+
+
+def copy_numbered(log: Path, folder: Path) -> Path:
+    """Copy a TUM log's images to a folder of numbered ones, as Redwood has them, and its calibration."""
+    for kind in ("rgb", "depth"):
+        (folder / kind).mkdir(parents=True)
+        for number, image in enumerate(sorted((log / kind).iterdir())):
+            shutil.copy(image, folder / kind / f"{number:06}.png")
+    shutil.copy(log / "calibration.toml", folder)
+    return folder
 
 
 def write_tiny_log(log: Path, n: int, *, ending: str = ".png") -> Path:

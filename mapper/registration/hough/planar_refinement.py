@@ -4,12 +4,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mapper.core.geometry import Transform, apply, rotation_exp, transform
+from mapper.core.geometry import Transform, apply, planar_motion, rotation_exp, transform
 from mapper.registration.hough.config import HoughConfig, OverlapConfig
 from mapper.registration.hough.description import HoughDescription
 from mapper.registration.hough.ground_removal import Ground
 from mapper.registration.hough.planar_kernels import FULL_OVERLAP, hill_climb
-from mapper.registration.hough.voting import planar_motion
 
 _HALVINGS = 2
 """Number of times that the steps are halved: to a quarter of a voxel; the points are then refined."""

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mapper.core.geometry import Array, Transform, transform
+from mapper.core.geometry import Array, Transform, planar_motion
 from mapper.registration.hough.config import VotingConfig
 from mapper.registration.hough.voting_kernels import distinct, vote_slices
 
@@ -33,13 +33,6 @@ class Peak:
     def motion(self) -> Transform:
         """(4, 4) T_target_source between the two level frames."""
         return planar_motion(self.dx_m, self.dy_m, self.alpha_rad)
-
-
-def planar_motion(dx_m: float, dy_m: float, alpha_rad: float) -> Transform:
-    """Return the (4, 4) motion that turns by α about z and then moves by (dx, dy)."""
-    cosine, sine = np.cos(alpha_rad), np.sin(alpha_rad)
-    R = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
-    return transform(R, np.array([dx_m, dy_m, 0.0]))
 
 
 def vote(target: Array, source: Array, config: VotingConfig) -> list[Peak]:

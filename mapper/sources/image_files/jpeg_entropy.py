@@ -20,6 +20,7 @@ from mapper.core.errors import DataError
 from mapper.sources.image_files.jpeg_kernels import (
     ENDS_EARLY,
     LONG_RUN,
+    LONGEST_CODE,
     NO_RESTART,
     TOO_LARGE,
     UNKNOWN_CODE,
@@ -38,7 +39,6 @@ _LARGEST_DC = 1024
 _DC_SLACK = 8
 """A grey level more, for encoders that do not compute exactly. AC coefficients have no such limit: where
 contrast is full, those of a fast DCT exceed the range of samples by two thirds."""
-_LONGEST_CODE = 16
 
 _WORDS = {
     UNKNOWN_CODE: "a code that is in no table",
@@ -144,9 +144,9 @@ def _huffman_tables(body: bytes) -> Iterator[tuple[int, _HuffmanTable]]:
     """Yield (number, table) of a DHT segment; numbers from 16 on are those of AC coefficients."""
     at = 0
     while at < len(body):
-        (counts,) = struct.unpack_from(f"{_LONGEST_CODE}s", body, at + 1)
-        end = at + 1 + _LONGEST_CODE + sum(counts)
-        yield body[at], _HuffmanTable(counts, body[at + 1 + _LONGEST_CODE : end])
+        (counts,) = struct.unpack_from(f"{LONGEST_CODE}s", body, at + 1)
+        end = at + 1 + LONGEST_CODE + sum(counts)
+        yield body[at], _HuffmanTable(counts, body[at + 1 + LONGEST_CODE : end])
         at = end
 
 

@@ -6,7 +6,8 @@ from numpy.typing import NDArray
 
 WHOLE, UNKNOWN_CODE, LONG_RUN, TOO_LARGE, ENDS_EARLY, UNREAD, NO_RESTART = range(7)
 
-_LONGEST_CODE = 16
+LONGEST_CODE = 16
+"""Bits of the longest Huffman code."""
 _LOOKUP_BITS = 11
 _MOST_DC_BITS, _MOST_AC_BITS = 11, 10  # of a coefficient of 8-bit samples
 _PADDING = 512
@@ -41,8 +42,8 @@ def read_scan(
     """
     tables = counts.shape[0]
     lookup = np.empty((tables, 1 << _LOOKUP_BITS), np.int32)
-    last_codes = np.empty((tables, _LONGEST_CODE + 1), np.int64)
-    offsets = np.empty((tables, _LONGEST_CODE + 1), np.int64)
+    last_codes = np.empty((tables, LONGEST_CODE + 1), np.int64)
+    offsets = np.empty((tables, LONGEST_CODE + 1), np.int64)
     for t in range(tables):
         _fill_table(counts[t], symbols[t], t % 2 == 1, lookup[t], last_codes[t], offsets[t])
     coded = np.empty(data.size - at + _PADDING, np.uint8)
@@ -121,7 +122,7 @@ def _fill_table(
     """Fill a table of what the next bits mean, 0 for longer codes and none, and last codes by length."""
     lookup[:] = 0
     code = first = 0
-    for length in range(1, _LONGEST_CODE + 1):
+    for length in range(1, LONGEST_CODE + 1):
         count = int64(counts[length - 1])
         offsets[length] = first - code
         last_codes[length] = code + count - 1 if count else -1
@@ -157,7 +158,7 @@ def _long_entry(
     offsets: NDArray[np.int64],
 ) -> int:
     """Return what the code means that the next bits, the window's highest, begin with; 0 if it is none."""
-    for length in range(1, _LONGEST_CODE + 1):
+    for length in range(1, LONGEST_CODE + 1):
         code = int64(uint64(window) >> uint64(64 - length))
         if code <= last_codes[length]:
             entry: int = _entry(length, int64(symbols[(code + offsets[length]) & 255]), is_ac)

@@ -8,8 +8,6 @@ but the y axes of camera and world point up, so that both frames are left-handed
 import re
 from pathlib import Path
 
-import numpy as np
-
 from mapper.core.errors import SourceError
 from mapper.core.geometry import Transform
 from mapper.core.trajectory import Trajectory
@@ -17,16 +15,15 @@ from mapper.sources.base import Log
 from mapper.sources.calibration import ICL_NUIM
 from mapper.sources.config import SourceConfig
 from mapper.sources.image_folders.numbered import RATE_HZ, find_images, stamp_at
-from mapper.sources.image_folders.pairing import apply_depth_offset
-from mapper.sources.image_folders.rgbd import FramePair, find_calibration, rgbd_log
-from mapper.sources.listed_files import present
+from mapper.sources.image_folders.pairing import apply_depth_offset, ordered_pairs, usable_pairs
+from mapper.sources.image_folders.rgbd import FramePair, assumed_camera_note, find_calibration, rgbd_log
+from mapper.sources.listed_files import within
 from mapper.sources.text import (
     parse_count,
     parse_numbers,
     pose_from_numbers,
     rows,
     table,
-    time_order,
     truth_from,
 )
 
@@ -34,6 +31,7 @@ DEPTH_UNITS_PER_M = 5000.0
 LOOKED_FOR = "associations.txt of N depth/N.png N rgb/N.png (ICL-NUIM)"
 
 _LIST = "associations.txt"
+_COLUMNS = ("number", "depth/number.png", "number", "rgb/number.png")
 _TRUTHS = ("*.gt.freiburg", "groundtruth.txt")
 _NUMBER = re.compile(r"\d{1,6}")  # a stamp of the epoch has more digits
 
@@ -47,8 +45,8 @@ def read_log(path: Path, config: SourceConfig) -> Log:
     """Return the log of an ICL-NUIM folder.
 
     Raises:
-        SourceError: A file is malformed, none of the listed images exists, or they are of another size than
-            the data set's and there is no calibration.
+        SourceError: A file is malformed, an image lies outside of the folder, none exists, or they are of
+            another size than the data set's and there is no calibration.
     """
     rate_hz = config.rate_hz or RATE_HZ
     pairs, notes = _read_pairs(path, rate_hz)
@@ -56,9 +54,7 @@ def read_log(path: Path, config: SourceConfig) -> Log:
         path, config.camera, known=ICL_NUIM, depth_units_per_m=DEPTH_UNITS_PER_M
     )
     if calibration.origin == ICL_NUIM.origin and not _has_truth(path):
-        notes.append(
-            f"camera assumed to be the {ICL_NUIM.origin}; if not, put a calibration.toml beside the log"
-        )
+        notes.append(assumed_camera_note(ICL_NUIM))
     truth, truth_notes = _read_truth(path, rate_hz)
     pairs_used, offset_notes = apply_depth_offset(pairs, config, path=path)
     return rgbd_log(
@@ -91,32 +87,31 @@ def _lists_numbers(path: Path) -> bool:
 def _read_pairs(folder: Path, rate_hz: float) -> tuple[list[FramePair], list[str]]:
     """Return the pairs of the list, or without one those of images with the same number."""
     if (folder / _LIST).is_file():
-        pairs, notes = _read_list(folder / _LIST, rate_hz)
-    elif images := find_images(folder):
-        stamped = [(stamp_at(pair.number, rate_hz=rate_hz), pair) for pair in images.pairs]
-        pairs = [FramePair(stamp_ns, pair.colour, stamp_ns, pair.depth) for stamp_ns, pair in stamped]
-        notes = list(images.notes)
-    else:
+        return usable_pairs(_read_list(folder / _LIST, rate_hz), listed_in=folder / _LIST)
+    images = find_images(folder)
+    if images is None:
         raise SourceError(f"{folder}: no colour and depth images with the same numbers; want {LOOKED_FOR}")
-    order, order_notes = time_order(np.array([pair.stamp_ns for pair in pairs], dtype=np.int64), what=_LIST)
-    return [pairs[i] for i in order], [*notes, *order_notes]
+    stamped = [(stamp_at(pair.number, rate_hz=rate_hz), pair) for pair in images.pairs]
+    pairs = [FramePair(stamp_ns, pair.colour, stamp_ns, pair.depth) for stamp_ns, pair in stamped]
+    ordered, order_notes = ordered_pairs(pairs, what="image names")
+    return ordered, [*images.notes, *order_notes]
 
 
-def _read_list(path: Path, rate_hz: float) -> tuple[list[FramePair], list[str]]:
-    listed = []
-    for where, words in table(path, "number", "depth/number.png", "number", "rgb/number.png"):
-        colour, depth = sorted((words[:2], words[2:]), key=lambda side: "depth" in side[1])
-        numbers = (parse_count(number, where=where) for number, _ in (colour, depth))
-        stamp_ns, depth_stamp_ns = (stamp_at(number, rate_hz=rate_hz) for number in numbers)
-        listed.append(FramePair(stamp_ns, path.parent / colour[1], depth_stamp_ns, path.parent / depth[1]))
-    has_colour = present(pair.colour for pair in listed)
-    has_depth = present(pair.depth for pair in listed)
-    pairs = [pair for pair, *has in zip(listed, has_colour, has_depth, strict=True) if all(has)]
+def _read_list(path: Path, rate_hz: float) -> list[FramePair]:
+    pairs = []
+    for where, words in table(path, *_COLUMNS):
+        sides = sorted((words[:2], words[2:]), key=lambda side: "depth" in side[1])
+        (stamp_ns, colour), (depth_stamp_ns, depth) = (
+            (
+                stamp_at(parse_count(number, where=where), rate_hz=rate_hz),
+                within(path.parent, name, where=where),
+            )
+            for number, name in sides
+        )
+        pairs.append(FramePair(stamp_ns, colour, depth_stamp_ns, depth))
     if not pairs:
-        raise SourceError(f"{path}: none of its {len(listed)} pairs of images exists")
-    if len(pairs) == len(listed):
-        return pairs, []
-    return pairs, [f"{_LIST}: {len(listed) - len(pairs)} of {len(listed)} listed pairs do not exist; dropped"]
+        raise SourceError(f"{path}: empty list; want lines of {' '.join(_COLUMNS)}")
+    return pairs
 
 
 def _read_truth(folder: Path, rate_hz: float) -> tuple[Trajectory | None, list[str]]:

@@ -8,24 +8,21 @@ truth has ``nan`` (or nothing) in all seven pose fields, or ends after the depth
 import re
 from pathlib import Path
 
-import numpy as np
-
 from mapper.core.errors import SourceError
 from mapper.core.geometry import Transform
 from mapper.core.timebase import ns_from_seconds_text
 from mapper.sources.base import Log
 from mapper.sources.calibration import freiburg_camera
 from mapper.sources.config import SourceConfig
-from mapper.sources.image_folders.pairing import apply_depth_offset
+from mapper.sources.image_folders.pairing import apply_depth_offset, usable_pairs
 from mapper.sources.image_folders.rgbd import FramePair, find_calibration, rgbd_log
-from mapper.sources.listed_files import present, within
+from mapper.sources.listed_files import within
 from mapper.sources.text import (
     parse_numbers,
     parse_stamp,
     pose_from_numbers,
     read_lines,
     rows,
-    time_order,
     truth_from,
 )
 
@@ -63,7 +60,7 @@ def read_log(path: Path, config: SourceConfig) -> Log:
             poses.append((pair.stamp_ns, pose_from_numbers(numbers)))
     if not pairs:
         raise SourceError(f"{file}: empty list; want lines of timestamp; rgb; depth; x; y; z; qx; qy; qz; qw")
-    pairs, notes = _usable(file, pairs)
+    pairs, notes = usable_pairs(pairs, listed_in=file)
     calibration, units_per_m = find_calibration(
         file.parent,
         config.camera,
@@ -110,21 +107,3 @@ def _parse(file: Path, number: int, words: list[str]) -> tuple[FramePair, list[s
     # The format has one stamp a line; an image named by its stamp, as TUM's are, still has its own.
     depth_stamp_ns = ns_from_seconds_text(depth.stem) if _STAMP_NAME.fullmatch(depth.stem) else stamp_ns
     return FramePair(stamp_ns, colour, depth_stamp_ns, depth), words[3:]
-
-
-def _usable(file: Path, pairs: list[FramePair]) -> tuple[list[FramePair], list[str]]:
-    """Return the pairs whose two images exist, in time order."""
-    has_colour = present(pair.colour for pair in pairs)
-    has_depth = present(pair.depth for pair in pairs)
-    kept = [pair for pair, *has in zip(pairs, has_colour, has_depth, strict=True) if all(has)]
-    if not kept:
-        raise SourceError(
-            f"{file}: none of its {len(pairs)} pairs of images exists; the first: {pairs[0].colour}"
-        )
-    notes = []
-    if len(kept) < len(pairs):
-        notes.append(
-            f"{file.name}: {len(pairs) - len(kept)} of {len(pairs)} listed pairs do not exist; dropped"
-        )
-    order, order_notes = time_order(np.array([pair.stamp_ns for pair in kept]), what=file.name)
-    return [kept[i] for i in order], [*notes, *order_notes]

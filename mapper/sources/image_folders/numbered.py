@@ -22,9 +22,9 @@ from mapper.sources.base import Log
 from mapper.sources.calibration import PRIMESENSE, SEVEN_SCENES
 from mapper.sources.calibration_file import calibration_file
 from mapper.sources.config import SourceConfig
-from mapper.sources.image_folders.pairing import apply_depth_offset
-from mapper.sources.image_folders.rgbd import FramePair, find_calibration, rgbd_log
-from mapper.sources.text import parse_count, parse_numbers, rows, time_order, truth_from
+from mapper.sources.image_folders.pairing import apply_depth_offset, ordered_pairs
+from mapper.sources.image_folders.rgbd import FramePair, assumed_camera_note, find_calibration, rgbd_log
+from mapper.sources.text import parse_count, parse_numbers, rows, truth_from
 
 DEPTH_UNITS_PER_M = 1000.0
 RATE_HZ = 30.0
@@ -35,9 +35,8 @@ _DEPTH_FOLDER = re.compile(r"(?:^|[^a-z])depth", re.IGNORECASE)
 _IMAGE_ENDINGS = frozenset({".png", ".jpg", ".jpeg", ".pgm", ".ppm", ".tif", ".tiff", ".bmp"})
 _NUMBERED = re.compile(r"\D*(?P<number>\d{1,18})(?:-(?P<microseconds>\d+))?\D*")
 _SEVEN_SCENES = re.compile(r"frame-\d+\.color\.\w+")
-_LEAST_STEP_US = (
-    2000  # of numbers that are microseconds: 500 images a second; nobody keeps every 2000th image
-)
+_LEAST_STEP_US = 2000
+"""Numbers that advance by less count images: 500 images a second are the most that cameras take."""
 _ROUGHLY_RIGID = 1e-2  # text of a few digits; anything further off is no rotation
 
 
@@ -107,13 +106,11 @@ def read_log(path: Path, config: SourceConfig) -> Log:
     )
     notes = list(images.notes)
     if calibration.origin == known.origin:
-        notes.append(
-            f"camera assumed to be the {known.origin}; if not, put a calibration.toml beside the log"
-        )
+        notes.append(assumed_camera_note(known))
     pairs, stamp_notes = stamped(images.pairs, rate_hz=config.rate_hz or RATE_HZ)
     truth, truth_notes = _read_truth(path, pairs)
-    order, order_notes = time_order(np.array([pair.stamp_ns for pair in pairs]), what="image names")
-    pairs_used, offset_notes = apply_depth_offset([pairs[i] for i in order], config, path=path)
+    ordered, order_notes = ordered_pairs(pairs, what="image names")
+    pairs_used, offset_notes = apply_depth_offset(ordered, config, path=path)
     return rgbd_log(
         pairs_used,
         calibration,

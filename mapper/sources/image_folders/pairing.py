@@ -10,6 +10,8 @@ from mapper.core.errors import SourceError
 from mapper.core.timebase import NS_PER_S, Stamps, nearest
 from mapper.sources.config import SourceConfig
 from mapper.sources.image_folders.rgbd import FramePair, unpaired_note
+from mapper.sources.listed_files import present
+from mapper.sources.text import time_order
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -23,6 +25,33 @@ class ImageList:
 
     stamps_ns: Stamps
     paths: list[Path]
+
+
+def usable_pairs(pairs: Sequence[FramePair], *, listed_in: Path) -> tuple[list[FramePair], list[str]]:
+    """Return the pairs of a list whose two images exist, in time order, and notes on the others.
+
+    Raises:
+        SourceError: No pair has both images.
+    """
+    has_colour = present(pair.colour for pair in pairs)
+    has_depth = present(pair.depth for pair in pairs)
+    kept = [pair for pair, *has in zip(pairs, has_colour, has_depth, strict=True) if all(has)]
+    if not kept:
+        raise SourceError(
+            f"{listed_in}: none of its {len(pairs)} pairs of images exists; the first: {pairs[0].colour}"
+        )
+    notes = []
+    if dropped := len(pairs) - len(kept):
+        notes.append(f"{listed_in.name}: {dropped} of {len(pairs)} listed pairs do not exist; dropped")
+    ordered, order_notes = ordered_pairs(kept, what=listed_in.name)
+    return ordered, [*notes, *order_notes]
+
+
+def ordered_pairs(pairs: Sequence[FramePair], *, what: str) -> tuple[list[FramePair], list[str]]:
+    """Return pairs in time order, the first of equal stamps only, and notes on what that changed."""
+    stamps_ns = np.array([pair.stamp_ns for pair in pairs], dtype=np.int64)
+    order, notes = time_order(stamps_ns, what=what)
+    return [pairs[i] for i in order], notes
 
 
 def depth_offset_ns(config: SourceConfig) -> int:

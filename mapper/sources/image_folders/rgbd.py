@@ -179,6 +179,11 @@ def find_calibration(
     return replace(stated, depth_units_per_m=stated_units_per_m), units_per_m
 
 
+def assumed_camera_note(camera: Calibration) -> str:
+    """Return the note on a log whose camera is taken to be that of its format."""
+    return f"camera assumed to be the {camera.origin}; if not, put a calibration.toml beside the log"
+
+
 def _renamed(folder: Path) -> str:
     """Return advice on a file that may hold intrinsics under a name of its own, as ORB-SLAM's TUM1.yaml."""
     found = [path.name for ending in ("yaml", "yml") for path in sorted(folder.glob(f"*.{ending}"))]

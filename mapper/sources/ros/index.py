@@ -104,10 +104,7 @@ def first_messages(recording: Recording, series: Iterable[Series]) -> dict[str, 
             continue
         for i in range(min(_TRIED, len(one))):
             with suppress(DataError, FrameError):
-                message = decode(one.topic, recording.read(one.place(i)))
-                if isinstance(message, ImageMessage):
-                    size_of(message, where=one.topic.name)  # raises if it holds no image
-                firsts[one.topic.name] = message
+                firsts[one.topic.name] = _whole_message(recording, one, i)
                 break
     return firsts
 
@@ -115,12 +112,23 @@ def first_messages(recording: Recording, series: Iterable[Series]) -> dict[str, 
 def why_unread(recording: Recording, series: Series) -> str:
     """Return why the first message of a topic cannot be read; empty if it can."""
     try:
-        message = decode(series.topic, recording.read(series.place(0)))
-        if isinstance(message, ImageMessage):
-            size_of(message, where=series.topic.name)
+        _whole_message(recording, series, 0)
     except (DataError, FrameError) as error:
         return str(error)
     return ""
+
+
+def _whole_message(recording: Recording, series: Series, i: int) -> Message:
+    """Return message ``i`` of a topic.
+
+    Raises:
+        DataError: It is damaged.
+        FrameError: It cannot be read, or has no image although its type says so.
+    """
+    message = decode(series.topic, recording.read(series.place(i)))
+    if isinstance(message, ImageMessage):
+        size_of(message, where=series.topic.name)
+    return message
 
 
 def stamp_of(topic: Topic, data: memoryview) -> int:

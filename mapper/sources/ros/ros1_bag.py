@@ -10,7 +10,7 @@ import struct
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, NamedTuple
 
 import lz4.frame
 
@@ -32,6 +32,14 @@ _LENGTH = struct.Struct("<I")
 _MESSAGE, _CHUNK, _CHUNK_INFO, _CONNECTION = 2, 5, 6, 7  # the values of a header's op
 _MOST_HEADER_BYTES = 1 << 20  # a header holds a few names and numbers
 _Fields = Mapping[bytes, bytes]
+
+
+class _Record(NamedTuple):
+    """Record of a bag: the fields of its header, and the bytes between which its data lies."""
+
+    fields: _Fields
+    start: int
+    end: int
 
 
 def open_bag(path: Path) -> BlockRecording:
@@ -65,14 +73,14 @@ class _Contents(Contents):
         """Yield the messages of a chunk."""
         at = 0
         while at < len(data):
-            fields, start, length = _record(data, at)
-            at = start + length
+            fields, start, end = _record_in(data, at)
+            at = end
             try:
                 if fields[b"op"][0] == _CONNECTION:
-                    self.add_connection(fields, bytes(data[start:at]))
+                    self.add_connection(fields, bytes(data[start:end]))
                 elif fields[b"op"][0] == _MESSAGE and fields[b"conn"] in self._topics:
                     sec, nsec = struct.unpack("<II", fields[b"time"])
-                    yield Part(self._topics[fields[b"conn"]], sec * NS_PER_S + nsec, start, length)
+                    yield Part(self._topics[fields[b"conn"]], sec * NS_PER_S + nsec, start, end - start)
             except (KeyError, struct.error, UnicodeDecodeError) as error:
                 raise DataError(f"a damaged record: {error}") from None
 
@@ -82,22 +90,21 @@ def _indexed(file: BinaryIO) -> _Contents | None:
     contents = _Contents()
     try:
         size = file.seek(0, os.SEEK_END)
-        fields, _, _ = _record_at(file, len(_MAGIC), size)
-        (at,) = struct.unpack("<Q", fields[b"index_pos"])
+        (at,) = struct.unpack("<Q", _record_at(file, len(_MAGIC), size).fields[b"index_pos"])
         starts: list[int] = []
         contents.expected = 0
         while len(_MAGIC) < at < size:
-            fields, start, length = _record_at(file, at, size)
-            at = start + length
+            fields, start, end = _record_at(file, at, size)
+            at = end
             file.seek(start)
             if fields[b"op"][0] == _CONNECTION:
-                contents.add_connection(fields, file.read(length))
+                contents.add_connection(fields, file.read(end - start))
             elif fields[b"op"][0] == _CHUNK_INFO:
                 starts += struct.unpack("<Q", fields[b"chunk_pos"])
-                contents.expected += sum(count for _, count in struct.iter_unpack("<II", file.read(length)))
+                counts = struct.iter_unpack("<II", file.read(end - start))
+                contents.expected += sum(count for _, count in counts)
         for at in sorted(starts):
-            _, start, length = _record_at(file, at, size)
-            contents.blocks.append(Span(at, start + length - at))
+            contents.blocks.append(Span(at, _record_at(file, at, size).end - at))
     except (DataError, KeyError, IndexError, struct.error, UnicodeDecodeError):
         return None
     return contents if contents.blocks and contents.are_apart() else None
@@ -110,20 +117,20 @@ def _walked(file: BinaryIO, path: Path) -> _Contents:
     at = len(_MAGIC)
     with suppress(DataError):
         while at < size:
-            fields, start, length = _record_at(file, at, size)
-            if not fields:  # zeros, as a file system leaves them where a file was not written to its end
+            record = _record_at(file, at, size)
+            if not record.fields:  # zeros, as a file system leaves them where a file was cut short
                 break
-            if fields.get(b"op") == bytes([_CHUNK]):
-                contents.blocks.append(Span(at, start + length - at))
-            at = start + length
+            if record.fields.get(b"op") == bytes([_CHUNK]):
+                contents.blocks.append(Span(at, record.end - at))
+            at = record.end
     contents.note_cut(path, at=at, size=size)
     return contents
 
 
 def _unpack(stored: bytes) -> memoryview:
     """Return the records of a chunk: a view where they are not compressed."""
-    fields, start, length = _record(memoryview(stored), 0)
-    data = memoryview(stored)[start : start + length]
+    fields, start, end = _record_in(memoryview(stored), 0)
+    data = memoryview(stored)[start:end]
     compression = fields.get(b"compression")
     try:
         if compression == b"none":
@@ -146,8 +153,8 @@ def _unpack(stored: bytes) -> memoryview:
     return memoryview(unpacked)
 
 
-def _record_at(file: BinaryIO, at: int, size: int) -> tuple[_Fields, int, int]:
-    """Return the header of a file's record at a byte, and start and length of its data."""
+def _record_at(file: BinaryIO, at: int, size: int) -> _Record:
+    """Return the record at a byte of a file."""
     if at > size:
         raise DataError("a record that begins after the file")
     file.seek(at)
@@ -159,11 +166,11 @@ def _record_at(file: BinaryIO, at: int, size: int) -> tuple[_Fields, int, int]:
     (length,) = _LENGTH.unpack(file.read(_LENGTH.size))
     if start + length > size:
         raise DataError("a record that ends after the file")
-    return fields, start, length
+    return _Record(fields, start, start + length)
 
 
-def _record(data: memoryview, at: int) -> tuple[_Fields, int, int]:
-    """Return the header of a chunk's record at a byte, and start and length of its data."""
+def _record_in(data: memoryview, at: int) -> _Record:
+    """Return the record at a byte of a chunk."""
     try:
         (header_length,) = _LENGTH.unpack_from(data, at)
         start = at + 2 * _LENGTH.size + header_length
@@ -172,7 +179,7 @@ def _record(data: memoryview, at: int) -> tuple[_Fields, int, int]:
         raise DataError("a chunk that ends within a record") from None
     if start + length > len(data):
         raise DataError("a chunk that ends within a record")
-    return _fields(bytes(data[at + _LENGTH.size : start - _LENGTH.size])), start, length
+    return _Record(_fields(bytes(data[at + _LENGTH.size : start - _LENGTH.size])), start, start + length)
 
 
 def _fields(header: bytes) -> _Fields:

@@ -15,7 +15,17 @@ from mapper.core.errors import FrameError, SourceError
 from mapper.core.frames import PinholeCamera
 from mapper.runtime.ordered_map import ordered_map
 from mapper.sources import open_source
-from tests.support.recordings import CAMERA, COLOR, DEPTH, camera_info, image, shots, write, write_folder
+from tests.support.recordings import (
+    CAMERA,
+    COLOR,
+    DEPTH,
+    add_messages,
+    camera_info,
+    image,
+    shots,
+    write,
+    write_folder,
+)
 from tests.support.tum_logs import FIRST_NS, PERIOD_NS, picture
 
 KINDS = ["log.mcap", "log.bag", "log"]
@@ -240,12 +250,7 @@ def test_a_recording_without_an_index_is_read_all_the_same(tmp_path):
             repeat_schemas=False,
         )
         writer.start()
-        channels = {}
-        for message in shots(5):
-            if message.topic not in channels:
-                schema = writer.register_schema(message.type, "ros2msg", b"")
-                channels[message.topic] = writer.register_channel(message.topic, "cdr", schema)
-            writer.add_message(channels[message.topic], message.stamp_ns, message.cdr, message.stamp_ns)
+        add_messages(writer, shots(5))
         writer.finish()
     source = open_source(path)
     assert [entry.load().stamp_ns for entry in source.entries()] == [
