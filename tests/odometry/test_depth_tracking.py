@@ -115,6 +115,18 @@ def test_without_the_depth_leg_it_is_lost():
     assert all(step.node is None for step in tracks)
 
 
+@pytest.mark.parametrize(("most", "begins"), [(15, True), (0, False)])
+def test_a_white_room_is_mapped_anew_once_a_gap_has_ended_its_map(most, begins):
+    poses = swaying()
+    frames = walk([*poses[:5], *[pose @ exp(np.array([0.0, 0.5, 0.0]), np.zeros(3)) for pose in poses]], ROOM)
+    odometry = build_frame_odometry(LocalMapConfig(max_lost_frames=most))
+    tracks = [odometry.track(odometry.observe(frame)) for frame in [*frames[:5], *frames[25:]]]
+    after = tracks[5:]
+    assert all((step.node is not None) == begins for step in after)
+    linked = {factor.i for factor in odometry.finish() if factor.j >= (after[0].node or 0)}
+    assert not begins or min(linked) >= after[0].node
+
+
 def test_a_map_does_not_begin_before_a_bare_wall():
     poses = [FACING_Y @ exp(np.zeros(3), np.array([0.02 * k, 0.0, 0.0])) for k in range(5)]
     tracks, _ = track(walk(poses, (50.0, 1.5, 50.0)))
