@@ -8,7 +8,7 @@ import pytest
 from mapper.core.geometry import Points, Transform, apply, exp, inverse, log
 from mapper.odometry.config import LocalMapConfig
 from mapper.odometry.factory import build_frame_odometry
-from mapper.odometry.local_map.camera_motion import CameraMotion, camera_motion
+from mapper.odometry.local_map.camera_motion import CameraMotion, camera_motion, refined_by_established
 from mapper.odometry.local_map.pose_tracker import project
 
 T_CAMERA_WORLD = exp(np.array([0.0, 0.01, 0.0]), np.array([0.02, 0.0, 0.01]))
@@ -92,6 +92,26 @@ def test_a_turn_and_a_step_before_a_wall_do_not_follow_who_starts_to_walk(
     )
     assert (miss_m(motion) > 0.05) == errs
     assert (motion.agree[500:].mean() > 0.5) == errs
+
+
+@pytest.mark.parametrize("tilt", [0.15, 0.2, 0.25, 0.3])
+def test_established_landmarks_at_an_edge_of_the_view_do_not_turn_it(observation, tilt):
+    """A strip of a wall, mapped from blurred images, is a little tilted, and fits a turned pose best."""
+    rng = np.random.default_rng(4)
+    edge = rng.uniform((-0.8, -0.6, 1.7), (-0.5, 0.6, 1.7), (60, 3))
+    rest = rng.uniform((-0.5, -0.6, 1.7), (0.9, 0.6, 1.7), (300, 3))
+    wall = np.concatenate([edge, rest])
+    z = apply(T_CAMERA_WORLD, wall)[:, 2]
+    pixels = project(T_CAMERA_WORLD, wall, observation.intrinsics) + 0.3 * rng.standard_normal((360, 2))
+    measured = np.column_stack([pixels, observation.intrinsics[4] / z])
+    observation = replace(observation, measured=measured)
+    mapped = wall.copy()
+    mapped[:60, 2] += tilt * (edge[:, 0] + 0.65)
+    found, agree = refined_by_established(
+        T_CAMERA_WORLD, mapped, observation, np.arange(360), np.repeat([4, 1], [60, 300]), np.ones((360, 3))
+    )
+    assert np.linalg.norm(log(found @ inverse(T_CAMERA_WORLD))[1]) < 0.02
+    assert agree[60:].mean() > 0.9
 
 
 def test_mismatches_are_no_other_motion(observation):

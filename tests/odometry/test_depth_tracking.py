@@ -85,6 +85,24 @@ def test_poses_are_less_certain_after_distortion_was_removed(white_room):
         assert np.trace(np.linalg.inv(other.information)) > 1.2 * np.trace(np.linalg.inv(one.information))
 
 
+@pytest.mark.parametrize("shift_m", [0.05, 0.1, 0.2])
+def test_keyframes_before_a_doubtful_motion_are_not_aligned_to(shift_m):
+    poses = swaying()
+    frames = walk(poses, ROOM)
+    odometry = build_frame_odometry(LocalMapConfig())
+    tracks = [odometry.track(odometry.observe(frame)) for frame in frames[:30]]
+    keyframes = odometry._map.keyframes
+    last = max(k for k, step in enumerate(tracks) if step.is_keyframe)
+    assert len(keyframes) >= 3
+    for keyframe in keyframes[:-1]:
+        keyframe.T_camera_world = keyframe.T_camera_world @ exp(np.zeros(3), np.full(3, shift_m))
+    keyframes[-1].doubt_m = shift_m
+    step = odometry.track(odometry.observe(frames[30]))
+    assert step.node == len(keyframes) - 1
+    T_true = inverse(poses[last]) @ poses[30]
+    assert np.linalg.norm((inverse(T_true) @ step.T_node_body)[:3, 3]) < 0.01
+
+
 def test_it_is_the_same_every_time(white_room):
     poses, tracks, _ = white_room
     again, _ = track(walk(poses, ROOM)[:10])
@@ -95,6 +113,18 @@ def test_it_is_the_same_every_time(white_room):
 def test_without_the_depth_leg_it_is_lost():
     tracks, _ = track(walk(swaying()[:4], ROOM), align_depth=False)
     assert all(step.node is None for step in tracks)
+
+
+@pytest.mark.parametrize(("most", "begins"), [(15, True), (0, False)])
+def test_a_white_room_is_mapped_anew_once_a_gap_has_ended_its_map(most, begins):
+    poses = swaying()
+    frames = walk([*poses[:5], *[pose @ exp(np.array([0.0, 0.5, 0.0]), np.zeros(3)) for pose in poses]], ROOM)
+    odometry = build_frame_odometry(LocalMapConfig(max_lost_frames=most))
+    tracks = [odometry.track(odometry.observe(frame)) for frame in [*frames[:5], *frames[25:]]]
+    after = tracks[5:]
+    assert all((step.node is not None) == begins for step in after)
+    linked = {factor.i for factor in odometry.finish() if factor.j >= (after[0].node or 0)}
+    assert not begins or min(linked) >= after[0].node
 
 
 def test_a_map_does_not_begin_before_a_bare_wall():

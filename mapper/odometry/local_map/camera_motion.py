@@ -16,6 +16,10 @@ _LEAST_OBSERVERS, _MOST_OBSERVERS = 2, 6
 """Keyframes that observe an established landmark, and from how many on all count the same."""
 _MIN_KEPT_RATIO = 0.5
 """When fewer of them agree, the established landmarks show no motion."""
+_MORE, _AS_WELL = 1.5, 0.9
+"""All pairs together give the pose if so many times as many agree with it as with the one of established
+landmarks, of these themselves so many, and if it is wider as well: landmarks at an edge of the view may fit a
+pose that is metres off as well as the right one."""
 _LEAST_OTHERS, _LEAST_OTHER_RATIO = 20, 0.12
 """Pairs that show another motion, in number and as a share of all. Mismatches agree on none;
 the upper and the lower rows of a rolling shutter gave 0.10."""
@@ -104,8 +108,9 @@ def refined_by_established(
 
     What moves soon contradicts the keyframes that saw it, so landmarks that most keyframes observe stand
     still. The pose is theirs first, and is then refined by all pairs that agree with it: however many
-    features a passer-by adds to the view, they have no weight. Arguments as for ``camera_motion``; by default
-    the weights are taken as they are.
+    features a passer-by adds to the view, they have no weight. Only where they agree with the pose of all
+    pairs as well, and that fits a far larger and wider part of the scene, it is that one. Arguments as for
+    ``camera_motion``; by default the weights are taken as they are.
     """
     is_established = _established(observers)
     if is_established is not None:
@@ -118,6 +123,15 @@ def refined_by_established(
         )
         agree = agreeing(T_found, points_world, observation, features, weights)
         if agree[is_established].sum() >= _MIN_KEPT_RATIO * is_established.sum():
+            if _MORE * agree.mean() < 1.0:
+                T_all, _ = refined(T_camera_world, points_world, observation, features, weights / variance)
+                agree_all = agreeing(T_all, points_world, observation, features, weights)
+                if (
+                    agree_all.sum() > _MORE * agree.sum()
+                    and agree_all[is_established].sum() >= _AS_WELL * agree[is_established].sum()
+                    and _spread_m(points_world[agree_all & ~agree]) > _WIDER * _spread_m(points_world[agree])
+                ):
+                    return T_all, agree_all
             T_found, _ = refined(
                 T_found, points_world[agree], observation, features[agree], weights / variance
             )

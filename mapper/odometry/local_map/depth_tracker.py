@@ -190,7 +190,9 @@ class DepthTracker:
         self._keyframes = [
             k
             for k in self._map.latest(last.reference)
-            if keyframes[k].origin == origin and _of_one_camera(self._map.observation(k).depth_cells, cells)
+            if keyframes[k].origin == origin
+            and not self._is_doubtful_between(k, last.reference)
+            and _of_one_camera(self._map.observation(k).depth_cells, cells)
         ]
         models = [(self._map.observation(k), keyframes[k].T_camera_world, k) for k in self._keyframes]
         unobserved = last.doubts or (last.depth is not None and last.depth.unobservable)
@@ -203,6 +205,10 @@ class DepthTracker:
         }
         surfaces = [self._surfaces[earlier.stamp_ns] for earlier, _, _ in models]
         return ReferenceSurfaces(surfaces, [T for _, T, _ in models], len(self._keyframes))
+
+    def _is_doubtful_between(self, a: int, b: int) -> bool:
+        """Return whether a doubtful motion separates two keyframes: their surfaces lie elsewhere then."""
+        return any(keyframe.doubt_m > 0.0 for keyframe in self._map.keyframes[min(a, b) + 1 : max(a, b) + 1])
 
     def _still_surface(
         self, observation: ImageObservation, T_camera_world: Transform, reference: int

@@ -261,14 +261,20 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
 
     def _not_found(self, observation: ImageObservation) -> FrameResult:
         """Return a lost frame, or begin a new sub-map with it once enough frames matched no landmarks."""
-        is_first = self._last is None
-        if observation.has_depth.sum() >= _MIN_START_FEATURES or (
-            is_first and self._depth.can_start(observation)
-        ):
+        last, most = self._last, self._config.max_lost_frames
+        if observation.has_depth.sum() >= _MIN_START_FEATURES:
             self._unknown_frames += 1
-            if is_first or 0 < self._config.max_lost_frames < self._unknown_frames:
-                return self._begin_sub_map(observation)
-        return self._lost(observation)
+            begins = last is None or 0 < most < self._unknown_frames
+        else:
+            is_open = last is None or (most > 0 and self._is_out_of_reach(last, observation))
+            begins = is_open and self._depth.can_start(observation)
+        return self._begin_sub_map(observation) if begins else self._lost(observation)
+
+    def _is_out_of_reach(self, last: TrackedPose, observation: ImageObservation) -> bool:
+        """Return whether a sub-map without texture ended too long ago: nothing in it is recognised."""
+        origin = self._map.observation(self._map.keyframes[last.reference].origin)
+        is_bare = all(there.has_depth.sum() < _MIN_START_FEATURES for there in (last.observation, origin))
+        return is_bare and observation.stamp_ns - last.stamp_ns > STEADY_NS
 
     def _begin_sub_map(self, observation: ImageObservation) -> FrameResult:
         """Make the frame a sub-map's first keyframe, at the world's origin or the last tracked pose."""
