@@ -108,13 +108,11 @@ class FeatureMatches:
 REPEATED = "repeated"
 """``Diagnostics.method`` of a frame whose image is that of the frame before: nothing shows its pose."""
 
-UNSEEN = "is not seen"
-"""In a doubt: of a motion that no surface shows."""
 SEE_MORE = (
     "a motion that no surface shows takes wheel odometry (wheels.txt), the poses of another odometry "
     "(odometry.kind=given), or a sensor that sees farther; loops do not show it"
 )
-"""What to try then."""
+"""What to try where ``Diagnostics.unobservable`` names a motion in most frames."""
 
 STEADY_NS = NS_PER_S
 """After a longer gap the frame before does not predict the pose of this one."""

@@ -19,6 +19,9 @@ _MAX_WHEEL_CHI2, _LEAST_WHEEL_FACTORS = 9.0, 5
 _MAX_SIGMA_M, _MAX_SIGMA_SHARE, _BROKEN_SIGMA_SHARE = 0.1, 0.1, 0.3
 _MAX_STEP_M, _MAX_STEP_RAD = 0.2, np.radians(5.0)
 
+COME_BACK = "come back to known places, so that loops hold the path"
+"""What to try where a path is uncertain."""
+
 
 def loop_warnings(results: RunResults) -> Iterator[RunWarning]:
     """Yield what is suspicious about loops: far from the odometry, or against the rest of the graph."""
@@ -83,8 +86,8 @@ def wheel_warnings(results: RunResults) -> Iterator[RunWarning]:
     )
 
 
-def uncertainty_warnings(results: RunResults) -> Iterator[RunWarning]:
-    """Yield a warning if the end of the path is uncertain."""
+def uncertainty_warnings(results: RunResults, suggestion: str) -> Iterator[RunWarning]:
+    """Yield a warning, with what to try, if the end of the path is uncertain."""
     poses = results.poses
     if poses is None:
         return
@@ -99,13 +102,13 @@ def uncertainty_warnings(results: RunResults) -> Iterator[RunWarning]:
             kind="uncertainty",
             sentence=f"the last pose is known to {sigma_m:.2g} m (1 σ) after {path_m:.1f} m of path "
             f"({share:.0%}, at most {_MAX_SIGMA_SHARE:.0%} is usual)",
-            suggestion="come back to known places, so that loops hold the path",
+            suggestion=suggestion,
             weight="break" if share > _BROKEN_SIGMA_SHARE else "doubt",
         )
 
 
-def step_warnings(results: RunResults, timeline: TimeLine) -> Iterator[RunWarning]:
-    """Yield a warning if uncertain steps connect two parts of the path."""
+def step_warnings(results: RunResults, timeline: TimeLine, suggestion: str) -> Iterator[RunWarning]:
+    """Yield a warning, with what to try, if uncertain steps connect two parts of the path."""
     try:
         relative = marginals_of(results.graph).relative
     except GraphError:
@@ -128,7 +131,7 @@ def step_warnings(results: RunResults, timeline: TimeLine) -> Iterator[RunWarnin
         f"{np.degrees(_MAX_STEP_RAD):.0f}° at best (1 σ), the worst to {worst_m:.2g} m and "
         f"{np.degrees(worst_rad):.2g}°: the parts before and after may not fit",
         where=timeline.place(first, last),
-        suggestion="come back to known places, so that loops hold the path",
+        suggestion=suggestion,
         weight="doubt",
     )
 

@@ -9,9 +9,10 @@ import numpy as np
 from mapper.core.geometry import path_length
 from mapper.core.timebase import NS_PER_S, stretches
 from mapper.navigation.config import TraversableConfig
-from mapper.odometry.base import SEE_MORE, UNSEEN
+from mapper.odometry.base import SEE_MORE
 from mapper.run.frame_outcomes import DISCONNECTED, FrameRecord
 from mapper.run.graph_warnings import (
+    COME_BACK,
     loop_warnings,
     step_warnings,
     uncertainty_warnings,
@@ -53,6 +54,7 @@ def find_warnings(results: RunResults, manifest: Manifest) -> list[RunWarning]:
     reported = {warning.sentence for warning in known}
     notes = [note for source in (manifest.input, *manifest.input.appended) for note in source.notes]
     timeline = TimeLine.of(results, manifest)
+    suggestion = SEE_MORE if _leave_motions_open(results.records) else COME_BACK
     found = [
         *known,
         *(RunWarning(kind="log", sentence=note) for note in notes if note not in reported),
@@ -64,15 +66,10 @@ def find_warnings(results: RunResults, manifest: Manifest) -> list[RunWarning]:
         *_levelling(manifest),
         *_depth_reach(manifest),
         *wheel_warnings(results),
-        *uncertainty_warnings(results),
-        *step_warnings(results, timeline),
+        *uncertainty_warnings(results, suggestion),
+        *step_warnings(results, timeline, suggestion),
         *_truth(results),
     ]
-    if any(warning.suggestion == SEE_MORE for warning in found):
-        found = [
-            warning.model_copy(update={"suggestion": SEE_MORE}) if warning.kind == "uncertainty" else warning
-            for warning in found
-        ]
     return sorted(found, key=lambda warning: _ORDER.index(warning.weight))
 
 
@@ -239,16 +236,26 @@ def _doubtful(records: Sequence[FrameRecord], timeline: TimeLine) -> Iterator[Ru
     first, last = max(
         stretches([record.outcome == "doubtful" for record in records]), key=lambda run: run[1] - run[0]
     )
-    unseen = sum(any(UNSEEN in doubt for doubt in record.doubts) for record in doubtful)
-    too_many = len(doubtful) > _FEW_FRAMES and share > _MAX_DOUBTFUL_SHARE
     yield RunWarning(
         kind="doubtful",
         sentence=f"{len(doubtful)} of {placed} placed frames are doubtful, {share:.1%} "
         f"(at most {_MAX_DOUBTFUL_SHARE:.0%} are usual): {'; '.join(texts)}",
-        suggestion=SEE_MORE if too_many and 2 * unseen > len(doubtful) else "",
+        suggestion=SEE_MORE if _leave_motions_open(records) else "",
         where=timeline.place(first, last),
-        weight="doubt" if too_many else "note",
+        weight="doubt" if _are_too_many(len(doubtful), placed) else "note",
     )
+
+
+def _leave_motions_open(records: Sequence[FrameRecord]) -> bool:
+    """Return whether too many frames are doubtful, most of them by a motion that no surface shows."""
+    doubtful = [record for record in records if record.outcome == "doubtful"]
+    unseen = sum(bool(record.diagnostics.unobservable) for record in doubtful)
+    placed = sum(record.node is not None for record in records)
+    return _are_too_many(len(doubtful), placed) and 2 * unseen > len(doubtful)
+
+
+def _are_too_many(doubtful: int, placed: int) -> bool:
+    return doubtful > _FEW_FRAMES and doubtful > _MAX_DOUBTFUL_SHARE * placed
 
 
 def _without_figures(text: str) -> str:

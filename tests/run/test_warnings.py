@@ -101,17 +101,17 @@ def test_doubtful_frames_and_their_main_reasons():
 
 
 def test_motions_that_nothing_shows_have_another_remedy_than_settings():
-    unseen = "translation along x is not seen but predicted, to ±2.80 m and 0.1° a second"
-    warning = only(results_of(changed={k: doubted(unseen) for k in range(11, 19)}))
+    unseen = doubted(unobservable="translation along x")
+    warning = only(results_of(changed=dict.fromkeys(range(11, 19), unseen)))
     assert "wheel odometry" in warning.suggestion
     trial = Trial(where="1 … 2 s", frames=15, unplaced=8, tried={"odometry.voxel_m=0.2": 1})
     assert with_trial(warning, trial) == warning
 
-    results = results_of(changed={k: doubted(unseen) for k in range(11, 19)}, sigmas=PoseSigmas(0.04, 0.05))
+    results = results_of(changed=dict.fromkeys(range(11, 19), unseen), sigmas=PoseSigmas(0.04, 0.05))
     (uncertain,) = found(results, kind="uncertainty")
     assert uncertain.suggestion == warning.suggestion  # not to come back, for loops
 
-    few = {k: doubted(unseen) for k in range(11, 14)} | {k: doubted() for k in range(20, 30)}
+    few = dict.fromkeys(range(11, 14), unseen) | {k: doubted() for k in range(20, 30)}
     assert not only(results_of(changed=few)).suggestion
 
 

@@ -75,6 +75,10 @@ def lost(method: str = "lost") -> dict[str, Any]:
     }
 
 
-def doubted(*doubts: str) -> dict[str, Any]:
-    """Return the changed fields of a doubtful frame's record."""
-    return {"outcome": "doubtful", "doubts": doubts or ("jump of 0.31 m where 0.09 m was predicted",)}
+def doubted(*doubts: str, unobservable: str = "") -> dict[str, Any]:
+    """Return the changed fields of a doubtful frame's record, in which a motion may be unobservable."""
+    return {
+        "outcome": "doubtful",
+        "doubts": doubts or ("jump of 0.31 m where 0.09 m was predicted",),
+        "diagnostics": replace(_HOW, unobservable=unobservable),
+    }

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from mapper.core.geometry import Array, Transform, adjoint, inverse
-from mapper.odometry.base import UNSEEN
 from mapper.odometry.scan_to_map.observed_part import Blend
 from mapper.odometry.scan_to_map.scan_fit import ScanFit
 from mapper.odometry.scan_to_map.usual_fit import Jump
@@ -114,9 +113,9 @@ class ScanNoise:
         if turns or (rate_mps > _TRUSTED_MPS and sigma_m > _TRUSTED_M):
             name = fit.unobservable or "a motion"
             known = f"±{rate_mps:.2f} m and {np.degrees(rate_radps):.1f}° a second"
-            doubts = (f"{name} {UNSEEN} but predicted, to {known}",)
+            doubts = (f"{name} is not seen but predicted, to {known}",)
             if blend.unknown_mps.any():
-                doubts = (f"{name} {UNSEEN}, and was not before: its velocity is unknown",)
+                doubts = (f"{name} is not seen, and was not before: its velocity is unknown",)
         return PoseNoise(covariance + predicted, independent, doubts)
 
 
