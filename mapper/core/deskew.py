@@ -1,6 +1,7 @@
 """Deskewing: the points of a sweep are moved to where they would have been measured at the scan's stamp."""
 
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 from numba import njit
@@ -22,6 +23,16 @@ class Twist:
 
     rotation_radps: Array
     translation_mps: Array
+
+    @classmethod
+    def of(cls, vector: Array) -> Self:
+        """Return the twist of a (6,) vector, rotation before translation."""
+        return cls(vector[:3], vector[3:])
+
+    @property
+    def vector(self) -> Array:
+        """(6,) rotation, rad/s, before translation, m/s."""
+        return np.concatenate([self.rotation_radps, self.translation_mps])
 
     def over(self, duration_s: float) -> Transform:
         """Return T_before_after (4, 4), the motion of the body in a duration."""

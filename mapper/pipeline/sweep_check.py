@@ -197,9 +197,8 @@ class _Velocities:
         for index, interval_s in enumerate(elapsed_s.tolist()):
             after = None
             if certain[index] and certain[index + 1] and 0.0 < interval_s <= _LONGEST_INTERVAL_S:
-                after = _vector(
-                    twist_between(self._poses[index], self._poses[index + 1], duration_s=interval_s)
-                )
+                change = twist_between(self._poses[index], self._poses[index + 1], duration_s=interval_s)
+                after = change.vector
             if before is not None and after is not None:
                 share = elapsed_s[index - 1] / (elapsed_s[index - 1] + interval_s)
                 self._velocities[index] = before + share * (after - before)
@@ -233,7 +232,3 @@ class _Velocities:
                 taken |= {first, second}
                 chosen.append((first, second))
         return chosen
-
-
-def _vector(twist: Twist) -> Array:
-    return np.concatenate([twist.rotation_radps, twist.translation_mps])

@@ -134,7 +134,7 @@ class RollingShutter:
     def twist_body(self, observation: ReadByRows) -> Twist:
         """Return the velocity in the last image, in the body's axes."""
         twist = adjoint(observation.T_body_camera) @ self.twist_camera
-        return Twist(twist[:3], twist[3:])
+        return Twist.of(twist)
 
     def corrected(self, observation: Observed, twist_body: Twist) -> Observed:
         """Return an observation corrected by a velocity of the body."""

@@ -107,12 +107,12 @@ class MotionModel:
         changed = np.diag(self.velocity_sigmas(time_ns) ** 2 + _NO_VARIANCE)  # S/t²
         of_mean = (self.pose_covariance + pose_covariance) / elapsed_s**2
         gain = 1.5 * changed @ np.linalg.inv(changed + of_mean)
-        before, mean = _vector(self.twist), _vector(self.mean_twist(time_ns, T_world_body))
+        before, mean = self.twist.vector, self.mean_twist(time_ns, T_world_body).vector
         expected = before + gain @ (mean - before)
         kept = np.eye(6) - gain
         covariance = 3.0 * changed - 1.5 * (gain @ changed + changed @ gain.T)
         covariance += gain @ (changed + of_mean) @ gain.T + kept @ self._covariance @ kept.T
-        return Twist(expected[:3], expected[3:]), covariance
+        return Twist.of(expected), covariance
 
     def velocity_sigmas(self, time_ns: int) -> Array:
         """Return (6,) standard deviations of what the velocity changes until a time, rad/s and m/s."""
@@ -125,7 +125,7 @@ class MotionModel:
 
     def change(self, time_ns: int, T_world_body: Transform) -> Array:
         """Return (6,) by how much the mean velocity to a pose differs from the one before, rad/s and m/s."""
-        return _lengths(_vector(self.mean_twist(time_ns, T_world_body)) - _vector(self.twist))
+        return _lengths(self.mean_twist(time_ns, T_world_body).vector - self.twist.vector)
 
     def mean_twist(self, time_ns: int, T_world_body: Transform) -> Twist:
         """Return the mean velocity from the last scan to a pose."""
@@ -187,11 +187,11 @@ def velocities_at(
     if min(elapsed_s) < _MIN_ELAPSED_S:
         return None
     first, second, third = T_world_body
-    before = _vector(twist_between(first, second, duration_s=elapsed_s[0]))
-    after = _vector(twist_between(second, third, duration_s=elapsed_s[1]))
+    before = twist_between(first, second, duration_s=elapsed_s[0]).vector
+    after = twist_between(second, third, duration_s=elapsed_s[1]).vector
     step = (after - before) * elapsed_s[0] / sum(elapsed_s)
     at_first, at_second = before - step, before + step
-    return Twist(at_first[:3], at_first[3:]), Twist(at_second[:3], at_second[3:]), _lengths(after - before)
+    return Twist.of(at_first), Twist.of(at_second), _lengths(after - before)
 
 
 def covariance_unmeasured(changes: Array) -> Array:
@@ -208,7 +208,3 @@ def _time_s2(elapsed_s: float, before_s: float) -> float:
 def _lengths(change: Array) -> Array:
     """Return (6,) the lengths of a change's rotation and of its translation, for all axes of each."""
     return np.repeat([float(np.linalg.norm(change[:3])), float(np.linalg.norm(change[3:]))], 3)
-
-
-def _vector(twist: Twist) -> Array:
-    return np.concatenate([twist.rotation_radps, twist.translation_mps])

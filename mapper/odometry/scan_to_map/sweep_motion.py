@@ -65,13 +65,13 @@ def sweep_motion(
     part = Scan(sweep.stamp_ns, sweep.points_body[::step_of], times_s=sweep.times_s[::step_of])
     times_s = sweep.times_s[::step_of].astype(np.float64)
     half_s = float(np.abs(times_s).max())
-    expected = _vector(prior)
-    velocity, T_world_scan = _vector(start), T_world_middle
+    expected = prior.vector
+    velocity, T_world_scan = start.vector, T_world_middle
     prior_information = np.linalg.inv(prior_covariance)
     voxel_m = keyframes[0].deskewed.prepared.voxel_m
     information = np.zeros((12, 12))
     for round_ in range(_ROUNDS):
-        points = deskewed(part, _twist(velocity)).points_body.astype(np.float64)
+        points = deskewed(part, Twist.of(velocity)).points_body.astype(np.float64)
         reach_m = max_pair_distance_m * (_WIDE if round_ < _WIDE_ROUNDS else 1.0)
         parts, distances = [], []
         for keyframe in keyframes:
@@ -104,12 +104,4 @@ def sweep_motion(
         if round_ >= _WIDE_ROUNDS and moved_m < _SETTLED * voxel_m:
             break
     covariance: Array = np.linalg.inv(information)[6:, 6:].astype(np.float64)
-    return SweepMotion(_twist(velocity), covariance, T_world_scan)
-
-
-def _vector(twist: Twist) -> Array:
-    return np.concatenate([twist.rotation_radps, twist.translation_mps])
-
-
-def _twist(velocity: Array) -> Twist:
-    return Twist(velocity[:3], velocity[3:])
+    return SweepMotion(Twist.of(velocity), covariance, T_world_scan)
