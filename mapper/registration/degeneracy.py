@@ -24,6 +24,7 @@ class Degeneracy:
             displaces the cloud by 1 m root mean square.
         extent_m: Root mean square distance of the points from their centroid.
         unobservable_count: Number of them, from the first, that are unobservable.
+        directions: (K, 3) orthonormal rows: the translations among these.
         text: Their names, as in "translation along x"; empty when all are observable.
     """
 
@@ -31,6 +32,7 @@ class Degeneracy:
     motions: Array
     extent_m: float
     unobservable_count: int
+    directions: Array
     text: str
 
     @property
@@ -73,6 +75,7 @@ def degeneracy_of(information: Array, *, points: Points, min_share: float = _MIN
         (tangents @ vectors).T,
         float(np.sqrt(np.trace(squares))),
         count,
+        _spanned(vectors[3:, :count]).T,
         _text(vectors[:, :count]),
     )
 
@@ -102,12 +105,19 @@ def _text(unobservable: Array) -> str:
     """Return the names of (6, K) motions about the centroid; any basis of one space gets the same names."""
     names = []
     for name, block in (("translation along", unobservable[3:]), ("rotation about", unobservable[:3])):
-        if block.size:
-            lines, weights, _ = np.linalg.svd(block, full_matrices=False)
-            lines = lines[:, weights**2 >= _PART]
-            if lines.size:
-                names.append(f"{name} {_lines(lines)}")
+        lines = _spanned(block)
+        if lines.size:
+            names.append(f"{name} {_lines(lines)}")
     return ", ".join(names)
+
+
+def _spanned(block: Array) -> Array:
+    """Return (3, K) orthonormal columns: the directions that make up most of some of (3, N) vectors."""
+    if not block.size:
+        return np.empty((3, 0))
+    lines, weights, _ = np.linalg.svd(block, full_matrices=False)
+    spanned: Array = lines[:, weights**2 >= _PART]
+    return spanned
 
 
 def _lines(lines: Array) -> str:

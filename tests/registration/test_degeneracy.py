@@ -53,6 +53,16 @@ def registered(scene, *, T_turned=None, noise_m=0.02):
     return information, degeneracy_of(information, points=clouds[1].points)
 
 
+def test_directions_are_those_of_unobservable_translations():
+    along = registered(corridor)[1].directions
+    assert along.shape == (1, 3)
+    assert abs(along[0, 0]) > 0.999
+    level = registered(plain)[1].directions  # rotation about z is unobservable, too
+    assert level.shape == (2, 3)
+    assert np.abs(level[:, 2]).max() < 0.05
+    assert registered(room)[1].directions.shape == (0, 3)
+
+
 @pytest.mark.parametrize(
     ("scene", "text"),
     [

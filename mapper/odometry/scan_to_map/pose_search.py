@@ -177,6 +177,7 @@ class PoseSearch:
             scan.deskewed,
             inverse(key.T_world_middle) @ found,
             max_pair_distance_m=self._config.max_pair_distance_m,
+            is_velocity_known=scan.spread is not None,
         )
         if fit is None:
             return None

@@ -36,6 +36,10 @@ _FACING = 0.3
 """Share of one point's displacement along its normals, from which on its pair shows the motion: more than
 the errors of normals make."""
 _OFF_VOXELS = 1.0  # nearer to the keyframe rings lie on the same places, and so errors of normals are alike
+_SAME_VOXELS = 0.25  # nearer to it a sensor seems to stand; 0.2 and 0.3 serve as well, 0.15 and 0.4 do not
+_LEAST_BREADTH = 7.0
+"""Breadth of the surface of a point that shows whether it stands: where rings pass from a road to a rail,
+normals lean along the road, wherever the sensor is. 6 and 10 serve as well."""
 _FEW_PAIRS, _ENOUGH_PAIRS = 8, 24
 """Pairs that face a motion and agree: a bare tunnel has up to 11 by chance, a field with two trees 13 to 60.
 They measure it to σ/√pairs, with the 0.1 m that a point agrees within to 0.02 m."""
@@ -162,6 +166,7 @@ def fit_of(
     T_key_scan: Transform,
     *,
     max_pair_distance_m: float,
+    is_velocity_known: bool = True,
 ) -> ScanFit | None:
     """Return the fit of a scan; None with too few pairs, or without normals.
 
@@ -169,11 +174,16 @@ def fit_of(
     bare tunnel seems to show the motion along it. Errors of the normals of two scans are independent, so the
     product of both scans' cosines (instrumental variables; Fuller 1987, §1.4) has none.
 
+    Where the sensor seems to stand, rings lie on the same places, and so they do on a road that looks alike
+    all along: only points whose neighbours lie on a plane show that motion.
+
     Args:
         keyframe: With the surfaces.
         deskewed: The scan.
         T_key_scan: (4, 4) motion between both in the middle of their sweeps.
         max_pair_distance_m: Largest distance between the points of a pair.
+        is_velocity_known: Whether earlier scans showed how the sensor moves. If not, it may seem to stand
+            along such a road also where its pose drifts across it, by up to a voxel.
     """
     target, source = keyframe.deskewed.prepared, deskewed.prepared
     points_key = apply(T_key_scan, source.points)
@@ -189,24 +199,31 @@ def fit_of(
     own = own * np.sign(np.einsum("ni,ni->n", own, normals))[:, None]
     rows = np.hstack([np.cross(points, normals), normals])
     own_rows = np.hstack([np.cross(points, own), own])
-    shown = np.einsum("ni,nj->ij", rows, own_rows)
+    shown, telling = _shown(rows, own_rows), np.ones(len(near), np.bool_)
     if np.trace(shown[3:, 3:]) <= 0.0:
         return None
+    degeneracy = degeneracy_of(shown, points=source.points, min_share=_SMALL_SHARE)
+    moved_voxels = float(np.linalg.norm(T_key_scan[:3, 3])) / source.voxel_m
+    if moved_voxels < (_SAME_VOXELS if is_velocity_known else _OFF_VOXELS):
+        is_broad = np.minimum(target.breadth[indices[near]], source.breadth[near]) > _LEAST_BREADTH
+        of_broad = _shown(rows[is_broad], own_rows[is_broad])
+        if np.trace(of_broad[3:, 3:]) > 0.0:
+            alone = degeneracy_of(of_broad, points=source.points, min_share=_SMALL_SHARE)
+            along_m = np.linalg.norm(alone.directions @ T_key_scan[:3, 3])
+            if len(alone.directions) and along_m < _SAME_VOXELS * source.voxel_m:
+                shown, telling, degeneracy = of_broad, is_broad, alone
     agree = (distances_m <= _ALONG * max_pair_distance_m) & normals_key.any(axis=1)
     agree &= np.abs(off_m) <= _SURFACE_VOXELS * source.voxel_m
     agreement, _ = weakest_direction(source.normals, agree)
     counts = FreeSpaceCheck(_MARGIN_M).count(keyframe.description, _checked(deskewed), T_key_scan)
-    degeneracy = degeneracy_of(0.5 * (shown + shown.T), points=source.points, min_share=_SMALL_SHARE)
-    observability, weights = _observability(degeneracy, points, rows, own_rows, agree[near])
+    observability, weights = _observability(degeneracy, points, rows, own_rows, agree[near] & telling)
     shown_m = _PAIR_VOXELS * source.voxel_m / np.sqrt(weights)
-    if np.linalg.norm(T_key_scan[:3, 3]) < _OFF_VOXELS * source.voxel_m:
+    if moved_voxels < _OFF_VOXELS:
         observability[: degeneracy.unobservable_count] = 0.0
     unobservable = ""
     if observability.min() < 0.5:
         least = 1.001 * float(degeneracy.shares[observability < 0.5].max())
-        unobservable = degeneracy_of(
-            0.5 * (shown + shown.T), points=source.points, min_share=max(least, 1e-9)
-        ).text
+        unobservable = degeneracy_of(shown, points=source.points, min_share=max(least, 1e-9)).text
     return ScanFit(
         overlap=len(near) / len(source.points),
         rmse_m=float(np.sqrt(np.mean(distances_m[near] ** 2))),
@@ -220,6 +237,13 @@ def fit_of(
         shown_m=np.minimum(shown_m, degeneracy.extent_m),
         unobservable=unobservable,
     )
+
+
+def _shown(rows: Array, own_rows: Array) -> Array:
+    """Return the (6, 6) information of products of both scans' rows."""
+    products = np.einsum("ni,nj->ij", rows, own_rows)
+    information: Array = 0.5 * (products + products.T)
+    return information
 
 
 def _observability(
