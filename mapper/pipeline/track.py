@@ -18,6 +18,7 @@ from mapper.loops.factory import build_loop_detector, build_verifier
 from mapper.loops.verification_log import VerificationLog
 from mapper.odometry.base import FrameResult, HindsightOdometry, Odometry, SensorCheck
 from mapper.odometry.factory import build_odometry, odometry_for
+from mapper.pipeline.doubtful_keyframes import without_doubtful_ends
 from mapper.pipeline.sweep_check import sweep_warnings
 from mapper.pipeline.tracking_checkpoints import FrameCheckpoint, TrackingCheckpoints
 from mapper.pipeline.tracking_result import BY_POSES, TrackingResult
@@ -223,10 +224,11 @@ class _FirstPass:
         detector = self._start.detector
         loops = (*self._start.loops, *detector.closures())
         self._graph.add_factors(loop.factor for loop in accepted_loops(loops))
+        tracks, graph = without_doubtful_ends(tracks, self._graph)
         return TrackingResult(
             tuple(tracks),
             tuple(self.skipped),
-            self._graph,
+            graph,
             loops,
             self.frame_ms,
             warnings,
