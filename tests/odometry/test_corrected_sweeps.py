@@ -116,6 +116,20 @@ def test_a_sensor_that_stops_turning_is_not_lost():
     assert np.linalg.norm(miss[:3, 3]) < 0.05
 
 
+def test_a_log_may_begin_with_a_fast_turn():
+    sensor = TURNING.sensor.model_copy(update={"rings": 16})
+    config = TURNING.model_copy(update={"seed": 6, "rate_hz": 5.0, "sensor": sensor, "duration_s": 12.0})
+    log = LidarSimulator(config).log()  # 206° a second at first, 0.2 s later 21°
+    odometry = build_frame_odometry(GicpOdometryConfig().scaled(SCALE))
+
+    tracks = [odometry.track(odometry.observe(log.entry_at(index).load())) for index in range(8)]
+
+    assert all(track.node is not None for track in tracks)
+    T_first_last, T_true = inverse(tracks[1].T_world_body) @ tracks[-1].T_world_body, log.truth.T_world_body
+    miss = inverse(inverse(T_true[1]) @ T_true[7]) @ T_first_last
+    assert np.linalg.norm(miss[:3, 3]) < 0.3  # 6 m otherwise
+
+
 def test_a_sweep_whose_velocity_three_poses_contradict_is_less_certain(monkeypatch):
     monkeypatch.setattr(PlacedScan, "turns_otherwise", lambda *_: True)
     odometry = build_frame_odometry(GicpOdometryConfig().scaled(SCALE))

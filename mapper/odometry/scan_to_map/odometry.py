@@ -25,6 +25,8 @@ from mapper.odometry.scan_to_map.scan_placement import ScanPlacement
 from mapper.odometry.scan_to_map.tracked_scan import PlacedScan, ScanState, TrackedScan
 
 _KEYFRAMES = 5  # so many last ones are compared with
+_CLEAR = 0.5  # score of a log's second scan; in rooms 0.6 to 0.8 is usual, in fields less
+_FIRST_TURNS_RADPS = (1.0, -1.0, 2.0, -2.0, 4.0, -4.0)  # about the vertical, at the beginning of a map
 
 
 class ScanOdometry(FrameOdometry[ScanObservation]):
@@ -73,8 +75,8 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
         if not self._state.keyframes:
             return self._start(observation, np.eye(4), method="start")
         placed = self._placement.place(self._state, observation)
-        if placed is not None and self._first is not None and self._first.scan.times_s is not None:
-            placed = self._begin_again(self._first, observation, placed.found.T_world_middle)
+        if self._first is not None and self._first.scan.times_s is not None:
+            placed = self._begin_again(self._first, observation, placed)
         elif placed is not None and self._before is not None:
             placed = self._after_correction(self._before, observation, placed)
         if placed is None:
@@ -110,10 +112,31 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
         """Return None: the pose is not from features."""
 
     def _begin_again(
-        self, first: ScanObservation, second: ScanObservation, T_world_second: Transform
+        self, first: ScanObservation, second: ScanObservation, placed: PlacedScan | None
     ) -> PlacedScan | None:
-        """Track a map's first two scans again, now that the motion during their sweeps is known."""
-        twist = self._state.motion.mean_twist(second.middle_ns, T_world_second)
+        """Track a map's first two scans again, with the motion during their sweeps that the second one shows.
+
+        Where it does not fit clearly, other motions are tried: the log may begin with a fast turn.
+        """
+        if placed is not None:
+            twist = self._state.motion.mean_twist(second.middle_ns, placed.found.T_world_middle)
+            placed = self._begun(first, second, twist)
+            if placed is not None and placed.found.score >= _CLEAR:
+                return placed
+        best, best_twist = placed, self._state.motion.twist
+        for turning_radps in _FIRST_TURNS_RADPS:
+            twist = Twist(np.array([0.0, 0.0, turning_radps]), np.zeros(3))
+            for _ in range(2):  # the second time with the mean velocity to the pose that was found
+                found = self._begun(first, second, twist)
+                if found is None:
+                    break
+                if best is None or found.found.score > best.found.score:
+                    best, best_twist = found, twist
+                twist = self._state.motion.mean_twist(second.middle_ns, found.found.T_world_middle)
+        return self._begun(first, second, best_twist)
+
+    def _begun(self, first: ScanObservation, second: ScanObservation, twist: Twist) -> PlacedScan | None:
+        """Begin a map with its first scan, deskewed by a velocity, and place the second one in it."""
         turning_radps = float(np.linalg.norm(twist.rotation_radps))
         self._begin(first, twist, turning_radps)  # it may just have begun to turn
         return self._placement.place(self._state, second)
