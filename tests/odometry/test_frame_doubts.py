@@ -93,6 +93,9 @@ def test_doubts_are_measured_against_what_is_usual(frames, odometry):
     assert doubt.phrases == ("the image fits the predicted motion better by 7 standard errors",)
     assert doubt.sigma_m == pytest.approx(0.1, rel=0.01)
     assert not assess(40, moved_m=0.01, excess=7.0).phrases
+    assert not assess(41, moved_m=0.0065, agreement=0.7).phrases
+    doubt = assess(42, moved_m=0.0065, moving=len(pose.observation) // 2)
+    assert doubt.phrases == ("jump of 0.01 m off the predicted place, 0.00 m is usual",)
 
 
 def test_a_jump_of_a_pose_by_depth_is_doubted_unless_a_motion_was_predicted_alone(frames, odometry):

@@ -103,6 +103,7 @@ class EarlierDepth:
         T_camera_world: Transform,
         reference: int,
         twist_camera: Array | None,
+        is_moving: NDArray[np.bool_] | None = None,
     ) -> Displacement:
         """Return how much of the depth image lies elsewhere than 0.4 s before.
 
@@ -111,12 +112,15 @@ class EarlierDepth:
             T_camera_world: (4, 4) its pose.
             reference: Keyframe of the same place; the newest up to it that is old enough is compared.
             twist_camera: (6,) velocity of the camera in its own axes, rad/s and m/s; None if it is unknown.
+            is_moving: (C,) cells of the depth image that are left out; None leaves out none.
         """
         earlier = self._earlier(observation, reference, most=1)
         if observation.depth_cells is None or not earlier:
             return Displacement()
         keyframe, cells = self._map.keyframes[earlier[0]], observation.depth_cells
         points = cells.points()
+        if is_moving is not None:
+            points = points[~is_moving]
         twists = [np.zeros(6)] * 2 if twist_camera is None else [twist_camera, keyframe.twist_camera]
         compared, beside_m = _apart(
             points,
@@ -159,6 +163,19 @@ class EarlierDepth:
         return earlier
 
 
+def hidden_points(
+    observation: ImageObservation, T_camera_world: Transform, points_world: Points
+) -> NDArray[np.bool_]:
+    """Return (N,) which points lie behind what a frame's depth image shows there; none without one."""
+    cells = observation.depth_cells
+    if cells is None:
+        return np.zeros(len(points_world), np.bool_)
+    hidden: NDArray[np.bool_] = _behind(
+        points_world, T_camera_world, cells.inverse_depth, cells.camera.parameters, cells.cell_px
+    )
+    return hidden
+
+
 def _cells_of(landmark_map: LandmarkMap, keyframe: int) -> DepthCells:
     cells = landmark_map.observation(keyframe).depth_cells
     assert cells is not None
@@ -197,6 +214,20 @@ def _in_free_space(points, T_camera_world, inverse_depth, T_keyframes_world, cam
             sigma_m = noise[0] + behind * (noise[1] + behind * noise[2])
             moved[n] = behind - z > _MARGIN_M + _MARGIN_RATIO * behind + _MARGIN_SIGMAS * sigma_m
     return moved
+
+
+@njit(cache=True, nogil=True)
+def _behind(points, T, inverse_depth, optics, cell_px):  # type: ignore[no-untyped-def]
+    """Return (N,) which points lie behind all nine cells about the one that a camera has them in."""
+    hidden = np.zeros(len(points), np.bool_)
+    shape = inverse_depth.shape
+    for n in range(len(points)):
+        line, column, z = cell_of(T, points[n], optics, cell_px, shape)
+        if line < 1 or column < 1 or line >= shape[0] - 1 or column >= shape[1] - 1:
+            continue
+        least = inverse_depth[line - 1 : line + 2, column - 1 : column + 2].min()
+        hidden[n] = least > 0.0 and z - 1.0 / least > _MARGIN_M + _MARGIN_RATIO * z
+    return hidden
 
 
 @njit(cache=True, nogil=True)

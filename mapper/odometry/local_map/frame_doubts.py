@@ -27,6 +27,8 @@ _LOW_AGREEMENT = 0.5
 _JUMP_RATIO = 8.0
 """Deviation from constant velocity, relative to the usual per second, that is a jump. The 99th percentile of
 right poses is 3 to 6."""
+_MANY_MOVING, _JUMP_RATIO_AMONG_MOVING = 0.1, 5.0
+"""The same while a larger share of the features moves: it is often the motion of something else then."""
 _SUPPORT_AGREEMENT, _SUPPORT_RATIO = 0.85, 2.0
 """A jump is accepted if the agreement is at least this share of the usual, and the uncertainty at most this
 multiple, and nothing in view moves by itself: fast motions are real."""
@@ -120,7 +122,9 @@ class FrameDoubts:
             and sigma_m <= _SUPPORT_RATIO * usual_m
             and tracked_pose.few_move
         )
-        jumps = [] if is_supported else self._jumps(motion)
+        many_move = len(tracked_pose.moving) > _MANY_MOVING * len(tracked_pose.observation)
+        ratio = _JUMP_RATIO_AMONG_MOVING if many_move else _JUMP_RATIO
+        jumps = [] if is_supported else self._jumps(motion, ratio)
         phrases += jumps
         if elsewhere := self._surfaces.doubt_of(tracked_pose, displaced):
             phrases.append(elsewhere)
@@ -151,15 +155,15 @@ class FrameDoubts:
         exceeds = any(miss > _APART * expected > 0.0 for miss, expected in zip(jump, usual, strict=True))
         return exceeds and (jump[0] > _LOOSE_RAD or jump[1] > _LOOSE_M)
 
-    def _jumps(self, motion: "_FrameMotion") -> list[str]:
+    def _jumps(self, motion: "_FrameMotion", ratio: float = _JUMP_RATIO) -> list[str]:
         jump, (usual_rad, usual_m) = motion.jump, self._usual_jump(motion.elapsed_s)
         phrases = []
-        if usual_rad and jump[0] > _JUMP_RATIO * usual_rad:
+        if usual_rad and jump[0] > ratio * usual_rad:
             phrases.append(
                 f"turn {math.degrees(jump[0]):.1f}° off the predicted one, "
                 f"{math.degrees(usual_rad):.1f}° is usual"
             )
-        if usual_m and jump[1] > _JUMP_RATIO * usual_m:
+        if usual_m and jump[1] > ratio * usual_m:
             phrases.append(f"jump of {jump[1]:.2f} m off the predicted place, {usual_m:.2f} m is usual")
         return phrases
 

@@ -106,6 +106,15 @@ class ImageObservation(Archivable):
         """
         return self.sensor_weights if moved.sum() > FEW_MOVING * len(self) else self.weights
 
+    def among_moving(self, moved: NDArray[np.bool_]) -> "ImageObservation":
+        """Return the observation as ``weights_among`` weighs it."""
+        if self.weights is self.sensor_weights or moved.sum() <= FEW_MOVING * len(self):
+            return self
+        unswept = None
+        if self.unswept is not None:
+            unswept = replace(self.unswept, weights=self.unswept.sensor_weights)
+        return replace(self, weights=self.sensor_weights, unswept=unswept)
+
     def swept(self, sweep_camera: Array) -> "ImageObservation":
         """Return the observation with the shift of each row by another motion of the camera taken out."""
         if not (sweep_camera.any() or self.sweep_camera.any()):

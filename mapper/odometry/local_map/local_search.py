@@ -12,7 +12,7 @@ from mapper.features.hamming import Bits
 from mapper.features.window_matching import GridFeatures, SearchWindows, match_windows
 from mapper.odometry.config import KeyframeOdometryConfig
 from mapper.odometry.local_map.camera_motion import refined_by_established
-from mapper.odometry.local_map.earlier_depth import EarlierDepth
+from mapper.odometry.local_map.earlier_depth import EarlierDepth, hidden_points
 from mapper.odometry.local_map.image_observation import ImageObservation
 from mapper.odometry.local_map.landmark_kernels import project_visible
 from mapper.odometry.local_map.landmarks import Ids, LandmarkMap
@@ -64,6 +64,7 @@ class LocalSearch:
         reference: int,
         agreement: float,
         method: str,
+        is_moving: NDArray[np.bool_] | None = None,
     ) -> TrackedPose | None:
         """Search the landmarks of the most covisible keyframes and refine the pose with all that match.
 
@@ -74,12 +75,16 @@ class LocalSearch:
             reference: Keyframe to search if no feature is matched.
             agreement: Share of the first matches that agree with it.
             method: Step that found the first pose, for ``TrackedPose.method``.
+            is_moving: (N,) features that are known to move by themselves; None if none is.
 
         Returns:
             The refined pose; None if too few landmarks agree.
         """
         landmarks = self._map.landmarks
         moved = self._earlier_depth.moved(observation, T_camera_world, reference)
+        if is_moving is not None:
+            moved |= is_moving
+            observation = observation.among_moving(is_moving)
         landmark_of_feature = np.where(moved, -1, landmark_of_feature).astype(np.int32)
         matched = landmark_of_feature[landmark_of_feature >= 0]
         keyframes = self._covisible(matched) or [reference]
@@ -100,7 +105,10 @@ class LocalSearch:
         T_camera_world, agree = self._refined_pose(observation, T_camera_world, features, ids, moved)
         in_view = len(visible) + len(matched)
         if agree.sum() < max(self._config.min_inliers, least_by_chance(in_view)):
-            return None
+            hidden = hidden_points(observation, T_camera_world, landmarks["position"][visible])
+            shown = in_view - int(hidden.sum())
+            if agree.sum() < max(self._config.min_inliers, least_by_chance(shown)):
+                return None
         landmark_of_feature[features[~agree]] = -1
         landmarks["visible"][visible] += 1
         landmarks["visible"][matched] += 1

@@ -12,6 +12,7 @@ from mapper.odometry.local_map.earlier_depth import EarlierDepth
 from mapper.odometry.local_map.image_observation import ImageObservation
 from mapper.odometry.local_map.landmarks import Ids, LandmarkMap
 from mapper.odometry.local_map.local_search import LocalSearch, PredictedFeatures
+from mapper.odometry.local_map.moving_feature_tracker import MovingFeatureTracker
 from mapper.odometry.local_map.pose_tracker import TrackedPose, project, unmatched
 from mapper.odometry.local_map.relocalizer import Relocalizer
 from mapper.odometry.local_map.triangulation import weights_with_landmarks
@@ -32,6 +33,7 @@ class MotionPoseTracker:
         self._config = config
         self._map = landmark_map
         self._search = LocalSearch(config, landmark_map)
+        self._moving = MovingFeatureTracker(config, self._search)
         self._relocalizer = relocalizer
         self._earlier_depth = EarlierDepth(landmark_map, config.depth_noise)
 
@@ -40,6 +42,22 @@ class MotionPoseTracker:
     ) -> TrackedPose | None:
         """Try the predicted motion, then the latest keyframes."""
         by_motion = self._by_motion(observation, last, T_predicted)
+        best = self._best(by_motion, observation, last)
+        if best is None or best is by_motion:
+            return best
+        is_moving = self._moving.moving(
+            best.T_camera_world,
+            observation,
+            last,
+            _mask(observation, best.moving),
+            best.landmark_of_feature >= 0,
+        )
+        return best if is_moving is None else replace(best, moving=np.flatnonzero(is_moving).astype(np.int32))
+
+    def _best(
+        self, by_motion: TrackedPose | None, observation: ImageObservation, last: TrackedPose
+    ) -> TrackedPose | None:
+        """Return the pose of most inliers, which few inliers are compared with."""
         if by_motion is not None and by_motion.inliers >= self._config.weak_inliers:
             return by_motion
         # A pose with few inliers may be wrong: it is compared with one that needs no prediction.
@@ -109,6 +127,15 @@ class MotionPoseTracker:
         agree = motion.agree
         if agree.sum() < self._config.min_matches // 2:
             return None
+        contradicting = features[motion.moving] if not motion.doubts else features[:0]
+        is_moving = self._moving.moving(
+            motion.T_camera_world,
+            observation,
+            last,
+            moved | _mask(observation, contradicting),
+            _mask(observation, features[agree]),
+            _mask(observation, features[~agree]),
+        )
         landmark_of_feature = unmatched(observation)
         landmark_of_feature[features[agree]] = ids[agree]
         found = self._search.refine(
@@ -118,14 +145,14 @@ class MotionPoseTracker:
             reference=last.reference,
             agreement=float(agree.mean()),
             method="map",
+            is_moving=is_moving,
         )
         if found is None:
             return None
-        return replace(
-            found,
-            doubts=motion.doubts,
-            moving=np.union1d(features[motion.moving], found.moving).astype(np.int32),
-        )
+        moving = found.moving
+        if is_moving is None:
+            moving = np.union1d(features[motion.moving], moving).astype(np.int32)
+        return replace(found, doubts=motion.doubts, moving=moving)
 
     def _matched(
         self,
@@ -165,3 +192,10 @@ class MotionPoseTracker:
         still[tracked_pose.moving] = False
         known = np.flatnonzero((is_landmark | observation.has_depth) & still)
         return known, points_world[known], np.where(is_landmark, ids, -1)[known].astype(np.int32)
+
+
+def _mask(observation: ImageObservation, features: NDArray[np.integer]) -> NDArray[np.bool_]:
+    """Return (N,) which features of a frame are among some of them."""
+    mask = np.zeros(len(observation), np.bool_)
+    mask[features] = True
+    return mask

@@ -129,8 +129,9 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
             tracked_pose = self._shutter.refined(tracked_pose, last, *self._landmarks_of(tracked_pose))
             self._calibration.pass_frame(self._before_last, last, tracked_pose)
         observation = tracked_pose.observation
+        T_camera_world, is_moving = tracked_pose.T_camera_world, tracked_pose.moving_cells()
         displaced = self._earlier_depth.displacement(
-            observation, tracked_pose.T_camera_world, tracked_pose.reference, self._shutter.known_twist
+            observation, T_camera_world, tracked_pose.reference, self._shutter.known_twist, is_moving
         )
         recognised = self._recovery.relocalised(tracked_pose, displaced, self._shutter.known_twist)
         if recognised is not None:

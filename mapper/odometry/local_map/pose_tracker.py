@@ -12,6 +12,7 @@ from mapper.odometry.base import Diagnostics
 from mapper.odometry.local_map.depth_alignment import DepthAlignment
 from mapper.odometry.local_map.image_observation import FEW_MOVING, ImageObservation
 from mapper.odometry.local_map.landmarks import Ids
+from mapper.odometry.local_map.moving_features import among_moving
 from mapper.registration.reprojection import refine_pose
 
 MAX_HAMMING = 64
@@ -84,6 +85,16 @@ class TrackedPose:
     def few_move(self) -> bool:
         """Whether next to no features move by themselves."""
         return len(self.moving) <= FEW_MOVING * len(self.observation)
+
+    def moving_cells(self) -> NDArray[np.bool_] | None:
+        """Return (C,) which cells of the depth image are among moving features; None if few move."""
+        cells = self.observation.depth_cells
+        if cells is None or self.few_move:
+            return None
+        is_moving = np.zeros(len(self.observation), np.bool_)
+        is_moving[self.moving] = True
+        features = self.observation.points_camera
+        return among_moving(cells.points(), features, is_moving, self.landmark_of_feature >= 0)
 
 
 class PoseTracker(Protocol):
