@@ -136,6 +136,8 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         if recognised is not None:
             (tracked_pose, displaced), expected = recognised, None
             self._velocity.restart()
+        elif not follows and self._recovery.is_contradicted(tracked_pose, displaced):
+            return self._not_found(observation)
         information = frame_information(self._map, tracked_pose)
         covariance = covariance_of(information)
         doubt = self._doubts.assess(
