@@ -35,6 +35,7 @@ from mapper.evaluators.metrics.trajectory import align, associate, ate
 from mapper.loops.closure import accepted_loops
 from mapper.pipeline.build import levelled
 from mapper.pipeline.components import largest_component
+from mapper.pipeline.joined_components import joined
 from mapper.pipeline.solve import solve
 from mapper.pipeline.track import track_log
 from mapper.pipeline.tracking_result import refuse_a_fragment
@@ -146,7 +147,8 @@ def mapped(log: Log, name: str, overrides: Sequence[str] = ()) -> Row:
     began = time.perf_counter()
     row = Row(name, len(log), path_m)
     try:
-        tracking = largest_component(track_log(log, config, progress=SILENT), progress=SILENT)
+        tracking = joined(log, track_log(log, config, progress=SILENT), config, progress=SILENT)
+        tracking = largest_component(tracking, progress=SILENT)
         if len(log) >= 2 * config.min_tracked_frames:  # a short log at a long stride is judged all the same
             refuse_a_fragment(tracking, config, sensor=log.sensor)
         solved = solve(tracking.graph, tracking.loops, config.graph)

@@ -120,7 +120,7 @@ class ImageVerifier:
             reason = f"reprojection: {inliers} of {len(pairs)} pairs agree, want {wanted:.0f}"
             return Verification(matches, reason, inliers, rmse_m)
         seen = T_j_i, points[agree], measured[agree], weights[agree], intrinsics
-        residual_px = _residual_px(*seen)
+        residual_px = rms_residual_px(*seen)
         T_ci_cj, information, scale = alignment.T_target_source, alignment.information, 1.0
         if config.measure == "reprojection":
             T_ci_cj = inverse(T_j_i)
@@ -139,7 +139,7 @@ class ImageVerifier:
         return Verification(matches, "", inliers, rmse_m, residual_px, T_i_j, information)
 
 
-def _residual_px(
+def rms_residual_px(
     T_j_i: Transform, points: Points, measured: Array, weights: Array, intrinsics: Array
 ) -> float:
     """Return the root mean square of the weighted distances of projected points from their pixels."""

@@ -27,6 +27,7 @@ from mapper.pipeline.checkpoints import (
 )
 from mapper.pipeline.components import largest_component
 from mapper.pipeline.floor import above_floor
+from mapper.pipeline.joined_components import joined
 from mapper.pipeline.solve import solve
 from mapper.pipeline.track import depth_cautions, first_session, track_log
 from mapper.pipeline.tracking_checkpoints import TrackingCheckpoints
@@ -146,6 +147,7 @@ class _Steps:
                 observer=self.observer,
                 checkpoints=None if self.checkpoints is None else TrackingCheckpoints(self.checkpoints),
             )
+            tracking = joined(self.source, tracking, self.config, progress=self.progress)
             return largest_component(tracking, progress=self.progress)
 
     def solve(self, tracking: TrackingResult) -> _Solved:

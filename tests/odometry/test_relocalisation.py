@@ -102,6 +102,22 @@ def test_without_sub_maps_frames_stay_lost(frames):
     assert all(t.node is None for t in tracked([*before, *elsewhere], odometry)[len(before) :])
 
 
+@pytest.mark.parametrize(("features", "begins"), [(60, False), (80, True)])
+def test_the_first_map_begins_with_fewer_features_than_later_ones(frames, features, begins):
+    odometry = build_frame_odometry(LocalMapConfig(max_lost_frames=1, align_depth=False))
+
+    def sparse(frame):
+        observation = odometry.observe(frame)
+        depth_m = observation.depth_m.copy()
+        depth_m[np.flatnonzero(observation.has_depth)[features:]] = np.nan
+        return replace(observation, depth_m=depth_m)
+
+    assert (odometry.track(sparse(frames[0])).node is not None) == begins
+    odometry.track(odometry.observe(frames[1]))
+    elsewhere = frames[seconds(2.3, 3.3)]
+    assert all(odometry.track(sparse(frame)).node is None for frame in elsewhere[:4])
+
+
 def test_darkness_is_no_place(frames):
     """Frames without features never begin a map, however many they are."""
     odometry = build_frame_odometry(LocalMapConfig(max_lost_frames=2))

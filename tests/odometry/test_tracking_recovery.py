@@ -108,3 +108,25 @@ def test_among_what_moves_the_predicted_pose_needs_no_more_features(odometry, mo
     other = replace(pose, T_camera_world=T_ASIDE @ pose.T_camera_world, method="fallback")
     best = odometry._tracker._better(predicted, other)
     assert best.method == ("map" if first else "fallback")
+
+
+@pytest.mark.parametrize(
+    ("inliers", "aside", "outcome"), [(40, True, "lost"), (40, False, "found"), (400, True, "found")]
+)
+def test_after_a_loss_a_pose_of_few_features_that_displaces_surfaces_is_not_taken(
+    odometry, frames, monkeypatch, inliers, aside, outcome
+):
+    track, last = odometry._tracker.track, odometry._last
+
+    def recognised(observation, *_):
+        pose = track(observation, last, None)
+        ids = pose.landmark_of_feature.copy()
+        ids[np.flatnonzero(ids >= 0)[inliers:]] = -1
+        T_camera_world = T_ASIDE @ pose.T_camera_world if aside else pose.T_camera_world
+        return replace(pose, T_camera_world=T_camera_world, landmark_of_feature=ids)
+
+    monkeypatch.setattr(odometry, "_find_pose", recognised)
+    monkeypatch.setattr(odometry._recovery, "relocalised", lambda *_: None)
+    odometry._lost_frames = 1
+    result = odometry.track(odometry.observe(frames[NOW]))
+    assert (result.node is None) == (outcome == "lost")

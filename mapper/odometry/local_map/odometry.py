@@ -51,6 +51,8 @@ from mapper.places.vocabulary import load_vocabulary
 
 _MIN_START_FEATURES = 100
 """Features with depth that a sub-map's first frame must have: a few times ``min_inliers``."""
+_MIN_FIRST_FEATURES = 70
+"""Those that the log's first sub-map needs: later ones may begin on a hand before the lens."""
 _OWN_SHARE = 0.5
 """Share of a pose's information that is left as its landmarks were measured no better than its features."""
 _FACTORS_PER_KEYFRAME = 4
@@ -137,6 +139,8 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         if recognised is not None:
             (tracked_pose, displaced), expected = recognised, None
             self._velocity.restart()
+        elif not follows and self._recovery.is_contradicted(tracked_pose, displaced):
+            return self._not_found(observation)
         information = frame_information(self._map, tracked_pose)
         covariance = covariance_of(information)
         doubt = self._doubts.assess(
@@ -263,7 +267,8 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
     def _not_found(self, observation: ImageObservation) -> FrameResult:
         """Return a lost frame, or begin a new sub-map with it once enough frames matched no landmarks."""
         last, most = self._last, self._config.max_lost_frames
-        if observation.has_depth.sum() >= _MIN_START_FEATURES:
+        enough = _MIN_FIRST_FEATURES if last is None else _MIN_START_FEATURES
+        if observation.has_depth.sum() >= enough:
             self._unknown_frames += 1
             begins = last is None or 0 < most < self._unknown_frames
         else:

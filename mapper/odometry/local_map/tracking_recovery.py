@@ -83,6 +83,14 @@ class TrackingRecovery:
         )
         return replace(found, doubts=(*found.doubts, doubt)), displaced
 
+    def is_contradicted(self, tracked_pose: TrackedPose, displaced: Displacement) -> bool:
+        """Return whether the depth image contradicts a pose that few landmarks agree with, after a gap.
+
+        A poster that hangs in two places gives some 30 inliers. Without frames before, nothing else tells.
+        """
+        is_weak = tracked_pose.inliers < self._config.weak_inliers
+        return is_weak and min(displaced.ratio, displaced.far_ratio) > _MOST
+
     def _undoubted(self, tracked_pose: TrackedPose, before: int | None) -> list[int]:
         """Return the sub-map's most similar keyframes without doubt, if given only those before another."""
         keyframes = self._map.keyframes

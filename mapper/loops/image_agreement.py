@@ -1,0 +1,90 @@
+"""Agreement of two whole RGB-D images under a motion: surfaces at the same depth that look alike."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from mapper.core.frames import Image, RgbdFrame, ray_table
+from mapper.core.geometry import Array, Transform, apply
+from mapper.sensing.config import KINECT_NOISE
+from mapper.sensing.depth_noise import depth_sigma_m
+
+_ROWS = 120
+"""Rows of the pixels that are compared."""
+_MIN_DEPTH_M = 0.2
+_SIGMAS, _SHARE, _LEAST_M = 3.0, 0.06, 0.03
+"""Depths are the same within so many of their standard deviations, this share of the depth, which an error of
+the motion by a degree gives at grazing incidence, and this distance."""
+_BLUR = 0.5
+"""Standard deviation of the blur, in pixels of the image with the coarser view."""
+_MIN_POINTS = 300
+"""With fewer pixels nothing is compared: an object may look like another."""
+
+
+@dataclass(frozen=True, slots=True)
+class ImageAgreement:
+    """Agreement of the pixels of one image with another one, where both see the same part of the scene.
+
+    Attributes:
+        points: Number of pixels on surfaces that the other image shows at the same depth.
+        same_ratio: Their share of all pixels that fall into the other image.
+        through_ratio: Share of the pixels in space that the other image sees through.
+        correlation: Correlation of the grey levels on the same surfaces, −1 … 1.
+    """
+
+    points: int
+    same_ratio: float
+    through_ratio: float
+    correlation: float
+
+
+def image_agreement(i: RgbdFrame, j: RgbdFrame, T_j_i: Transform) -> ImageAgreement:
+    """Return how image i agrees with image j.
+
+    Args:
+        i: First frame.
+        j: Second frame.
+        T_j_i: (4, 4) pose of the first camera in the second.
+    """
+    step = max(i.camera.height_px // _ROWS, 1)
+    z_i = i.depth_m[::step, ::step].astype(np.float64)
+    measured = z_i > 0.0
+    z_i = z_i[measured]
+    rays = ray_table(i.camera)[::step, ::step][measured].astype(np.float64)
+    points_j = apply(T_j_i, np.column_stack([rays * z_i[:, None], z_i]))
+    in_front = np.flatnonzero(points_j[:, 2] > _MIN_DEPTH_M)
+    pixels = j.camera.distort(j.camera.project(points_j[in_front])) if len(in_front) else np.empty((0, 2))
+    seen = (pixels > -0.5).all(axis=1) & (
+        pixels < np.array([j.camera.width_px, j.camera.height_px]) - 0.5
+    ).all(axis=1)
+    columns, rows = np.rint(pixels[seen]).astype(np.intp).T
+    z_j = j.depth_m[rows, columns].astype(np.float64)
+    known = z_j > 0.0
+    chosen, columns, rows, z_j = in_front[seen][known], columns[known], rows[known], z_j[known]
+    if len(chosen) < _MIN_POINTS:
+        return ImageAgreement(0, 0.0, 0.0, 0.0)
+    predicted, z_i = points_j[chosen, 2], z_i[chosen]
+    deepest = np.maximum(predicted, z_i)
+    limit = _LEAST_M + _SHARE * predicted + _SIGMAS * depth_sigma_m(KINECT_NOISE, deepest)
+    same = np.abs(z_j - predicted) < limit
+    zoom = float(np.median(predicted / z_i))  # pixels of i in one of j
+    grey_i = _blurred(i.gray, zoom)[::step, ::step][measured][chosen[same]]
+    grey_j = _blurred(j.gray, 1.0 / zoom)[rows[same], columns[same]]
+    return ImageAgreement(
+        int(same.sum()),
+        float(same.mean()),
+        float((z_j - predicted >= limit).mean()),
+        _correlation(grey_i.astype(np.float64), grey_j.astype(np.float64)),
+    )
+
+
+def _blurred(grey: Image, zoom: float) -> Image:
+    """Return an image as another one shows it whose pixels are so many times as large."""
+    return grey if zoom <= 1.0 else np.asarray(cv2.GaussianBlur(grey, (0, 0), _BLUR * zoom), np.uint8)
+
+
+def _correlation(a: Array, b: Array) -> float:
+    if len(a) < _MIN_POINTS or np.ptp(a) == 0.0 or np.ptp(b) == 0.0:
+        return 0.0
+    return float(np.corrcoef(a, b)[0, 1])
