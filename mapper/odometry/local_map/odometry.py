@@ -8,7 +8,7 @@ import numpy as np
 
 from mapper.core.deskew import Twist
 from mapper.core.frames import Frame
-from mapper.core.geometry import Array, Points, Transform, inverse
+from mapper.core.geometry import Array, Transform, inverse
 from mapper.features.factory import build_detector
 from mapper.features.frame_view import ImageView
 from mapper.graph.model import BetweenFactor
@@ -45,7 +45,7 @@ from mapper.odometry.local_map.readout_time import ReadoutTime
 from mapper.odometry.local_map.relocalizer import Relocalizer
 from mapper.odometry.local_map.rolling_shutter import RollingShutter
 from mapper.odometry.local_map.tracking_recovery import TrackingRecovery
-from mapper.odometry.local_map.triangulation import add_triangulated, weights_with_landmarks
+from mapper.odometry.local_map.triangulation import add_triangulated, inlier_landmarks
 from mapper.odometry.local_map.velocity_filter import VelocityFilter
 from mapper.places.vocabulary import load_vocabulary
 
@@ -128,7 +128,9 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         if last is None or tracked_pose is None:
             return self._not_found(observation)
         if follows:
-            tracked_pose = self._shutter.refined(tracked_pose, last, *self._landmarks_of(tracked_pose))
+            tracked_pose = self._shutter.refined(
+                tracked_pose, last, *inlier_landmarks(self._map, tracked_pose)
+            )
             self._calibration.pass_frame(self._before_last, last, tracked_pose)
         observation = tracked_pose.observation
         T_camera_world, is_moving = tracked_pose.T_camera_world, tracked_pose.moving_cells()
@@ -340,20 +342,6 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
             return True
         self._unknown_frames = self._config.max_lost_frames  # another place, so a sub-map may begin at once
         return False
-
-    def _landmarks_of(self, tracked_pose: TrackedPose) -> tuple[Points, Array]:
-        """Return the (M, 3) landmarks of a pose's inliers, in the order of their features, and weights."""
-        observation, ids = tracked_pose.observation, tracked_pose.landmark_of_feature
-        features = np.flatnonzero(ids >= 0)
-        weights = weights_with_landmarks(
-            self._map,
-            tracked_pose.T_camera_world,
-            observation,
-            features,
-            ids[features],
-            observation.weights,
-        )
-        return self._map.landmarks["position"][ids[features]], weights[features]
 
     def _add_keyframe(
         self, tracked_pose: TrackedPose, *, neighbour: int | None, doubt: Doubt = NO_DOUBT

@@ -13,7 +13,7 @@ from mapper.features.window_matching import assign
 from mapper.odometry.local_map.image_observation import ImageObservation
 from mapper.odometry.local_map.landmark_kernels import MIN_DEPTH_M
 from mapper.odometry.local_map.landmarks import MIN_SHARED_LANDMARKS, Ids, LandmarkMap
-from mapper.odometry.local_map.pose_tracker import MAX_HAMMING
+from mapper.odometry.local_map.pose_tracker import MAX_HAMMING, TrackedPose
 from mapper.odometry.local_map.ray_uncertainty import ray_slope
 from mapper.registration.reprojection import CHI2_2DOF
 
@@ -215,3 +215,18 @@ def _depth(p, t, ray, variance):  # type: ignore[no-untyped-def]
     if e0 * e0 + e1 * e1 > CHI2_2DOF * variance:
         return 0.0, 0.0
     return z, np.sqrt(variance / slope2) * z_b
+
+
+def inlier_landmarks(landmark_map: LandmarkMap, tracked_pose: TrackedPose) -> tuple[Points, Array]:
+    """Return the (M, 3) landmarks of a pose's inliers, in the order of their features, and weights."""
+    observation, ids = tracked_pose.observation, tracked_pose.landmark_of_feature
+    features = np.flatnonzero(ids >= 0)
+    weights = weights_with_landmarks(
+        landmark_map,
+        tracked_pose.T_camera_world,
+        observation,
+        features,
+        ids[features],
+        observation.weights,
+    )
+    return landmark_map.landmarks["position"][ids[features]], weights[features]
