@@ -14,9 +14,8 @@ from mapper.graph.model import PoseGraph
 from mapper.odometry.base import REPEATED
 from mapper.run.frame_outcomes import FrameRecord
 
-_MAX_GAP_NS, _MAX_GAP_FRAMES = 2 * NS_PER_S, 4
-"""Where tracked frames are farther apart than this time and than so many usual intervals, a frame keeps its
-own pose, unless its image is a repeated one."""
+MAX_GAP_NS = 2 * NS_PER_S
+"""Where tracked frames are farther apart, a frame keeps its own pose, unless its image is a repeated one."""
 
 _VELOCITY_NS = NS_PER_S // 10
 """Time over which the velocity at the ends of a gap is measured, at least: half and double are as good."""
@@ -75,7 +74,7 @@ def estimates_of_doubtful(
     velocity at both ends where this errs clearly less. Both errors are measured on this log's tracked frames,
     over gaps of the same duration. A frame whose own covariance is unknown gets the motion's pose; one
     without tracked frames around it, or in a gap as long as the log's tracked stretches, keeps its own pose,
-    as do others in gaps of more than 2 s and four usual intervals unless their image repeats.
+    as do others in gaps of more than ``MAX_GAP_NS`` unless their image repeats.
 
     Args:
         trajectory: Poses of all frames that were placed, in the world of the graph.
@@ -100,8 +99,6 @@ class _MotionAround:
 
     def __init__(self, tracked: Trajectory) -> None:
         self._stamps_ns, self._poses = tracked.stamps_ns, tracked.T_world_body
-        usual_ns = float(np.median(np.diff(tracked.stamps_ns))) if len(tracked) > 1 else 0.0
-        self._max_gap_ns = max(_MAX_GAP_NS, _MAX_GAP_FRAMES * usual_ns)
         self._variances: dict[int, Array | None] = {}  # at the middle, by the duration of the gap
 
     def combined_with(self, own: Estimate, stamp_ns: int, *, is_seen: bool) -> Estimate:
@@ -112,7 +109,7 @@ class _MotionAround:
         begin = end - 1
         begin_ns, end_ns = (int(self._stamps_ns[k]) for k in (begin, end))
         gap_ns = end_ns - begin_ns
-        if is_seen and gap_ns > self._max_gap_ns:
+        if is_seen and gap_ns > MAX_GAP_NS:
             return own
         if gap_ns not in self._variances:
             self._variances[gap_ns] = self._measured(gap_ns)

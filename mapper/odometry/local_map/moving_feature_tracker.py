@@ -4,6 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.geometry import Transform, apply, inverse
+from mapper.core.timebase import NS_PER_S
 from mapper.odometry.config import LocalMapConfig
 from mapper.odometry.local_map.camera_motion import agreeing
 from mapper.odometry.local_map.image_observation import ImageObservation
@@ -15,6 +16,8 @@ _MAX_RATIO = 0.9
 _LEAST_RATIO = 0.1
 """While a smaller share of the features moves, they are not followed: of those on a real desk, which has many
 edges, up to 0.09 seem to."""
+_MAX_ELAPSED_NS = NS_PER_S // 5
+"""After longer, features that moved are elsewhere, and others move only by the errors of a wide baseline."""
 
 
 class MovingFeatureTracker:
@@ -39,6 +42,8 @@ class MovingFeatureTracker:
     ) -> NDArray[np.bool_] | None:
         """Return (N,) which features of a frame move; None while next to none do, nor did in the last one.
 
+        None also where the last frame was long ago.
+
         Args:
             T_camera_world: (4, 4) pose of the frame.
             observation: The frame.
@@ -47,6 +52,8 @@ class MovingFeatureTracker:
             is_still: (N,) features that agree with the pose.
             contradicts: (N,) features that do not, mismatches among them; None if there are none.
         """
+        if observation.stamp_ns - last.stamp_ns > _MAX_ELAPSED_NS:
+            return None
         moved_before = len(last.moving) > _LEAST_RATIO * len(last.observation)
         if not moved_before and is_moving.sum() <= _LEAST_RATIO * len(observation):
             return None
