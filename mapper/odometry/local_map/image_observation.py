@@ -106,6 +106,12 @@ class ImageObservation(Archivable):
         """
         return self.sensor_weights if moved.sum() > FEW_MOVING * len(self) else self.weights
 
+    def mask_of(self, features: NDArray[np.integer]) -> NDArray[np.bool_]:
+        """Return (N,) which features are among some of them, given by their indices."""
+        mask = np.zeros(len(self), np.bool_)
+        mask[features] = True
+        return mask
+
     def among_moving(self, moved: NDArray[np.bool_]) -> "ImageObservation":
         """Return the observation as ``weights_among`` weighs it."""
         if self.weights is self.sensor_weights or moved.sum() <= FEW_MOVING * len(self):

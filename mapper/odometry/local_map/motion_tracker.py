@@ -49,7 +49,7 @@ class MotionPoseTracker:
             best.T_camera_world,
             observation,
             last,
-            _mask(observation, best.moving),
+            observation.mask_of(best.moving),
             best.landmark_of_feature >= 0,
         )
         return best if is_moving is None else replace(best, moving=np.flatnonzero(is_moving).astype(np.int32))
@@ -132,9 +132,9 @@ class MotionPoseTracker:
             motion.T_camera_world,
             observation,
             last,
-            moved | _mask(observation, contradicting),
-            _mask(observation, features[agree]),
-            _mask(observation, features[~agree]),
+            moved | observation.mask_of(contradicting),
+            observation.mask_of(features[agree]),
+            observation.mask_of(features[~agree]),
         )
         landmark_of_feature = unmatched(observation)
         landmark_of_feature[features[agree]] = ids[agree]
@@ -192,10 +192,3 @@ class MotionPoseTracker:
         still[tracked_pose.moving] = False
         known = np.flatnonzero((is_landmark | observation.has_depth) & still)
         return known, points_world[known], np.where(is_landmark, ids, -1)[known].astype(np.int32)
-
-
-def _mask(observation: ImageObservation, features: NDArray[np.integer]) -> NDArray[np.bool_]:
-    """Return (N,) which features of a frame are among some of them."""
-    mask = np.zeros(len(observation), np.bool_)
-    mask[features] = True
-    return mask

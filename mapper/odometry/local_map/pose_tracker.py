@@ -91,9 +91,7 @@ class TrackedPose:
         cells = self.observation.depth_cells
         if cells is None or self.few_move:
             return None
-        is_moving = np.zeros(len(self.observation), np.bool_)
-        is_moving[self.moving] = True
-        features = self.observation.points_camera
+        is_moving, features = self.observation.mask_of(self.moving), self.observation.points_camera
         return among_moving(cells.points(), features, is_moving, self.landmark_of_feature >= 0)
 
 

@@ -179,11 +179,7 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
         if before.placed.turns_otherwise(again):
             result = self._placed(before.observation, replace(before.placed, contradiction_radps=off_radps))
             self._again[result.stamp_ns], self._waiting = result, tuple(result.factors)
-            keyframes = [
-                *self._state.keyframes,
-                *([] if self._state.doubtful is None else [self._state.doubtful]),
-            ]
-            keyframe = next(key for key in keyframes if key.node == placed.found.keyframe.node)
+            keyframe = self._state.keyframe_of(placed.found.keyframe.node)
             return replace(placed, found=replace(placed.found, keyframe=keyframe))
         if before.first is not None:
             self._begin(before.first, at_first, float(np.linalg.norm(change[:3])))
@@ -192,11 +188,9 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
         if found is not None:
             result = self._placed(before.observation, replace(again, deskewed=deskewed, found=found))
             is_same = (result.node, result.is_keyframe) == (before.result.node, before.result.is_keyframe)
-            corrected = (
-                self._placement.place(self._state, observation, placed)
-                if is_same and not result.doubts
-                else None
-            )
+            corrected = None
+            if is_same and not result.doubts:
+                corrected = self._placement.place(self._state, observation, placed)
             score = before.placed.found.score + placed.found.score
             if corrected is not None and found.score + corrected.found.score >= score:
                 self._again[result.stamp_ns], self._waiting = result, tuple(result.factors)
