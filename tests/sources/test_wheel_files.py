@@ -1,0 +1,63 @@
+"""Wheel odometry beside a log: poses, encoders, mountings, malformed files."""
+
+import numpy as np
+import pytest
+
+from mapper.core.errors import SourceError
+from mapper.core.geometry import transform
+from mapper.core.timebase import NS_PER_S as S
+from mapper.sources import open_source
+from mapper.sources.config import SourceConfig, WheelsConfig
+from mapper.sources.trajectory_files import write_tum
+from tests.support.planar import arc
+
+R_BASE_OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+
+
+def test_poses_beside_a_log_are_led_to_a_camera_that_looks_forward(tiny_tum_log):
+    log = tiny_tum_log(3)
+    base = arc(4, turn_rad=0.2)
+    write_tum(log / "wheels.txt", base)
+    source = open_source(log)
+    assert source.notes == ["wheels.txt: wheel odometry, 4 poses"]
+    expected = base.T_world_body @ transform(R_BASE_OPTICAL, np.zeros(3))
+    np.testing.assert_allclose(source.wheels.T_world_body, expected, atol=1e-12)
+    assert len(open_source(log, SourceConfig(first_frame=1)).wheels) == 4
+    mounted = WheelsConfig(body_in_base=(0.1, 0.0, 0.4, 0.0, 0.0, 0.0, 1.0))
+    wheels = open_source(log, SourceConfig(wheels=mounted)).wheels
+    np.testing.assert_allclose(wheels.T_world_body[0][:3, 3], [0.1, 0.0, 0.4], atol=1e-12)
+
+
+def test_encoders_beside_a_log_want_a_wheelbase(tiny_tum_log):
+    log = tiny_tum_log(3)
+    (log / "encoders.txt").write_text("# stamp path_m steering_rad\n2.0 1.5 0.0\n1.0 0.5 0.0\n")
+    with pytest.raises(
+        SourceError, match=r"encoders.txt: the wheelbase is unknown; --set source.wheels.whee"
+    ):
+        open_source(log)
+    source = open_source(log, SourceConfig(wheels=WheelsConfig(wheelbase_m=0.5)))
+    assert source.wheels.stamps_ns.tolist() == [S, 2 * S]
+    np.testing.assert_allclose(source.wheels.positions_world, [[0, 0, 0], [1, 0, 0]], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "why"),
+    [
+        ("encoders.txt", "1.0 2.0\n", r"encoders.txt:1: 2 columns, want 3: stamp path_m steering_rad"),
+        ("encoders.txt", "1.0 2.0 1.6\n", r"encoders.txt:1: .* within ±π/2 rad"),
+        ("encoders.txt", "# none\n", r"encoders.txt: no readings"),
+        ("wheels.txt", "1.0 0 0 0\n", r"wheels.txt:1: 4 columns, want 8"),
+    ],
+)
+def test_malformed_files_are_named(tiny_tum_log, name, text, why):
+    log = tiny_tum_log(2)
+    (log / name).write_text(text)
+    with pytest.raises(SourceError, match=why):
+        open_source(log, SourceConfig(wheels=WheelsConfig(wheelbase_m=0.5)))
+
+
+def test_a_mounting_without_a_rotation_is_refused(tiny_tum_log):
+    log = tiny_tum_log(2)
+    write_tum(log / "wheels.txt", arc(2))
+    with pytest.raises(SourceError, match=r"body_in_base=\(0.0, .* its quaternion is zero"):
+        open_source(log, SourceConfig(wheels=WheelsConfig(body_in_base=(0.0,) * 7)))
