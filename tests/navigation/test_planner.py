@@ -15,14 +15,8 @@ CELL = 0.05
 POINT = PlanConfig(radius_m=0.0)
 
 
-def free_cells(shape, share, seed):
-    free = np.random.default_rng(seed).random(shape) > share
-    free[0, 0, 0] = free[-1, -1, -1] = True
-    return free
-
-
-def dijkstra_length(free):
-    """Return the shortest length from the first to the last cell by scipy, steps as documented."""
+def dijkstra_lengths(free, start):
+    """Return the shortest length from a cell to every cell by scipy, steps as documented."""
     sparse = pytest.importorskip("scipy.sparse", reason="the oracle for path lengths")
     from scipy.sparse.csgraph import dijkstra
 
@@ -46,22 +40,24 @@ def dijkstra_length(free):
     graph = sparse.csr_array(
         (np.concatenate(lengths), (np.concatenate(rows), np.concatenate(columns))), (free.size, free.size)
     )
-    return dijkstra(graph, indices=0)[-1]
+    return dijkstra(graph, indices=index[start]).reshape(free.shape)
 
 
 @pytest.mark.parametrize("shape", [(1, 40, 50), (6, 15, 12)], ids=["plane", "space"])
 @pytest.mark.parametrize("seed", range(4))
-def test_the_search_is_as_short_as_dijkstra_s(shape, seed):
-    free = free_cells(shape, 0.2, seed)
-    expected = dijkstra_length(free)
-
-    found = shortest_path(free, (0, 0, 0), tuple(n - 1 for n in shape))
-
-    assert found.reached == np.isfinite(expected)
-    if found.reached:
-        assert path_length(found.cells) == pytest.approx(expected, abs=1e-9)
-        assert found.cells[0].tolist() == [0, 0, 0]
-        assert free[tuple(found.cells.T)].all()
+def test_the_search_is_as_short_as_dijkstra_s_in_every_direction(shape, seed):
+    rng = np.random.default_rng(seed)
+    free = rng.random(shape) > 0.2
+    cells = [tuple(cell) for cell in rng.choice(np.argwhere(free), 12)]
+    for start in cells[:3]:
+        expected = dijkstra_lengths(free, start)
+        for goal in cells:
+            found = shortest_path(free, start, goal)
+            assert found.reached == np.isfinite(expected[goal])
+            assert tuple(found.cells[0]) == start
+            assert free[tuple(found.cells.T)].all()
+            if found.reached:
+                assert path_length(found.cells) == pytest.approx(expected[goal], abs=1e-9)
 
 
 def test_no_diagonal_squeezes_between_two_obstacles():

@@ -109,6 +109,18 @@ def test_a_gentle_ramp_is_free_and_a_steep_one_is_not():
     assert row_codes(traversable_grid(steep, TraversableConfig(max_slope_rad=0.6)), [1.5]) == [FREE]
 
 
+@pytest.mark.parametrize("degrees", [30, 90, 135, 240])
+def test_a_slope_is_measured_in_its_own_direction_up_to_the_edges(degrees):
+    up = np.array([np.cos(np.radians(degrees)), np.sin(np.radians(degrees))])
+    x, y = (axis.ravel() for axis in np.meshgrid(np.arange(30), np.arange(30)))
+    for slope, is_free in ((0.3, True), (0.42, False)):  # 17 and 23 degrees; the limit is 20
+        tops = np.floor((np.column_stack([x, y]) - 15.0) @ up * slope)
+        columns = zip(x * CELL, y * CELL, tops * CELL, strict=True)
+        solids = [((x0, y0, z - CELL), (x0 + CELL, y0 + CELL, z)) for x0, y0, z in columns]
+        grid = traversable_grid(octree_of(*solids), TraversableConfig())
+        assert ((grid.cells == FREE) == is_free).all()
+
+
 def test_what_only_a_steep_side_leads_to_is_no_floor():
     solids = [floor(0.0, 1.0)]
     solids += [((1.0 + n * CELL, 0.0, 0.0), (1.05 + n * CELL, 1.0, (n + 1) * 2 * CELL)) for n in range(10)]
