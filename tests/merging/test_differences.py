@@ -3,6 +3,7 @@ import shutil
 
 import cv2
 import numpy as np
+import pytest
 
 from mapper.core.geometry import apply, exp, inverse
 from mapper.merging.differences import compare_maps
@@ -69,6 +70,21 @@ def test_a_room_is_the_same_as_itself_seen_in_another_frame():
     assert not found.appeared
     assert not found.vanished
     assert found.same > 0.99 * (found.same + len(found.not_seen_again))
+
+
+@pytest.mark.parametrize(("hits", "misses", "differs"), [(2, 4, True), (1, 4, False), (2, 3, False)])
+def test_weak_evidence_is_no_change(hits, misses, differs):
+    """A wall of 9 voxels: one map hit them so often, the rays of the other passed them so often."""
+    wall = np.array([[1.05, y, z] for y in (-0.1, 0.0, 0.1) for z in (-0.1, 0.0, 0.1)], np.float32) + 0.05
+    hit, passed = (OctreeMap(OctreeConfig(resolution_m=0.1, max_range_m=20.0)) for _ in range(2))
+    for _ in range(hits):
+        hit.insert_points(wall, np.array([0.05, 0.05, 0.05]))
+    beyond = wall + np.float32([1.0, 0.0, 0.0])
+    for _ in range(misses):
+        for point in beyond:  # along x, through one voxel of the wall each
+            passed.insert_points(point[None], np.array([0.05, point[1], point[2]], np.float64))
+    assert bool(compared(passed, hit).appeared) == differs
+    assert bool(compared(hit, passed).vanished) == differs
 
 
 def test_maps_of_two_places_are_doubted():
