@@ -31,7 +31,7 @@ from mapper.merging.placing import Placed
 from mapper.merging.stages import Stages
 from mapper.navigation.floor import Floor, driven_ground
 from mapper.navigation.traversable import TraversableFloor, traversable
-from mapper.octree.grid import OccupancyGrid, with_obstacles
+from mapper.octree.grid import OccupancyGrid, overlap_of, with_obstacles
 from mapper.octree.ground_height import (
     NOTHING,
     DrivenGround,
@@ -206,20 +206,14 @@ class _Raster:
 
     def overlap(
         self, first: NDArray[np.int64], size: tuple[int, ...]
-    ) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
+    ) -> tuple[tuple[slice, ...], tuple[slice, ...]]:
         """Return the rows and columns that a window covers, in the raster and in the window.
 
         Args:
             first: (2,) x and y keys of the window's first column.
             size: H, W of the window.
         """
-        corner = (first - self.first)[::-1]
-        low = np.maximum(corner, 0)
-        high = np.maximum(np.minimum(corner + size, self.shape), low)
-        rows, columns = (slice(a, b) for a, b in zip(low.tolist(), high.tolist(), strict=True))
-        own_low, own_high = (low - corner).tolist(), (high - corner).tolist()
-        own_rows, own_columns = (slice(a, b) for a, b in zip(own_low, own_high, strict=True))
-        return (rows, columns), (own_rows, own_columns)
+        return overlap_of((first - self.first)[::-1], size, self.shape)
 
 
 def _raster(workspace: Workspace, extent: Extent, driven: DrivenGround | None) -> _Raster:
