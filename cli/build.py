@@ -90,7 +90,7 @@ def build(
     """
     out = place_of(out, RUNS / name_of(log), overwrite=overwrite)
     overrides = merged(selection(first, last, stride, require_truth), set_)
-    make_observer = _observer_factory(rerun, step=step, overwrite=overwrite)
+    make_observer = observer_factory(rerun, step=step, overwrite=overwrite)
     if onto is None:
         run, metrics = built(
             log,
@@ -158,7 +158,7 @@ def _preview(source: "Log", out: Path, progress: "Progress") -> "Observer":
     return Preview(shown.resolve(), source, on_first=lambda: progress.note(f"first picture: {shown}"))
 
 
-def _observer_factory(rerun: str | None, *, step: bool, overwrite: bool) -> "ObserverFactory | None":
+def observer_factory(rerun: str | None, *, step: bool, overwrite: bool) -> "ObserverFactory | None":
     """Return the observer of a build, refusing at once what would fail at its end."""
     if rerun is None:
         refuse_without("--rerun", {"--step": step})

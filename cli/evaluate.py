@@ -203,8 +203,10 @@ def _path_errors(
 
 def _answer(run: "Run | None", metrics: "list[Metric]", found: "Assessment", format_: Format) -> Answer:
     """Return the metrics and, of a run, its verdict."""
+    from mapper.evaluators.metrics.metric import records_of
+
     text = _text(metrics, found, format_)
-    document: dict[str, Any] = {"metrics": _every_metric(metrics, found)}
+    document: dict[str, Any] = {"metrics": records_of(_every_metric(metrics, found))}
     if run is not None:
         from mapper.cli.summary import verdict_text
 
@@ -241,6 +243,7 @@ def _of_merged_map(
     from mapper.evaluators.metrics.evaluate import Assessment
     from mapper.evaluators.metrics.map_reference import read_reference
     from mapper.evaluators.metrics.merged_map import merged_map_metrics, merged_map_quality
+    from mapper.evaluators.metrics.metric import records_of
     from mapper.merging.merged_map import open_map
 
     merged = open_map(folder)
@@ -252,7 +255,7 @@ def _of_merged_map(
     text = _text(metrics, Assessment(tuple(metrics)), format_)
     if notes and format_ in (Format.TEXT, Format.MARKDOWN):
         text = "\n".join([text, "", *notes])
-    return Answer({"metrics": metrics, "notes": notes}, text)
+    return Answer({"metrics": records_of(metrics), "notes": notes}, text)
 
 
 def _needed(run: "Run | None", path: Path, option: str) -> "Run":
@@ -312,8 +315,6 @@ def _every_metric(metrics: "list[Metric]", found: "Assessment") -> "list[Metric]
 
 
 def _text(metrics: "list[Metric]", found: "Assessment", format_: Format) -> str:
-    from dataclasses import asdict
-
     from mapper.evaluators.metrics import metric
     from mapper.evaluators.metrics.segments import LENGTH_COLUMNS, length_records
     from mapper.evaluators.tables import table as tables
@@ -321,7 +322,7 @@ def _text(metrics: "list[Metric]", found: "Assessment", format_: Format) -> str:
     if format_ is Format.JSON:
         return metric.json_text(_every_metric(metrics, found))
     if format_ is Format.CSV:
-        return tables.csv_text([asdict(one) for one in _every_metric(metrics, found)]).rstrip("\n")
+        return tables.csv_text(metric.records_of(_every_metric(metrics, found))).rstrip("\n")
     records = length_records(found.lengths)
     if format_ is Format.MARKDOWN:
         shown = [metric.markdown_table(metrics), tables.markdown_table(LENGTH_COLUMNS, records)]

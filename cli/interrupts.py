@@ -16,10 +16,11 @@ _AGAIN_S = 0.05
 def handle_interrupts() -> None:
     """Raise KeyboardInterrupt at Ctrl-C, and Terminated at SIGTERM, in the main thread."""
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, _interrupt)
+        signal.signal(number, interrupt)
 
 
-def _interrupt(number: int, frame: FrameType | None) -> None:
+def interrupt(number: int, frame: FrameType | None) -> None:
+    """Raise for a signal; in a module that cannot take an exception it is sent again a little later."""
     if _is_unsafe(frame):
         timer = threading.Timer(_AGAIN_S, os.kill, (os.getpid(), number))
         timer.daemon = True

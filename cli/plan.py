@@ -78,7 +78,7 @@ def plan(
     """
     from mapper.config.loading import overridden
     from mapper.export.plan import draw_plan, plan_json, write_plan
-    from mapper.merging.floors import keep_out_of, storeys_of
+    from mapper.merging.floors import keep_out_of, traversable_of
     from mapper.merging.map_folders import open_map_folder
     from mapper.navigation.config import PlanConfig
     from mapper.navigation.planner import plan_2d, plan_3d
@@ -101,7 +101,7 @@ def plan(
         octree = read_octree(built.file(files.OCTREE_OT))
         found = plan_3d(octree, start, goal, config=config, keep_out=keep_out_of(built))
     elif has_storeys:
-        found = plan_storeys(storeys_of(built), start, goal, config=config)
+        found = plan_storeys(traversable_of(built), start, goal, config=config)
     else:
         found = plan_2d(grid, start, goal, config=config)
     if isinstance(built, Run):

@@ -16,15 +16,18 @@ if TYPE_CHECKING:
 
 
 _DIGITS = 3
-_OF_ACCURACY = (
-    "ATE RMSE",
-    "RPE translation RMSE",
-    "RPE rotation RMSE",
-    "relative translation mean",
-    "relative rotation mean",
-    "loops wrongly accepted",
+_ACCURACY = frozenset(
+    {
+        "ATE RMSE",
+        "RPE translation RMSE",
+        "RPE rotation RMSE",
+        "relative translation mean",
+        "relative rotation mean",
+        "loops wrongly accepted",
+    }
 )
-_OF_COVERAGE = ("path length", "longest gap", "true revisits")
+_COVERAGE = frozenset({"path length", "longest gap", "true revisits", "true revisits with a loop"})
+"""Quantities of metrics by what they answer."""
 
 
 def report(
@@ -105,12 +108,12 @@ def _figures(run: "Run") -> "list[Figure]":
     figures += [Figure(name, value, "Is it complete?") for name, value in complete]
     for metric in metrics:
         name, value, unit = shown(metric, digits=_DIGITS)
-        figures.append(Figure(name, f"{value} {unit}", _question(name)))
+        figures.append(Figure(name, f"{value} {unit}", _question(metric.quantity)))
     return figures + [Figure(name, value, "How fast was it?") for name, value in fast]
 
 
-def _question(metric: str) -> "Question":
+def _question(quantity: str) -> "Question":
     """Return what a metric answers first of all."""
-    if metric.startswith(_OF_ACCURACY):
+    if quantity in _ACCURACY:
         return "Is it right?"
-    return "Is it complete?" if metric.startswith(_OF_COVERAGE) else ""
+    return "Is it complete?" if quantity in _COVERAGE else ""

@@ -2,7 +2,6 @@
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from importlib.util import find_spec
 from math import degrees
 from pathlib import Path
@@ -11,16 +10,23 @@ from statistics import median
 from typing import Any
 
 from mapper.cli.answer import Answer, rows_text
-from mapper.evaluators.metrics.evaluate import CLOCK_OFFSET
-from mapper.evaluators.metrics.metric import Metric
+from mapper.evaluators.metrics.evaluate import (
+    ATE_RMSE,
+    ATE_WITHOUT_OFFSET,
+    CLOCK_OFFSET,
+    PATH_LENGTH,
+    RPE_RMSE_M,
+    RPE_RMSE_RAD,
+    START_TO_END,
+)
+from mapper.evaluators.metrics.metric import Metric, records_of
 from mapper.loops.closure import LoopClosure, accepted_loops, rejections
 from mapper.run.folder import Run
 from mapper.run.frame_outcomes import FrameRecord
 from mapper.run.manifest import Counts, Timing
 
 _SHOWN_NOTES = frozenset({"gap", "lost", "doubtful", "skipped", "levelling", "shutter"})
-_ATE, _RPE_M, _RPE_RAD, _LENGTH = "ATE RMSE", "RPE translation RMSE", "RPE rotation RMSE", "path length"
-_SHOWN = (_ATE, _RPE_M, _RPE_RAD, _LENGTH, "start-to-end offset")
+_SHOWN = frozenset({ATE_RMSE, RPE_RMSE_M, RPE_RMSE_RAD, PATH_LENGTH, START_TO_END})
 
 
 def summary_of(run: Run, metrics: Sequence[Metric]) -> Answer:
@@ -38,7 +44,7 @@ def run_document(run: Run, metrics: Sequence[Metric]) -> dict[str, Any]:
         "keyframes": counts.nodes,
         "factors": counts.factors,
         "loops": _loop_counts(run.loops),
-        "metrics": [asdict(metric) for metric in metrics],
+        "metrics": records_of(metrics),
         "octree": {
             "leaves": counts.leaves,
             "occupied": counts.occupied,
@@ -65,7 +71,7 @@ def short_text(run: Run, metrics: Sequence[Metric]) -> str:
     """Return the main figures in eight lines, and why a run is not trusted."""
     counts, timing, verdict = run.manifest.counts, run.manifest.timing, run.verdict
     logs = f", of {run.manifest.input.title}" if run.manifest.input.appended else ""
-    lengths_m = [metric.value for metric in metrics if metric.name.startswith(_LENGTH)]
+    lengths_m = [metric.value for metric in metrics if metric.quantity == PATH_LENGTH]
     in_browser = "" if find_spec("rerun") else " --html"
     path = f", along a path of {lengths_m[0]:.2f} m" if lengths_m else ""
     speed = f"{timing.frames_per_s:.1f} frames/s, {timing.real_time_factor:.2f} × real time"
@@ -96,7 +102,7 @@ def summary_text(run: Run, metrics: Sequence[Metric]) -> str:
         ("frames", counts.frames_text),
         ("keyframes", f"{counts.nodes}, with {counts.factors} factors"),
         ("loops", _loops_text(run.loops)),
-        *((metric.name, _value_text(metric)) for metric in metrics if metric.name.startswith(_SHOWN)),
+        *((metric.name, _value_text(metric)) for metric in metrics if metric.quantity in _SHOWN),
         *_left_open(run.records),
         ("octree", f"{counts.voxels_text} of {run.config.octree.resolution_m:g} m"),
     ]
@@ -142,14 +148,15 @@ def _verdict_rows(run: Run) -> list[tuple[str, str]]:
 
 def _accuracy_text(metrics: Sequence[Metric]) -> str:
     """Return the errors by the truth; empty without one."""
-    found = {start: metric for metric in metrics for start in _SHOWN if metric.name.startswith(start)}
-    if _ATE not in found:
+    found = {metric.quantity: metric for metric in metrics}
+    if ATE_RMSE not in found:
         return ""
-    text = f"{found[_ATE].name} {_value_text(found[_ATE])}"
-    if _RPE_M in found and _RPE_RAD in found:
-        text += f"; from frame to frame {_value_text(found[_RPE_M])} and {_value_text(found[_RPE_RAD])}"
-    if offset := [metric for metric in metrics if metric.name.startswith(CLOCK_OFFSET)]:
-        late_s, rmse_m = (metric.value for metric in offset)
+    text = f"{found[ATE_RMSE].name} {_value_text(found[ATE_RMSE])}"
+    if RPE_RMSE_M in found and RPE_RMSE_RAD in found:
+        steps = (_value_text(found[quantity]) for quantity in (RPE_RMSE_M, RPE_RMSE_RAD))
+        text += f"; from frame to frame {' and '.join(steps)}"
+    if CLOCK_OFFSET in found:
+        late_s, rmse_m = (found[quantity].value for quantity in (CLOCK_OFFSET, ATE_WITHOUT_OFFSET))
         how = "late" if late_s > 0.0 else "early"
         text += f"; the truth's stamps seem {abs(late_s):.3f} s {how}, without which ATE is {rmse_m:.4f} m"
     return text

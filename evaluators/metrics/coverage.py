@@ -23,7 +23,7 @@ def frame_coverage(frames_ns: Stamps, poses_ns: Stamps) -> list[Metric]:
     _, apart_ns = nearest(poses_ns, frames_ns)
     tracked = apart_ns <= min(MAX_TRUTH_GAP_NS, 0.5 * usual_ns)
     return [
-        Metric("coverage, frames with a pose", 100.0 * float(tracked.mean()), "%"),
+        Metric("coverage", 100.0 * float(tracked.mean()), "%", "frames with a pose"),
         Metric("frames without a pose", int((~tracked).sum()), "frames"),
         *_gap_metrics(np.concatenate([_untracked_s(frames_ns, tracked), _pauses_s(frames_ns, tracked)])),
     ]
@@ -42,7 +42,7 @@ def time_coverage(poses_ns: Stamps, *, begin_ns: int, end_ns: int) -> list[Metri
     pauses_ns = np.diff(np.concatenate([[begin_ns], inside, [end_ns]])).astype(np.float64)
     gaps_s = pauses_ns[pauses_ns > _GAP_INTERVALS * usual_ns] / NS_PER_S
     covered = 1.0 - float(gaps_s.sum()) * NS_PER_S / (end_ns - begin_ns)
-    return [Metric("coverage, share of the truth's time", 100.0 * covered, "%"), *_gap_metrics(gaps_s)]
+    return [Metric("coverage", 100.0 * covered, "%", "share of the truth's time"), *_gap_metrics(gaps_s)]
 
 
 def _gap_metrics(gaps_s: NDArray[np.float64]) -> list[Metric]:

@@ -32,7 +32,13 @@ ALIGNED = {
     "se3": "SE(3)-aligned",
     "sim3": "Sim(3)-aligned",
 }
+ATE_RMSE = "ATE RMSE"
+RPE_RMSE_M, RPE_RMSE_RAD = "RPE translation RMSE", "RPE rotation RMSE"
+PATH_LENGTH, START_TO_END = "path length", "start-to-end offset"
 CLOCK_OFFSET = "clock offset of the truth"
+ATE_WITHOUT_OFFSET = f"{CLOCK_OFFSET}: {ATE_RMSE} without it"
+"""Quantities of metrics that a summary of a run shows."""
+
 _CLOCK_NS = 1_000_000
 
 
@@ -73,7 +79,7 @@ class Assessment:
     @property
     def ate_m(self) -> float | None:
         """Absolute trajectory error, RMSE, metres, after the alignment; None without truth."""
-        return next((m.value for m in self.metrics if m.name.startswith("ATE RMSE")), None)
+        return next((m.value for m in self.metrics if m.quantity == ATE_RMSE), None)
 
     def __str__(self) -> str:
         return text_table(self.metrics)
@@ -169,8 +175,8 @@ def assess(
     offset = start_end_offset(estimate)
     own = [
         *_coverage(estimate, truth, frames_ns),
-        Metric("path length", estimate.path_length_m, "m"),
-        Metric("start-to-end offset", offset.translation_m, "m"),
+        Metric(PATH_LENGTH, estimate.path_length_m, "m"),
+        Metric(START_TO_END, offset.translation_m, "m"),
         Metric("start-to-end rotation", offset.rotation_rad, "rad"),
     ]
     if truth is None:
@@ -194,14 +200,14 @@ def _against_truth(aligned: Matched, alignment: AlignmentKind) -> list[Metric]:
     how = ALIGNED[alignment]
     return [
         Metric("matched poses", len(aligned), "pairs"),
-        Metric(f"ATE RMSE, {how}", position.rmse, "m"),
-        Metric(f"ATE mean, {how}", position.mean, "m"),
-        Metric(f"ATE median, {how}", position.median, "m"),
-        Metric(f"ATE std, {how}", position.std, "m"),
-        Metric(f"ATE min, {how}", position.min, "m"),
-        Metric(f"ATE max, {how}", position.max, "m"),
-        Metric("RPE translation RMSE, consecutive", steps.translation_m.rmse, "m"),
-        Metric("RPE rotation RMSE, consecutive", steps.rotation_rad.rmse, "rad"),
+        Metric(ATE_RMSE, position.rmse, "m", how),
+        Metric("ATE mean", position.mean, "m", how),
+        Metric("ATE median", position.median, "m", how),
+        Metric("ATE std", position.std, "m", how),
+        Metric("ATE min", position.min, "m", how),
+        Metric("ATE max", position.max, "m", how),
+        Metric(RPE_RMSE_M, steps.translation_m.rmse, "m", "consecutive"),
+        Metric(RPE_RMSE_RAD, steps.rotation_rad.rmse, "rad", "consecutive"),
     ]
 
 
@@ -223,7 +229,7 @@ def _clock_metrics(estimate: Trajectory, truth: Trajectory, alignment: Alignment
         return []
     return [
         Metric(CLOCK_OFFSET, found.offset_s, "s"),
-        Metric(f"{CLOCK_OFFSET}: ATE RMSE without it", found.rmse_m, "m"),
+        Metric(ATE_WITHOUT_OFFSET, found.rmse_m, "m"),
     ]
 
 

@@ -66,7 +66,7 @@ def map_quality(
         T_map_reference, how = refined, f"{how}, then registered"
     check = check_occupancy(run.octree, reference, T_map_reference, voxels=voxels)
     metrics = [
-        Metric(f"map compared with the {reference.name}, placed {how}", len(check.occupied), "voxels"),
+        Metric(f"map compared with the {reference.name}", len(check.occupied), "voxels", f"placed {how}"),
         *([Metric("registration moved it by", moved_m, "m")] if register else []),
         *check_metrics(check),
         *_distances(reference, check, cloud, T_map_reference),
@@ -123,4 +123,4 @@ def _distances(
 
 
 def _both(distance: CloudDistance, way: str) -> list[Metric]:
-    return [Metric(f"MHD, {way}", distance.mhd_m, "m"), Metric(f"MPD, {way}", distance.mpd_m, "m")]
+    return [Metric("MHD", distance.mhd_m, "m", way), Metric("MPD", distance.mpd_m, "m", way)]

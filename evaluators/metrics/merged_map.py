@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from mapper.core.errors import DataError, MapperError
-from mapper.evaluators.metrics.evaluate import ALIGNED
+from mapper.evaluators.metrics.evaluate import ALIGNED, ATE_RMSE
 from mapper.evaluators.metrics.map_reference import Reference, check_occupancy
 from mapper.evaluators.metrics.metric import Metric
 from mapper.evaluators.metrics.occupancy import check_metrics
@@ -49,7 +49,7 @@ def merged_map_metrics(
             notes.append(matched)
             continue
         known.append(matched)
-        metrics.append(Metric(f"{name}: ATE RMSE, {ALIGNED[alignment]}", _rmse_m(matched, alignment), "m"))
+        metrics.append(Metric(f"{name}: {ATE_RMSE}", _rmse_m(matched, alignment), "m", ALIGNED[alignment]))
     if len(known) > 1:
         together = Matched(
             np.concatenate([matched.stamps_ns for matched in known]),
@@ -58,7 +58,7 @@ def merged_map_metrics(
         )
         how = f"{len(known)} runs {ALIGNED[alignment]} as one"
         metrics.append(
-            Metric(f"ATE RMSE, {how}, if their truths share a frame", _rmse_m(together, alignment), "m")
+            Metric(ATE_RMSE, _rmse_m(together, alignment), "m", f"{how}, if their truths share a frame")
         )
     return metrics, notes
 
@@ -76,7 +76,7 @@ def merged_map_quality(merged: MergedMap, reference: Reference, *, voxels: int) 
         )
     check = check_occupancy(merged.octree, reference, np.eye(4), voxels=voxels)
     head = Metric(
-        f"map compared with the {reference.name}, in the map's world", len(check.occupied), "voxels"
+        f"map compared with the {reference.name}", len(check.occupied), "voxels", "in the map's world"
     )
     return [head, *check_metrics(check)]
 

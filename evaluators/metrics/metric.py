@@ -2,8 +2,8 @@
 
 import json
 import math
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 
 from mapper.core.errors import DataError
 
@@ -15,22 +15,34 @@ class Metric:
     """One measured number.
 
     Attributes:
-        name: Name for a reader, with what it depends on: "ATE RMSE, SE(3)-aligned".
+        quantity: Name of what is measured: "ATE RMSE".
         value: A finite number; what could not be measured is not a metric.
         unit: "m", "rad", "s", or what was counted: "pairs", "frames".
+        condition: What the value depends on: "SE(3)-aligned".
     """
 
-    name: str
+    quantity: str
     value: float
     unit: str
+    condition: str = ""
 
     def __post_init__(self) -> None:
-        if not self.name or not self.unit:
+        if not self.quantity or not self.unit:
             raise DataError(
                 f"metric {self.name!r} of {self.value}: needs a name and a unit, not {self.unit!r}"
             )
         if not math.isfinite(self.value):
             raise DataError(f"metric {self.name!r} is {self.value}; leave out what could not be measured")
+
+    @property
+    def name(self) -> str:
+        """Name for a reader, with the condition: "ATE RMSE, SE(3)-aligned"."""
+        return f"{self.quantity}, {self.condition}" if self.condition else self.quantity
+
+
+def records_of(metrics: Iterable[Metric]) -> list[dict[str, str | float]]:
+    """Return each metric's name, value and unit for other programs: every digit, angles in radians."""
+    return [{"name": metric.name, "value": metric.value, "unit": metric.unit} for metric in metrics]
 
 
 def text_table(metrics: Sequence[Metric]) -> str:
@@ -50,7 +62,7 @@ def markdown_table(metrics: Sequence[Metric]) -> str:
 
 def json_text(metrics: Sequence[Metric]) -> str:
     """Return a JSON list for other programs: every digit, angles in radians."""
-    return json.dumps([asdict(metric) for metric in metrics], indent=2, ensure_ascii=False)
+    return json.dumps(records_of(metrics), indent=2, ensure_ascii=False)
 
 
 def shown(metric: Metric, *, digits: int = 6) -> tuple[str, str, str]:

@@ -165,19 +165,19 @@ def check_metrics(check: OccupancyCheck) -> list[Metric]:
     within = f"within {check.voxels} voxel{'s' if check.voxels != 1 else ''}"
     precision, recall = float(check.right.mean()), float(check.found[check.seen].mean())
     metrics = [
-        Metric(f"occupied precision, {within}", precision, "ratio"),
-        Metric(f"occupied recall where the map looked, {within}", recall, "ratio"),
+        Metric("occupied precision", precision, "ratio", within),
+        Metric("occupied recall where the map looked", recall, "ratio", within),
         Metric(
-            f"occupied F-score, {within}", 2.0 * precision * recall / max(precision + recall, 1e-300), "ratio"
+            "occupied F-score", 2.0 * precision * recall / max(precision + recall, 1e-300), "ratio", within
         ),
     ]
     if not check.seen.all():
         whole = float(check.found.mean())
-        metrics.append(Metric(f"occupied recall of the whole reference, {within}", whole, "ratio"))
+        metrics.append(Metric("occupied recall of the whole reference", whole, "ratio", within))
     if len(check.free_right) and len(check.open_free):
         metrics += [
-            Metric(f"free precision, {within}", float(check.free_right.mean()), "ratio"),
-            Metric(f"free recall, {within}", float(check.open_free.mean()), "ratio"),
+            Metric("free precision", float(check.free_right.mean()), "ratio", within),
+            Metric("free recall", float(check.open_free.mean()), "ratio", within),
         ]
     return metrics
 

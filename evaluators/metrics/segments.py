@@ -93,11 +93,11 @@ def segment_metrics(errors: Sequence[LengthErrors]) -> list[Metric]:
     rotation = statistics(np.concatenate([length.rotation_radpm for length in known]))
     over = "all lengths" if len(errors) > 1 else f"{known[0].length_m:g} m"
     return [
-        Metric(f"segments, {over}", sum(map(len, known)), "segments"),
-        Metric(f"relative translation mean, {over}", 100.0 * translation.mean, "%"),
-        Metric(f"relative translation median, {over}", 100.0 * translation.median, "%"),
-        Metric(f"relative rotation mean, {over}", rotation.mean, "rad/m"),
-        Metric(f"relative rotation median, {over}", rotation.median, "rad/m"),
+        Metric("segments", sum(map(len, known)), "segments", over),
+        Metric("relative translation mean", 100.0 * translation.mean, "%", over),
+        Metric("relative translation median", 100.0 * translation.median, "%", over),
+        Metric("relative rotation mean", rotation.mean, "rad/m", over),
+        Metric("relative rotation median", rotation.median, "rad/m", over),
     ]
 
 

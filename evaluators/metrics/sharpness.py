@@ -119,12 +119,12 @@ def sharpness_metrics(views: Views, *, radius_m: float) -> list[Metric]:
     entropy = 0.5 * (3.0 * np.log(2.0 * np.pi * np.e) + np.log(variances).sum(axis=1))
     about = f"radius {radius_m:g} m"
     return [
-        Metric(f"patches seen in several frames, {about}", len(patches), "patches"),
-        Metric(f"wall thickness median, {about}", float(np.median(thickness_m)), "m"),
-        Metric(f"wall thickness quartile, {about}", float(np.percentile(thickness_m, 25.0)), "m"),
-        Metric(f"double walls, {about}", 100.0 * float(np.mean(double)), "%"),
-        Metric(f"mean map entropy, {about}", float(entropy.mean()), "nats"),
-        Metric(f"mean plane variance, {about}", float(variances[:, 0].mean()), "m²"),
+        Metric("patches seen in several frames", len(patches), "patches", about),
+        Metric("wall thickness median", float(np.median(thickness_m)), "m", about),
+        Metric("wall thickness quartile", float(np.percentile(thickness_m, 25.0)), "m", about),
+        Metric("double walls", 100.0 * float(np.mean(double)), "%", about),
+        Metric("mean map entropy", float(entropy.mean()), "nats", about),
+        Metric("mean plane variance", float(variances[:, 0].mean()), "m²", about),
     ]
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from mapper.core.toml_text import toml_text
 from mapper.evaluators.depth_camera.accuracy import Accuracy, DepthLevel, ResidualMap
 from mapper.evaluators.depth_camera.noise_fit import NoiseFit
 from mapper.evaluators.depth_camera.study import DepthStudy, records_of
@@ -64,11 +65,10 @@ def write_depth_study(folder: Path, study: DepthStudy) -> None:
 def _sensor_toml(study: DepthStudy) -> str:
     """Return the noise as a configuration that ``mapper build`` reads."""
     fit = study.fit
-    a, b, c = fit.noise.constant_m, fit.noise.linear, fit.noise.quadratic_per_m
+    settings = toml_text({"odometry": {"depth_noise": fit.noise.model_dump()}})
     return (
         f"# mapper sensor depth: σ_z = {fit.noise.text} m,\n"
-        f"# measured at {fit.low_m:.2f} … {fit.high_m:.2f} m in {', '.join(study.logs)}\n"
-        f"\n[odometry.depth_noise]\nconstant_m = {a!r}\nlinear = {b!r}\nquadratic_per_m = {c!r}\n"
+        f"# measured at {fit.low_m:.2f} … {fit.high_m:.2f} m in {', '.join(study.logs)}\n\n{settings}\n"
     )
 
 

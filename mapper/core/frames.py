@@ -55,6 +55,11 @@ class PinholeCamera:
         return np.array([[self.fx_px, 0.0, self.cx_px], [0.0, self.fy_px, self.cy_px], [0.0, 0.0, 1.0]])
 
     @property
+    def intrinsics(self) -> Array:
+        """(4,) fx, fy, cx, cy in pixels."""
+        return np.array([self.fx_px, self.fy_px, self.cx_px, self.cy_px])
+
+    @property
     def parameters(self) -> Array:
         """(9,) fx, fy, cx, cy in pixels and the distortion's coefficients, as compiled code takes them."""
         return np.array([self.fx_px, self.fy_px, self.cx_px, self.cy_px, *self.distortion])
@@ -98,13 +103,17 @@ class PinholeCamera:
             return pixels
         import cv2
 
-        rays = (pixels - [self.cx_px, self.cy_px]) / [self.fx_px, self.fy_px]
-        points_camera = np.column_stack([rays, np.ones(len(rays))])
+        points_camera = np.column_stack([self.rays(pixels), np.ones(len(pixels))])
         measured, _ = cv2.projectPoints(
             points_camera, np.zeros(3), np.zeros(3), self.matrix, np.array(self.distortion)
         )
         raw: Array = measured.reshape(-1, 2)
         return raw
+
+    def rays(self, pixels: Array) -> Array:
+        """Return the (N, 2) x/z and y/z, camera frame, of the rays of (N, 2) undistorted pixels."""
+        rays: Array = (pixels - [self.cx_px, self.cy_px]) / [self.fx_px, self.fy_px]
+        return rays
 
     def project(self, points_camera: Points) -> Array:
         """Return the undistorted pixels (N, 2) of (N, 3) camera-frame points with positive depth."""
@@ -118,8 +127,7 @@ def ray_table(camera: PinholeCamera) -> NDArray[np.float32]:
     """Return the (H, W, 2) float32 undistorted x/z and y/z of every pixel's ray, camera frame."""
     columns, rows = np.meshgrid(np.arange(camera.width_px), np.arange(camera.height_px))
     ideal = camera.undistort(np.column_stack([columns.ravel(), rows.ravel()]))
-    table = (ideal - [camera.cx_px, camera.cy_px]) / [camera.fx_px, camera.fy_px]
-    return table.astype(np.float32).reshape(camera.height_px, camera.width_px, 2)
+    return camera.rays(ideal).astype(np.float32).reshape(camera.height_px, camera.width_px, 2)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -16,7 +16,7 @@ from mapper.doctor.system_libraries import apt_line
 from mapper.runtime.extras import DISTRIBUTION, install_line
 
 _PATIENCE_S = 60.0
-_REQUIREMENT = re.compile(r"(?P<name>[\w.-]+)(\[[\w,]*\])?(>=(?P<least>[\d.]+))?")
+REQUIREMENT = re.compile(r"(?P<name>[\w.-]+)(\[[\w,]*\])?(>=(?P<least>[\d.]+))?")
 _EXTRA = re.compile(r"""extra == ['"](?P<name>[\w-]+)['"]""")
 _MISSING_OBJECT = re.compile(r"(?P<object>lib[\w.+-]+\.so[\w.]*): cannot open shared object file")
 
@@ -48,7 +48,7 @@ def requirements() -> dict[str, Requirement]:
     except metadata.PackageNotFoundError:
         return found
     for line in lines:
-        match, extra = _REQUIREMENT.match(line), _EXTRA.search(line)
+        match, extra = REQUIREMENT.match(line), _EXTRA.search(line)
         if match is None or (extra is not None and extra["name"] in {"all", "dev"}):
             continue
         found.setdefault(match["name"], Requirement(match["least"] or "0", extra and extra["name"]))

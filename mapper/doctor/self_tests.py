@@ -32,7 +32,7 @@ def gtsam(_folder: Path) -> None:
     for node in range(2):
         guess.insert(node, gtsam.Pose3())
     solved = gtsam.LevenbergMarquardtOptimizer(graph, guess).optimize()
-    _expect_near(solved.atPose3(1).translation(), np.array([1.0, 0.0, 0.0]))
+    expect_near(solved.atPose3(1).translation(), np.array([1.0, 0.0, 0.0]))
 
 
 def opencv(_folder: Path) -> None:
@@ -49,7 +49,7 @@ def open3d(_folder: Path) -> None:
 
     source, target = (o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points)) for points in _corners())
     found = o3d.pipelines.registration.registration_ndt(source, target)
-    _expect_near(found.transformation[:3, 3], _SHIFT_M)
+    expect_near(found.transformation[:3, 3], _SHIFT_M)
 
 
 def kiss_icp(_folder: Path) -> None:
@@ -61,7 +61,7 @@ def kiss_icp(_folder: Path) -> None:
     voxels = VoxelHashMap(voxel_size=0.5, max_distance=100.0, max_points_per_voxel=20)
     voxels.add_points(target)
     icp = Registration(max_num_iterations=100, convergence_criterion=1e-5, max_num_threads=1)
-    _expect_near(icp.align_points_to_map(source, voxels, np.eye(4), 0.5, 0.1)[:3, 3], _SHIFT_M)
+    expect_near(icp.align_points_to_map(source, voxels, np.eye(4), 0.5, 0.1)[:3, 3], _SHIFT_M)
 
 
 def kiss_matcher(_folder: Path) -> None:
@@ -140,7 +140,7 @@ def laspy(folder: Path) -> None:
     cloud.header.scales = np.full(3, 0.001)
     cloud.xyz = np.eye(3)
     cloud.write(path)
-    _expect_near(np.array(laspy.read(path).xyz), np.eye(3))
+    expect_near(np.array(laspy.read(path).xyz), np.eye(3))
 
 
 def lz4(_folder: Path) -> None:
@@ -156,7 +156,7 @@ def pypcd4(folder: Path) -> None:
 
     path = folder / "cloud.pcd"
     PointCloud.from_xyz_points(np.eye(3, dtype=np.float32)).save(path)
-    _expect_near(PointCloud.from_path(path).numpy(("x", "y", "z")), np.eye(3))
+    expect_near(PointCloud.from_path(path).numpy(("x", "y", "z")), np.eye(3))
 
 
 def rosbags(_folder: Path) -> None:
@@ -203,7 +203,7 @@ def zstandard(_folder: Path) -> None:
 
 def numpy(_folder: Path) -> None:
     """Solve three equations."""
-    _expect_near(np.linalg.solve(2.0 * np.eye(3), np.ones(3)), np.full(3, 0.5))
+    expect_near(np.linalg.solve(2.0 * np.eye(3), np.ones(3)), np.full(3, 0.5))
 
 
 def scipy(_folder: Path) -> None:
@@ -287,7 +287,8 @@ def _expect(is_so: object, message: str) -> None:
         raise WrongAnswerError(message)
 
 
-def _expect_near(found: NDArray[np.floating], wanted: NDArray[np.floating]) -> None:
+def expect_near(found: NDArray[np.floating], wanted: NDArray[np.floating]) -> None:
+    """Refuse a result that is not near the right one, in metres."""
     _expect(np.allclose(found, wanted, atol=_TOLERANCE_M), f"got {np.round(found, 3).tolist()}")
 
 

@@ -9,12 +9,10 @@ from mapper.core.geometry import Array
 from mapper.export.page import FAINT, INK, hex_of, new_figure, save
 from mapper.export.palette import ESTIMATE, FACTORS
 from mapper.graph.model import PoseGraph, Solution
+from mapper.loops.closure import MIN_WEIGHT
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-
-_ACCEPTED_WEIGHT = 0.5
-"""Least weight of a factor that is drawn as accepted."""
 
 
 def write_graph_views(path: Path, graph: PoseGraph, solution: Solution, *, title: str) -> None:
@@ -23,7 +21,7 @@ def write_graph_views(path: Path, graph: PoseGraph, solution: Solution, *, title
     Args:
         path: PNG file to write.
         graph: Nodes at their first estimates.
-        solution: Solution of that graph; factors that weigh less than half are drawn dotted.
+        solution: Solution of that graph; factors that it rejected are drawn dotted.
         title: Headline.
     """
     solved = np.array(list(solution.T_world_node.values()))[:, :3, 3]
@@ -52,7 +50,7 @@ def _draw_factors(axes: "Axes", seen: Array, graph: PoseGraph, solution: Solutio
     index = {node: k for k, node in enumerate(graph.T_world_node)}
     ends = np.array([(index[factor.i], index[factor.j]) for factor in graph.factors], np.int64).reshape(-1, 2)
     origins = np.array([factor.origin for factor in graph.factors])
-    accepted = np.array(solution.weights) >= _ACCEPTED_WEIGHT
+    accepted = np.array(solution.weights) >= MIN_WEIGHT
     for origin, color in FACTORS.items():
         for drawn, style in ((accepted, "solid"), (~accepted, "dotted")):
             lines = seen[ends[drawn & (origins == origin)]]

@@ -85,7 +85,8 @@ from mapper.octree.grid import OccupancyGrid
 from mapper.runtime.atomic import atomic_file
 from mapper.sources.ros.typestore import definition
 
-PLAN_TOPICS = ("/plan", "/plan/dots")
+_PLAN, _DOTS = "/plan", "/dots"
+PLAN_TOPICS = (_PLAN, _PLAN + _DOTS)
 
 _LIBRARY = "mapper"
 _POINT = np.dtype([("position", "<f4", 3), ("rgba", "u1", 4)])
@@ -171,19 +172,7 @@ class McapLog:
 
     def trajectory(self, stamp_ns: int, trajectory: Trajectory, *, name: str, color: Rgb = ESTIMATE) -> None:
         """Log a whole trajectory on /trajectory/NAME, and its path as dots below that."""
-        topic = f"/trajectory/{name}"
-        self._publish(
-            topic,
-            messages.PosesInFrame(
-                timestamp=timestamp_of(stamp_ns),
-                frame_id=WORLD,
-                poses=[pose_of(T) for T in trajectory.T_world_body],
-            ),
-            stamp_ns,
-        )
-        positions = trajectory.positions_world
-        points = sample_segments(positions[:-1], positions[1:])
-        self._points(f"{topic}/dots", stamp_ns, points, np.array(color, np.uint8))
+        self._path(f"/trajectory/{name}", stamp_ns, trajectory.T_world_body, color)
 
     def factors(
         self,
@@ -212,7 +201,7 @@ class McapLog:
             clouds.append(points)
             colors.append(np.broadcast_to(np.array(color, np.uint8), points.shape))
         self._publish("/graph/factors", messages.SceneUpdate(entities=entities), stamp_ns)
-        self._points("/graph/factors/dots", stamp_ns, np.concatenate(clouds), np.concatenate(colors))
+        self._points(f"/graph/factors{_DOTS}", stamp_ns, np.concatenate(clouds), np.concatenate(colors))
 
     def cloud(
         self, stamp_ns: int, points_world: NDArray[np.floating], *, colors: NDArray[np.uint8], name: str
@@ -237,16 +226,15 @@ class McapLog:
         """
         T_world_waypoint = np.tile(np.eye(4), (len(waypoints_world), 1, 1))
         T_world_waypoint[:, :3, 3] = waypoints_world
-        topic, dots_topic = PLAN_TOPICS
-        self._publish(
-            topic,
-            messages.PosesInFrame(
-                timestamp=timestamp_of(stamp_ns), frame_id=WORLD, poses=[pose_of(T) for T in T_world_waypoint]
-            ),
-            stamp_ns,
-        )
-        points = sample_segments(waypoints_world[:-1], waypoints_world[1:])
-        self._points(dots_topic, stamp_ns, points, np.array(PLAN, np.uint8))
+        self._path(_PLAN, stamp_ns, T_world_waypoint, PLAN)
+
+    def _path(self, topic: str, stamp_ns: int, T_world_path: Array, color: Rgb) -> None:
+        """Log (N, 4, 4) poses on a topic, and the lines between them as dots below that."""
+        poses = [pose_of(T) for T in T_world_path]
+        message = messages.PosesInFrame(timestamp=timestamp_of(stamp_ns), frame_id=WORLD, poses=poses)
+        self._publish(topic, message, stamp_ns)
+        points = sample_segments(T_world_path[:-1, :3, 3], T_world_path[1:, :3, 3])
+        self._points(f"{topic}{_DOTS}", stamp_ns, points, np.array(color, np.uint8))
 
     def copy(self, path: Path, *, without: Container[str]) -> None:
         """Log every message of another MCAP file, in its order, except those on some topics.

@@ -10,7 +10,7 @@ from mapper.core.errors import DataError
 from mapper.export.grid import write_grid, write_values
 from mapper.navigation.config import CostmapConfig
 from mapper.navigation.distance_transform import NONE, squares_to_centres
-from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, with_obstacles
+from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, overlap_of, with_obstacles
 from mapper.run.map_folder import MapFolder
 from mapper.runtime.atomic import MANIFEST_NAME, FolderKind, atomic_folder, write_text
 from mapper.runtime.progress import Progress
@@ -63,10 +63,7 @@ def keepout_mask(grid: OccupancyGrid, floor: OccupancyGrid) -> OccupancyGrid:
         raise DataError(f"nav2: cells of {grid.resolution_m:g} m and {floor.resolution_m:g} m; fuse again")
     offset = np.rint((floor.origin_world_m - grid.origin_world_m) / grid.resolution_m).astype(int)[::-1]
     blocked = np.zeros(grid.cells.shape, np.bool_)
-    low = np.clip(offset, 0, grid.cells.shape)
-    high = np.clip(offset + floor.cells.shape, 0, grid.cells.shape)
-    inside = tuple(slice(*ends) for ends in zip(low, high, strict=True))
-    own = tuple(slice(*ends) for ends in zip(low - offset, high - offset, strict=True))
+    inside, own = overlap_of(offset, floor.shape, grid.shape)
     blocked[inside] = floor.cells[own] == OCCUPIED
     cells = np.where(blocked & (grid.cells != OCCUPIED), OCCUPIED, FREE).astype(np.int8)
     return OccupancyGrid(cells, grid.origin_world_m, grid.resolution_m)

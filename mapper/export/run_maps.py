@@ -13,7 +13,7 @@ from mapper.mapping.config import edits_of
 from mapper.mapping.edits import MapEditor
 from mapper.mapping.fusion import Maps, Snapshot
 from mapper.navigation.floor import reachable_floor
-from mapper.navigation.traversable import Storey, traversable
+from mapper.navigation.traversable import TraversableFloor, traversable
 from mapper.octree.grid import OccupancyGrid
 from mapper.octree.grid_file import stored_grid_if_any
 from mapper.run import files
@@ -55,16 +55,15 @@ def editor_of(run: Run) -> MapEditor:
     return MapEditor(edits_of(run.manifest.edits), path_world, room_m)
 
 
-def storeys_of_run(run: Run) -> tuple[Storey, ...]:
-    """Return the storeys of a run's floor and their links, found again from its octree and its path.
+def floor_of_run(run: Run) -> TraversableFloor:
+    """Return a run's floor with its links, found again from its octree and its path.
 
     Raises:
         MapFileError: The octree cannot be read.
     """
     config, editor = run.config.traversable, editor_of(run)
     floor = reachable_floor(run.octree, config, positions_world=editor.path_world)
-    storeys = traversable(floor, config, with_links=True)
-    return editor.edit_storeys(storeys)[0]
+    return editor.edit_floor(traversable(floor, config, with_links=True))[0]
 
 
 def _storeys(run: Run) -> Iterator[OccupancyGrid]:

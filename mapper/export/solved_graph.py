@@ -10,6 +10,7 @@ from mapper.graph.components import components
 from mapper.graph.config import GraphConfig
 from mapper.graph.g2o import write_g2o
 from mapper.graph.model import PoseGraph, Solution
+from mapper.loops.closure import MIN_WEIGHT
 from mapper.runtime.atomic import FolderKind, atomic_folder, write_json
 from mapper.sources.trajectory_files import write_tum
 
@@ -17,8 +18,6 @@ GRAPH, KEYFRAMES, PICTURE, REPORT = "graph.g2o", "keyframes.tum", "graph.png", "
 _FOLDER = FolderKind(
     "a solved graph", manifest_keys=frozenset(), files=frozenset({GRAPH, KEYFRAMES, PICTURE, REPORT})
 )
-BELIEVED = 0.5
-"""A factor that weighs less is rejected."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,7 +57,7 @@ class SolvedGraph:
     def rejected(self) -> list[tuple[int, int]]:
         """Nodes i, j of every loop that the solver rejected."""
         pairs = zip(self.graph.factors, self.solution.weights, strict=True)
-        return [(factor.i, factor.j) for factor, weight in pairs if weight < BELIEVED]
+        return [(factor.i, factor.j) for factor, weight in pairs if weight < MIN_WEIGHT]
 
 
 def write_solved_graph(out: Path, solved: SolvedGraph) -> None:

@@ -8,6 +8,7 @@ import numpy as np
 from mapper.core.errors import DataError
 from mapper.core.frames import Image
 from mapper.core.geometry import Array
+from mapper.core.toml_text import toml_text
 from mapper.line_laser.config import (
     Covariance,
     LateralLaw,
@@ -174,18 +175,7 @@ def calibrate(
 
 def calibration_text(calibration: LineLaserCalibration) -> str:
     """Return the text of a calibration file."""
-    tree = calibration.model_dump(exclude_none=True)
-    plain = "".join(f"{key} = {value!r}\n" for key, value in tree.items() if not isinstance(value, dict))
-    tables = [
-        f"\n[{name}]\n" + "".join(f"{key} = {_toml(value)}\n" for key, value in table.items())
-        for name, table in tree.items()
-        if isinstance(table, dict)
-    ]
-    return plain + "".join(tables)
-
-
-def _toml(value: float | Covariance) -> str:
-    return repr([list(row) for row in value]) if isinstance(value, tuple) else repr(value)
+    return f"{toml_text(calibration.model_dump(exclude_none=True))}\n"
 
 
 def _line(x: Array, y: Array) -> tuple[tuple[float, float], Covariance]:

@@ -13,6 +13,7 @@ from mapper.core.geometry import Array, Points
 from mapper.line_laser.config import LineLaserMapConfig
 from mapper.line_laser.ranging import LineScan
 from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+from mapper.octree.sensor_model import log_odds
 from mapper.runtime.progress import SILENT, Progress
 
 _MARGIN_CELLS = 2
@@ -57,26 +58,26 @@ def map_scans(
             f"line laser: a map of {size[0]} × {size[1]} cells, want {_MAX_CELLS} at most; "
             "are the wheels right? else raise map.resolution_m"
         )
-    log_odds = np.zeros(size[::-1], np.float32)
-    known = np.zeros(log_odds.shape, np.bool_)
+    odds = np.zeros(size[::-1], np.float32)
+    known = np.zeros(odds.shape, np.bool_)
     with progress.stage("map") as report:
         for done, (scan, ends, T) in enumerate(zip(scans, ends_world, T_world_sensor, strict=True), start=1):
             corners = np.concatenate([T[None, :2, 3], ends]) / config.resolution_m - low
-            _update(log_odds, known, scan, corners, config)
+            _update(odds, known, scan, corners, config)
             report(done, len(scans))
-    states = np.full(log_odds.shape, UNKNOWN, np.int8)
-    states[known] = np.where(log_odds[known] > 0.0, OCCUPIED, FREE)
+    states = np.full(odds.shape, UNKNOWN, np.int8)
+    states[known] = np.where(odds[known] > 0.0, OCCUPIED, FREE)
     return OccupancyGrid(states, low * config.resolution_m, config.resolution_m)
 
 
 def _update(
-    log_odds: NDArray[np.float32],
+    odds: NDArray[np.float32],
     known: NDArray[np.bool_],
     scan: LineScan,
     corners: Points,
     config: LineLaserMapConfig,
 ) -> None:
-    """Add one scan to the map; ``corners`` are the sensor and then the scan's ends, in cells (x, y)."""
+    """Add one scan to the log-odds; ``corners`` are the sensor and then the scan's ends, in cells (x, y)."""
     first = np.floor(corners.min(axis=0)).astype(np.int64) - 1
     last = np.floor(corners.max(axis=0)).astype(np.int64) + 2
     window = (slice(first[1], last[1]), slice(first[0], last[0]))
@@ -88,13 +89,10 @@ def _update(
         cv2.fillPoly(states, [fixed], _SEEN_FREE, shift=_SUBCELL_BITS)
     columns, rows = np.floor(local[1:][~scan.is_floor]).astype(np.int64).T
     states[rows, columns] = _SEEN_OCCUPIED
-    miss, hit = _log_odds(config.miss_probability), _log_odds(config.hit_probability)
+    miss, hit = log_odds(config.miss_probability), log_odds(config.hit_probability)
+    lowest, highest = log_odds(config.clamp_min_probability), log_odds(config.clamp_max_probability)
     change = np.array([0.0, miss, hit], np.float32)
-    log_odds[window] = np.clip(
-        log_odds[window] + change[states],
-        _log_odds(config.clamp_min_probability),
-        _log_odds(config.clamp_max_probability),
-    )
+    odds[window] = np.clip(odds[window] + change[states], lowest, highest)
     known[window] |= states > 0
 
 
@@ -103,7 +101,3 @@ def _neighbours(columns: NDArray[np.int64]) -> Iterator[slice]:
     breaks = np.flatnonzero(np.diff(columns) > 1) + 1
     bounds = [0, *breaks.tolist(), len(columns)]
     yield from starmap(slice, pairwise(bounds))
-
-
-def _log_odds(probability: float) -> float:
-    return float(np.log(probability / (1.0 - probability)))

@@ -143,20 +143,17 @@ def apply_solution(
     loops: Sequence[LoopClosure],
     T_world_before: Mapping[int, Transform],
     solution: Solution,
-    *,
-    min_weight: float,
 ) -> tuple[LoopClosure, ...]:
-    """Return the loops with their discrepancies and weights; those with too little weight are rejected.
+    """Return the loops with their discrepancies and weights; below ``MIN_WEIGHT`` they are rejected.
 
     Args:
         loops: Every candidate; the accepted ones are the solved graph's last factors, in this order.
         T_world_before: Poses before the solve.
         solution: Solution of that graph.
-        min_weight: A loop that weighs less is rejected.
     """
     weights = iter(solution.weights[len(solution.weights) - len(accepted_loops(loops)) :])
     return tuple(
-        _apply_solution(loop, next(weights), T_world_before, solution.T_world_node, min_weight)
+        _apply_solution(loop, next(weights), T_world_before, solution.T_world_node)
         if loop.verdict == "accepted" and loop.T_i_j is not None
         else loop
         for loop in loops
@@ -168,7 +165,6 @@ def _apply_solution(
     weight: float,
     T_world_before: Mapping[int, Transform],
     T_world_after: Mapping[int, Transform],
-    min_weight: float,
 ) -> LoopClosure:
     assert loop.T_i_j is not None
     solved = replace(
@@ -177,7 +173,7 @@ def _apply_solution(
         after=discrepancy(loop.T_i_j, T_world_after[loop.i], T_world_after[loop.j]),
         weight=weight,
     )
-    if weight >= min_weight:
+    if weight >= MIN_WEIGHT:
         return solved
     return replace(
         solved, verdict="rejected", reason=f"{SOLVER}: contradicts the rest of the graph, weight {weight:.2f}"

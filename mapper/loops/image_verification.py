@@ -14,7 +14,7 @@ from mapper.loops.config import ImageVerificationConfig
 from mapper.registration.base import Alignment
 from mapper.registration.isvd import Isvd
 from mapper.registration.p3p import ransac_p3p
-from mapper.registration.reprojection import VIRTUAL_BASELINE_PX_M, normal_matrix, refine_pose
+from mapper.registration.reprojection import image_measurements, normal_matrix, refine_pose
 from mapper.registration.variance_factor import residual_statistics
 
 MAX_SIGMA_M = 0.05
@@ -155,11 +155,15 @@ def _largest_sigma_m(information: Array) -> float:
 
 
 def _measurements(view: ImageView, features: NDArray[np.intp]) -> tuple[Array, Array, Array]:
-    """Return (M, 3) u, v, bf/z, their (M, 3) inverse variances, and (5,) intrinsics."""
-    depth_m = view.points_camera[features, 2]
-    sigma_px = np.repeat(view.sigma_px[features, None], 3, axis=1)
-    return (
-        np.column_stack([view.pixels[features], VIRTUAL_BASELINE_PX_M / depth_m]),
-        sigma_px**-2.0,
-        np.append(view.intrinsics, VIRTUAL_BASELINE_PX_M),
+    """Return (M, 3) u, v, bf/z, their (M, 3) inverse variances, and (5,) intrinsics.
+
+    The disparity counts as much as the pixel.
+    """
+    sigma_px = view.sigma_px[features]
+    return image_measurements(
+        view.pixels[features],
+        view.points_camera[features, 2],
+        view.intrinsics,
+        sigma_px=sigma_px,
+        disparity_sigma_px=sigma_px,
     )

@@ -18,7 +18,12 @@ from mapper.loops.base import Verification
 from mapper.loops.image_agreement import ImageAgreement, image_agreement
 from mapper.loops.image_verification import rms_residual_px
 from mapper.registration.p3p import ransac_p3p
-from mapper.registration.reprojection import VIRTUAL_BASELINE_PX_M, normal_matrix, refine_pose
+from mapper.registration.reprojection import (
+    disparity_sigmas_px,
+    image_measurements,
+    normal_matrix,
+    refine_pose,
+)
 from mapper.registration.variance_factor import residual_statistics
 from mapper.sensing.config import KINECT_NOISE
 from mapper.sensing.depth_noise import depth_sigma_m
@@ -119,11 +124,10 @@ def _measurements(view: ImageView, features: NDArray[np.intp]) -> tuple[Array, A
     """Return (M, 3) u, v, bf/z, their (M, 3) inverse variances, and (5,) intrinsics."""
     z = view.points_camera[features, 2]
     sigma_m = np.hypot(depth_sigma_m(KINECT_NOISE, z), _DEPTH_SHARE * z)
-    # Without depth the weight is not used, but it is a factor in sums.
-    disparity_sigma_px = np.where(np.isnan(z), 1.0, VIRTUAL_BASELINE_PX_M / z**2 * sigma_m)
-    sigma_px = view.sigma_px[features]
-    return (
-        np.column_stack([view.pixels[features], VIRTUAL_BASELINE_PX_M / z]),
-        np.column_stack([sigma_px, sigma_px, disparity_sigma_px]) ** -2.0,
-        np.append(view.intrinsics, VIRTUAL_BASELINE_PX_M),
+    return image_measurements(
+        view.pixels[features],
+        z,
+        view.intrinsics,
+        sigma_px=view.sigma_px[features],
+        disparity_sigma_px=disparity_sigmas_px(z, sigma_m),
     )

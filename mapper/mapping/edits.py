@@ -10,7 +10,7 @@ from mapper.core.errors import DataError
 from mapper.core.frames import Points32
 from mapper.core.geometry import Array, Points, Transform, apply
 from mapper.mapping.config import AppliedEdit, Edits, Region
-from mapper.navigation.traversable import Storey, trimmed
+from mapper.navigation.traversable import Storey, TraversableFloor, trimmed
 from mapper.octree.columns import NOWHERE, Columns
 from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from mapper.octree.ground_height import DrivenGround, nearest_heights
@@ -78,27 +78,25 @@ class MapEditor:
         floor = _Cells(first_world, driven.heights, columns.resolution_m)
         return replace(driven, swept=driven.swept & self._on_floor(self.edits.keep, floor))
 
-    def edit_storeys(self, storeys: tuple[Storey, ...]) -> tuple[tuple[Storey, ...], list[AppliedEdit]]:
+    def edit_floor(self, floor: TraversableFloor) -> tuple[TraversableFloor, list[AppliedEdit]]:
         """Return a floor cropped and with its keep-out regions blocked.
 
         Storeys of which nothing is left are gone. The path begins on the first storey that is left if its own
         is gone.
         """
         if not self.edits.keep and not self.edits.keepout:
-            return storeys, []
-        edited, blocked = [], np.zeros(len(self.edits.keepout), np.int64)
-        for storey in storeys:
-            cells, counts = self._edited_cells(storey)
-            edited.append(trimmed(replace(storey, grid=replace(storey.grid, cells=cells))))
-            blocked += np.array(counts, np.int64)
-        left = [storey for storey in edited if (storey.grid.cells != UNKNOWN).any()] or edited[:1]
-        if not any(storey.is_home for storey in left):
-            left[0] = replace(left[0], is_home=True)
+            return floor, []
+        blocked = np.zeros(len(self.edits.keepout), np.int64)
+        storeys = [self._edited(storey, blocked) for storey in floor.storeys]
+        links = [self._edited(link, np.zeros_like(blocked)) for link in floor.links]
+        left = [number for number, storey in enumerate(storeys) if _is_known(storey)] or [0]
+        home_number = left.index(floor.home_number) if floor.home_number in left else 0
         done = [
             AppliedEdit(kind="keepout", region=region, count=int(count))
             for region, count in zip(self.edits.keepout, blocked, strict=True)
         ]
-        return tuple(left), done
+        kept = tuple(storeys[number] for number in left)
+        return TraversableFloor(kept, home_number, tuple(filter(_is_known, links))), done
 
     def keepout(self, grid: OccupancyGrid, level: NDArray[np.int32]) -> OccupancyGrid | None:
         """Return where the keep-out regions are, in the cells of a slice; None if there are none.
@@ -132,20 +130,20 @@ class MapEditor:
             inside[in_height] |= covered(region, points_world[in_height, :2], self.path_world)
         return inside
 
-    def _edited_cells(self, storey: Storey) -> tuple[NDArray[np.int8], list[int]]:
-        """Return the (H, W) cells of a storey, and how many each keep-out region has blocked."""
-        cells, counts = storey.grid.cells.copy(), [0] * len(self.edits.keepout)
+    def _edited(self, storey: Storey, blocked: NDArray[np.int64]) -> Storey:
+        """Return a storey after the edits; add the cells that each keep-out region blocks to (K,) counts."""
         if not (storey.heights > NOWHERE).any():
-            return cells, counts
+            return trimmed(storey)
+        cells = storey.grid.cells.copy()
         heights, _ = nearest_heights(storey.heights)
         floor = _Cells(storey.grid.origin_world_m, heights, storey.grid.resolution_m)
         if self.edits.keep:
             cells[~self._on_floor(self.edits.keep, floor)] = UNKNOWN
         for number, region in enumerate(self.edits.keepout):
             inside = self._on_floor((region,), floor)
-            counts[number] = int(np.count_nonzero(cells[inside] != OCCUPIED))
+            blocked[number] += np.count_nonzero(cells[inside] != OCCUPIED)
             cells[inside] = OCCUPIED
-        return cells, counts
+        return trimmed(replace(storey, grid=replace(storey.grid, cells=cells)))
 
     def _voxels(self, octree: OctreeMap, region: Region) -> Iterator[tuple[NDArray[np.int64], Mask]]:
         """Yield (B,) slots of blocks that a region may overlap, and the (B, 512) mask of its voxels."""
@@ -214,6 +212,10 @@ def covered(region: Region, points_world: Points | Points32, path_world: Points)
         distance_m, _ = path.query(points_world, distance_upper_bound=region.path_radius_m)
         inside &= np.isfinite(distance_m)
     return inside
+
+
+def _is_known(storey: Storey) -> bool:
+    return bool((storey.grid.cells != UNKNOWN).any())
 
 
 def _in_polygon(points: Points | Points32, corners: Points) -> Mask:

@@ -177,7 +177,7 @@ def fuse_log(
     cropped = editor.crop(octree)
     grid = cut_slice(octree, config.slice, driven=driven)
     octree.drop_unknown()  # the slice has the columns of all blocks, as the floor
-    storeys, blocked = editor.edit_storeys(traversable(floor, config.traversable))
+    passable, blocked = editor.edit_floor(traversable(floor, config.traversable))
     kept = octree.are_occupied(points_world)
     made = (*erased, *cropped, *blocked)
     if made:
@@ -194,8 +194,8 @@ def fuse_log(
         dynamic_points_world=dynamic_points_world,
         dynamic_colors=dynamic_colors,
         grid=grid,
-        traversable=next(storey.grid for storey in storeys if storey.is_home),
-        storeys=tuple(storey.grid for storey in storeys) if len(storeys) > 1 else (),
+        traversable=passable.home.grid,
+        storeys=passable.over_each_other,
         keepout=editor.keepout(grid, floor_below(grid, config.slice, driven=driven)),
         has_path=len(floor.path) > 0,
         edits=made,

@@ -63,7 +63,6 @@ _LOWEST_PERCENT = 0.5
 _NEAR_SENSOR_M = 12.0
 _MIN_SENSOR_HEIGHT_M = 0.15
 _MIN_FLOOR_POINTS = 100
-_FLOOR_SEEN = "floor "
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -116,19 +115,18 @@ def find_level(
         patches, trajectory, accelerations, up_guess=up_guess, tolerance_m=tolerance_m
     )
     if axes.stands_on_floor:
-        floor_m, floor_detail = _floor_below(scans, up_world, tolerance_m=tolerance_m)
+        floor = _floor_below(scans, up_world, tolerance_m=tolerance_m)
     else:
         heights_m = _heights(scans, up_world)
-        floor_m, floor_detail = _floor(patches, heights_m, up_world=up_world, tolerance_m=tolerance_m)
-    T_level_world = _frame(trajectory.T_world_body[0], up_world, floor_m, axes)
-    has_floor = floor_detail.startswith(_FLOOR_SEEN)
-    details = [up_detail, floor_detail]
+        floor = _floor(patches, heights_m, up_world=up_world, tolerance_m=tolerance_m)
+    T_level_world = _frame(trajectory.T_world_body[0], up_world, floor.height_m, axes)
+    details = [up_detail, floor.detail]
     if config.heading == "walls":
         walls = wall_heading(patches, T_level_world[:3, :3])
         if walls.determined:
             T_level_world = exp(np.array([0.0, 0.0, -walls.angle_rad]), np.zeros(3)) @ T_level_world
         details.append(_heading_text(walls))
-    return Level(T_level_world, method, "; ".join(details), has_floor)
+    return Level(T_level_world, method, "; ".join(details), floor.is_seen)
 
 
 def _up(
@@ -236,16 +234,29 @@ def _heights(scans: Sequence[tuple[Scan, Transform]], up_world: Array) -> Array:
     return np.concatenate([np.empty(0), *heights])
 
 
-def _floor(
-    patches: Patches, heights_m: Array, *, up_world: Array, tolerance_m: float
-) -> tuple[float | None, str]:
-    """Return the floor's height along up, or None if there are no points, and the detail of its source.
+@dataclass(frozen=True, slots=True)
+class _Floor:
+    """The floor.
+
+    Attributes:
+        height_m: Height along up; None is that of the first pose.
+        detail: Source of the height; part of a sentence.
+        is_seen: Whether a surface shows it; else it is a guess.
+    """
+
+    height_m: float | None
+    detail: str
+    is_seen: bool
+
+
+def _floor(patches: Patches, heights_m: Array, *, up_world: Array, tolerance_m: float) -> _Floor:
+    """Return the floor that patches show.
 
     The floor is the lowest surface that faces up with enough patches. If many points lie deeper, that surface
     is a table, and the lowest points give the floor.
     """
     if not len(heights_m):
-        return None, "no points seen: the floor is put at the first pose"
+        return _Floor(None, "no points seen: the floor is put at the first pose", is_seen=False)
     faces_up = patches.normals_world @ up_world > _FLAT_COSINE
     heights_up_m = patches.centres_world[faces_up] @ up_world
     surfaces = levels_of(heights_up_m, tolerance_m=tolerance_m, least=least_support(len(heights_up_m)))
@@ -255,15 +266,15 @@ def _floor(
         chosen = int(np.flatnonzero(medians_m <= medians_m.min() + _NEAR_FLOOR_M)[0])
         floor_m = float(medians_m[chosen])
         if (heights_m < floor_m - _NEAR_FLOOR_M).mean() <= _MAX_BELOW_FLOOR_RATIO:
-            return floor_m, f"{_FLOOR_SEEN}seen in {len(surfaces[chosen])} of {len(patches)} patches"
+            detail = f"floor seen in {len(surfaces[chosen])} of {len(patches)} patches"
+            return _Floor(floor_m, detail, is_seen=True)
     lowest_m = float(np.percentile(heights_m, _LOWEST_PERCENT))
-    return lowest_m, f"no floor seen: z = 0 is where the lowest {_LOWEST_PERCENT} % of the points end"
+    detail = f"no floor seen: z = 0 is where the lowest {_LOWEST_PERCENT} % of the points end"
+    return _Floor(lowest_m, detail, is_seen=False)
 
 
-def _floor_below(
-    scans: Sequence[tuple[Scan, Transform]], up_world: Array, *, tolerance_m: float
-) -> tuple[float | None, str]:
-    """Return the floor's height along up below the first scan with a floor, and the detail of its source.
+def _floor_below(scans: Sequence[tuple[Scan, Transform]], up_world: Array, *, tolerance_m: float) -> _Floor:
+    """Return the floor below the first scan that shows one.
 
     It is the best supported height below the sensor among the points around it.
     """
@@ -277,8 +288,10 @@ def _floor_below(
         levels = levels_of(below_m, tolerance_m=tolerance_m, least=least)
         if levels:
             floor_m = float(np.median(below_m[levels[0]]))
-            return floor_m + float(sensor_world @ up_world), f"{_FLOOR_SEEN}{-floor_m:.2f} m below the sensor"
-    return None, "no floor seen below the sensor: the floor is put at the first pose"
+            height_m = floor_m + float(sensor_world @ up_world)
+            return _Floor(height_m, f"floor {-floor_m:.2f} m below the sensor", is_seen=True)
+    detail = "no floor seen below the sensor: the floor is put at the first pose"
+    return _Floor(None, detail, is_seen=False)
 
 
 def _frame(T_world_first: Transform, up_world: Array, floor_m: float | None, axes: BodyAxes) -> Transform:

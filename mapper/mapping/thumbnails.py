@@ -1,7 +1,5 @@
 """Thumbnails of a log's images: small JPEG copies and their camera."""
 
-from dataclasses import replace
-
 import cv2
 
 from mapper.core.errors import DataError
@@ -33,18 +31,7 @@ def shrunk_camera(camera: PinholeCamera, *, width_px: int) -> PinholeCamera:
     """Return the camera of the image of :func:`encode_jpeg` at the same ``width_px``."""
     if camera.width_px <= width_px:
         return camera
-    height_px = _height_px(camera.width_px, camera.height_px, width_px)
-    scale_x, scale_y = width_px / camera.width_px, height_px / camera.height_px
-    # Pixel centres lie at integers, so it is the corner at -0.5 that stays fixed.
-    return replace(
-        camera,
-        width_px=width_px,
-        height_px=height_px,
-        fx_px=camera.fx_px * scale_x,
-        fy_px=camera.fy_px * scale_y,
-        cx_px=(camera.cx_px + 0.5) * scale_x - 0.5,
-        cy_px=(camera.cy_px + 0.5) * scale_y - 0.5,
-    )
+    return camera.resized(width_px, _height_px(camera.width_px, camera.height_px, width_px))
 
 
 def _height_px(width: int, height: int, width_px: int) -> int:

@@ -6,13 +6,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.geometry import Points, apply, inverse
-from mapper.export.run_maps import editor_of, storeys_of_run
+from mapper.export.run_maps import editor_of, floor_of_run
 from mapper.mapping.config import Edits
 from mapper.mapping.edits import MapEditor
 from mapper.merging.merged_map import MapManifest, MergedMap
 from mapper.navigation.config import TraversableConfig
 from mapper.navigation.floor import Floor, floor_of, margin_for
-from mapper.navigation.traversable import Storey, traversable
+from mapper.navigation.traversable import TraversableFloor, traversable
 from mapper.octree.columns import block_extent, columns_of, occupied_voxels
 from mapper.octree.reading import read_octree
 from mapper.run.folder import Run
@@ -52,8 +52,8 @@ def floor_over(
     return floor_of(columns, config, paths_world=paths_map, floor_z_m=floor_z_m)
 
 
-def storeys_of_map(merged: MergedMap) -> tuple[Storey, ...]:
-    """Return the storeys of a merged map's floor and their links, found again from tiles and runs' paths.
+def floor_of_map(merged: MergedMap) -> TraversableFloor:
+    """Return a merged map's floor with its links, found again from its tiles and its runs' paths.
 
     Raises:
         MapFileError: A tile cannot be read.
@@ -75,8 +75,9 @@ def storeys_of_map(merged: MergedMap) -> tuple[Storey, ...]:
         resolution_m=manifest.octree.resolution_m,
         floor_z_m=manifest.floor_z_m,
     )
-    storeys = traversable(floor, manifest.traversable, with_links=True)
-    return with_keepout(storeys, editors_of(manifest, paths_map))
+    return with_keepout(
+        traversable(floor, manifest.traversable, with_links=True), editors_of(manifest, paths_map)
+    )
 
 
 def editors_of_map(merged: MergedMap) -> list[MapEditor]:
@@ -111,21 +112,21 @@ def editors_of(manifest: MapManifest, paths_map: Sequence[Points]) -> list[MapEd
     return editors
 
 
-def with_keepout(storeys: tuple[Storey, ...], editors: Sequence[MapEditor]) -> tuple[Storey, ...]:
-    """Return the storeys of a floor with the runs' keep-out regions blocked."""
+def with_keepout(floor: TraversableFloor, editors: Sequence[MapEditor]) -> TraversableFloor:
+    """Return a floor with the runs' keep-out regions blocked."""
     for editor in editors:
-        storeys, _ = editor.edit_storeys(storeys)
-    return storeys
+        floor, _ = editor.edit_floor(floor)
+    return floor
 
 
-def storeys_of(folder: Run | MergedMap) -> tuple[Storey, ...]:
-    """Return the storeys of the floor of a run or of a merged map, as ``storeys_of_map`` does.
+def traversable_of(folder: Run | MergedMap) -> TraversableFloor:
+    """Return the floor of a run or of a merged map, as ``floor_of_map`` does.
 
     Raises:
         MapFileError: The octree, or a tile, cannot be read.
         RunError: A merged run's trajectory is missing.
     """
-    return storeys_of_run(folder) if isinstance(folder, Run) else storeys_of_map(folder)
+    return floor_of_run(folder) if isinstance(folder, Run) else floor_of_map(folder)
 
 
 def keep_out_of(folder: Run | MergedMap) -> Callable[[Points], NDArray[np.bool_]] | None:

@@ -124,7 +124,7 @@ def solve_jointly(
     loops = [_between(place, first_nodes) for place in used]
     joint.add_factors(loop.factor for loop in loops)
     solution = optimize(joint, config.model_copy(update={"solve": "batch", "robust": "gnc"}))
-    solved = apply_solution(loops, joint.T_world_node, solution, min_weight=MIN_WEIGHT)
+    solved = apply_solution(loops, joint.T_world_node, solution)
     kept = [weight >= MIN_WEIGHT for weight in solution.weights]
     factors = [factor for factor, is_kept in zip(joint.factors, kept, strict=True) if is_kept]
     whole = PoseGraph(solution.T_world_node, joint.stamps_ns, factors)

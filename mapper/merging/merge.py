@@ -212,12 +212,10 @@ def _write_grids(folder: Path, sliced: Sliced, placed: Sequence[Placed], manifes
         if sliced.keepout is not None:
             write_grid(folder, files.KEEPOUT, sliced.keepout)
         draw(folder / files.SUMMARY, sliced.grid, placed, manifest)
-    storeys = sliced.storeys
-    for storey in storeys:
-        if storey.is_home:
-            write_grid(folder, files.TRAVERSABLE, storey.grid)
-    for number, storey in enumerate(storeys[: files.MOST_STOREYS] if len(storeys) > 1 else ()):
-        write_grid(folder, files.storey(number), storey.grid)
+    if sliced.floor is not None:
+        write_grid(folder, files.TRAVERSABLE, sliced.floor.home.grid)
+        for number, storey in enumerate(sliced.floor.over_each_other[: files.MOST_STOREYS]):
+            write_grid(folder, files.storey(number), storey)
 
 
 def _kept_of(partial: Path, manifest: MapManifest) -> list[str]:

@@ -30,8 +30,8 @@ from mapper.merging.merged_map import MapManifest
 from mapper.merging.placing import Placed
 from mapper.merging.stages import Stages
 from mapper.navigation.floor import Floor, driven_ground
-from mapper.navigation.traversable import Storey, traversable
-from mapper.octree.grid import OccupancyGrid, with_obstacles
+from mapper.navigation.traversable import TraversableFloor, traversable
+from mapper.octree.grid import OccupancyGrid, overlap_of, with_obstacles
 from mapper.octree.ground_height import (
     NOTHING,
     DrivenGround,
@@ -53,14 +53,14 @@ class Sliced:
         columns: Results of all columns of tiles.
         grid: The slice; None if there is none.
         keepout: The runs' keep-out regions in its cells; None if there are none.
-        storeys: Storeys of the traversable floor; empty if there is none.
+        floor: Traversable floor; None if there is none.
         missing: Reasons why there is no slice or no floor.
     """
 
     columns: Sequence[SlicedColumn]
     grid: OccupancyGrid | None
     keepout: OccupancyGrid | None
-    storeys: Sequence[Storey]
+    floor: TraversableFloor | None
     missing: Sequence[str]
 
 
@@ -97,7 +97,7 @@ def slice_map(
         _save_ground(raster, columns.values(), manifest, driven)
     done = _sliced_columns(workspace, stages, columns.values(), manifest)
     if not _is_level(placed):
-        return Sliced(done, None, None, (), missing)
+        return Sliced(done, None, None, None, missing)
     seen = np.zeros(raster.shape, np.uint8)
     for tiles in columns.values():
         raster.join(np.bitwise_or, seen, tiles[0], BAND)
@@ -111,8 +111,8 @@ def slice_map(
         missing.append(f"no {error}")
     editors = editors_of(manifest, paths_map)
     keepout = None if grid is None else _keepout(grid, manifest, driven, editors)
-    storeys = () if floor is None else with_keepout(traversable(floor, manifest.traversable), editors)
-    return Sliced(done, grid, keepout, storeys, missing)
+    passable = None if floor is None else with_keepout(traversable(floor, manifest.traversable), editors)
+    return Sliced(done, grid, keepout, passable, missing)
 
 
 def _is_level(placed: Sequence[Placed]) -> bool:
@@ -206,20 +206,14 @@ class _Raster:
 
     def overlap(
         self, first: NDArray[np.int64], size: tuple[int, ...]
-    ) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
+    ) -> tuple[tuple[slice, ...], tuple[slice, ...]]:
         """Return the rows and columns that a window covers, in the raster and in the window.
 
         Args:
             first: (2,) x and y keys of the window's first column.
             size: H, W of the window.
         """
-        corner = (first - self.first)[::-1]
-        low = np.maximum(corner, 0)
-        high = np.maximum(np.minimum(corner + size, self.shape), low)
-        rows, columns = (slice(a, b) for a, b in zip(low.tolist(), high.tolist(), strict=True))
-        own_low, own_high = (low - corner).tolist(), (high - corner).tolist()
-        own_rows, own_columns = (slice(a, b) for a, b in zip(own_low, own_high, strict=True))
-        return (rows, columns), (own_rows, own_columns)
+        return overlap_of((first - self.first)[::-1], size, self.shape)
 
 
 def _raster(workspace: Workspace, extent: Extent, driven: DrivenGround | None) -> _Raster:

@@ -12,7 +12,7 @@ from mapper.navigation.config import PlanConfig
 from mapper.navigation.line_of_sight import shortened
 from mapper.navigation.planner import Plan, Space, clearance_of, point_text, space_of
 from mapper.navigation.search import shortest_path
-from mapper.navigation.traversable import Storey
+from mapper.navigation.traversable import Storey, TraversableFloor
 from mapper.navigation.voxels import layer
 from mapper.octree.columns import NOWHERE
 from mapper.octree.grid import UNKNOWN, OccupancyGrid
@@ -20,7 +20,7 @@ from mapper.octree.ground_height import nearest_heights
 
 
 def plan_storeys(
-    storeys: tuple[Storey, ...], start_world: Array, goal_world: Array, *, config: PlanConfig
+    floor: TraversableFloor, start_world: Array, goal_world: Array, *, config: PlanConfig
 ) -> Plan:
     """Return a shortest path for a disc over the storeys of a floor; see ``plan_2d``.
 
@@ -29,7 +29,7 @@ def plan_storeys(
     with floor there.
 
     Args:
-        storeys: Storeys from :func:`mapper.navigation.traversable.traversable`, with links.
+        floor: Floor from :func:`mapper.navigation.traversable.traversable`, with links.
         start_world: (2,) or (3,) metres.
         goal_world: (2,) or (3,) metres.
         config: Radius, and whether unknown cells are blocked.
@@ -40,12 +40,13 @@ def plan_storeys(
     Raises:
         PlanError: An end is outside, unknown or too close to an obstacle, or no path joins the two.
     """
-    joined, heights = _aligned(storeys)
+    parts = (*floor.storeys, *floor.links)  # numbered in this order from here on
+    joined, heights = _aligned(parts)
     spaces = [space_of(layer(grid), config) for grid in joined]
     ends = [np.append(point[:2], 0.0) for point in (start_world, goal_world)]
-    numbers = [_storey_at(storeys, point) for point in (start_world, goal_world)]
-    is_link = [storey.is_link for storey in storeys]
-    layers = [_with_room(storeys, spaces, *at) for at in zip(numbers, (start_world, goal_world), strict=True)]
+    numbers = [_storey_at(floor, point) for point in (start_world, goal_world)]
+    is_link = [number >= len(floor.storeys) for number in range(len(parts))]
+    layers = [_with_room(floor, spaces, *at) for at in zip(numbers, (start_world, goal_world), strict=True)]
     chain = _chain(spaces, heights, is_link, *layers)
     if not chain:
         raise PlanError(
@@ -65,11 +66,11 @@ def plan_storeys(
             f"for a radius of {config.radius_m:g} m; plan with a smaller radius"
         )
     cells = found.cells.astype(np.float64) + 0.5
-    parts: list[Array] = [cells[found.cells[:, 0] == 2 * place, 1:] for place in range(len(chain))]
-    parts[0] = np.vstack([first.in_cells(ends[0])[1:], parts[0]])
-    parts[-1] = np.vstack([parts[-1], last.in_cells(ends[1])[1:]])
+    legs: list[Array] = [cells[found.cells[:, 0] == 2 * place, 1:] for place in range(len(chain))]
+    legs[0] = np.vstack([first.in_cells(ends[0])[1:], legs[0]])
+    legs[-1] = np.vstack([legs[-1], last.in_cells(ends[1])[1:]])
     on_floors = [
-        _on_floor(spaces[number], heights[number], cells) for number, cells in zip(chain, parts, strict=True)
+        _on_floor(spaces[number], heights[number], leg) for number, leg in zip(chain, legs, strict=True)
     ]
     waypoints_world = np.concatenate([part_world for part_world, _ in on_floors])
     clearance_m = min(clearance_m for _, clearance_m in on_floors)
@@ -79,7 +80,7 @@ def plan_storeys(
 
 
 def _aligned(storeys: tuple[Storey, ...]) -> tuple[list[OccupancyGrid], list[NDArray[np.int32]]]:
-    """Return the grids and heights of all storeys in one raster; heights with a ring like ``layer``."""
+    """Return the grids and heights of some storeys in one raster; heights with a ring like ``layer``."""
     cell_m = storeys[0].grid.resolution_m
     firsts = np.array([np.rint(storey.grid.origin_world_m / cell_m) for storey in storeys], np.int64)
     sizes = np.array([storey.grid.cells.shape[::-1] for storey in storeys])
@@ -108,27 +109,25 @@ def _on_floor(space: Space, heights: NDArray[np.int32], cells: Array) -> tuple[A
     return part_world, clearance_m
 
 
-def _storey_at(storeys: tuple[Storey, ...], point_world: Array) -> int:
+def _storey_at(floor: TraversableFloor, point_world: Array) -> int:
     """Return the storey of a point: that whose floor is nearest to its height, if it has one."""
-    storeys = tuple(storey for storey in storeys if not storey.is_link)  # they come first
-    tops = [_top_at(storey, point_world) for storey in storeys]
-    home = next(number for number, storey in enumerate(storeys) if storey.is_home)
+    tops, home = [_top_at(storey, point_world) for storey in floor.storeys], floor.home_number
     if len(point_world) == 2:
-        order = sorted(range(len(storeys)), key=lambda number: number != home)
+        order = sorted(range(len(tops)), key=lambda number: number != home)
         return next((number for number in order if tops[number] is not None), home)
     away = [np.inf if top is None else abs(top - float(point_world[2])) for top in tops]
     return int(np.argmin(away)) if np.isfinite(away).any() else home
 
 
-def _with_room(storeys: tuple[Storey, ...], spaces: list[Space], number: int, point_world: Array) -> int:
+def _with_room(floor: TraversableFloor, spaces: list[Space], number: int, point_world: Array) -> int:
     """Return a storey, or where a robot has room on a link alone, as at the storey's end, the link."""
-    top_m = _top_at(storeys[number], point_world)
+    top_m = _top_at(floor.storeys[number], point_world)
     if top_m is None or _has_room(spaces[number], point_world):
         return number
-    links = (
-        n for n, storey in enumerate(storeys) if storey.is_link and _top_at(storey, point_world) == top_m
-    )
-    return next((link for link in links if _has_room(spaces[link], point_world)), number)
+    for link, storey in enumerate(floor.links, start=len(floor.storeys)):
+        if _top_at(storey, point_world) == top_m and _has_room(spaces[link], point_world):
+            return link
+    return number
 
 
 def _has_room(space: Space, point_world: Array) -> bool:

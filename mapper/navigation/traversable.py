@@ -31,18 +31,40 @@ class Storey:
         grid: Floor, obstacles, unknown.
         heights: (H, W) int32 heights of the floor in voxels above z = 0, in the grid's cells; NOWHERE
             where it was not seen.
-        is_home: Whether the path begins here.
-        is_link: Whether it is no storey, but where two of them meet.
     """
 
     grid: OccupancyGrid
     heights: Heights
-    is_home: bool = True
-    is_link: bool = False
 
 
-def traversable(floor: Floor, config: TraversableConfig, *, with_links: bool = False) -> tuple[Storey, ...]:
-    """Return every storey of a floor that a robot can reach, the lowest first.
+@dataclass(frozen=True, slots=True, eq=False)
+class TraversableFloor:
+    """Floor that a robot can reach.
+
+    Attributes:
+        storeys: Its storeys, the lowest first; at least one.
+        home_number: Number of the storey on which the path begins.
+        links: Floor where two storeys meet, over which paths lead from one to the other; empty unless it was
+            looked for.
+    """
+
+    storeys: tuple[Storey, ...]
+    home_number: int = 0
+    links: tuple[Storey, ...] = ()
+
+    @property
+    def home(self) -> Storey:
+        """The storey on which the path begins."""
+        return self.storeys[self.home_number]
+
+    @property
+    def over_each_other(self) -> tuple[OccupancyGrid, ...]:
+        """The grids of all storeys, the lowest first; empty where no floor lies over another."""
+        return tuple(storey.grid for storey in self.storeys) if len(self.storeys) > 1 else ()
+
+
+def traversable(floor: Floor, config: TraversableConfig, *, with_links: bool = False) -> TraversableFloor:
+    """Return the floor that a robot can reach, as grids.
 
     Floor is free, small gaps in it included. A cell is occupied where an obstacle lies between step and head
     height, where the ground is too steep, and where it drops by more than a step; heights are relative to the
@@ -51,16 +73,17 @@ def traversable(floor: Floor, config: TraversableConfig, *, with_links: bool = F
     Args:
         floor: The floor.
         config: The limits by which it was found, and the robot's radius.
-        with_links: Whether the links between storeys follow, by which paths lead from one to another.
+        with_links: Whether links between storeys are looked for.
     """
     storeys, links = storeys_of(floor, with_links=with_links)
-    home = _home(floor, storeys)
-    found = [_storey(floor, heights, config, number == home) for number, heights in enumerate(storeys)]
-    found += [replace(_storey(floor, heights, config, False), is_link=True) for heights in links]
-    return tuple(found)
+    return TraversableFloor(
+        tuple(_storey(floor, heights, config) for heights in storeys),
+        _home_number(floor, storeys),
+        tuple(_storey(floor, heights, config) for heights in links),
+    )
 
 
-def _home(floor: Floor, storeys: list[Heights]) -> int:
+def _home_number(floor: Floor, storeys: list[Heights]) -> int:
     """Return the number of the storey nearest to the path's ground, where the path first has floor below."""
     columns = floor.columns
     points = floor.path.points_world / columns.resolution_m
@@ -75,7 +98,7 @@ def _home(floor: Floor, storeys: list[Heights]) -> int:
     return int(np.argmin(away[:, first[0]]))
 
 
-def _storey(floor: Floor, heights: Heights, config: TraversableConfig, is_home: bool) -> Storey:
+def _storey(floor: Floor, heights: Heights, config: TraversableConfig) -> Storey:
     columns, limits = floor.columns, floor.limits
     reached = heights > NOWHERE
     cells = np.full(columns.shape, UNKNOWN, np.int8)
@@ -91,7 +114,7 @@ def _storey(floor: Floor, heights: Heights, config: TraversableConfig, is_home: 
         cells[blocked] = OCCUPIED
         cells[(cells == FREE) & _within(blocked, config.robot_radius_m / columns.resolution_m)] = OCCUPIED
     origin_world_m = (columns.first - KEY_ZERO).astype(np.float64) * columns.resolution_m
-    return trimmed(Storey(OccupancyGrid(cells, origin_world_m, columns.resolution_m), heights, is_home))
+    return trimmed(Storey(OccupancyGrid(cells, origin_world_m, columns.resolution_m), heights))
 
 
 def trimmed(storey: Storey) -> Storey:

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from mapper.core.errors import DataError
 from mapper.core.geometry import Array
@@ -84,6 +84,24 @@ class OccupancyGrid:
             raise DataError(f"grid: origin {self.origin_world_m}, want two finite numbers")
         if not 0.0 < self.resolution_m < np.inf:
             raise DataError(f"grid: resolution {self.resolution_m} m, want > 0")
+
+
+def overlap_of(
+    corner: ArrayLike, size: tuple[int, ...], shape: tuple[int, ...]
+) -> tuple[tuple[slice, ...], tuple[slice, ...]]:
+    """Return the rows and columns that a window covers of an array, in the array and in the window.
+
+    Args:
+        corner: (2,) row and column of the window's first cell in the array; it may lie outside.
+        size: H, W of the window.
+        shape: H, W of the array.
+    """
+    low, high = (np.clip(np.add(corner, beyond), 0, shape) for beyond in (0, size))
+    inside, own = (
+        tuple(slice(*ends) for ends in zip((low - begin).tolist(), (high - begin).tolist(), strict=True))
+        for begin in (0, corner)
+    )
+    return inside, own
 
 
 def with_obstacles(grid: OccupancyGrid, others: OccupancyGrid | None) -> OccupancyGrid:

@@ -84,7 +84,7 @@ class WindowBuffer:
             )
         if size > len(self._cells):
             try:
-                self._cells = _sparse_zeros(size)
+                self._cells = sparse_zeros(size)
             except OSError:
                 raise MapSizeError(
                     f"a scan of {extent} voxels needs {size / 2**30:.0f} GiB of address space, which the "
@@ -99,7 +99,7 @@ class WindowBuffer:
         )
 
 
-def _sparse_zeros(size: int) -> NDArray[np.uint8]:
+def sparse_zeros(size: int) -> NDArray[np.uint8]:
     """Return (size,) zeros that take memory only where they are written.
 
     ``np.zeros`` allocates huge pages: a ray that enters one would pay for clearing and keeping 2 MiB.

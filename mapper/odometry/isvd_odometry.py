@@ -11,7 +11,7 @@ from mapper.core.errors import FrameError
 from mapper.core.frames import Frame, PinholeCamera, RgbdFrame
 from mapper.core.geometry import Array, Transform, apply, inverse
 from mapper.core.timebase import NS_PER_S
-from mapper.features.base import Detector
+from mapper.features.base import Detector, Features
 from mapper.features.factory import build_detector
 from mapper.features.frame_view import ImageView
 from mapper.graph.model import BetweenFactor
@@ -34,7 +34,7 @@ from mapper.odometry.local_map.readout_time import ReadoutTime
 from mapper.odometry.local_map.rolling_shutter import RollingShutter
 from mapper.odometry.registration_errors import RegistrationErrors
 from mapper.registration.base import Alignment
-from mapper.registration.reprojection import VIRTUAL_BASELINE_PX_M
+from mapper.registration.reprojection import disparity_sigmas_px, image_measurements
 from mapper.sensing.config import KINECT_NOISE
 from mapper.sensing.depth_filter import dif
 from mapper.sensing.depth_noise import depth_sigma_m, feature_depth_m
@@ -100,20 +100,21 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
         z[z > config.max_depth_m] = np.nan
         pixels = self._undistorted(features.pixels, camera)
         at = self._undistorted(np.rint(features.pixels), camera) if config.whole_pixels else pixels
-        rays = (at - [camera.cx_px, camera.cy_px]) / [camera.fx_px, camera.fy_px]
-        sigma_px = self._detector.scale_factor ** features.octave.astype(np.float64)
         sigma_m = np.hypot(depth_sigma_m(config.depth_noise or KINECT_NOISE, z), _DEPTH_SHARE * z)
-        # Without depth the weight is not used, but it is a factor in sums.
-        disparity_sigma_px = np.where(np.isnan(z), 1.0, VIRTUAL_BASELINE_PX_M / z**2 * sigma_m)
+        measured, weights, intrinsics = image_measurements(
+            pixels,
+            z,
+            camera.intrinsics,
+            sigma_px=self._sigma_px(features),
+            disparity_sigma_px=disparity_sigmas_px(z, sigma_m),
+        )
         return IsvdObservation(
             stamp_ns=frame.stamp_ns,
             features=features,
-            points_body=apply(frame.T_body_camera, np.column_stack([rays * z[:, None], z])),
-            measured=np.column_stack([pixels, VIRTUAL_BASELINE_PX_M / z]),
-            weights=np.column_stack([sigma_px, sigma_px, disparity_sigma_px]) ** -2.0,
-            intrinsics=np.array(
-                [camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px, VIRTUAL_BASELINE_PX_M]
-            ),
+            points_body=apply(frame.T_body_camera, np.column_stack([camera.rays(at) * z[:, None], z])),
+            measured=measured,
+            weights=weights,
+            intrinsics=intrinsics,
             camera=camera,
             T_body_camera=frame.T_body_camera,
         )
@@ -136,14 +137,13 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
         """Return the view for place recognition, by the readout time as it is known now."""
         if twist is not None:
             observation = self._shutter.corrected(observation, twist)
-        features, camera = observation.features, observation.camera
         return ImageView(
             stamp_ns=observation.stamp_ns,
             pixels=observation.measured[:, :2],
-            sigma_px=self._detector.scale_factor ** features.octave.astype(np.float64),
-            descriptors=features.descriptors,
+            sigma_px=self._sigma_px(observation.features),
+            descriptors=observation.features.descriptors,
             points_camera=apply(inverse(observation.T_body_camera), observation.points_body),
-            intrinsics=np.array([camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px]),
+            intrinsics=observation.camera.intrinsics,
             T_body_camera=observation.T_body_camera,
         )
 
@@ -175,6 +175,11 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
     def _corrected(self, frame: TrackedFrame) -> IsvdObservation:
         """Return what a frame observed, by the readout time as it is known now."""
         return self._shutter.corrected(frame.observation, frame.twist)
+
+    def _sigma_px(self, features: Features) -> Array:
+        """Return the (N,) standard deviations of features' pixels: one pixel of their pyramid level."""
+        sigma_px: Array = self._detector.scale_factor ** features.octave.astype(np.float64)
+        return sigma_px
 
     def _undistorted(self, pixels: NDArray[np.float32], camera: PinholeCamera) -> Array:
         exact: Array = pixels.astype(np.float64)

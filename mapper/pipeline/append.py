@@ -9,14 +9,13 @@ from mapper.core.errors import ConfigError, LoopError
 from mapper.loops.closure import LoopClosure, accepted_loops, why_none_accepted
 from mapper.loops.config import KeyframeLoopsConfig
 from mapper.loops.factory import build_keyframe_loop_detector
-from mapper.odometry.factory import odometry_for
 from mapper.odometry.node_offset import NodeOffset
 from mapper.pipeline.components import component_of
-from mapper.pipeline.floor import UP_LEVEL, above_floor, tracked_stamps
+from mapper.pipeline.floor import above_level_floor, tracked_stamps
 from mapper.pipeline.fuse import carry_times, fuse_into
 from mapper.pipeline.reobserve import reobserve
 from mapper.pipeline.solve import solve
-from mapper.pipeline.track import Start, depth_cautions, track_log, wheel_measurements
+from mapper.pipeline.track import Start, depth_cautions, session_odometry, track_log
 from mapper.pipeline.tracking_result import from_tracking, refuse_a_fragment, save_places
 from mapper.run.edits_file import edits_text, parse_edits, write_edits
 from mapper.run.folder import Run, open_run
@@ -89,13 +88,11 @@ def append(
         _refuse_unconnected(second, run, solved.loops, known)
         trusted_ns = tracked_stamps(before.records) | {track.stamp_ns for track in tracking.tracked}
         with writer.clock.stage("level"):
-            graph, floor_nodes = above_floor(
-                source, solved.graph, config, up_world=UP_LEVEL, trusted_ns=trusted_ns
-            )
-        later = from_tracking(replace(tracking, graph=graph, loops=solved.loops), None)
+            solved = above_level_floor(source, solved, config, trusted_ns=trusted_ns)
+        later = from_tracking(replace(tracking, graph=solved.graph, loops=solved.loops), None)
         save_places(writer, tracking)
-        save_solved(writer, before.solved(graph, solved.loops).then(later, truth=source.truth))
-        writer.update(solve=solved.report.model_copy(update={"floor_nodes": floor_nodes}))
+        save_solved(writer, before.solved(solved.graph, solved.loops).then(later, truth=source.truth))
+        writer.update(solve=solved.report)
         write_edits(writer.folder, edits)
         fuse_into(
             writer, source, joined, progress, observer=observer, before=run.scan_updates(), edits=wanted
@@ -142,9 +139,8 @@ def _after(
     detector = build_keyframe_loop_detector(config.loops, config.graph.solve)
     views = reobserve(first, before.trajectory, set(graph.stamps_ns.values()), config, progress=progress)
     detector.preload(graph, {node: views[stamp_ns] for node, stamp_ns in graph.stamps_ns.items()})
-    odometry = odometry_for(config.odometry, session, wheel_measurements(session, config))
-    offset_odometry = NodeOffset(odometry, first_node=max(graph.T_world_node) + 1)
-    return Start(offset_odometry, detector, graph.without_loops(), before.loops)
+    odometry = NodeOffset(session_odometry(session, config), first_node=max(graph.T_world_node) + 1)
+    return Start(odometry, detector, graph.without_loops(), before.loops)
 
 
 def _refuse_unconnected(second: Log, run: Run, loops: Sequence[LoopClosure], known: Set[int]) -> None:

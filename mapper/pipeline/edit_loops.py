@@ -14,7 +14,7 @@ from mapper.loops.base import Proposal, Verifier, verify_proposal
 from mapper.loops.closure import LoopClosure, accepted_loops
 from mapper.loops.config import NoLoopsConfig
 from mapper.loops.factory import LOOPS_OF, build_verifier
-from mapper.pipeline.floor import UP_LEVEL, above_floor, tracked_stamps
+from mapper.pipeline.floor import above_level_floor, tracked_stamps
 from mapper.pipeline.fuse import fuse_changed
 from mapper.pipeline.reobserve import reobserve
 from mapper.pipeline.solve import solve
@@ -78,11 +78,10 @@ def edit_loops(
         _refuse_rejected(loop)
     if len(components(solved.graph)) > len(components(graph)):
         raise LoopError(f"{run.path}: without these loops the graph falls apart; nothing removed")
-    graph, floor_nodes = above_floor(
-        source, solved.graph, run.config, up_world=UP_LEVEL, trusted_ns=tracked_stamps(tracked.records)
-    )
-    report = solved.report.model_copy(update={"floor_nodes": floor_nodes})
-    return fuse_changed(source, run, tracked.solved(graph, solved.loops), solve=report, progress=progress)
+    trusted_ns = tracked_stamps(tracked.records)
+    solved = above_level_floor(source, solved, run.config, trusted_ns=trusted_ns)
+    changed = tracked.solved(solved.graph, solved.loops)
+    return fuse_changed(source, run, changed, solve=solved.report, progress=progress)
 
 
 def _held(loops: Sequence[LoopClosure], pair: Pair) -> int | None:

@@ -1,6 +1,7 @@
 """The floor that a depth camera moves over: its path gets the height and tilt that the floor shows."""
 
 from collections.abc import Container, Iterable
+from dataclasses import replace
 
 import numpy as np
 
@@ -11,6 +12,7 @@ from mapper.graph.floor_factors import floor_factors, on_one_floor, with_height_
 from mapper.graph.model import PoseGraph
 from mapper.graph.optimize import optimize
 from mapper.mapping.floor_planes import floor_plane
+from mapper.pipeline.solve import Solved
 from mapper.pipeline.tracking_result import BY_POSES
 from mapper.run.frame_outcomes import FrameRecord
 from mapper.runtime.ordered_map import ordered_map
@@ -28,6 +30,14 @@ UP_LEVEL = np.array([0.0, 0.0, 1.0])
 def tracked_stamps(records: Iterable[FrameRecord]) -> set[int]:
     """Return the stamps of the frames that were tracked without a doubt."""
     return {record.stamp_ns for record in records if record.outcome == "tracked"}
+
+
+def above_level_floor(
+    source: Log, solved: Solved, config: BuildConfig, *, trusted_ns: Container[int]
+) -> Solved:
+    """Return a solution in the world of a run as ``above_floor`` does, with the number of nodes reported."""
+    graph, nodes = above_floor(source, solved.graph, config, up_world=UP_LEVEL, trusted_ns=trusted_ns)
+    return replace(solved, graph=graph, report=solved.report.model_copy(update={"floor_nodes": nodes}))
 
 
 def above_floor(

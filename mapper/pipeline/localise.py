@@ -21,13 +21,12 @@ from mapper.graph.optimize import optimize
 from mapper.loops.closure import SOLVER, Discrepancy, accepted_loops, exceeds, why_none_accepted
 from mapper.loops.config import PlaceLoopsConfig, ScanLoopsConfig
 from mapper.loops.map_constraints import build_map_constraint_detector
-from mapper.odometry.factory import odometry_for
 from mapper.odometry.node_offset import NodeOffset
 from mapper.pipeline.components import component_of
 from mapper.pipeline.kidnapping import without_jumps
 from mapper.pipeline.known_map import KnownMap, detector_of, loops_between_days
 from mapper.pipeline.solve import solve
-from mapper.pipeline.track import Start, depth_cautions, track_log, wheel_measurements
+from mapper.pipeline.track import Start, depth_cautions, session_odometry, track_log
 from mapper.pipeline.tracking_result import TrackingResult, from_tracking
 from mapper.run import files
 from mapper.run.localised import LocalisedManifest, find_stretches
@@ -114,10 +113,10 @@ def _refuse_unfit(source: Log, known: KnownMap, config: BuildConfig) -> None:
 
 def _start(source: Log, known: KnownMap, config: BuildConfig) -> Start:
     map_node = known.places.map_node
-    odometry = odometry_for(config.odometry, source, wheel_measurements(source, config))
     detector = build_map_constraint_detector(loops_between_days(config.loops, source.sensor), known.places)
     graph = PoseGraph({map_node: np.eye(4)}, {map_node: 0})
-    return Start(NodeOffset(odometry, first_node=map_node + 1), detector, graph)
+    odometry = NodeOffset(session_odometry(source, config), first_node=map_node + 1)
+    return Start(odometry, detector, graph)
 
 
 def _solved_in_map(

@@ -11,7 +11,7 @@ from mapper.graph.config import GraphConfig
 from mapper.graph.drift import innovations
 from mapper.graph.model import PoseGraph, Solution
 from mapper.graph.optimize import optimize
-from mapper.loops.closure import MIN_WEIGHT, LoopClosure, accepted_loops, apply_solution
+from mapper.loops.closure import LoopClosure, accepted_loops, apply_solution
 from mapper.run.manifest import Solve
 
 _ROUNDING = 1e-12
@@ -46,7 +46,7 @@ def solve(graph: PoseGraph, loops: Sequence[LoopClosure], config: GraphConfig) -
     """
     graph = align_components(graph)
     solution = optimize(graph, config)
-    loops = apply_solution(loops, graph.T_world_node, solution, min_weight=MIN_WEIGHT)
+    loops = apply_solution(loops, graph.T_world_node, solution)
     others, held = graph.without_loops().factors, accepted_loops(loops)
     factors = [loop.factor for loop in held]
     report = Solve(

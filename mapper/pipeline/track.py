@@ -69,7 +69,7 @@ def first_session(
             f"odometry.kind={config.odometry.kind} counts none; want loops.kind=places, scans or none"
         )
     if odometry is None:
-        odometry = odometry_for(config.odometry, source, wheel_measurements(source, config))
+        odometry = session_odometry(source, config)
     elif isinstance(odometry, Trajectory):
         odometry = build_odometry(config.odometry, odometry)
     loops = config.loops
@@ -110,7 +110,7 @@ def track_log(
         state = checkpoints.restore(odometry, checks)
         odometry, known = state.odometry, state.frames
     searches = start.searches or VerificationLog(None)
-    first_pass = _FirstPass(start, wheel_measurements(source, config))
+    first_pass = _FirstPass(start, _wheel_measurements(source, config))
     first_pass.repeat(known, searches)
     entries = map(checks.log.entry_at, range(len(known), len(source)))
     observations = ordered_map(partial(_observe, odometry), entries, workers=config.workers)
@@ -267,7 +267,16 @@ def _in_hindsight(
     ]
 
 
-def wheel_measurements(source: Log, config: BuildConfig) -> WheelMeasurements:
+def session_odometry(source: Log, config: BuildConfig) -> Odometry[Any]:
+    """Return the configured odometry of a log, before its first frame; the log's wheels check its gaps.
+
+    Raises:
+        ConfigError: It needs wheels or poses and there are none.
+    """
+    return odometry_for(config.odometry, source, _wheel_measurements(source, config))
+
+
+def _wheel_measurements(source: Log, config: BuildConfig) -> WheelMeasurements:
     """Return the log's wheel measurements, for factors; none where wheels are the odometry."""
     wheels = None if config.odometry.kind in BY_POSES else source.wheels
     return WheelMeasurements(wheels, config.graph.wheels)

@@ -6,7 +6,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.core.geometry import Array, Transform, apply, is_rigid
+from mapper.core.geometry import Array, Points, Transform, apply, is_rigid
 from mapper.registration.base import Alignment, failed
 from mapper.registration.gauss_newton import GAUSSIAN, PLANE, POINT, descend_on_points
 from mapper.registration.surfaces import Prepared
@@ -138,7 +138,7 @@ def measured(
             f"{near.sum()} of {len(source.points)} points have a partner within {max_pair_distance_m:g} m, "
             f"fewer than {_MIN_PAIRS}: the clouds do not overlap"
         )
-    jacobian, residuals_m = _plane_rows(target, source, T_target_source, indices[near], near)
+    jacobian, residuals_m = plane_rows(target, source.points[near], T_target_source, indices[near])
     has_normal = jacobian.any(axis=1)
     rms_m = float(np.sqrt((residuals_m**2).sum() / max(has_normal.sum(), 1)))
     sigma_m = max(rms_m, _MIN_SIGMA_VOXELS * source.voxel_m)
@@ -154,15 +154,20 @@ def measured(
     )
 
 
-def _plane_rows(
-    target: Prepared,
-    source: Prepared,
-    T_target_source: Transform,
-    partners: NDArray[np.intp],
-    paired: NDArray[np.bool_],
+def plane_rows(
+    target: Prepared, points_source: Points, T_target_source: Transform, partners: NDArray[np.intp]
 ) -> tuple[Array, Array]:
-    """Return (M, 6) Jacobian rows and (M,) distances along the target's normals; 0 where there is none."""
-    normals, points_source = target.normals[partners], source.points[paired]
+    """Return the (M, 6) Jacobian of (M,) distances along the target's normals, and these, in metres.
+
+    Both are 0 where there is no normal. The Jacobian is by the source's tangent: T ← T · exp(δ).
+
+    Args:
+        target: Cloud that stays.
+        points_source: (M, 3) points of the cloud that moves.
+        T_target_source: (4, 4) motion in question.
+        partners: (M,) their partners in the target.
+    """
+    normals = target.normals[partners]
     differences = apply(T_target_source, points_source) - target.points[partners]
     normals_source = normals @ T_target_source[:3, :3]
     jacobian = np.hstack([np.cross(points_source, normals_source), normals_source])

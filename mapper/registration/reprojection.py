@@ -3,6 +3,7 @@
 import numpy as np
 from numba import njit
 
+from mapper.core.geometry import Array
 from mapper.core.linear import solve_positive, twist_exp
 
 CHI2_2DOF, CHI2_3DOF = 5.991, 7.815
@@ -13,6 +14,33 @@ HUBER_2DOF, HUBER_3DOF = np.sqrt(CHI2_2DOF), np.sqrt(CHI2_3DOF)
 
 VIRTUAL_BASELINE_PX_M = 40.0
 """bf where no setting has it: depth z counts as the disparity bf / z (Mur-Artal & Tardós 2017)."""
+
+
+def image_measurements(
+    pixels: Array, depth_m: Array, intrinsics: Array, *, sigma_px: Array, disparity_sigma_px: Array
+) -> tuple[Array, Array, Array]:
+    """Return what ``refine_pose`` takes of features: (N, 3) measured, (N, 3) weights, (5,) intrinsics.
+
+    Args:
+        pixels: (N, 2) undistorted pixels.
+        depth_m: (N,) NaN without depth.
+        intrinsics: (4,) fx, fy, cx, cy.
+        sigma_px: (N,) standard deviation of a feature's pixel, along both axes.
+        disparity_sigma_px: (N,) likewise of bf / z; finite without depth, too.
+    """
+    return (
+        np.column_stack([pixels, VIRTUAL_BASELINE_PX_M / depth_m]),
+        np.column_stack([sigma_px, sigma_px, disparity_sigma_px]) ** -2.0,
+        np.append(intrinsics, VIRTUAL_BASELINE_PX_M),
+    )
+
+
+def disparity_sigmas_px(depth_m: Array, sigma_m: Array) -> Array:
+    """Return the (N,) standard deviations of bf / z by those of (N,) depths, both in metres.
+
+    Without depth it is 1: the weight is not used, but it is a factor in sums.
+    """
+    return np.where(np.isnan(depth_m), 1.0, VIRTUAL_BASELINE_PX_M / depth_m**2 * sigma_m)
 
 
 @njit(cache=True, nogil=True)

@@ -343,15 +343,17 @@ def now_text() -> str:
 
 def is_merged_map(folder: Path) -> bool:
     """Return whether a folder holds a merged map, not a run."""
-    try:
-        return '"kind": "merged map"' in read_text(folder / MANIFEST_NAME)[:200]
-    except DataError:
-        return False
+    return _is_of_kind(folder, "merged map")
 
 
 def is_localised_log(folder: Path) -> bool:
     """Return whether a folder holds a log that was localised in a map, not a run."""
+    return _is_of_kind(folder, "localised log")
+
+
+def _is_of_kind(folder: Path, kind: str) -> bool:
+    """Return whether a folder's manifest is of a kind; it may be damaged, and is not parsed."""
     try:
-        return '"kind": "localised log"' in read_text(folder / MANIFEST_NAME)
+        return f'\n  "kind": "{kind}"' in read_text(folder / MANIFEST_NAME)
     except DataError:
         return False

@@ -54,14 +54,16 @@ def find_warnings(results: RunResults, manifest: Manifest) -> list[RunWarning]:
     reported = {warning.sentence for warning in known}
     notes = [note for source in (manifest.input, *manifest.input.appended) for note in source.notes]
     timeline = TimeLine.of(results, manifest)
-    suggestion = SEE_MORE if _leave_motions_open(results.records) else COME_BACK
+    doubtful = list(_doubtful(results.records, timeline))
+    # Where surfaces leave motions open, the path is uncertain for the same reason.
+    suggestion = next((warning.suggestion for warning in doubtful if warning.suggestion), COME_BACK)
     found = [
         *known,
         *(RunWarning(kind="log", sentence=note) for note in notes if note not in reported),
         *_skipped(results.records, manifest),
         *_gaps(timeline),
         *_lost(results.records, timeline),
-        *_doubtful(results.records, timeline),
+        *doubtful,
         *loop_warnings(results),
         *_levelling(manifest),
         *_depth_reach(manifest),
@@ -225,7 +227,8 @@ def _doubtful(records: Sequence[FrameRecord], timeline: TimeLine) -> Iterator[Ru
     if not doubtful:
         return
     placed = sum(record.node is not None for record in records)
-    share = len(doubtful) / placed
+    are_too_many = len(doubtful) > max(_FEW_FRAMES, _MAX_DOUBTFUL_SHARE * placed)
+    unseen = sum(bool(record.diagnostics.unobservable) for record in doubtful)
     # The same doubt with other figures is the same reason.
     examples: dict[str, str] = {}
     for record in doubtful:
@@ -238,24 +241,12 @@ def _doubtful(records: Sequence[FrameRecord], timeline: TimeLine) -> Iterator[Ru
     )
     yield RunWarning(
         kind="doubtful",
-        sentence=f"{len(doubtful)} of {placed} placed frames are doubtful, {share:.1%} "
+        sentence=f"{len(doubtful)} of {placed} placed frames are doubtful, {len(doubtful) / placed:.1%} "
         f"(at most {_MAX_DOUBTFUL_SHARE:.0%} are usual): {'; '.join(texts)}",
-        suggestion=SEE_MORE if _leave_motions_open(records) else "",
+        suggestion=SEE_MORE if are_too_many and 2 * unseen > len(doubtful) else "",
         where=timeline.place(first, last),
-        weight="doubt" if _are_too_many(len(doubtful), placed) else "note",
+        weight="doubt" if are_too_many else "note",
     )
-
-
-def _leave_motions_open(records: Sequence[FrameRecord]) -> bool:
-    """Return whether too many frames are doubtful, most of them by a motion that no surface shows."""
-    doubtful = [record for record in records if record.outcome == "doubtful"]
-    unseen = sum(bool(record.diagnostics.unobservable) for record in doubtful)
-    placed = sum(record.node is not None for record in records)
-    return _are_too_many(len(doubtful), placed) and 2 * unseen > len(doubtful)
-
-
-def _are_too_many(doubtful: int, placed: int) -> bool:
-    return doubtful > _FEW_FRAMES and doubtful > _MAX_DOUBTFUL_SHARE * placed
 
 
 def _without_figures(text: str) -> str:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Protocol, Self, TypeVar
 from mapper.core.errors import ConfigError
 from mapper.runtime.extras import extra
 from mapper.runtime.threads import one_thread_per_library
-from mapper.runtime.worker_process import Failure, Work, WorkerProcess, _reason, attempt
+from mapper.runtime.worker_process import Failure, Work, WorkerProcess, attempt, reason_of
 
 if TYPE_CHECKING:
     from distributed import Future
@@ -226,7 +226,7 @@ class _DaskCluster(AbstractContextManager["_DaskCluster"]):
         if isinstance(error, self._killed):
             begun = error.allowed_failures + 1
             return index, Failure(f"its worker ended, {begun} of {begun} times; its log may say why", begun)
-        return index, Failure(_reason(error), 1)
+        return index, Failure(reason_of(error), 1)
 
     def _gone(self) -> ConfigError:
         return ConfigError(f"{self._scheduler}: the Dask scheduler went away before all jobs were done")

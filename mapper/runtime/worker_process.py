@@ -38,10 +38,11 @@ def attempt(job: Work) -> Any:
     try:
         return job()
     except Exception as error:
-        return Failure(_reason(error), 1)
+        return Failure(reason_of(error), 1)
 
 
-def _reason(error: BaseException) -> str:
+def reason_of(error: BaseException) -> str:
+    """Return why a job failed, in one line; of an error that is not ours also where it was raised."""
     message = " ".join(str(error).split())
     if isinstance(error, MapperError):
         return "; ".join([message, *getattr(error, "__notes__", ())])
@@ -89,7 +90,7 @@ def _serve(connection: Connection) -> None:
         try:
             connection.send(outcome)
         except (pickle.PicklingError, TypeError, AttributeError) as error:
-            connection.send(Failure(_reason(error), 1))
+            connection.send(Failure(reason_of(error), 1))
 
 
 def _unpacked(packed: bytes) -> Any:

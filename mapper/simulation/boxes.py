@@ -100,8 +100,7 @@ def view_of(boxes: Boxes, camera: PinholeCamera, T_world_camera: Transform) -> B
     R_box_world[:, 2, 2] = 1.0
     R_box_camera = np.ascontiguousarray(R_box_world @ T_world_camera[:3, :3])
     origin_box = np.einsum("nij,nj->ni", R_box_world, T_world_camera[:3, 3] - boxes.centers_world)
-    intrinsics = np.array([camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px])
-    return BoxView(boxes.half_sizes_m, R_box_camera, origin_box, intrinsics)
+    return BoxView(boxes.half_sizes_m, R_box_camera, origin_box, camera.intrinsics)
 
 
 def write_scene(

@@ -13,6 +13,7 @@ import numpy as np
 
 from mapper.core.errors import DataError, SourceError
 from mapper.core.frames import NO_DISTORTION, PinholeCamera
+from mapper.core.toml_text import toml_text
 from mapper.runtime.regular_files import read_text
 from mapper.sources.calibration import Calibration
 
@@ -92,7 +93,7 @@ def calibration_text(camera: PinholeCamera, *, depth_units_per_m: float) -> str:
         "distortion": [float(k) for k in camera.distortion],
         "depth_factor": float(depth_units_per_m),
     }
-    return "".join(f"{key} = {value!r}\n" for key, value in values.items())
+    return f"{toml_text(values)}\n"
 
 
 # What each number is called: by us, ROS, OpenCV, Kalibr and ORB-SLAM ("Camera.fx" counts as "fx").

@@ -174,8 +174,7 @@ def _features(frame: RgbdFrame) -> _Features:
     depth_m = frame.depth_m[rows, columns].astype(np.float64)
     kept = depth_m > 0.0
     camera = frame.camera
-    ideal = camera.undistort(pixels[kept])
-    rays = (ideal - [camera.cx_px, camera.cy_px]) / [camera.fx_px, camera.fy_px]
+    rays = camera.rays(camera.undistort(pixels[kept]))
     points = np.column_stack([rays, np.ones(len(rays))]) * depth_m[kept, None]
     return _Features(points, np.zeros((0, 32), np.uint8) if descriptors is None else descriptors[kept])
 

@@ -206,7 +206,7 @@ def _content_text(frame: Frame) -> str:
 
 
 def _calibration_text(camera: PinholeCamera) -> str:
-    numbers = ", ".join(f"{v:g}" for v in (camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px))
+    numbers = ", ".join(f"{v:g}" for v in camera.intrinsics)
     distortion = ", ".join(f"{k:g}" for k in camera.distortion) if any(camera.distortion) else "none"
     return f"fx fy cx cy {numbers} px, distortion {distortion}"
 

@@ -6,9 +6,9 @@ import tomllib
 
 import pytest
 
-from mapper.cli.toml_text import toml_text
 from mapper.config.describe import settings
 from mapper.config.loading import load_config
+from mapper.core.toml_text import toml_text
 from tests.support.command_line import mapper
 
 

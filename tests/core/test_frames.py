@@ -42,7 +42,7 @@ def test_undistortion_undoes_opencvs_distortion_to_the_corners():
     columns, rows = np.meshgrid(np.arange(0, 640, 13.0), np.arange(0, 480, 11.0))
     measured = np.column_stack([columns.ravel(), rows.ravel()])
     ideal = FR1.undistort(measured)
-    rays = np.column_stack([(ideal - [FR1.cx_px, FR1.cy_px]) / [FR1.fx_px, FR1.fy_px], np.ones(len(ideal))])
+    rays = np.column_stack([FR1.rays(ideal), np.ones(len(ideal))])
     again, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), FR1.matrix, np.array(FR1.distortion))
     np.testing.assert_allclose(again.reshape(-1, 2), measured, atol=1e-4)
     assert np.abs(ideal - measured).max() > 2.0, "freiburg1 does distort"

@@ -10,7 +10,7 @@ from mapper.core.errors import DataError
 from mapper.doctor import libraries, machine
 from mapper.doctor.finding import Finding
 from mapper.doctor.libraries import Requirement, check_library, tried, usual_patience_s
-from mapper.doctor.self_tests import SELF_TESTS, WrongAnswerError, _expect_near
+from mapper.doctor.self_tests import SELF_TESTS, WrongAnswerError, expect_near
 from mapper.doctor.system_libraries import apt_line, check_system_libraries
 from tests.support.command_line import invoke
 from tests.support.paths import ROOT
@@ -27,7 +27,7 @@ def test_every_library_that_we_need_has_a_self_test():
     project = tomllib.loads(PYPROJECT.read_text())["project"]
     extras = project["optional-dependencies"]
     lines = chain(project["dependencies"], *(extras[name] for name in extras if name not in {"all", "dev"}))
-    assert {libraries._REQUIREMENT.match(line)["name"] for line in lines} == set(SELF_TESTS)
+    assert {libraries.REQUIREMENT.match(line)["name"] for line in lines} == set(SELF_TESTS)
 
 
 def test_requirements_know_what_is_optional(monkeypatch):
@@ -174,4 +174,4 @@ def test_every_self_test_passes_here(name, tmp_path):
 
 def test_a_wrong_answer_is_an_error():
     with pytest.raises(WrongAnswerError, match=r"got \[0\.1\]"):
-        _expect_near(np.array([0.1]), np.array([0.5]))
+        expect_near(np.array([0.1]), np.array([0.5]))

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from mapper.cli.answer import Output
-from mapper.cli.build import _observer_factory, built
+from mapper.cli.build import built, observer_factory
 from mapper.config.export import RerunConfig
 from mapper.core.frames import Scan
 from mapper.export.rerun.live import LiveRerun
@@ -159,7 +159,7 @@ def test_stepping_waits_after_each_frame_until_told_to_run_on(desk_log, tmp_path
         tmp_path / "run",
         overwrite=False,
         output=Output(quiet=True),
-        make_observer=_observer_factory(str(path), step=True, overwrite=False),
+        make_observer=observer_factory(str(path), step=True, overwrite=False),
     )
     assert keys.lines == []
     assert len(Told(path).values("/diagnostics/features", "Scalars:scalars")) == 12

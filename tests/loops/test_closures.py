@@ -77,7 +77,7 @@ def test_loops_that_the_solver_lets_go_are_rejected():
         loop(0, 2, at(5.0)),
     ]
     solved = Solution({0: at(0.0), 1: at(1.1), 2: at(2.0)}, 1, (0.0,) * 3, (0.0,) * 3, (1.0, 0.9, 0.02))
-    kept, alone, refused = apply_solution(loops, before, solved, min_weight=0.5)
+    kept, alone, refused = apply_solution(loops, before, solved)
     assert kept.verdict == "accepted"
     assert kept.before.translation_m == pytest.approx(0.1)
     assert kept.after.translation_m == pytest.approx(0.0, abs=1e-9)

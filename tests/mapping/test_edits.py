@@ -1,5 +1,7 @@
 """Edits by hand: which voxels and cells a region holds, and what is left of octree and grids."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -114,8 +116,9 @@ def house():
 
 
 def edited(house, **regions):
-    positions, _, storeys = house
-    return MapEditor(Edits(**regions), positions, room_m=1.8).edit_storeys(storeys)
+    positions, _, floor = house
+    found, done = MapEditor(Edits(**regions), positions, room_m=1.8).edit_floor(floor)
+    return found.storeys, done
 
 
 def code_at(storey, x_m, y_m):
@@ -125,7 +128,7 @@ def code_at(storey, x_m, y_m):
 
 def test_a_keepout_is_blocked_on_the_storeys_whose_room_it_reaches(house):
     square = ((2.0, 4.0), (4.0, 4.0), (4.0, 6.0), (2.0, 6.0))
-    before = house[2]
+    before = house[2].storeys
     assert [code_at(storey, 3.0, 5.0) for storey in before] == [FREE, FREE]
 
     (hall, upper), (done,) = edited(house, keepout=(Region(polygon_m=square, height_m=(0.0, 1.0)),))
@@ -140,10 +143,15 @@ def test_a_keepout_is_blocked_on_the_storeys_whose_room_it_reaches(house):
 def test_a_crop_leaves_the_floor_whose_room_it_reaches(house):
     storeys, _ = edited(house, keep=(Region(box_m=((2.0, 2.0, 3.5), (9.0, 9.0, 6.0))),))
     (upper,) = storeys
-    assert upper.is_home, "the path begins on what is left of it"
     assert upper.heights[upper.heights > -1000].min() == 31
     assert upper.grid.origin_world_m == pytest.approx([2.0, 2.0])
     assert upper.heights.shape == upper.grid.cells.shape
+
+    positions, _, floor = house
+    for home_number in (0, 1):  # the path begins on what is left
+        begins = replace(floor, home_number=home_number)
+        editor = MapEditor(Edits(keep=(Region(box_m=((2.0, 2.0, 3.5), (9.0, 9.0, 6.0))),)), positions, 1.8)
+        assert editor.edit_floor(begins)[0].home_number == 0
 
     (nothing,), _ = edited(house, keep=(Region(box_m=((50.0, 50.0, 0.0), (60.0, 60.0, 1.0))),))
     assert (nothing.grid.cells == UNKNOWN).all()

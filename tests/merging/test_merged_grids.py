@@ -10,7 +10,7 @@ from mapper.cli.main import app
 from mapper.core.errors import RunError
 from mapper.core.geometry import apply, exp
 from mapper.mapping.config import AppliedEdit, Region
-from mapper.merging.floors import storeys_of_map
+from mapper.merging.floors import floor_of_map
 from mapper.merging.placing import Placed, as_built
 from mapper.navigation.config import TraversableConfig
 from mapper.navigation.floor import driven_ground, floor_of, margin_for
@@ -69,15 +69,13 @@ def test_the_floor_is_that_of_the_whole_below_all_paths(maps, tmp_path):
 
     found = merged_map_of(as_built(runs), tmp_path / "map", tile_m=1.6).map
 
-    home = next(storey for storey in expected if storey.is_home)
+    home = expected.home
     assert (home.grid.cells == FREE).any()
     np.testing.assert_array_equal(found.traversable.cells, home.grid.cells)
     np.testing.assert_allclose(found.traversable.origin_world_m, home.grid.origin_world_m)
-    again = [storey for storey in storeys_of_map(found) if not storey.is_link]
-    assert len(again) == len(expected)
-    for one, other in zip(again, expected, strict=True):
+    for one, other in zip(floor_of_map(found).storeys, expected.storeys, strict=True):
         np.testing.assert_array_equal(one.heights, other.heights)
-    assert (found.path / "traversable_0.pgm").exists() == (len(expected) > 1)
+    assert (found.path / "traversable_0.pgm").exists() == (len(expected.storeys) > 1)
 
 
 def test_a_map_too_wide_for_a_floor_says_so(maps, tmp_path, monkeypatch):

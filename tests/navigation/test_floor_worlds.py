@@ -73,7 +73,7 @@ def test_a_lower_yard_behind_a_wall_does_not_move_the_ground_of_the_street(drop_
     grid = cut_slice(octree, BAND, driven=driven_ground(floor))
     assert (codes_at(grid, street) != OCCUPIED).all()
     assert (codes_at(grid, [(x, 6.1) for x in np.arange(1.0, 23.0)]) == OCCUPIED).all()
-    (storey,) = traversable(floor, config_for(0.2))
+    (storey,) = traversable(floor, config_for(0.2)).storeys
     assert (codes_at(storey.grid, street) == FREE).all()
     assert (codes_at(storey.grid, [(x, 10.0) for x in np.arange(1.0, 23.0)]) != FREE).all()
 
@@ -82,10 +82,12 @@ def test_floors_over_each_other_are_storeys_that_share_the_ramps_between_them():
     for world_of, heights_m in ((two_storeys, [0.0, 3.06]), (bridge, [0.0, 3.0]), (ramps, [0.0, 2.5])):
         world = world_of()
         _, floor, config = floor_of(world, 0.1)
-        storeys = traversable(floor, config)
+        found = traversable(floor, config)
+        storeys = found.storeys
         usual = [np.median(s.heights[s.heights > -1000]) * 0.1 for s in storeys]
         np.testing.assert_allclose(usual, heights_m, atol=0.11)
-        assert [storey.is_home for storey in storeys] == [True, False]
+        assert len(storeys) == 2
+        assert found.home is storeys[0]
         upper = [point for point in world.path if point[2] > 2.4]
         assert codes_at(storeys[0].grid, world.path[:1]).tolist() == [FREE]
         assert (codes_at(storeys[1].grid, upper) == FREE).all()
@@ -97,27 +99,27 @@ def test_floors_over_each_other_are_storeys_that_share_the_ramps_between_them():
 
 def test_a_room_without_a_door_is_no_floor():
     _, floor, config = floor_of(rooms(), 0.1)
-    (storey,) = traversable(floor, config)
+    (storey,) = traversable(floor, config).storeys
     assert (codes_at(storey.grid, [(10.5, 3.0), (11.0, 1.0)]) == UNKNOWN).all()
 
 
 def test_bushes_do_not_lead_up_to_canopies():
     _, floor, config = floor_of(courtyard(), 0.2)
-    (storey,) = traversable(floor, config)
+    (storey,) = traversable(floor, config).storeys
     assert codes_at(storey.grid, [(8.0, 3.0), (11.0, 4.0)]).tolist() == [OCCUPIED, OCCUPIED]
     assert storey.heights.max() <= 2  # canopies hang 11 voxels high and more
 
 
 def test_a_step_below_a_voxel_counts_as_one_voxel():
     world = rooms()
-    (coarse,) = traversable(*floor_of(world, 0.2, max_step_m=0.05)[1:])
+    (coarse,) = traversable(*floor_of(world, 0.2, max_step_m=0.05)[1:]).storeys
     assert (codes_at(coarse.grid, world.positions()) == FREE).all()
 
 
 def test_ground_that_was_never_seen_is_free_under_the_footprint_alone():
     world = World([Slab(0.0, 10.0, 0.0, 4.0)], [], [(1.0, 2.0, 0.0), (9.0, 2.0, 0.0)], [(3.0, 7.0, 0.0, 4.0)])
     _, floor, config = floor_of(world, 0.1)
-    (storey,) = traversable(floor, config)
+    (storey,) = traversable(floor, config).storeys
     assert (codes_at(storey.grid, world.positions()) == FREE).all()
     assert codes_at(storey.grid, [(5.0, 2.3), (5.0, 2.7), (5.0, 0.5)]).tolist() == [FREE, UNKNOWN, UNKNOWN]
     assert floor.path.share_seen == pytest.approx(0.5, abs=0.1)
@@ -132,7 +134,7 @@ def test_a_camera_over_a_desk_does_not_make_the_desk_a_floor():
     octree = world.octree(0.05)
     config = TraversableConfig()
     floor = reachable_floor(octree, config, positions_world=world.positions() - np.array([0.0, 0.0, 0.6]))
-    (storey,) = traversable(floor, config)
+    (storey,) = traversable(floor, config).storeys
     assert len(floor.path) == 0
     assert codes_at(storey.grid, [(1.8, 1.5), (0.5, 0.5)]).tolist() == [OCCUPIED, FREE]
 
@@ -142,5 +144,5 @@ def test_a_table_that_a_walking_camera_is_held_over_does_not_raise_the_path():
     world = World([Slab(0.0, 10.0, 0.0, 4.0), table], [], [(1.0, 2.0, 0.0), (9.0, 2.0, 0.0)])
     _, floor, config = floor_of(world, 0.1)
     np.testing.assert_allclose(floor.path.points_world[:, 2], 0.0, atol=0.101)
-    (storey,) = traversable(floor, config)
+    (storey,) = traversable(floor, config).storeys
     assert codes_at(storey.grid, [(4.5, 2.0)]).tolist() == [OCCUPIED]

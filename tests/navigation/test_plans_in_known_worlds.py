@@ -122,9 +122,8 @@ def test_distances_agree_with_the_true_solids(source, octree):
 
 def test_the_traversable_floor_is_free_in_the_true_flat(source, octree):
     config = TraversableConfig()
-    (storey,) = traversable(
-        reachable_floor(octree, config, positions_world=source.truth.positions_world), config
-    )
+    floor = reachable_floor(octree, config, positions_world=source.truth.positions_world)
+    (storey,) = traversable(floor, config).storeys
     floor = storey.grid
     heights_m = np.arange(config.max_step_m + CELL / 2, config.head_room_m, CELL)
     free = centres(floor, FREE)

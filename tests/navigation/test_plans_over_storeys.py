@@ -15,7 +15,7 @@ ROBOT = TraversableConfig(max_step_m=0.2, head_room_m=1.8, max_gap_m=0.2)
 PLAN = PlanConfig(layer="traversable", radius_m=0.15)
 
 
-def storeys_of(world):
+def floor_of(world):
     floor = reachable_floor(world.octree(0.1), ROBOT, positions_world=world.positions())
     return traversable(floor, ROBOT, with_links=True)
 
@@ -41,8 +41,8 @@ def spiral(turns):
 
 
 def test_a_path_leads_up_the_stairs_and_its_waypoints_have_heights():
-    storeys = storeys_of(two_storeys())
-    plan = plan_storeys(storeys, np.array([8.0, 6.0]), np.array([2.0, 5.0, 3.06]), config=PLAN)
+    floor = floor_of(two_storeys())
+    plan = plan_storeys(floor, np.array([8.0, 6.0]), np.array([2.0, 5.0, 3.06]), config=PLAN)
     assert plan.storeys == (0, 1)
     np.testing.assert_allclose(plan.waypoints_world[[0, -1]], [[8.0, 6.0, 0.0], [2.0, 5.0, 3.1]], atol=0.11)
     climbing = plan.waypoints_world[(plan.waypoints_world[:, 2] > 0.3) & (plan.waypoints_world[:, 2] < 2.8)]
@@ -54,10 +54,10 @@ def test_a_path_leads_up_the_stairs_and_its_waypoints_have_heights():
 
 def test_any_two_places_of_the_path_are_joined():
     for world in (two_storeys(), bridge()):
-        storeys = storeys_of(world)
+        floor = floor_of(world)
         for start in world.path[::2]:
             for goal in world.path[1::3]:
-                plan = plan_storeys(storeys, np.array(start), np.array(goal), config=PLAN)
+                plan = plan_storeys(floor, np.array(start), np.array(goal), config=PLAN)
                 np.testing.assert_allclose(
                     plan.waypoints_world[[0, -1], :2], [start[:2], goal[:2]], atol=0.11
                 )
@@ -67,22 +67,21 @@ def test_any_two_places_of_the_path_are_joined():
 def test_spiral_stairs_are_one_way_up_and_down(turns):
     """A turn fills a storey, so that storeys share no floor but where they meet."""
     world = spiral(turns)
-    storeys = storeys_of(world)
-    floors = [storey for storey in storeys if not storey.is_link]
-    assert len(floors) >= 2
-    assert storeys[: len(floors)] == tuple(floors)
+    floor = floor_of(world)
+    assert len(floor.storeys) >= 2
+    assert floor.links
     for start, goal in ((0, -1), (-1, 0), (3, 40), (45, 20)):
-        plan = plan_storeys(storeys, np.array(world.path[start]), np.array(world.path[goal]), config=PLAN)
+        plan = plan_storeys(floor, np.array(world.path[start]), np.array(world.path[goal]), config=PLAN)
         ends = [world.path[start], world.path[goal]]
         np.testing.assert_allclose(plan.waypoints_world[[0, -1]], ends, atol=0.21)
-        assert set(plan.storeys) <= set(range(len(floors)))
+        assert set(plan.storeys) <= set(range(len(floor.storeys)))
         climbed_m = np.abs(np.diff(plan.waypoints_world[:, 2])).sum()
         assert climbed_m == pytest.approx(abs(ends[1][2] - ends[0][2]), abs=0.5)
 
 
 def test_a_point_without_a_height_is_on_the_storey_where_the_log_begins():
-    storeys = storeys_of(two_storeys())
-    plan = plan_storeys(storeys, np.array([8.0, 6.0]), np.array([2.0, 5.0]), config=PLAN)
+    floor = floor_of(two_storeys())
+    plan = plan_storeys(floor, np.array([8.0, 6.0]), np.array([2.0, 5.0]), config=PLAN)
     assert plan.storeys == (0,)
     assert plan.waypoints_world[:, 2].max() <= 0.1
 
@@ -90,7 +89,7 @@ def test_a_point_without_a_height_is_on_the_storey_where_the_log_begins():
 def test_storeys_that_only_a_narrower_robot_can_change_are_named():
     with pytest.raises(PlanError, match="plan with a smaller radius"):
         plan_storeys(
-            storeys_of(two_storeys()),
+            floor_of(two_storeys()),
             np.array([8.0, 6.0]),
             np.array([2.0, 5.0, 3.06]),
             config=PlanConfig(layer="traversable", radius_m=0.8),

@@ -33,7 +33,7 @@ NO_PATH = np.empty((0, 3))
 def traversable_grid(octree, config, *, path=NO_PATH, floor_z_m=0.0):
     """Return the grid of the only storey; without a path it begins at all floor at the floor's height."""
     floor = reachable_floor(octree, config, positions_world=np.asarray(path), floor_z_m=floor_z_m)
-    (storey,) = traversable(floor, config)
+    (storey,) = traversable(floor, config).storeys
     return storey.grid
 
 
@@ -196,7 +196,7 @@ def test_the_footprint_is_free_beside_the_map_too():
     octree = octree_of(floor(x1=4.0))
     path = [(x, 0.5, 0.3) for x in np.arange(0.02, 3.0, 0.1)]
     reached = reachable_floor(octree, TraversableConfig(footprint_m=0.3), positions_world=np.array(path))
-    (storey,) = traversable(reached, TraversableConfig())
+    (storey,) = traversable(reached, TraversableConfig()).storeys
     level = cut_slice(octree, SliceConfig(), driven=driven_ground(reached))
     for grid in (storey.grid, level):
         assert code_at(grid, -0.2, 0.5) == FREE
@@ -221,5 +221,5 @@ def test_one_storey_is_left_where_all_are_small():
     for _ in range(30):
         octree = OctreeMap(OctreeConfig(resolution_m=0.05))
         octree.insert_points(rng.uniform(-0.4, 0.4, (300, 3)).astype(np.float32), np.zeros(3))
-        storeys = traversable(reachable_floor(octree, config, positions_world=NO_PATH), config)
-        assert sum(storey.is_home for storey in storeys) == 1
+        storeys = traversable(reachable_floor(octree, config, positions_world=NO_PATH), config).storeys
+        assert len(storeys) == 1

@@ -5,7 +5,7 @@ import pytest
 
 from mapper.core.errors import DataError
 from mapper.octree.config import OctreeConfig, SliceConfig
-from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, shrunk
+from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, overlap_of, shrunk
 from mapper.octree.map import OctreeMap
 from mapper.octree.slice import cut_slice
 from tests.support.grids import state_at
@@ -146,3 +146,13 @@ def test_a_shrunk_grid_shows_what_matters_most():
     assert small.resolution_m == 1.0
     np.testing.assert_array_equal(small.origin_world_m, [1.0, -2.0])
     assert shrunk(small, 4) is small
+
+
+@pytest.mark.parametrize("corner", [(-1, -2), (0, 0), (3, 1), (-9, 0), (1, 9)])
+def test_a_window_and_an_array_share_the_cells_where_they_overlap(corner):
+    array, window = np.zeros((4, 5)), np.arange(1, 7).reshape(2, 3)
+    inside, own = overlap_of(corner, window.shape, array.shape)
+    array[inside] = window[own]
+    padded = np.zeros((40, 40))
+    padded[20 + corner[0] : 22 + corner[0], 20 + corner[1] : 23 + corner[1]] = window
+    np.testing.assert_array_equal(array, padded[20:24, 20:25])

@@ -8,13 +8,14 @@ from mapper.core.geometry import angle_between, apply, exp, inverse, log
 from mapper.odometry.local_map.depth_alignment import ReferenceSurfaces, align_depth, observes_all
 from mapper.odometry.local_map.depth_kernels import Landmarks, PosePrior
 from mapper.odometry.local_map.depth_surfaces import depth_cells, surface_of
+from mapper.registration.reprojection import VIRTUAL_BASELINE_PX_M
 from tests.support.depth_rooms import CAMERA, CORNER, box_depth
 
 ROOM, WALL_ONLY = (1.6, 2.1, 1.3), (50.0, 1.5, 50.0)
 FACING_A_WALL = np.array(
     [[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
 )
-INTRINSICS = np.array([CAMERA.fx_px, CAMERA.fy_px, CAMERA.cx_px, CAMERA.cy_px, 40.0])
+INTRINSICS = np.append(CAMERA.intrinsics, VIRTUAL_BASELINE_PX_M)
 NO_LANDMARKS = Landmarks(np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 3)), INTRINSICS)
 
 

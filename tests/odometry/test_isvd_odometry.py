@@ -48,7 +48,7 @@ def observation(stamp_ns, pixels, points, descriptors) -> IsvdObservation:
     zeros = np.zeros(len(pixels), np.float32)
     features = Features(pixels.astype(np.float32), np.zeros(len(pixels), np.int32), zeros, zeros, descriptors)
     measured = np.column_stack([pixels, BF_PX_M / points[:, 2]])
-    intrinsics = np.array([CAMERA.fx_px, CAMERA.fy_px, CAMERA.cx_px, CAMERA.cy_px, BF_PX_M])
+    intrinsics = np.append(CAMERA.intrinsics, BF_PX_M)
     return IsvdObservation(
         stamp_ns, features, points, measured, np.ones((len(pixels), 3)), intrinsics, CAMERA, np.eye(4)
     )

@@ -22,7 +22,7 @@ def pair(seed: int) -> tuple[IsvdObservation, IsvdObservation]:
     rng = np.random.default_rng(seed)
     pixels = rng.uniform([20.0, 20.0], [620.0, 460.0], (400, 2))
     z = rng.uniform(1.0, 4.0, 400)
-    rays = (pixels - [CAMERA.cx_px, CAMERA.cy_px]) / [CAMERA.fx_px, CAMERA.fy_px]
+    rays = CAMERA.rays(pixels)
     points = apply(T_BODY_CAMERA, np.column_stack([rays * z[:, None], z]))
     descriptors = rng.integers(0, 256, (400, 32), dtype=np.uint8)
     return observed(points, descriptors, rng), observed(apply(inverse(MOTION), points), descriptors, rng)
@@ -33,7 +33,7 @@ def observed(points_body: np.ndarray, descriptors: np.ndarray, rng: np.random.Ge
     pixels = CAMERA.project(points) + rng.normal(0.0, PIXEL_SIGMA, (len(points), 2))
     disparity = BF_PX_M / points[:, 2] + rng.normal(0.0, DISPARITY_SIGMA, len(points))
     z = BF_PX_M / disparity
-    rays = (pixels - [CAMERA.cx_px, CAMERA.cy_px]) / [CAMERA.fx_px, CAMERA.fy_px]
+    rays = CAMERA.rays(pixels)
     zeros = np.zeros(len(points), np.float32)
     return IsvdObservation(
         stamp_ns=0,
@@ -43,7 +43,7 @@ def observed(points_body: np.ndarray, descriptors: np.ndarray, rng: np.random.Ge
         points_body=apply(T_BODY_CAMERA, np.column_stack([rays * z[:, None], z])),
         measured=np.column_stack([pixels, disparity]),
         weights=np.tile([PIXEL_SIGMA**-2.0, PIXEL_SIGMA**-2.0, DISPARITY_SIGMA**-2.0], (len(points), 1)),
-        intrinsics=np.array([CAMERA.fx_px, CAMERA.fy_px, CAMERA.cx_px, CAMERA.cy_px, BF_PX_M]),
+        intrinsics=np.append(CAMERA.intrinsics, BF_PX_M),
         camera=CAMERA,
         T_body_camera=T_BODY_CAMERA,
     )

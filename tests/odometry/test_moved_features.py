@@ -10,9 +10,8 @@ import pytest
 
 from mapper.core.frames import RgbdFrame
 from mapper.core.geometry import exp
-from mapper.odometry.config import LocalMapConfig
-from mapper.odometry.factory import build_frame_odometry
 from mapper.odometry.local_map.earlier_depth import EarlierDepth
+from tests.support.desk_frames import odometry_after
 
 NOW = 40
 """Frame that is looked at: 1.3 s after the first."""
@@ -21,10 +20,7 @@ STILL = np.zeros(6)
 
 @pytest.fixture
 def odometry(frames):
-    odometry = build_frame_odometry(LocalMapConfig())
-    for frame in frames[: NOW + 1]:
-        odometry.track(odometry.observe(frame))
-    return odometry
+    return odometry_after(frames[: NOW + 1])
 
 
 @pytest.fixture
@@ -151,12 +147,3 @@ def test_without_older_keyframes_nothing_is_known(odometry, earlier_depth):
     early = replace(pose.observation, stamp_ns=origin_ns + 100_000_000)
     assert not earlier_depth.moved(early, pose.T_camera_world, pose.reference).any()
     assert earlier_depth.displacement(early, pose.T_camera_world, pose.reference, STILL).ratio == 0.0
-
-
-def test_the_depths_noise_counts_only_while_many_features_have_moved(odometry):
-    observation = odometry._last.observation
-    moved = np.zeros(len(observation), np.bool_)
-    moved[: len(moved) // 30] = True
-    assert observation.weights_among(moved) is observation.weights
-    moved[: len(moved) // 10] = True
-    assert observation.weights_among(moved) is observation.sensor_weights

@@ -7,10 +7,9 @@ import pytest
 
 from mapper.core.frames import RgbdFrame
 from mapper.core.geometry import apply, exp, inverse
-from mapper.odometry.config import LocalMapConfig
-from mapper.odometry.factory import build_frame_odometry
 from mapper.odometry.local_map.earlier_depth import Displacement, EarlierDepth, hidden_points
 from mapper.odometry.local_map.moving_features import among_moving
+from tests.support.desk_frames import odometry_after
 
 NOW = 40
 WALKED_M = np.array([0.08, 0.0, 0.0])
@@ -18,10 +17,7 @@ WALKED_M = np.array([0.08, 0.0, 0.0])
 
 @pytest.fixture
 def odometry(frames):
-    odometry = build_frame_odometry(LocalMapConfig())
-    for frame in frames[: NOW + 1]:
-        odometry.track(odometry.observe(frame))
-    return odometry
+    return odometry_after(frames[: NOW + 1])
 
 
 @pytest.fixture
@@ -92,6 +88,8 @@ def test_landmarks_behind_a_visitor_are_hidden(odometry, frames):
 def test_among_moving_features_depth_has_its_own_noise(odometry):
     observation = odometry._last.observation.swept(np.full(6, 0.01))
     few, many = (np.arange(len(observation)) < share * len(observation) for share in (0.04, 0.06))
+    assert observation.weights_among(few) is observation.weights
+    assert observation.weights_among(many) is observation.sensor_weights
     assert observation.among_moving(few) is observation
     weighted = observation.among_moving(many)
     assert weighted.weights is observation.sensor_weights

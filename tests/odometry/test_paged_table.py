@@ -11,6 +11,7 @@ from mapper.odometry.local_map.paged_table import PAGE_ROWS, WORKING_SET_STEPS, 
 from mapper.runtime.archive import Archive
 from mapper.runtime.journal import Journal
 from mapper.runtime.state_pickle import dumps, loads
+from tests.support.desk_frames import odometry_after
 
 ROWS = 8 * PAGE_ROWS
 
@@ -168,9 +169,7 @@ def test_tracking_does_not_depend_on_what_is_in_memory(frames, monkeypatch):
 
 
 def test_observations_follow_every_change_of_the_readout_time(frames):
-    odometry = build_frame_odometry(LocalMapConfig())
-    for frame in frames[:20]:
-        odometry.track(odometry.observe(frame))
+    odometry = odometry_after(frames[:20])
     local_map = odometry._map
     observations = np.arange(local_map._observations.size)
     wanted = local_map._measured(observations)

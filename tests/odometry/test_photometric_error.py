@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from mapper.core.geometry import exp
-from mapper.odometry.config import LocalMapConfig
-from mapper.odometry.factory import build_frame_odometry
 from mapper.odometry.local_map.photometric_error import excess_error
+from tests.support.desk_frames import odometry_after
 
 NOW = 40
 
@@ -16,9 +15,7 @@ NOW = 40
 @pytest.fixture
 def poses(frames):
     """Return the tracked poses of two frames, the later one first."""
-    odometry = build_frame_odometry(LocalMapConfig())
-    for frame in frames[:NOW]:
-        odometry.track(odometry.observe(frame))
+    odometry = odometry_after(frames[:NOW])
     before = odometry._last
     odometry.track(odometry.observe(frames[NOW]))
     return odometry._last, before

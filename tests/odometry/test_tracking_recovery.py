@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 
 from mapper.core.geometry import exp, inverse, log
-from mapper.odometry.config import LocalMapConfig
-from mapper.odometry.factory import build_frame_odometry
 from mapper.odometry.local_map.doubt import Doubt
 from mapper.odometry.local_map.earlier_depth import Displacement
 from mapper.odometry.local_map.pose_tracker import unmatched
+from tests.support.desk_frames import odometry_after
 
 NOW = 42
 STILL = np.zeros(6)
@@ -20,10 +19,7 @@ T_ASIDE = exp(np.array([0.0, 0.05, 0.0]), np.array([0.0, 0.0, 0.3]))
 
 @pytest.fixture
 def odometry(frames):
-    odometry = build_frame_odometry(LocalMapConfig())
-    for frame in frames[:NOW]:
-        odometry.track(odometry.observe(frame))
-    return odometry
+    return odometry_after(frames[:NOW])
 
 
 def miss_m(pose, right):

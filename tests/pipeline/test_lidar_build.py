@@ -41,7 +41,7 @@ def run(log, tmp_path_factory):
 
 
 def error_m(run):
-    return next(m.value for m in evaluate(run.trajectory, run.truth) if m.name.startswith("ATE"))
+    return evaluate(run.trajectory, run.truth).ate_m
 
 
 def test_every_scan_is_placed_close_to_the_truth(run):

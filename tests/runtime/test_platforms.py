@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from mapper.doctor.machine import processors
-from mapper.octree.window import _sparse_zeros
+from mapper.octree.window import sparse_zeros
 from mapper.runtime import atomic
 from mapper.runtime.atomic import FolderKind, atomic_folder, flush_to_disk
 from mapper.runtime.file_array import FileArray
@@ -98,7 +98,7 @@ def test_a_build_needs_nothing_of_linux(tmp_path):
 
 def test_zeros_without_advice_on_huge_pages(monkeypatch):
     monkeypatch.delattr(mmap, "MADV_NOHUGEPAGE")
-    zeros = _sparse_zeros(5000)
+    zeros = sparse_zeros(5000)
     zeros[7] = 1
     assert (zeros.sum(), zeros.dtype, zeros.shape) == (1, np.uint8, (5000,))
 

@@ -7,7 +7,7 @@ from mapper.core.errors import SourceError
 from mapper.sources import open_source
 from mapper.sources.config import CameraConfig, SourceConfig
 from mapper.sources.depth_scale import depth_warnings
-from mapper.sources.image_folders.tum import _MILLIMETRES_NOTE, _UNITS_NOTE
+from mapper.sources.image_folders.tum import MILLIMETRES_NOTE, UNITS_NOTE
 from tests.support.tum_logs import CALIBRATION, FIRST_NS, PERIOD_NS, write_picture
 
 N = 4
@@ -38,7 +38,7 @@ def written(folder, colour="rgb/{}.png", depth="depth/{}.png", name=seconds, lat
 )
 def test_images_named_by_their_stamps_need_no_list(tmp_path, colour, depth, name):
     log = open_source(written(tmp_path, colour, depth, name, late_ns=4_000_000))
-    assert (log.kind, len(log), list(log.notes)) == ("tum", N, [_MILLIMETRES_NOTE])
+    assert (log.kind, len(log), list(log.notes)) == ("tum", N, [MILLIMETRES_NOTE])
     assert log.stamps_ns.tolist() == [stamp_ns // 1000 * 1000 for stamp_ns in STAMPS_NS]
     files = log.entry_at(1).files
     assert (files.depth_units_per_m, files.depth_stamp_ns - log.stamps_ns[1]) == (1000.0, 4_000_000)
@@ -61,7 +61,7 @@ def test_a_list_of_pairs_takes_the_place_of_both_lists(tmp_path, name, is_depth_
     (tmp_path / name).write_text("\n".join(lines))
     (tmp_path / "calibration.toml").write_text(CALIBRATION)
     log = open_source(tmp_path)
-    assert (log.kind, len(log), list(log.notes)) == ("tum", N, [_UNITS_NOTE])
+    assert (log.kind, len(log), list(log.notes)) == ("tum", N, [UNITS_NOTE])
     files = log.entry_at(2).files
     assert (files.colour.name, files.depth.name, files.depth_units_per_m) == ("a2.png", "b2.png", 5000.0)
     assert files.depth_stamp_ns - log.stamps_ns[2] == 5_000_000
@@ -104,7 +104,7 @@ def test_millimetres_taken_for_tums_units_are_told_without_a_truth(tiny_tum_log,
     (folder / "calibration.toml").write_text(CALIBRATION + stated)
     write_near(folder)
     log = open_source(folder)
-    assert (_UNITS_NOTE in log.notes) == is_warned
+    assert (UNITS_NOTE in log.notes) == is_warned
     why = "a twentieth of it is within 0.22 m, but cameras measure 0.3 to 8 m; is source.camera"
     assert [why in warning for warning in depth_warnings(log)] == [True] * is_warned
 

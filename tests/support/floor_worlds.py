@@ -214,7 +214,7 @@ def _agree(top, z, cell_m):
 def score(world, octree, config):
     """Return how right the traversable floor of a world's map is; unseen ground is not asked for."""
     floor = reachable_floor(octree, config, positions_world=world.positions())
-    storeys = traversable(floor, config)
+    storeys = traversable(floor, config).storeys
     cell = octree.resolution_m
     truth = world.reachable(
         step_m=config.max_step_m, slope=np.tan(config.max_slope_rad), room_m=config.head_room_m

@@ -140,8 +140,7 @@ def _rays_of(camera: PinholeCamera, cell_px: int) -> Array:
     middle = 0.5 * (cell_px - 1)
     x, y = np.meshgrid(np.arange(columns) * cell_px + middle, np.arange(rows) * cell_px + middle)
     ideal = camera.undistort(np.column_stack([x.ravel(), y.ravel()]))
-    rays: Array = (ideal - [camera.cx_px, camera.cy_px]) / [camera.fx_px, camera.fy_px]
-    return rays.reshape(rows, columns, 2)
+    return camera.rays(ideal).reshape(rows, columns, 2)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -201,9 +201,7 @@ def observe_image(
     depth_m, column, row = feature_depth_m(frame.depth_m, features.pixels[order])
     if config.max_depth_m is not None:
         depth_m[depth_m > config.max_depth_m] = np.nan
-    intrinsics = np.array(
-        [camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px, config.virtual_baseline_px_m]
-    )
+    intrinsics = np.append(camera.intrinsics, config.virtual_baseline_px_m)
     bits = pack(features.descriptors[order])
     sigma_px = detector.scale_factor ** octave.astype(np.float64)
     disparity_sigma_px, sensor_px = _disparity_sigmas_px(frame, depth_m, (column, row), sigma_px, config)

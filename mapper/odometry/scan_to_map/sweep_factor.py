@@ -4,12 +4,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mapper.core.deskew import Twist, deskewed
 from mapper.core.geometry import Array, Transform, apply, exp, inverse
 from mapper.odometry.scan_to_map.scan_observation import ScanObservation
-from mapper.registration.surfaces import Prepared
+from mapper.registration.refining import plane_rows
 
 _POINTS = 2000
 _POSE_STEPS = 15
@@ -107,14 +106,17 @@ def _cost(first: Sweep, second: Sweep, factor: float) -> float:
     T_first_second = inverse(_middle(first, factor)) @ _middle(second, factor)
     distances_m = np.full(len(points), np.inf)
     for _ in range(_POSE_STEPS):
-        near, normals_first, distances_m = _paired(target, apply(T_first_second, points))
+        indices, apart_m = target.nearest(apply(T_first_second, points))
+        is_near = (apart_m <= _NEAR_VOXELS * target.voxel_m) & target.normals[indices].any(axis=1)
+        near = np.flatnonzero(is_near)
+        rows, near_m = plane_rows(target, points[near], T_first_second, indices[near])
+        distances_m = np.full(len(points), np.inf)
+        distances_m[near] = near_m
         if len(near) < _FEWEST_PAIRS:
             break
-        normals = normals_first @ T_first_second[:3, :3]
-        rows = np.hstack([np.cross(points[near], normals), normals])
-        weights = 1.0 / (1.0 + (distances_m[near] / (_SCALE_VOXELS * target.voxel_m)) ** 2)
+        weights = 1.0 / (1.0 + (near_m / (_SCALE_VOXELS * target.voxel_m)) ** 2)
         information = np.einsum("ni,n,nj->ij", rows, weights, rows) + 1e-6 * np.eye(6)
-        moved = np.linalg.solve(information, -rows.T @ (weights * distances_m[near]))
+        moved = np.linalg.solve(information, -rows.T @ (weights * near_m))
         T_first_second = T_first_second @ exp(moved[:3], moved[3:])
         turned_rad, moved_m = float(np.linalg.norm(moved[:3])), float(np.linalg.norm(moved[3:]))
         if turned_rad <= _SETTLED_RAD and moved_m <= _SETTLED_VOXELS * target.voxel_m:
@@ -122,16 +124,6 @@ def _cost(first: Sweep, second: Sweep, factor: float) -> float:
     farthest_m = _FARTHEST_VOXELS * target.voxel_m
     scaled = np.minimum(np.abs(distances_m), farthest_m) / (_SCALE_VOXELS * target.voxel_m)
     return float(np.log1p(scaled**2).mean())
-
-
-def _paired(target: Prepared, points: Array) -> tuple[NDArray[np.intp], Array, Array]:
-    """Return the rows with a partner, its normals, and (N,) distances from surfaces: infinite without one."""
-    indices, apart_m = target.nearest(points)
-    near = np.flatnonzero((apart_m <= _NEAR_VOXELS * target.voxel_m) & target.normals[indices].any(axis=1))
-    normals = target.normals[indices[near]]
-    distances_m: Array = np.full(len(points), np.inf)
-    distances_m[near] = np.einsum("ni,ni->n", normals, points[near] - target.points[indices[near]])
-    return near, normals, distances_m
 
 
 def _scaled(twist: Twist, factor: float) -> Twist:

@@ -83,7 +83,7 @@ def check_entropy(data: bytes) -> None:
     Raises:
         DataError: They are damaged; says how, and where.
     """
-    headers = _Headers(huffman=dict(_STANDARD_TABLES))
+    headers = _Headers(huffman=dict(STANDARD_TABLES))
     at = 2
     try:
         while (found := _next_marker(data, at)) is not None:
@@ -192,7 +192,7 @@ def _ceil(value: int, divisor: int) -> int:
 
 
 _DC_SYMBOLS = bytes(range(12))
-_STANDARD_TABLES: Mapping[int, _HuffmanTable] = {
+STANDARD_TABLES: Mapping[int, _HuffmanTable] = {
     0x00: _HuffmanTable(bytes.fromhex("00010501010101010100000000000000"), _DC_SYMBOLS),
     0x01: _HuffmanTable(bytes.fromhex("00030101010101010101010000000000"), _DC_SYMBOLS),
     0x10: _HuffmanTable(

@@ -107,7 +107,7 @@ def _unfilter(filtered: NDArray[np.uint8], pixels: NDArray[np.uint8], step: int)
             for x in range(step):
                 target[x] = uint8(source[x] + above[x])
             for x in range(step, row):
-                predicted = _paeth(int32(target[x - step]), int32(above[x]), int32(above[x - step]))
+                predicted = paeth(int32(target[x - step]), int32(above[x]), int32(above[x - step]))
                 target[x] = uint8(source[x] + predicted)
         else:
             return False
@@ -116,7 +116,7 @@ def _unfilter(filtered: NDArray[np.uint8], pixels: NDArray[np.uint8], step: int)
 
 
 @njit(nogil=True, inline="always")
-def _paeth(left: int, above: int, corner: int) -> int:
+def paeth(left: int, above: int, corner: int) -> int:
     """Return whichever neighbour is nearest to left + above − corner (Paeth 1991), left first, corner last.
 
     Comparing 3·corner − left − above with the smaller and the larger neighbour gives the same answer as

@@ -22,14 +22,15 @@ def check_pixels(data: bytes) -> None:
     Raises:
         DataError: It is larger than ``MOST_MEGAPIXELS``, or no PNG, JPEG, BMP, TIFF, WebP or PBM, PGM or PPM.
     """
-    width_px, height_px = _size(data)
+    width_px, height_px = size_of(data)
     if width_px * height_px > MOST_MEGAPIXELS * 10**6:
         raise DataError(
             f"an image of {width_px}×{height_px} px; more than {MOST_MEGAPIXELS} megapixels are not decoded"
         )
 
 
-def _size(data: bytes) -> tuple[int, int]:
+def size_of(data: bytes) -> tuple[int, int]:
+    """Return the width and height that an image's header states."""
     try:
         if data.startswith(png.SIGNATURE):
             return png.size_of(data)

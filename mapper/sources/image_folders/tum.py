@@ -31,8 +31,8 @@ from mapper.sources.text import (
 DEPTH_UNITS_PER_M = 5000.0
 MILLIMETRES_PER_M = 1000.0
 
-_MILLIMETRES_NOTE = "depth taken to be in millimetres; if not, source.camera.depth_factor (TUM's is 5000)"
-_UNITS_NOTE = "depth taken as TUM's 5000 units a metre; source.camera.depth_factor=1000 reads millimetres"
+MILLIMETRES_NOTE = "depth taken to be in millimetres; if not, source.camera.depth_factor (TUM's is 5000)"
+UNITS_NOTE = "depth taken as TUM's 5000 units a metre; source.camera.depth_factor=1000 reads millimetres"
 _LIST = "rgb.txt"
 _ASSOCIATIONS = ("associations.txt", "associated.txt", "association.txt", "associate.txt", "assoc.txt")
 
@@ -95,7 +95,7 @@ def log_of_images(
     )
     are_units_assumed = known is None and calibration.depth_units_per_m is None
     if are_units_assumed:
-        pair_notes.append(_MILLIMETRES_NOTE if units_per_m == MILLIMETRES_PER_M else _UNITS_NOTE)
+        pair_notes.append(MILLIMETRES_NOTE if units_per_m == MILLIMETRES_PER_M else UNITS_NOTE)
     truth, truth_notes = read_truth(path / "groundtruth.txt")
     return rgbd_log(
         pairs,

@@ -55,7 +55,7 @@ def open_mcap(path: Path) -> BlockRecording:
         magic=_MAGIC,
         called="MCAP files",
         read_contents=lambda file: _summarised(file) or _walked(file, path),
-        unpack=_unpack,
+        unpack=unpack,
     )
 
 
@@ -186,7 +186,7 @@ def _walked(file: BinaryIO, path: Path) -> _Contents:
     return contents
 
 
-def _unpack(stored: bytes) -> memoryview:
+def unpack(stored: bytes) -> memoryview:
     """Return the records of a chunk; any other record is its own content."""
     if len(stored) < _RECORD.size:
         raise DataError("a chunk beyond the end of the file")

@@ -17,9 +17,9 @@ from mapper.sources.ros.decode import decode
 from mapper.sources.ros.entries import Located
 from mapper.sources.ros.frame_tree import FrameTree
 from mapper.sources.ros.index import Series, first_messages, index_of
+from mapper.sources.ros.message_order import ordered
 from mapper.sources.ros.messages import TRANSFORMS, ImuMessage, Message, PoseMessage
 from mapper.sources.ros.recording import Recording
-from mapper.sources.ros.time_line import ordered
 from mapper.sources.ros.topics import frame_of
 from mapper.sources.wheel_files import mounting
 

@@ -54,7 +54,7 @@ def open_bag(path: Path) -> BlockRecording:
         magic=_MAGIC,
         called="ROS 1 bags of format 2.0",
         read_contents=lambda file: _indexed(file) or _walked(file, path),
-        unpack=_unpack,
+        unpack=unpack,
     )
 
 
@@ -127,7 +127,7 @@ def _walked(file: BinaryIO, path: Path) -> _Contents:
     return contents
 
 
-def _unpack(stored: bytes) -> memoryview:
+def unpack(stored: bytes) -> memoryview:
     """Return the records of a chunk: a view where they are not compressed."""
     fields, start, end = _record_in(memoryview(stored), 0)
     data = memoryview(stored)[start:end]

@@ -17,9 +17,9 @@ from mapper.sources.image_folders.pairing import depth_offset_ns
 from mapper.sources.ros.entries import CloudEntry, rgbd_entry
 from mapper.sources.ros.image_messages import MILLIMETRES_PER_M, has_float_depth, size_of
 from mapper.sources.ros.index import Series, why_unread
+from mapper.sources.ros.message_order import ordered, paired
 from mapper.sources.ros.messages import IMAGES, CameraMessage, FileMessage, ImageMessage
 from mapper.sources.ros.reader import RecordingReader
-from mapper.sources.ros.time_line import ordered, paired
 from mapper.sources.ros.topics import CameraTopics, choose, frame_of, is_called_registered
 
 _SAME_LENS_RATIO = 0.01

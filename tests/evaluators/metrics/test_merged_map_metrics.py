@@ -59,7 +59,7 @@ def test_the_map_is_held_against_a_reference_in_its_own_world(runs, tmp_path):
     leaves = merged.octree.leaves()
     centres = leaves.centres_world[leaves.log_odds >= merged.octree.occupied_log_odds]
     (_, precision, *_) = merged_map_quality(merged, Reference("cloud", points=centres), voxels=0)
-    assert precision.name.startswith("occupied precision")
+    assert precision.quantity == "occupied precision"
     assert precision.value == 1.0
     with pytest.raises(DataError, match="no truth of its own"):
         merged_map_quality(merged, Reference("synthetic world", in_truth=True), voxels=1)

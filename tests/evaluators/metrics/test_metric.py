@@ -3,7 +3,7 @@ import json
 import pytest
 
 from mapper.core.errors import DataError
-from mapper.evaluators.metrics.metric import Metric, json_text, markdown_table, text_table
+from mapper.evaluators.metrics.metric import Metric, json_text, markdown_table, records_of, text_table
 
 METRICS = [
     Metric("matched poses", 786, "pairs"),
@@ -44,4 +44,11 @@ def test_a_report_sees_markdown():
 
 
 def test_a_program_reads_back_every_digit_and_radians():
-    assert [Metric(**entry) for entry in json.loads(json_text(METRICS))] == METRICS
+    read = [(entry["name"], entry["value"], entry["unit"]) for entry in json.loads(json_text(METRICS))]
+    assert read == [(metric.name, metric.value, metric.unit) for metric in METRICS]
+
+
+def test_a_name_has_the_condition():
+    metric = Metric("ATE RMSE", 0.01, "m", "SE(3)-aligned")
+    assert metric.name == "ATE RMSE, SE(3)-aligned"
+    assert records_of([metric]) == [{"name": metric.name, "value": 0.01, "unit": "m"}]

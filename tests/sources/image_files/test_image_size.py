@@ -11,7 +11,7 @@ import pytest
 
 from mapper.core.errors import DataError, FrameError
 from mapper.sources.image_files.reading import decode_colour, decode_depth_units, decode_grey
-from mapper.sources.image_files.size import MOST_MEGAPIXELS, _size
+from mapper.sources.image_files.size import MOST_MEGAPIXELS, size_of
 
 DECODERS = {
     "colour": lambda data: decode_colour(data, "x"),
@@ -40,13 +40,13 @@ def with_size(data: bytes, old: tuple[int, int], new: tuple[int, int], layout: s
 @pytest.mark.parametrize("ending", [".png", ".jpg", ".bmp", ".tiff", ".ppm"])
 def test_sizes_are_those_that_opencv_decodes(ending):
     data = cv2.imencode(ending, np.zeros((7, 13, 3), np.uint8))[1].tobytes()
-    assert _size(data) == (13, 7)
+    assert size_of(data) == (13, 7)
     assert decode_colour(data, "x").shape == (7, 13, 3)
 
 
 def test_a_comment_in_a_pgm_is_no_size():
     data = b"P5\n# 9 9\n3 # 8\n2\n255\n" + bytes(6)
-    assert _size(data) == (3, 2)
+    assert size_of(data) == (3, 2)
     assert decode_grey(data, "x").shape == (2, 3)
 
 
@@ -84,7 +84,7 @@ def test_an_image_without_measure_is_not_decoded(decode, data):
 def test_headers_that_end_are_named(data):
     for end in range(3, len(data)):
         with suppress(DataError):  # and nothing else
-            _size(data[:end])
+            size_of(data[:end])
 
 
 def test_pixels_beyond_those_announced_are_not_unpacked():

@@ -60,7 +60,7 @@ def test_png_returns_any_pixels_that_went_in(pixels):
 def test_the_branchless_predictor_is_paeths(left, above, corner):
     guess = left + above - corner
     nearest = min((abs(guess - value), order) for order, value in enumerate((left, above, corner)))
-    assert png._paeth.py_func(left, above, corner) == (left, above, corner)[nearest[1]]
+    assert png.paeth.py_func(left, above, corner) == (left, above, corner)[nearest[1]]
 
 
 @pytest.mark.parametrize("cut", [1, 8, 20, 40, 200, 0.5, -13])

@@ -13,7 +13,7 @@ from PIL import Image
 from mapper.core.errors import DataError, FrameError
 from mapper.sources import open_source
 from mapper.sources.image_files import jpeg
-from mapper.sources.image_files.jpeg_entropy import _STANDARD_TABLES, check_entropy
+from mapper.sources.image_files.jpeg_entropy import STANDARD_TABLES, check_entropy
 from tests.support.jpeg_writing import (
     SIXTEEN_ZEROS,
     coder,
@@ -119,7 +119,7 @@ def test_what_follows_the_end_marker_is_not_read(trailing):
 
 
 def test_the_tables_that_may_be_left_out_are_opencvs():
-    ours = {number: bytes([number]) + b"".join(table) for number, table in _STANDARD_TABLES.items()}
+    ours = {number: bytes([number]) + b"".join(table) for number, table in STANDARD_TABLES.items()}
     assert ours == standard_tables()
 
 

@@ -47,15 +47,15 @@ def mcap_chunk(content: bytes) -> bytes:
 @pytest.mark.parametrize("compression", PACK)
 def test_a_bag_s_chunk_is_unpacked_no_further_than_it_announces(compression):
     content = bytes(range(256)) * 40
-    assert bytes(ros1_bag._unpack(bag_chunk(content, compression))) == content
+    assert bytes(ros1_bag.unpack(bag_chunk(content, compression))) == content
     for size in (0, 100, len(content) - 1, len(content) + 1):
         with pytest.raises(DataError, match=rf"a chunk of \d+ bytes or more, want {size}"):
-            ros1_bag._unpack(bag_chunk(content, compression, size=size))
+            ros1_bag.unpack(bag_chunk(content, compression, size=size))
     bomb = bag_chunk(bytes(64 << 20), compression, size=1000)
     tracemalloc.start()
     try:
         with pytest.raises(DataError, match="a chunk of 1001 bytes or more, want 1000"):
-            ros1_bag._unpack(bomb)
+            ros1_bag.unpack(bomb)
         assert tracemalloc.get_traced_memory()[1] < len(bomb) + (1 << 20)
     finally:
         tracemalloc.stop()
@@ -66,9 +66,9 @@ def test_no_chunk_is_unpacked_that_announces_too_much(monkeypatch):
     content = bytes((1 << 20) + 1)
     too_much = "a chunk of 1048577 bytes; more than 1048576 are taken for damage"
     for unpack, chunk in (
-        (mcap_file._unpack, mcap_chunk(content)),
-        (ros1_bag._unpack, bag_chunk(content, "lz4")),
-        (ros1_bag._unpack, bag_chunk(content, "bz2")),
+        (mcap_file.unpack, mcap_chunk(content)),
+        (ros1_bag.unpack, bag_chunk(content, "lz4")),
+        (ros1_bag.unpack, bag_chunk(content, "bz2")),
     ):
         with pytest.raises(DataError, match=too_much):
             unpack(chunk)

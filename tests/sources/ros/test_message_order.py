@@ -4,8 +4,8 @@ import pytest
 from mapper.core.errors import SourceError
 from mapper.core.timebase import NS_PER_S
 from mapper.sources.ros.index import Series
+from mapper.sources.ros.message_order import ordered, paired
 from mapper.sources.ros.recording import Topic
-from mapper.sources.ros.time_line import ordered, paired
 
 MS = 1_000_000
 
