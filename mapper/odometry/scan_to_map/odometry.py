@@ -232,6 +232,8 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
         doubts = (*self._search.doubts(found), *of_sweep)
         fits = not doubts
         covariance = noise.covariance if fits else noise.inflated(found.jump)
+        if fits and self._search.usual.is_weak(found.shares):
+            covariance = covariance + found.fit.weak_covariance(deskewed.prepared.voxel_m)
         if fits and keyframe is self._state.doubtful:
             self._state.matcher.clear()
             self._state.matcher.add(keyframe.deskewed, keyframe.T_world_middle, is_keyframe=True)
