@@ -3,6 +3,7 @@
 from dataclasses import replace
 from functools import cache
 from itertools import pairwise
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,6 +14,8 @@ from mapper.odometry.factory import build_frame_odometry
 from mapper.odometry.node_offset import NodeOffset
 from mapper.odometry.scan_to_map.config import GicpOdometryConfig
 from mapper.odometry.scan_to_map.motion_model import velocities_at
+from mapper.odometry.scan_to_map.odometry import ScanOdometry
+from mapper.odometry.scan_to_map.scan_placement import ScanPlacement
 from mapper.odometry.scan_to_map.tracked_scan import PlacedScan
 from mapper.simulation.config import LIDAR_SCENES, LidarSynthConfig
 from mapper.simulation.lidar import LidarSimulator
@@ -128,6 +131,47 @@ def test_a_log_may_begin_with_a_fast_turn():
     T_first_last, T_true = inverse(tracks[1].T_world_body) @ tracks[-1].T_world_body, log.truth.T_world_body
     miss = inverse(inverse(T_true[1]) @ T_true[7]) @ T_first_last
     assert np.linalg.norm(miss[:3, 3]) < 0.3  # 6 m otherwise
+
+
+def begun(odometry, monkeypatch, scores):
+    """Return the velocities by which a map's two scans are deskewed that fit with scores where they stand."""
+    velocities = []
+
+    def placed(*arguments):
+        twist = arguments[-1]
+        velocities.append(twist)
+        score = scores(float(twist.rotation_radps[2]))
+        found = SimpleNamespace(score=score, T_world_middle=np.eye(4))
+        return None if score is None else SimpleNamespace(found=found)
+
+    monkeypatch.setattr(ScanOdometry, "_begun", placed)
+    monkeypatch.setattr(ScanPlacement, "place", lambda *_: None)
+    monkeypatch.setattr(ScanOdometry, "_placed", lambda *arguments: arguments[-1])
+    first, second, third = (source().entry_at(index).load() for index in range(3))
+    odometry.track(odometry.observe(first))
+    odometry.track(odometry.observe(second))
+    number = len(velocities)
+    odometry.track(odometry.observe(third))
+    assert len(velocities) == number  # turns are tried once
+    return velocities
+
+
+def test_turns_are_tried_for_the_first_two_scans_only(monkeypatch):
+    odometry = build_frame_odometry(GicpOdometryConfig().scaled(SCALE))
+
+    velocities = begun(odometry, monkeypatch, lambda _: None)
+
+    assert len(velocities) == 7
+    assert np.linalg.norm(velocities[-1].vector) == 0.0
+
+
+def test_a_turn_that_the_poses_do_not_show_is_not_taken(monkeypatch):
+    odometry = build_frame_odometry(GicpOdometryConfig().scaled(SCALE))
+    monkeypatch.setattr(ScanOdometry, "_not_found", lambda *_: None)
+
+    velocities = begun(odometry, monkeypatch, lambda turning_radps: 0.1 * abs(turning_radps) or None)
+
+    assert np.linalg.norm(velocities[-1].vector) == 0.0  # both scans bent alike fit each other
 
 
 def test_a_sweep_whose_velocity_three_poses_contradict_is_less_certain(monkeypatch):

@@ -292,6 +292,47 @@ def test_a_direction_that_disagrees_is_a_doubt_where_the_motion_was_predicted(is
     assert doubts == (() if is_shown else ("30% agree in the weakest direction, 90% is usual",))
 
 
+@pytest.mark.parametrize(
+    ("usual_contradicting", "shares", "contradicts"),
+    [
+        (0.001, Shares(0.5, 0.15, 0.0105), True),
+        (0.001, Shares(0.5, 0.2, 0.0105), False),  # more agrees
+        (0.001, Shares(0.5, 0.05, 0.0039), False),  # about as usual
+        (0.02, Shares(0.5, 0.3, 0.03), False),  # rain
+    ],
+)
+def test_few_contradictions_are_too_many_where_little_agrees(usual_contradicting, shares, contradicts):
+    usual = UsualFit()
+    for _ in range(5):
+        usual.add(Shares(0.5, 0.2, usual_contradicting))
+
+    assert usual.contradicts(shares) == contradicts
+
+
+def test_a_pose_that_agrees_little_is_weak():
+    usual = UsualFit()
+    assert usual.is_weak(Shares(0.9, 0.7, 0.0))
+    assert not usual.is_weak(Shares(0.9, 0.8, 0.0))
+    for _ in range(5):
+        usual.add(Shares(0.9, 0.6, 0.01))
+    assert usual.is_weak(Shares(0.9, 0.4, 0.01))
+    assert not usual.is_weak(Shares(0.9, 0.5, 0.01))
+    assert usual.is_weak(Shares(0.9, 0.5, 0.02))
+
+
+def test_a_weak_pose_is_less_certain_in_the_direction_where_the_least_agrees(monkeypatch):
+    sigmas_m = {}
+    for is_weak in (False, True):
+        monkeypatch.setattr(UsualFit, "is_weak", lambda *_, is_weak=is_weak: is_weak)
+        odometry = ScanOdometry(INDOOR, GicpMatcher(INDOOR))
+        odometry.track(odometry.observe(room_scan(0, seed=1)))
+        track = odometry.track(odometry.observe(room_scan(500_000_000, seed=2)))
+        sigmas_m[is_weak] = np.sqrt(np.linalg.eigvalsh(track.covariance[3:, 3:]))
+
+    assert sigmas_m[True].max() == pytest.approx(0.5 * 0.2, rel=0.05)  # half a voxel
+    assert sigmas_m[True][1] < 2.0 * sigmas_m[False].max()
+
+
 def test_less_than_a_part_of_the_usual_agreement_is_unusual_however_much_scans_differ():
     usual = UsualFit()
     for overlap, agreement in [(0.3, 0.1), (0.9, 0.9), (0.6, 0.5), (0.4, 0.2), (0.8, 0.8)]:

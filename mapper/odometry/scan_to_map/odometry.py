@@ -27,6 +27,7 @@ from mapper.odometry.scan_to_map.tracked_scan import PlacedScan, ScanState, Trac
 _KEYFRAMES = 5  # so many last ones are compared with
 _CLEAR = 0.5  # score of a log's second scan; in rooms 0.6 to 0.8 is usual, in fields less
 _FIRST_TURNS_RADPS = (1.0, -1.0, 2.0, -2.0, 4.0, -4.0)  # about the vertical, at the beginning of a map
+_SHOWN = 0.2  # share of such a turn that the poses show at least, should it end soon after the first sweep
 
 
 class ScanOdometry(FrameOdometry[ScanObservation]):
@@ -57,6 +58,7 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
             deque(maxlen=_KEYFRAMES),
         )
         self._first: ScanObservation | None = None
+        self._has_tried_turns = False
         self._before: TrackedScan | None = None
         self._waiting: tuple[BetweenFactor, ...] = ()
         self._again: dict[int, FrameResult] = {}  # of scans that were tracked again, by their stamps
@@ -116,24 +118,32 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
     ) -> PlacedScan | None:
         """Track a map's first two scans again, with the motion during their sweeps that the second one shows.
 
-        Where it does not fit clearly, other motions are tried: the log may begin with a fast turn.
+        Where it does not fit clearly, other motions are tried once: the log may begin with a fast turn. Scans
+        that are bent alike fit each other, so a motion counts only where the poses show part of it.
         """
+        twist = STILL
         if placed is not None:
             twist = self._state.motion.mean_twist(second.middle_ns, placed.found.T_world_middle)
             placed = self._begun(first, second, twist)
             if placed is not None and placed.found.score >= _CLEAR:
                 return placed
-        best, best_twist = placed, self._state.motion.twist
+        if self._has_tried_turns:
+            return placed
+        self._has_tried_turns = True
+        best = -np.inf if placed is None else placed.found.score
         for turning_radps in _FIRST_TURNS_RADPS:
-            twist = Twist(np.array([0.0, 0.0, turning_radps]), np.zeros(3))
+            tried = Twist(np.array([0.0, 0.0, turning_radps]), np.zeros(3))
             for _ in range(2):  # the second time with the mean velocity to the pose that was found
-                found = self._begun(first, second, twist)
+                found = self._begun(first, second, tried)
                 if found is None:
                     break
-                if best is None or found.found.score > best.found.score:
-                    best, best_twist = found, twist
-                twist = self._state.motion.mean_twist(second.middle_ns, found.found.T_world_middle)
-        return self._begun(first, second, best_twist)
+                mean = self._state.motion.mean_twist(second.middle_ns, found.found.T_world_middle)
+                shown = mean.rotation_radps @ tried.rotation_radps
+                is_shown = shown >= _SHOWN * tried.rotation_radps @ tried.rotation_radps
+                if is_shown and found.found.score > best:
+                    twist, best = tried, found.found.score
+                tried = mean
+        return self._begun(first, second, twist)
 
     def _begun(self, first: ScanObservation, second: ScanObservation, twist: Twist) -> PlacedScan | None:
         """Begin a map with its first scan, deskewed by a velocity, and place the second one in it."""
@@ -222,6 +232,8 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
         doubts = (*self._search.doubts(found), *of_sweep)
         fits = not doubts
         covariance = noise.covariance if fits else noise.inflated(found.jump)
+        if fits and self._search.usual.is_weak(found.shares):
+            covariance = covariance + found.fit.weak_covariance(deskewed.prepared.voxel_m)
         if fits and keyframe is self._state.doubtful:
             self._state.matcher.clear()
             self._state.matcher.add(keyframe.deskewed, keyframe.T_world_middle, is_keyframe=True)
@@ -291,6 +303,7 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
         self._search.usual.clear()
         self._state.noise.restart()
         self._lost_scans, self._first, self._before = 0, observation, None
+        self._has_tried_turns = False
         waiting, self._waiting = self._waiting, ()
         deskewed = observation.deskew(STILL)
         self._state.motion = MotionModel(observation.middle_ns, T_world_body)

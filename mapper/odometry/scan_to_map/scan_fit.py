@@ -46,6 +46,7 @@ They measure it to σ/√pairs, with the 0.1 m that a point agrees within to 0.0
 _PAIR_VOXELS = 0.6
 """Error of such a pair: a point agrees within 0.33 voxels, a standard deviation of 0.19, and the normals of
 ten neighbours err alike. 0.45 and 0.8 serve as well."""
+_WEAK_VOXELS = 0.5  # error of a pose in the direction in which less agrees than usual
 _LEAST_WEIGHT = 1e-6  # keeps the error of a motion that no pair shows finite
 
 
@@ -100,6 +101,7 @@ class ScanFit:
         rmse_m: Root mean square distance of these pairs.
         agreement: Share that lies on the surfaces, of those that face the direction where the least does; its
             partners may lie farther along them than those of pairs.
+        weakest: (3,) that direction, scan's frame.
         contradicting: Share of the points in space that the keyframe's rays passed.
         rows: (M, 6) Jacobian of the pairs' distances from the keyframe's surfaces by the scan's tangent.
         residuals_m: (M,) these distances.
@@ -114,6 +116,7 @@ class ScanFit:
     overlap: float
     rmse_m: float
     agreement: float
+    weakest: Array
     contradicting: float
     rows: Array
     residuals_m: Array
@@ -127,6 +130,12 @@ class ScanFit:
     def surface_covariance(self) -> Array:
         """(6, 6) of the scan's tangent, from its distances to the surfaces."""
         return surface_covariance(self.rows, self.residuals_m, self.points)
+
+    def weak_covariance(self, voxel_m: float) -> Array:
+        """Return the (6, 6) covariance of an error in the direction where the least agrees."""
+        covariance = np.zeros((6, 6))
+        covariance[3:, 3:] = (_WEAK_VOXELS * voxel_m) ** 2 * np.outer(self.weakest, self.weakest)
+        return covariance
 
 
 def directions_of(deskewed: DeskewedScan) -> int:
@@ -214,7 +223,7 @@ def fit_of(
                 shown, telling, degeneracy = of_broad, is_broad, alone
     agree = (distances_m <= _ALONG * max_pair_distance_m) & normals_key.any(axis=1)
     agree &= np.abs(off_m) <= _SURFACE_VOXELS * source.voxel_m
-    agreement, _ = weakest_direction(source.normals, agree)
+    agreement, weakest = weakest_direction(source.normals, agree)
     counts = FreeSpaceCheck(_MARGIN_M).count(keyframe.description, _checked(deskewed), T_key_scan)
     observability, weights = _observability(degeneracy, points, rows, own_rows, agree[near] & telling)
     shown_m = _PAIR_VOXELS * source.voxel_m / np.sqrt(weights)
@@ -228,6 +237,7 @@ def fit_of(
         overlap=len(near) / len(source.points),
         rmse_m=float(np.sqrt(np.mean(distances_m[near] ** 2))),
         agreement=agreement,
+        weakest=weakest,
         contradicting=counts.contradicting_ratio,
         rows=rows,
         residuals_m=residuals_m,
