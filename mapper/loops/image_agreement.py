@@ -1,12 +1,14 @@
 """Agreement of two whole RGB-D images under a motion: surfaces at the same depth that look alike."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from mapper.core.frames import Image, RgbdFrame, ray_table
-from mapper.core.geometry import Array, Transform, apply
+from mapper.core.geometry import Transform, apply
 from mapper.sensing.config import KINECT_NOISE
 from mapper.sensing.depth_noise import depth_sigma_m
 
@@ -18,6 +20,9 @@ _SIGMAS, _SHARE, _LEAST_M = 3.0, 0.06, 0.03
 the motion by a degree gives at grazing incidence, and this distance."""
 _BLUR = 0.5
 """Standard deviation of the blur, in pixels of the image with the coarser view."""
+_LOCAL, _NOISE_LEVELS = 0.05, 2.0
+"""Standard deviation of the window about each pixel over which grey levels are normalised, in heights of the
+coarser view, and grey levels of noise, which do not count as contrast."""
 _MIN_POINTS = 300
 """With fewer pixels nothing is compared: an object may look like another."""
 
@@ -31,12 +36,15 @@ class ImageAgreement:
         same_ratio: Their share of all pixels that fall into the other image.
         through_ratio: Share of the pixels in space that the other image sees through.
         correlation: Correlation of the grey levels on the same surfaces, −1 … 1.
+        local_correlation: The same of grey levels without their local mean, in local standard deviations:
+            light and one poster of high contrast do not outweigh the rest.
     """
 
     points: int
     same_ratio: float
     through_ratio: float
     correlation: float
+    local_correlation: float
 
 
 def image_agreement(i: RgbdFrame, j: RgbdFrame, T_j_i: Transform) -> ImageAgreement:
@@ -63,19 +71,23 @@ def image_agreement(i: RgbdFrame, j: RgbdFrame, T_j_i: Transform) -> ImageAgreem
     known = z_j > 0.0
     chosen, columns, rows, z_j = in_front[seen][known], columns[known], rows[known], z_j[known]
     if len(chosen) < _MIN_POINTS:
-        return ImageAgreement(0, 0.0, 0.0, 0.0)
+        return ImageAgreement(0, 0.0, 0.0, 0.0, 0.0)
     predicted, z_i = points_j[chosen, 2], z_i[chosen]
     deepest = np.maximum(predicted, z_i)
     limit = _LEAST_M + _SHARE * predicted + _SIGMAS * depth_sigma_m(KINECT_NOISE, deepest)
     same = np.abs(z_j - predicted) < limit
     zoom = float(np.median(predicted / z_i))  # pixels of i in one of j
-    grey_i = _blurred(i.gray, zoom)[::step, ::step][measured][chosen[same]]
-    grey_j = _blurred(j.gray, 1.0 / zoom)[rows[same], columns[same]]
+    greys = _blurred(i.gray, zoom), _blurred(j.gray, 1.0 / zoom)
+    details = (_normalised(grey, z) for grey, z in zip(greys, (zoom, 1.0 / zoom), strict=True))
+    correlations = [
+        _correlation(of_i[::step, ::step][measured][chosen[same]], of_j[rows[same], columns[same]])
+        for of_i, of_j in (greys, details)
+    ]
     return ImageAgreement(
         int(same.sum()),
         float(same.mean()),
         float((z_j - predicted >= limit).mean()),
-        _correlation(grey_i.astype(np.float64), grey_j.astype(np.float64)),
+        *correlations,
     )
 
 
@@ -84,7 +96,17 @@ def _blurred(grey: Image, zoom: float) -> Image:
     return grey if zoom <= 1.0 else np.asarray(cv2.GaussianBlur(grey, (0, 0), _BLUR * zoom), np.uint8)
 
 
-def _correlation(a: Array, b: Array) -> float:
+def _normalised(grey: Image, zoom: float) -> NDArray[np.float32]:
+    """Return grey levels less their local mean, in local standard deviations."""
+    levels = grey.astype(np.float32)
+    sigma_px = _LOCAL * grey.shape[0] * max(zoom, 1.0)
+    detail = levels - cv2.GaussianBlur(levels, (0, 0), sigma_px)
+    spread = np.sqrt(cv2.GaussianBlur(detail * detail, (0, 0), sigma_px)) + _NOISE_LEVELS
+    return np.asarray(detail / spread, np.float32)
+
+
+def _correlation(a: NDArray[Any], b: NDArray[Any]) -> float:
+    a, b = a.astype(np.float64), b.astype(np.float64)
     if len(a) < _MIN_POINTS or np.ptp(a) == 0.0 or np.ptp(b) == 0.0:
         return 0.0
     return float(np.corrcoef(a, b)[0, 1])

@@ -117,6 +117,19 @@ SEE_MORE = (
 STEADY_NS = NS_PER_S
 """After a longer gap the frame before does not predict the pose of this one."""
 
+_FAST_M_S, _FAST_RATIO = 2.0, 3.0
+"""Least speed, and least ratio to a log's usual one, that a sensor does not keep up between two places: a
+brisk walk is 2 m/s."""
+
+
+def fastest_m_s(usual_m_s: float) -> float:
+    """Return the speed beyond which a sensor cannot have come from one place to another.
+
+    Args:
+        usual_m_s: Median speed of the log; 0 if it is not known.
+    """
+    return max(_FAST_M_S, _FAST_RATIO * usual_m_s)
+
 
 class MotionCheck(Protocol):
     """Other measurement of the body's motion, which holds whatever the images show.

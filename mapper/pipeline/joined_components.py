@@ -16,8 +16,9 @@ from mapper.features.frame_view import ImageView
 from mapper.graph.components import components
 from mapper.graph.model import PoseGraph
 from mapper.loops.base import Verification
-from mapper.loops.closure import Discrepancy, LoopClosure, discrepancy, exceeds
+from mapper.loops.closure import Discrepancy, LoopClosure, accepted_loops, discrepancy, exceeds
 from mapper.loops.config import GateConfig, PlaceLoopsConfig
+from mapper.loops.reach_gate import checked_reach
 from mapper.loops.wide_baseline import verify_wide
 from mapper.odometry.base import FrameResult
 from mapper.odometry.config import IsvdOdometryConfig
@@ -82,12 +83,13 @@ def joined(
     if len(parts) < 2 or source.sensor != "rgbd" or not isinstance(config.loops, PlaceLoopsConfig):
         return tracking
     loops = _Search(source, tracking, config, config.loops.gate, progress).loops(parts)
-    for loop in loops:
+    accepted = accepted_loops(loops)
+    for loop in accepted:
         progress.note(
             f"nodes {loop.i} and {loop.j}, of two parts of the path, show one place: {loop.inliers} features "
             "and the depth images agree"
         )
-    graph = tracking.graph.with_factors([*tracking.graph.factors, *(loop.factor for loop in loops)])
+    graph = tracking.graph.with_factors([*tracking.graph.factors, *(loop.factor for loop in accepted)])
     return replace(tracking, graph=graph, loops=(*tracking.loops, *loops))
 
 
@@ -112,11 +114,11 @@ class _Search:
         self._frame_of = lru_cache(16)(lambda stamp_ns: _rgbd(source.entry_at(index_of[stamp_ns]).load()))
 
     def loops(self, parts: Sequence[Sequence[int]]) -> list[LoopClosure]:
-        """Return the loops between parts, given as nodes, at most one for any two."""
+        """Return the loops between parts, given as nodes, at most one for any two, with their verdicts."""
         keyframes = self._keyframes(parts)
         self._observe(frame for part in keyframes for frame in part)
         loops = []
-        for first, second in combinations(keyframes, 2):
+        for (first, nodes_i), (second, nodes_j) in combinations(zip(keyframes, parts, strict=True), 2):
             hits = self._links(product(first, second))
             around = {
                 (i.stamp_ns, j.stamp_ns): (i, j)
@@ -125,7 +127,8 @@ class _Search:
             }
             links = self._links(around.values())
             if (loop := _agreed(links, self._graph, self._gate)) is not None:
-                loops.append(loop)
+                ends = (nodes_i, nodes_j) if loop.i in nodes_i else (nodes_j, nodes_i)
+                loops.append(checked_reach(loop, ends, self._graph.T_world_node, self._graph.stamps_ns))
         return loops
 
     def _keyframes(self, parts: Sequence[Sequence[int]]) -> list[list[FrameResult]]:

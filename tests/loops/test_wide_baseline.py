@@ -74,5 +74,22 @@ def test_another_painting_has_the_same_depths_and_other_grey_levels(images):
     assert other.correlation < 0.3
 
 
+def shaded(seed):
+    """Return a painting in pale colours, in the light of a lamp at its side."""
+    light = np.linspace(40.0, 215.0, 1200)
+    return light[np.newaxis] + 0.15 * (painting(seed) - 128.0)
+
+
+def test_light_alone_makes_no_place(views):
+    """Two walls in the light of one lamp: only the details of the images tell them apart."""
+    near, same, other = (wall_image(shaded(seed), T, 0) for seed, T in ((1, NEAR), (1, FAR), (2, FAR)))
+    alike = image_agreement(near, other, T_FAR_NEAR)
+    assert alike.correlation > 0.6
+    assert alike.local_correlation < 0.3
+    assert image_agreement(near, same, T_FAR_NEAR).local_correlation > 0.6
+    assert verify_wide(views[0], views[1], [near, same].__getitem__).reason == ""
+    assert verify_wide(views[0], views[1], [near, other].__getitem__).reason.startswith("images")
+
+
 def test_views_that_share_nothing_do_not_agree(images):
     assert image_agreement(images[0], images[1], facing(0.0, 0.0, -9.0)).points == 0

@@ -26,12 +26,12 @@ FAR = [facing(-0.3, 0.3 - 0.05 * k, -5.5, yaw=0.1) for k in range(4)]
 CONFIG = load_config(None, [], sensor="rgbd").model_copy(update={"workers": 1})
 
 
-def broken(*paintings: int):
+def broken(*paintings: int, pause_ns: int = 5_000_000_000):
     """A log of a near and of a far walk along walls, and its path in two parts whose relation is unknown."""
     elsewhere = facing(3.0, 1.0, 0.0, yaw=2.0)
     graph, tracks, entries = PoseGraph(), [], []
     for node, pose in enumerate([*NEAR, *FAR]):
-        stamp_ns = INTERVAL_NS * node + (5_000_000_000 if node >= len(NEAR) else 0)
+        stamp_ns = INTERVAL_NS * node + (pause_ns if node >= len(NEAR) else 0)
         painted = painting(paintings[node // len(NEAR)])
         entries.append(MemoryEntry(stamp_ns, wall_image(painted, pose, stamp_ns)))
         tracked = pose if node < len(NEAR) else elsewhere @ pose
@@ -65,6 +65,13 @@ def test_walls_that_are_painted_otherwise_stay_apart():
     log, tracking = broken(1, 2)
     result = joined(log, tracking, CONFIG, progress=SILENT)
     assert result.loops == ()
+    assert len(components(result.graph)) == 2
+
+
+def test_a_place_that_is_too_far_away_for_the_time_between_joins_nothing():
+    log, tracking = broken(1, 1, pause_ns=1_200_000_000)
+    result = joined(log, tracking, CONFIG, progress=SILENT)
+    assert [loop.rejected_by for loop in result.loops] == ["reach"]
     assert len(components(result.graph)) == 2
 
 

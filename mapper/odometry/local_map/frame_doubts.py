@@ -47,6 +47,11 @@ class FrameDoubts:
         self._surfaces = DisplacedSurfaces()
         self._shown_since_ns = 0
 
+    @property
+    def usual_speed_m_s(self) -> float:
+        """Median speed of the undoubted frames; 0 while too little is known."""
+        return self._usual("speed_m_s")
+
     def assess(
         self,
         tracked_pose: TrackedPose,

@@ -126,6 +126,19 @@ class LocalSearch:
             moving=np.flatnonzero(moved).astype(np.int32),
         )
 
+    def missing_in_view(self, tracked_pose: TrackedPose) -> Array:
+        """Return (M, 2) pixels of the landmarks that a pose has in view but that no feature agrees with.
+
+        Those that the depth image hides are left out.
+        """
+        observation, T_camera_world = tracked_pose.observation, tracked_pose.T_camera_world
+        matched = tracked_pose.landmark_of_feature[tracked_pose.landmark_of_feature >= 0]
+        keyframes = self._covisible(matched) or [tracked_pose.reference]
+        visible, predicted = self._visible(observation, T_camera_world, keyframes, except_for=matched)
+        hidden = hidden_points(observation, T_camera_world, self._map.landmarks["position"][visible])
+        pixels: Array = predicted.pixels[~hidden]
+        return pixels
+
     def _covisible(self, landmarks: Ids) -> list[int]:
         """Return the keyframes that observe any of the landmarks, in decreasing order of how many."""
         counts = self._map.shared_counts(landmarks)

@@ -28,6 +28,7 @@ from mapper.odometry.local_map.depth_tracker import DepthTracker
 from mapper.odometry.local_map.doubt import NO_DOUBT, Doubt
 from mapper.odometry.local_map.earlier_depth import EarlierDepth
 from mapper.odometry.local_map.frame_doubts import FrameDoubts
+from mapper.odometry.local_map.gap_check import GapCheck
 from mapper.odometry.local_map.image_observation import ImageObservation, observe_image
 from mapper.odometry.local_map.keyframe_decision import KeyframeDecision
 from mapper.odometry.local_map.landmarks import MIN_SHARED_LANDMARKS, LandmarkMap
@@ -82,7 +83,6 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
             motion_check: Rules out poses after a gap; None if only the images measure the motion.
         """
         self._config = config
-        self._motion_check = motion_check
         self._detector = build_detector(config.detector)
         readout = ReadoutTime(config.readout_s, windows_sharing=config.bundle_keyframes)
         self._readout = readout
@@ -96,6 +96,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         self._velocity = VelocityFilter()
         self._depth = DepthTracker(config, self._map)
         self._earlier_depth = EarlierDepth(self._map, config.depth_noise)
+        self._gap_check = GapCheck(config, self._map, motion_check)
         self._recovery = TrackingRecovery(config, self._map, self._relocalizer, self._earlier_depth)
         self._decision = KeyframeDecision(config, self._map)
         self._doubts = FrameDoubts()
@@ -326,22 +327,15 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         return tracked_pose.stamp_ns - last.stamp_ns <= STEADY_NS and one_map
 
     def _is_possible(self, tracked_pose: TrackedPose) -> bool:
-        """Return whether a pose after a gap is possible by another measurement of the motion since, if any.
-
-        Images alone do not distinguish two rooms with the same furniture. The motion is that since the last
-        tracked frame, and that since the keyframe that was recognised, if it is of another sub-map.
-        """
-        check, last = self._motion_check, self._last
-        if check is None or last is None:
+        """Return whether a pose after a gap is possible by the motion to it and by what should be in view."""
+        last = self._last
+        if last is None:
             return True
-        keyframes = self._map.keyframes
-        known = keyframes[tracked_pose.reference]
-        since = last if known.origin == keyframes[last.reference].origin else known
-        T_begin_end = inverse(since.body_pose) @ tracked_pose.body_pose
-        if not check.contradiction(T_begin_end, since.stamp_ns, tracked_pose.stamp_ns):
-            return True
-        self._unknown_frames = self._config.max_lost_frames  # another place, so a sub-map may begin at once
-        return False
+        if self._gap_check.is_out_of_reach(tracked_pose, last, self._doubts.usual_speed_m_s):
+            # Another place, so that a sub-map may begin at once.
+            self._unknown_frames = self._config.max_lost_frames
+            return False
+        return not self._gap_check.agrees_in_part(tracked_pose, last)
 
     def _add_keyframe(
         self, tracked_pose: TrackedPose, *, neighbour: int | None, doubt: Doubt = NO_DOUBT
