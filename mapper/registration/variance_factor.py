@@ -3,8 +3,9 @@
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
-from mapper.core.geometry import Array, Points, Transform
+from mapper.core.geometry import Array, Points, Transform, apply
 from mapper.registration.reprojection import normal_matrix, scores
 
 _COLUMNS, _ROWS = 4, 3
@@ -64,9 +65,7 @@ def residual_statistics(
     if freedom <= 0.0:
         return ResidualStatistics(1.0, 1.0)
     variance = float(squares.sum()) / freedom
-    share = measured[:, :2] / (2.0 * intrinsics[2:4])
-    cell = np.clip((share * [_COLUMNS, _ROWS]).astype(np.intp), 0, [_COLUMNS - 1, _ROWS - 1])
-    cells, cell_of = np.unique(cell @ [1, _COLUMNS], return_inverse=True)
+    cells, cell_of = np.unique(_cells(measured, intrinsics), return_inverse=True)
     if len(cells) < 2:
         return ResidualStatistics(variance, 1.0)
     sums = np.zeros((len(cells), 6))
@@ -76,3 +75,35 @@ def residual_statistics(
     scores_of_cells = np.zeros((_COLUMNS * _ROWS, 6))
     scores_of_cells[cells] = sums @ np.linalg.cholesky(0.5 * (covariance + covariance.T)) / np.sqrt(alone)
     return ResidualStatistics(variance, together * len(cells) / (len(cells) - 1) / alone, scores_of_cells)
+
+
+def disparity_variance_ratio(
+    T_camera_world: Transform, points: Points, measured: Array, sigma_px: Array, intrinsics: Array
+) -> float:
+    """Return the variance of disparities relative to that of pixels, by a pose's residuals.
+
+    A component of variance (Helmert 1907) of each, from the sums of residuals within cells of the image
+    (Liang & Zeger 1986, eq. 8): errors that neighbours share, as distortion of depth is, count for more.
+
+    Args:
+        T_camera_world: (4, 4) at the least squares.
+        points: (N, 3) metres, world; inliers only.
+        measured: (N, 3) u, v, bf/z in pixels.
+        sigma_px: (N,) standard deviations of the features' pixels.
+        intrinsics: (5,) fx, fy, cx, cy, bf.
+    """
+    points_camera = apply(T_camera_world, points)
+    z = points_camera[:, 2:]
+    pixels = points_camera[:, :2] / z * intrinsics[:2] + intrinsics[2:4]
+    residuals = (measured - np.column_stack([pixels, intrinsics[4] / z])) / sigma_px[:, np.newaxis]
+    sums = np.zeros((_COLUMNS * _ROWS, 3))
+    np.add.at(sums, _cells(measured, intrinsics), residuals)
+    u, v, disparity = (sums**2).sum(axis=0)
+    return float(2.0 * disparity / max(u + v, 1e-12))
+
+
+def _cells(measured: Array, intrinsics: Array) -> NDArray[np.intp]:
+    """Return the (N,) number of the cell of the image in which each pixel lies."""
+    share = measured[:, :2] / (2.0 * intrinsics[2:4])
+    cell = np.clip((share * [_COLUMNS, _ROWS]).astype(np.intp), 0, [_COLUMNS - 1, _ROWS - 1])
+    return cell[:, 0] + _COLUMNS * cell[:, 1]

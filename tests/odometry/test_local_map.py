@@ -16,6 +16,7 @@ from mapper.graph.optimize import optimize
 from mapper.odometry.config import LocalMapConfig
 from mapper.odometry.factory import build_frame_odometry
 from mapper.odometry.local_map.keyframe_decision import KeyframeDecision
+from mapper.sensing.config import DepthNoiseConfig
 from tests.support.desk_frames import ate_rmse_m, blank
 
 
@@ -66,6 +67,41 @@ def test_depth_beyond_the_limit_is_not_used(frames):
     every, near = depth_m(), depth_m(max_depth_m=1.4)
     assert np.nanmax(every) > 1.4
     assert np.array_equal(near, np.where(every <= 1.4, every, np.nan), equal_nan=True)
+
+
+def test_disparities_weigh_what_the_residuals_of_a_log_show(frames):
+    """A measured noise of the sensor is taken as it is."""
+
+    def relative_weight(**settings):
+        odometry = build_frame_odometry(LocalMapConfig(keyframe_ratio=0.99, mapped_ratio=0.95, **settings))
+        for frame in frames:
+            odometry.track(odometry.observe(frame))
+        assert len(odometry._map.keyframes) > 10
+        weights = odometry._last.observation.weights[odometry._last.observation.has_depth]
+        return weights[:, 2] / weights[:, 0], odometry._residuals.disparity_sigma**-2
+
+    weight, expected = relative_weight()
+    assert expected > 1.5
+    assert np.allclose(weight, expected)
+    noise = DepthNoiseConfig(constant_m=0.01)
+    kept, _ = relative_weight(depth_noise=noise)
+    assert np.ptp(kept) > 0.0
+
+
+def test_disparities_have_the_usual_weight_where_much_moves(frames):
+    odometry = build_frame_odometry(LocalMapConfig())
+    for frame in frames[:10]:
+        odometry.track(odometry.observe(frame))
+    odometry._residuals.disparity_sigma = 0.5
+
+    def relative_weights(frame, moving):
+        odometry._last = replace(odometry._last, moving=np.arange(moving, dtype=np.int32))
+        odometry.track(odometry.observe(frame))
+        weights = odometry._last.observation.weights[odometry._last.observation.has_depth]
+        return np.unique(np.round(weights[:, 2] / weights[:, 0], 6))
+
+    assert relative_weights(frames[10], moving=0) == 4.0
+    assert relative_weights(frames[11], moving=len(odometry._last.observation) // 2) == 1.0
 
 
 def test_the_same_frames_give_the_same_bytes(frames):

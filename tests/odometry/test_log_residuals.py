@@ -52,3 +52,22 @@ def test_the_variance_of_features_is_the_usual_one_within_limits():
     assert variance(*[0.3] * 8, 50.0) == 0.3
     assert variance(*[0.01] * 9) == 0.15
     assert variance(*[4.0] * 9) == 1.0
+
+
+def disparity_sigma(*ratios, most=1.0):
+    residuals = LogResiduals(disparity_sigma=most)
+    for ratio in ratios:
+        residuals.add_disparity_ratio(ratio)
+    return residuals.disparity_sigma
+
+
+def test_disparities_are_as_uncertain_as_most_keyframes_show():
+    assert disparity_sigma() == 1.0
+    assert disparity_sigma(*[0.25] * 4) == 1.0
+    assert disparity_sigma(*[0.25] * 8, 9.0) == 0.5
+
+
+def test_disparities_have_limits_within_which_residuals_decide():
+    assert disparity_sigma(*[9.0] * 20) == 1.0
+    assert disparity_sigma(*[1e-4] * 20) == 1.0 / 3.0
+    assert disparity_sigma(*[0.16] * 20, most=0.2) == 0.2

@@ -106,6 +106,12 @@ class ImageObservation(Archivable):
         """
         return self.sensor_weights if moved.sum() > FEW_MOVING * len(self) else self.weights
 
+    def with_disparity_sigma(self, relative: float) -> "ImageObservation":
+        """Return the observation with virtual disparities whose error is this share of a pixel's."""
+        weights = self.weights.copy()
+        weights[:, 2] = weights[:, 0] / relative**2
+        return replace(self, weights=weights)
+
     def mask_of(self, features: NDArray[np.integer]) -> NDArray[np.bool_]:
         """Return (N,) which features are among some of them, given by their indices."""
         mask = np.zeros(len(self), np.bool_)

@@ -1,5 +1,6 @@
 """Residuals of a log's keyframes, which give the uncertainty of its poses."""
 
+import math
 from bisect import insort
 from statistics import median
 
@@ -20,6 +21,9 @@ USUAL_VARIANCE = 0.25
 """Variance of features as long as too few keyframes show it: real and synthetic logs have 0.1 to 0.35."""
 _LEAST_VARIANCE = 0.15
 """Landmarks err as well, while a keyframe's residuals are those to its own."""
+_LEAST_DISPARITY_SIGMA = 1.0 / 3.0
+"""Disparities are not taken as more certain than this share of a pixel's: logs of a simulated Kinect have
+residuals of 0.15 to 0.5, with distortion of depth 0.3 to 1.6, and fr1_xyz has 1.5."""
 
 
 class LogResiduals:
@@ -29,7 +33,16 @@ class LogResiduals:
     each other tell how much of such errors a log has.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, disparity_sigma: float = 1.0) -> None:
+        """Start before the first keyframe.
+
+        Args:
+            disparity_sigma: Standard deviation of virtual disparities relative to that of a pixel, at most.
+        """
+        self.disparity_sigma = disparity_sigma
+        """As the argument, but less where residuals of more than a few keyframes show it."""
+        self._most_disparity_sigma = disparity_sigma
+        self._disparity_ratios = [disparity_sigma**2] * _FEWEST  # as if so many keyframes had shown it
         self._factors: list[float] = []  # of the keyframes, in increasing order, as are the next
         self._effects: list[float] = []
         self._variances: list[float] = []
@@ -43,6 +56,12 @@ class LogResiduals:
         if len(self._factors) >= _FEWEST:
             self._factor = median(self._factors)
             self._scale = float(np.clip((median(self._effects) - _NONE) / (_WHOLE - _NONE), _LEAST, 1.0))
+
+    def add_disparity_ratio(self, ratio: float) -> None:
+        """Add a keyframe's variance of virtual disparities relative to that of its pixels."""
+        insort(self._disparity_ratios, ratio)
+        sigma = max(math.sqrt(median(self._disparity_ratios)), _LEAST_DISPARITY_SIGMA)
+        self.disparity_sigma = min(sigma, self._most_disparity_sigma)
 
     @property
     def variance(self) -> float:

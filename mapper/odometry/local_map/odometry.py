@@ -36,6 +36,7 @@ from mapper.odometry.local_map.log_residuals import LogResiduals
 from mapper.odometry.local_map.photometric_error import excess_error
 from mapper.odometry.local_map.pose_information import (
     covariance_of,
+    disparity_ratio,
     frame_information,
     keyframe_residuals,
     relative_information,
@@ -100,7 +101,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         self._recovery = TrackingRecovery(config, self._map, self._relocalizer, self._earlier_depth)
         self._decision = KeyframeDecision(config, self._map)
         self._doubts = FrameDoubts()
-        self._residuals = LogResiduals()
+        self._residuals = LogResiduals(disparity_sigma=config.disparity_sigma_px)
         self._calibration = CalibrationChecks(self._map)
         self._agreeing = np.zeros(0, np.bool_)  # features by which the last frame was tracked
         self._lost_frames = 0  # since the last tracked one
@@ -118,6 +119,9 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         """Track the next frame, in time order."""
         self._map.step()
         last = self._last
+        # A measured noise is taken as it is; where much moves, more weight would prefer passers-by's motion.
+        if self._config.depth_noise is None and (last is None or last.few_move):
+            observation = observation.with_disparity_sigma(self._residuals.disparity_sigma)
         follows = (
             last is not None and not self._lost_frames and observation.stamp_ns - last.stamp_ns <= STEADY_NS
         )
@@ -366,6 +370,8 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         if (statistics := keyframe_residuals(self._map, index)) is not None:
             self._residuals.add(statistics)
             self._map.residual_variance = self._residuals.variance
+        if (ratio := disparity_ratio(self._map, index)) is not None:
+            self._residuals.add_disparity_ratio(ratio)
         self._decision.restart()
         keyframe = self._map.keyframes[index]
         keyframe.doubt_rad, keyframe.doubt_m = doubt.sigma_rad, doubt.sigma_m

@@ -9,7 +9,11 @@ from mapper.odometry.local_map.landmarks import MIN_SHARED_LANDMARKS, LandmarkMa
 from mapper.odometry.local_map.pose_tracker import TrackedPose
 from mapper.odometry.local_map.triangulation import weights_with_landmarks
 from mapper.registration.reprojection import normal_matrix
-from mapper.registration.variance_factor import ResidualStatistics, residual_statistics
+from mapper.registration.variance_factor import (
+    ResidualStatistics,
+    disparity_variance_ratio,
+    residual_statistics,
+)
 
 _WEAK_PRIOR = np.diag([1.0] * 3 + [0.01] * 3)
 """1 rad and 10 m: keeps the information positive definite where few landmarks leave it singular."""
@@ -77,6 +81,27 @@ def keyframe_residuals(landmark_map: LandmarkMap, index: int) -> ResidualStatist
         observation.weights[features],
         observation.intrinsics,
         redundancy=1.0 - 1.0 / observers[features],  # a landmark is the mean of what its observers saw
+    )
+
+
+def disparity_ratio(landmark_map: LandmarkMap, index: int) -> float | None:
+    """Return the variance of a keyframe's virtual disparities relative to that of its pixels.
+
+    None where few landmarks with depth have another observer.
+    """
+    ids = landmark_map.landmark_of_feature(index)
+    observers = landmark_map.landmarks["observers"][ids]
+    observation = landmark_map.observation(index)
+    is_measured = (ids >= 0) & (observers > 1) & (landmark_map.landmarks["ray_sigma_m"][ids] == 0.0)
+    features = np.flatnonzero(is_measured & ~np.isnan(observation.measured[:, 2]))
+    if len(features) < MIN_SHARED_LANDMARKS:
+        return None
+    return disparity_variance_ratio(
+        landmark_map.keyframes[index].T_camera_world,
+        landmark_map.landmarks["position"][ids[features]],
+        observation.measured[features],
+        observation.weights[features, 0] ** -0.5,
+        observation.intrinsics,
     )
 
 
