@@ -6,17 +6,20 @@ from pathlib import Path
 
 from mapper.config.build import BuildConfig
 from mapper.core.errors import ConfigError, LoopError
+from mapper.core.geometry import inverse
 from mapper.loops.closure import LoopClosure, accepted_loops, why_none_accepted
 from mapper.loops.config import KeyframeLoopsConfig
 from mapper.loops.factory import build_keyframe_loop_detector
+from mapper.odometry.base import FrameResult
 from mapper.odometry.node_offset import NodeOffset
 from mapper.pipeline.components import component_of
 from mapper.pipeline.floor import above_level_floor, tracked_stamps
 from mapper.pipeline.fuse import carry_times, fuse_into
+from mapper.pipeline.joined_components import joined
 from mapper.pipeline.reobserve import reobserve
 from mapper.pipeline.solve import solve
 from mapper.pipeline.track import Start, depth_cautions, session_odometry, track_log
-from mapper.pipeline.tracking_result import from_tracking, refuse_a_fragment, save_places
+from mapper.pipeline.tracking_result import TrackingResult, from_tracking, refuse_a_fragment, save_places
 from mapper.run.edits_file import edits_text, parse_edits, write_edits
 from mapper.run.folder import Run, open_run
 from mapper.run.manifest import Manifest, Timing, library_versions, now_text
@@ -70,8 +73,8 @@ def append(
     source, warnings = chained(first, second), depth_cautions(second)
     for note in (*source.notes, *(warning.sentence for warning in warnings)):
         progress.note(note)
-    joined = config.model_copy(update={"source": run.config.source})
-    with write_run(out, _manifest(run, source, config.source), joined, overwrite=overwrite) as writer:
+    whole = config.model_copy(update={"source": run.config.source})
+    with write_run(out, _manifest(run, source, config.source), whole, overwrite=overwrite) as writer:
         carry_times(writer, run.manifest.timing)
         before = load_tracking(run)
         known = before.graph.T_world_node.keys()
@@ -79,6 +82,7 @@ def append(
             session = source.sessions[-1].log
             start = _after(before, first, session, config, progress)
             tracking = track_log(session, config, progress=progress, start=start, observer=observer)
+            tracking = _joined(source, before, tracking, config, progress)
         writer.warn([*warnings, *tracking.warnings])
         refuse_a_fragment(tracking, config, sensor=source.sensor)
         _refuse_unconnected(second, run, tracking.loops, known)
@@ -94,9 +98,7 @@ def append(
         save_solved(writer, before.solved(solved.graph, solved.loops).then(later, truth=source.truth))
         writer.update(solve=solved.report)
         write_edits(writer.folder, edits)
-        fuse_into(
-            writer, source, joined, progress, observer=observer, before=run.scan_updates(), edits=wanted
-        )
+        fuse_into(writer, source, whole, progress, observer=observer, before=run.scan_updates(), edits=wanted)
     return open_run(out)
 
 
@@ -141,6 +143,28 @@ def _after(
     detector.preload(graph, {node: views[stamp_ns] for node, stamp_ns in graph.stamps_ns.items()})
     odometry = NodeOffset(session_odometry(session, config), first_node=max(graph.T_world_node) + 1)
     return Start(odometry, detector, graph.without_loops(), before.loops)
+
+
+def _joined(
+    source: Log, before: StoredTracking, tracking: TrackingResult, config: BuildConfig, progress: Progress
+) -> TrackingResult:
+    """Return a session with loops to the earlier ones by images from near and far, where no others are."""
+    poses = dict(before.trajectory.items())
+    known = [
+        FrameResult(
+            stamp_ns=record.stamp_ns,
+            node=record.node,
+            T_node_body=inverse(before.graph.T_world_node[record.node]) @ T_world_body,
+            T_world_body=T_world_body,
+            is_keyframe=record.is_keyframe,
+            diagnostics=record.diagnostics,
+            doubts=record.doubts,
+        )
+        for record in before.records
+        if record.node is not None and (T_world_body := poses.get(record.stamp_ns)) is not None
+    ]
+    both = replace(tracking, tracks=(*known, *tracking.tracks))
+    return replace(joined(source, both, config, progress=progress), tracks=tracking.tracks)
 
 
 def _refuse_unconnected(second: Log, run: Run, loops: Sequence[LoopClosure], known: Set[int]) -> None:

@@ -128,8 +128,18 @@ class _Search:
             links = self._links(around.values())
             if (loop := _agreed(links, self._graph, self._gate)) is not None:
                 ends = (nodes_i, nodes_j) if loop.i in nodes_i else (nodes_j, nodes_i)
-                loops.append(checked_reach(loop, ends, self._graph.T_world_node, self._graph.stamps_ns))
+                loops.append(self._reached(loop, *ends))
         return loops
+
+    def _reached(self, loop: LoopClosure, with_i: Sequence[int], with_j: Sequence[int]) -> LoopClosure:
+        """Return a loop, rejected if the sensor cannot have moved so far between its parts.
+
+        Only nodes of the log's last session count: the time between two sessions may be made up.
+        """
+        sessions, stamps_ns = self._source.sessions, self._graph.stamps_ns
+        begin_ns = int(sessions[-1].log.stamps_ns[0]) if sessions else 0
+        ends = [[node for node in nodes if stamps_ns[node] >= begin_ns] for nodes in (with_i, with_j)]
+        return checked_reach(loop, (ends[0], ends[1]), self._graph.T_world_node, stamps_ns)
 
     def _keyframes(self, parts: Sequence[Sequence[int]]) -> list[list[FrameResult]]:
         """Return keyframes of every part, evenly spread over it."""
