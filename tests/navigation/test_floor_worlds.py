@@ -97,6 +97,16 @@ def test_floors_over_each_other_are_storeys_that_share_the_ramps_between_them():
         assert shared
 
 
+def test_home_is_the_storey_on_which_the_path_begins():
+    for world_of in (two_storeys, bridge, ramps):
+        world = world_of()
+        highest = max(range(len(world.path)), key=lambda n: world.path[n][2])
+        world.path[:] = world.path[highest:] + world.path[highest - 1 :: -1]
+        _, floor, config = floor_of(world, 0.1)
+        found = traversable(floor, config)
+        assert found.home is found.storeys[-1]
+
+
 def test_a_room_without_a_door_is_no_floor():
     _, floor, config = floor_of(rooms(), 0.1)
     (storey,) = traversable(floor, config).storeys
