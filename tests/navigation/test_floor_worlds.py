@@ -1,5 +1,7 @@
 """The traversable floor and the slice against the exact geometry of small worlds."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -97,14 +99,17 @@ def test_floors_over_each_other_are_storeys_that_share_the_ramps_between_them():
         assert shared
 
 
-def test_home_is_the_storey_on_which_the_path_begins():
-    for world_of in (two_storeys, bridge, ramps):
-        world = world_of()
-        highest = max(range(len(world.path)), key=lambda n: world.path[n][2])
-        world.path[:] = world.path[highest:] + world.path[highest - 1 :: -1]
-        _, floor, config = floor_of(world, 0.1)
-        found = traversable(floor, config)
-        assert found.home is found.storeys[-1]
+def test_home_is_the_storey_on_which_the_path_begins_wherever_the_world_lies():
+    world = two_storeys()
+    slabs, blocks = (
+        [replace(solid, x0=solid.x0 + 40.0, x1=solid.x1 + 40.0) for solid in solids]
+        for solids in (world.slabs, world.blocks)
+    )
+    down = [(x + 40.0, y, z) for x, y, z in world.path[::-1]]
+    _, floor, config = floor_of(World(slabs, blocks, down), 0.1)
+    found = traversable(floor, config)
+    assert len(found.storeys) == 2
+    assert found.home is found.storeys[1]
 
 
 def test_a_room_without_a_door_is_no_floor():
