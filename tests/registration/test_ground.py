@@ -9,6 +9,7 @@ from mapper.registration.hough.config import (
     LevellingConfig,
     ObjectsConfig,
 )
+from mapper.registration.hough.ground_kernels import column_heights
 from mapper.registration.hough.ground_plane import level
 from mapper.registration.hough.ground_removal import find_ground, find_obstacles, surroundings
 from mapper.registration.hough.object_detection import centres_of
@@ -165,3 +166,19 @@ def test_a_group_without_a_large_part_is_one_object():
 def test_an_empty_field_has_no_constellation(rng, centres):
     assert len(centres_in(field(rng), centres)) == 0
     assert len(centres_in(np.empty((0, 3)), centres)) == 0
+
+
+def test_columns_are_those_of_the_moved_points():
+    rng = np.random.default_rng(3)
+    points = rng.uniform(-6.0, 6.0, (3000, 3))
+    T = transform(rotation_exp(np.array([0.3, -0.2, 0.8])), np.array([0.4, -0.7, 1.5]))
+    count, low, high, mean = column_heights(points, T, 0.5, 16)
+    moved = apply(T, points)
+    for row, column in ((3, 12), (8, 8), (14, 1)):
+        here = (np.floor(moved[:, :2] / 0.5).astype(int) == (column - 8, row - 8)).all(axis=1)
+        z = moved[here, 2]
+        assert count[row, column] == len(z) > 0
+        np.testing.assert_allclose(
+            [low[row, column], high[row, column], mean[row, column]], [z.min(), z.max(), z.mean()], rtol=1e-6
+        )
+    assert count.sum() == (np.abs(moved[:, :2]) < 4.0).all(axis=1).sum()
