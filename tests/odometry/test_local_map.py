@@ -88,20 +88,20 @@ def test_disparities_weigh_what_the_residuals_of_a_log_show(frames):
     assert np.ptp(kept) > 0.0
 
 
-def test_disparities_have_the_usual_weight_where_much_moves(frames):
+def test_keyframes_in_which_much_moves_keep_the_usual_weight(frames):
     odometry = build_frame_odometry(LocalMapConfig())
     for frame in frames[:10]:
         odometry.track(odometry.observe(frame))
     odometry._residuals.disparity_sigma = 0.5
 
-    def relative_weights(frame, moving):
-        odometry._last = replace(odometry._last, moving=np.arange(moving, dtype=np.int32))
-        odometry.track(odometry.observe(frame))
-        weights = odometry._last.observation.weights[odometry._last.observation.has_depth]
+    def relative_weights(moving):
+        last = replace(odometry._last, moving=np.arange(moving, dtype=np.int32))
+        observation = odometry._add_keyframe(last, neighbour=last.reference).observation
+        weights = observation.weights[observation.has_depth]
         return np.unique(np.round(weights[:, 2] / weights[:, 0], 6))
 
-    assert relative_weights(frames[10], moving=0) == 4.0
-    assert relative_weights(frames[11], moving=len(odometry._last.observation) // 2) == 1.0
+    assert relative_weights(moving=0) == 4.0
+    assert relative_weights(moving=len(odometry._last.observation) // 2) == 1.0
 
 
 def test_the_same_frames_give_the_same_bytes(frames):

@@ -119,9 +119,6 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         """Track the next frame, in time order."""
         self._map.step()
         last = self._last
-        # A measured noise is taken as it is; where much moves, more weight would prefer passers-by's motion.
-        if self._config.depth_noise is None and (last is None or last.few_move):
-            observation = observation.with_disparity_sigma(self._residuals.disparity_sigma)
         follows = (
             last is not None and not self._lost_frames and observation.stamp_ns - last.stamp_ns <= STEADY_NS
         )
@@ -349,6 +346,9 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         ``neighbour`` is a keyframe of the sub-map in which it was tracked; None begins a new one.
         """
         config, observation = self._config, tracked_pose.observation
+        # A measured noise is taken as it is; where much moves, more weight would prefer passers-by's motion.
+        if config.depth_noise is None and tracked_pose.few_move:
+            observation = observation.with_disparity_sigma(self._residuals.disparity_sigma)
         is_new = observation.has_depth & (tracked_pose.landmark_of_feature < 0)
         is_new[tracked_pose.moving] = False
         index = self._map.add_keyframe(
