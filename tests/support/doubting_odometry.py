@@ -9,7 +9,7 @@ import pytest
 
 from mapper.core.geometry import Transform
 from mapper.odometry.factory import odometry_for
-from mapper.pipeline import append, track
+from mapper.pipeline import track
 
 DOUBT = "jump of 0.50 m where 0.02 m was predicted"
 SIGMAS = np.array([0.1, 0.1, 0.1, 0.5, 0.5, 0.5])
@@ -57,9 +57,8 @@ def doubt_frames(
     doubted_keyframes: frozenset[int] = frozenset(),
 ) -> None:
     """Let every odometry that is built from now on be a doubting one."""
-    for module in (track, append):
-        patch.setattr(
-            module,
-            "odometry_for",
-            lambda *arguments: DoubtingOdometry(odometry_for(*arguments), moved, doubted_keyframes),
-        )
+    patch.setattr(
+        track,
+        "odometry_for",
+        lambda *arguments: DoubtingOdometry(odometry_for(*arguments), moved, doubted_keyframes),
+    )
