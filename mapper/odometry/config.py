@@ -97,8 +97,8 @@ class KeyframeOdometryConfig(Config):
     """bf: depth z is used as the disparity bf / z (Mur-Artal & Tardós 2017); 40 to 43 for a Kinect. For
     another sensor, set it to the focal length times the baseline."""
     disparity_sigma_px: PositiveFloat = 1.0
-    """Standard deviation of the virtual disparity relative to that of a pixel, at most: less where a log's
-    residuals show it."""
+    """Standard deviation of the virtual disparity relative to that of a pixel; in bundle adjustments less
+    where a log's residuals show it."""
     depth_noise: DepthNoiseConfig | None = None
     """Depth noise of the sensor, as measured by ``mapper sensor depth``, which replaces the disparity's."""
     depth_residual: bool = True
