@@ -39,7 +39,7 @@ class Stepping:
         place = "lost" if step.track.node is None else f"node {step.track.node}, {how.inliers} inliers"
         kept = ", a keyframe" if step.track.is_keyframe else ""
         if step.track.doubts:
-            kept += f", doubtful: {', '.join(step.track.doubts)}"
+            kept += f", doubtful: {', '.join(doubt.text for doubt in step.track.doubts)}"
         _say(f"frame {self._frames} at {step.track.stamp_ns}: {how.method}, {place}{kept} ", end="")
         sys.stderr.flush()
         answer = sys.stdin.readline()

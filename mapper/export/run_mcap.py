@@ -6,6 +6,7 @@ from dataclasses import asdict
 
 import numpy as np
 
+from mapper.core.doubts import doubts_text
 from mapper.export.foxglove_messages import WORLD
 from mapper.export.mcap_log import McapLog
 from mapper.export.palette import TRUTH
@@ -104,7 +105,7 @@ def _fields(record: FrameRecord, frame_ms: Mapping[int, float]) -> dict[str, int
         "node": -1 if record.node is None else record.node,
         "is_keyframe": int(record.is_keyframe),
         **asdict(record.diagnostics),
-        "doubts": "; ".join(record.doubts),
+        "doubts": doubts_text(record.doubts),
     }
     if frame_ms:
         fields["ms"] = frame_ms.get(record.stamp_ns, 0.0)

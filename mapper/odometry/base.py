@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Protocol, TypeVar, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
+from mapper.core.doubts import Doubt
 from mapper.core.frames import Frame
 from mapper.core.geometry import Array, Transform
 from mapper.core.timebase import NS_PER_S
@@ -59,7 +60,7 @@ class FrameResult:
             be more accurate; until then these connect the node to the path.
         twist: Assumed motion of the body during a scan's sweep; None if nothing was deskewed.
         is_sharp: False if the frame is unfit for place recognition: a scan swept in unknown motion.
-        doubts: Why the pose may be wrong, a phrase each; empty if there is no reason.
+        doubts: Why the pose may be wrong; empty if there is no reason.
         covariance: (6, 6) of the pose in the body's tangent (rotation, translation), rad² and m²: relative to
             ``node``, or for a keyframe to the keyframe before it. None if nothing measured it.
     """
@@ -74,7 +75,7 @@ class FrameResult:
     links: Sequence[BetweenFactor] = field(default_factory=tuple)
     twist: Twist | None = None
     is_sharp: bool = True
-    doubts: tuple[str, ...] = ()
+    doubts: tuple[Doubt, ...] = ()
     covariance: Array | None = None
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from mapper.config.build import BuildConfig
+from mapper.core.doubts import Doubt
 from mapper.core.errors import ConfigError, LoopError
 from mapper.core.geometry import distances_along
 from mapper.core.timebase import NS_PER_S
@@ -193,7 +194,7 @@ def _doubtful_unless_confirmed(
     first and after the last constraint of a part of the path nothing shows this, least of all where the map
     was searched in vain.
     """
-    graph, doubts = tracking.graph, dict[int, str]()
+    graph, doubts = tracking.graph, dict[int, Doubt]()
     held = {loop.j for loop in accepted_loops(tracking.loops)}
     failed = {loop.j for loop in tracking.loops} - held
     for nodes in components(graph.without_loops()):
@@ -205,7 +206,8 @@ def _doubtful_unless_confirmed(
         for loop in tracking.loops
         if loop.rejected_by == SOLVER and loop.after is not None and exceeds(loop.after, slack)
     } - held
-    doubts |= dict.fromkeys(contradicting, "the place that was recognised here contradicts the others")
+    contradicted = Doubt("contradicted place", "the place that was recognised here contradicts the others")
+    doubts |= dict.fromkeys(contradicting, contradicted)
     tracks = tuple(
         replace(track, doubts=(*track.doubts, doubts[track.node])) if track.node in doubts else track
         for track in tracking.tracks
@@ -215,7 +217,7 @@ def _doubtful_unless_confirmed(
 
 def _unconfirmed(
     graph: PoseGraph, nodes: Sequence[int], held: set[int], failed: set[int], path_m: float
-) -> dict[int, str]:
+) -> dict[int, Doubt]:
     """Return the doubts about the nodes of one part of the path that no constraint nearby confirms.
 
     Args:
@@ -236,9 +238,11 @@ def _unconfirmed(
         is_between = known[0] <= node <= known[-1]
         limit_m = path_m * (_FAR if is_between else _FAR_BEYOND)
         if not begin < node < end:
-            doubts[node] = "the map was searched in vain here, at the end of what was recognised"
+            text = "the map was searched in vain here, at the end of what was recognised"
+            doubts[node] = Doubt("searched in vain", text)
         elif np.abs(known_m - at_m).min() > limit_m:
-            doubts[node] = f"more than {limit_m:g} m of path from the nearest place that was recognised"
+            text = f"more than {limit_m:g} m of path from the nearest place that was recognised"
+            doubts[node] = Doubt("far from recognised places", text)
     return doubts
 
 

@@ -107,7 +107,7 @@ def refuse_a_fragment(tracking: TrackingResult, config: BuildConfig, *, sensor: 
         found += f", {doubtful} more are doubtful"
     unseen = [track for track in tracking.placed if track.doubts and track.diagnostics.unobservable]
     if 2 * len(unseen) > read:
-        found, hint = f"{found} ({unseen[-1].doubts[-1]})", SEE_MORE
+        found, hint = f"{found} ({unseen[-1].doubts[-1].text})", SEE_MORE
     raise TrackingError(
         f"{found}, want at least {enough:.0f}; {hint} "
         f"(min_tracked_frames and min_tracked_ratio set the limit){unread}"

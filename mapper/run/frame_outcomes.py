@@ -9,6 +9,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
+from mapper.core.doubts import Doubt, doubts_of, doubts_text, kinds_text
 from mapper.core.errors import DataError, RunError
 from mapper.core.rotations import row_of_pose
 from mapper.core.timebase import Stamps
@@ -44,11 +45,11 @@ _COLUMNS = (
     "doubts",
     *_SIGMAS,
     *_POSE,
+    "doubt_kinds",
 )
 DISCONNECTED = "disconnected"
 """``Diagnostics.method`` of a frame that was placed, but in a part of the path that is left out."""
 
-_DOUBTS_JOINED_BY = "; "
 _NOTHING = Diagnostics(features=0, matches=0, inliers=0, residual=0.0, residual_unit="", method="")
 
 
@@ -63,7 +64,7 @@ class FrameRecord:
         node: Graph node that its pose is relative to; None unless placed.
         is_keyframe: The frame is that node.
         diagnostics: Figures on its tracking; all zero for a skipped frame.
-        doubts: Why the pose may be wrong, a few words each.
+        doubts: Why the pose may be wrong.
         sigmas: Standard deviations of the pose relative to its node, or of a keyframe's to the keyframe
             before it: rotation about and translation along the body's x, y, z (rad, m). None if unknown.
         pose_in_node: Pose as tracked of a doubtful frame that is no node, to which neighbours were added: x y
@@ -75,7 +76,7 @@ class FrameRecord:
     node: int | None
     is_keyframe: bool
     diagnostics: Diagnostics
-    doubts: tuple[str, ...] = ()
+    doubts: tuple[Doubt, ...] = ()
     sigmas: tuple[float, ...] | None = None
     pose_in_node: tuple[float, ...] | None = None
 
@@ -124,9 +125,10 @@ def write_records(path: Path, records: Iterable[FrameRecord]) -> None:
                 repr(float(how.residual)),
                 how.residual_unit,
                 how.unobservable,
-                _DOUBTS_JOINED_BY.join(record.doubts),
+                doubts_text(record.doubts),
                 *_cells(record.sigmas, len(_SIGMAS)),
                 *_cells(record.pose_in_node, len(_POSE)),
+                kinds_text(record.doubts),
             ]
         )
     write_text(path, text.getvalue())
@@ -189,7 +191,6 @@ def _numbers(row: Mapping[str, str], names: Sequence[str]) -> tuple[float, ...] 
 
 
 def _record(row: dict[str, str]) -> FrameRecord:
-    doubts = row.get("doubts") or ""  # older runs have none
     return FrameRecord(
         stamp_ns=int(row["stamp_ns"]),
         outcome=_OUTCOMES[row["outcome"]],
@@ -205,7 +206,8 @@ def _record(row: dict[str, str]) -> FrameRecord:
             # Older runs have this column as "unseen", or not at all.
             unobservable=row.get("unobservable", row.get("unseen", "")),
         ),
-        doubts=tuple(doubts.split(_DOUBTS_JOINED_BY)) if doubts else (),
+        # Older runs have no kinds, or no doubts either.
+        doubts=doubts_of(row.get("doubts") or "", row.get("doubt_kinds") or ""),
         sigmas=_numbers(row, _SIGMAS),
         pose_in_node=_numbers(row, _POSE),
     )

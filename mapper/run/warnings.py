@@ -1,6 +1,5 @@
 """Warnings about a run, all of them, from its results."""
 
-import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 
@@ -229,13 +228,10 @@ def _doubtful(records: Sequence[FrameRecord], timeline: TimeLine) -> Iterator[Ru
     placed = sum(record.node is not None for record in records)
     are_too_many = len(doubtful) > max(_FEW_FRAMES, _MAX_DOUBTFUL_SHARE * placed)
     unseen = sum(bool(record.diagnostics.unobservable) for record in doubtful)
-    # The same doubt with other figures is the same reason.
-    examples: dict[str, str] = {}
-    for record in doubtful:
-        for doubt in record.doubts:
-            examples.setdefault(_without_figures(doubt), doubt)
-    reasons = Counter(_without_figures(doubt) for record in doubtful for doubt in record.doubts)
-    texts = [f"{examples[reason]} ({count})" for reason, count in reasons.most_common(_REASONS)]
+    doubts = [doubt for record in doubtful for doubt in record.doubts]
+    examples = {doubt.kind: doubt.text for doubt in reversed(doubts)}
+    kinds = Counter(doubt.kind for doubt in doubts)
+    texts = [f"{examples[kind]} ({count})" for kind, count in kinds.most_common(_REASONS)]
     first, last = max(
         stretches([record.outcome == "doubtful" for record in records]), key=lambda run: run[1] - run[0]
     )
@@ -247,10 +243,6 @@ def _doubtful(records: Sequence[FrameRecord], timeline: TimeLine) -> Iterator[Ru
         where=timeline.place(first, last),
         weight="doubt" if are_too_many else "note",
     )
-
-
-def _without_figures(text: str) -> str:
-    return re.sub(r"-?\d+(\.\d+)?", "…", text)
 
 
 def _levelling(manifest: Manifest) -> Iterator[RunWarning]:

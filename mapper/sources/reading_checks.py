@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from itertools import groupby
 from typing import Any, Literal
 
+from mapper.core.doubts import Doubt
 from mapper.core.frames import Frame, Scan
 from mapper.core.timebase import NS_PER_S
 from mapper.sources.base import Log, WrappedEntry
@@ -96,14 +97,14 @@ class ReadingChecks:
             for run in self.repeated(what, fewest=fewest)
         ]
 
-    def doubts(self) -> dict[int, list[str]]:
+    def doubts(self) -> dict[int, list[Doubt]]:
         """Return why frames are doubtful, by stamp: they repeat the data of an earlier one."""
-        doubts: dict[int, list[str]] = {}
+        doubts: dict[int, list[Doubt]] = {}
         for what, _, named, fewest in _FROZEN:
             for run in self.repeated(what, fewest=fewest):
                 for index in run[1:]:
-                    said = f"{named} as {index - run[0]} frames before"
-                    doubts.setdefault(int(self._stamps_ns[index]), []).append(said)
+                    doubt = Doubt(named, f"{named} as {index - run[0]} frames before")
+                    doubts.setdefault(int(self._stamps_ns[index]), []).append(doubt)
         return doubts
 
     def _named(self, run: range) -> str:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from mapper.config.build import BuildConfig
+from mapper.core.doubts import Doubt
 from mapper.core.errors import ConfigError
 from mapper.evaluators.metrics.evaluate import evaluate
 from mapper.export.report.data import Figure, chapter_of, drawn
@@ -76,7 +77,7 @@ def test_uncertainty_and_doubt_are_the_poses_s(runs):
     assert path["band_m"][-1] > 0.0
     assert path["doubtful"] == [False] * 31
     records = list(chapter.results.records)
-    records[7] = replace(records[7], outcome="doubtful", doubts=("jump",))
+    records[7] = replace(records[7], outcome="doubtful", doubts=(Doubt("jump", "jump"),))
     doubted = replace(chapter, results=replace(chapter.results, records=records, poses=None))
     path = drawn(doubted)["path"]
     assert [k for k, is_doubtful in enumerate(path["doubtful"]) if is_doubtful] == [7]

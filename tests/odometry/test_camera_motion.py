@@ -140,7 +140,7 @@ def test_two_motions_of_half_the_scene_each_are_doubtful(observation):
         observation, rng, still=room(120, rng), moved=room(100, rng), observers=(0, 0), T_moved=T_moved
     )
     assert len(motion.doubts) == 1
-    assert "of 220 features show another motion" in motion.doubts[0]
+    assert "of 220 features show another motion" in motion.doubts[0].text
 
 
 def test_features_that_move_become_no_landmarks(frames):

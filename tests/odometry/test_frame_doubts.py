@@ -7,14 +7,15 @@ import numpy as np
 import pytest
 
 from mapper.config.loading import load_config
+from mapper.core.doubts import Doubt, doubts_text
 from mapper.core.frames import RgbdFrame
 from mapper.core.geometry import exp
 from mapper.odometry.base import REPEATED
 from mapper.odometry.config import LocalMapConfig
 from mapper.odometry.factory import build_frame_odometry
+from mapper.odometry.local_map.assessment import UNDOUBTED, Assessment
 from mapper.odometry.local_map.depth_alignment import DepthAlignment
 from mapper.odometry.local_map.displaced_surfaces import DisplacedSurfaces
-from mapper.odometry.local_map.doubt import NO_DOUBT, Doubt
 from mapper.odometry.local_map.earlier_depth import Displacement
 from mapper.odometry.local_map.frame_doubts import FrameDoubts
 from mapper.pipeline.track import track_log
@@ -45,7 +46,7 @@ def test_a_frozen_camera_is_doubted_until_it_moves_again(frames, odometry):
     frozen = [later(frames[29], of) for of in frames[30:36]]
     tracks = track([*frames[:30], *frozen, *frames[36:45]], odometry)
 
-    doubtful = [i for i, step in enumerate(tracks) if any("same" in doubt for doubt in step.doubts)]
+    doubtful = [i for i, step in enumerate(tracks) if any("same" in doubt.text for doubt in step.doubts)]
     assert doubtful == list(range(30, 36))
     assert not any(tracks[i].is_keyframe for i in doubtful)
     assert [i for i, step in enumerate(tracks) if step.diagnostics.method == REPEATED] == doubtful
@@ -76,26 +77,28 @@ def test_doubts_are_measured_against_what_is_usual(frames, odometry):
         covariance = np.diag([1e-6] * 3 + [sigma_m**2] * 3)
         return doubts.assess(now, covariance, last, pose.T_camera_world, displaced, excess)
 
-    assert not any(assess(k).phrases for k in range(1, 30))
-    assert not assess(30, moved_m=0.3).phrases
+    assert not any(assess(k).doubts for k in range(1, 30))
+    assert not assess(30, moved_m=0.3).doubts
     doubt = assess(31, moved_m=0.3, agreement=0.7)
-    assert doubt.phrases == ("jump of 0.30 m off the predicted place, 0.00 m is usual",)
+    assert doubts_text(doubt.doubts) == "jump of 0.30 m off the predicted place, 0.00 m is usual"
     assert doubt.sigma_m == pytest.approx(0.3, rel=0.01)
-    assert "which tell the translation to 0.050 m, 0.001 m is usual" in assess(32, sigma_m=0.05).phrases[0]
-    assert "40% of the matches agree, 95% is usual" in assess(33, agreement=0.4).phrases
+    assert (
+        "which tell the translation to 0.050 m, 0.001 m is usual" in assess(32, sigma_m=0.05).doubts[0].text
+    )
+    assert "40% of the matches agree, 95% is usual" in doubts_text(assess(33, agreement=0.4).doubts)
     doubt = assess(34, displaced=Displacement(0.6, 0.15, 0.4))
-    assert doubt.phrases == ("60% of the surfaces lie elsewhere than 0.4 s before",)
+    assert doubts_text(doubt.doubts) == "60% of the surfaces lie elsewhere than 0.4 s before"
     assert doubt.sigma_m == pytest.approx(0.15)
-    assert not assess(35, displaced=Displacement(0.45, 0.15, 0.4)).phrases
-    assert not assess(37, moved_m=0.1, excess=3.0).phrases
-    assert not assess(38, excess=7.0).phrases
+    assert not assess(35, displaced=Displacement(0.45, 0.15, 0.4)).doubts
+    assert not assess(37, moved_m=0.1, excess=3.0).doubts
+    assert not assess(38, excess=7.0).doubts
     doubt = assess(39, moved_m=0.1, excess=7.0)
-    assert doubt.phrases == ("the image fits the predicted motion better by 7 standard errors",)
+    assert doubts_text(doubt.doubts) == "the image fits the predicted motion better by 7 standard errors"
     assert doubt.sigma_m == pytest.approx(0.1, rel=0.01)
-    assert not assess(40, moved_m=0.01, excess=7.0).phrases
-    assert not assess(41, moved_m=0.0065, agreement=0.7).phrases
+    assert not assess(40, moved_m=0.01, excess=7.0).doubts
+    assert not assess(41, moved_m=0.0065, agreement=0.7).doubts
     doubt = assess(42, moved_m=0.0065, moving=len(pose.observation) // 2)
-    assert doubt.phrases == ("jump of 0.01 m off the predicted place, 0.00 m is usual",)
+    assert doubts_text(doubt.doubts) == "jump of 0.01 m off the predicted place, 0.00 m is usual"
 
 
 def test_a_jump_of_a_pose_by_depth_is_doubted_unless_a_motion_was_predicted_alone(frames, odometry):
@@ -118,12 +121,12 @@ def test_a_jump_of_a_pose_by_depth_is_doubted_unless_a_motion_was_predicted_alon
         covariance = np.diag([1e-6] * 6)
         return doubts.assess(poses[0], covariance, poses[1], pose.T_camera_world, NOT_DISPLACED, 0.0)
 
-    assert not any(assess(k).phrases for k in range(1, 30))
-    assert not assess(30, moved_m=0.005).phrases
-    assert not assess(31, moved_m=0.3, depth=blind).phrases
-    assert not assess(32, moved_m=0.3, last_depth=blind).phrases
+    assert not any(assess(k).doubts for k in range(1, 30))
+    assert not assess(30, moved_m=0.005).doubts
+    assert not assess(31, moved_m=0.3, depth=blind).doubts
+    assert not assess(32, moved_m=0.3, last_depth=blind).doubts
     doubt = assess(33, moved_m=0.3)
-    assert doubt.phrases == ("jump of 0.30 m off the predicted place, 0.00 m is usual",)
+    assert doubts_text(doubt.doubts) == "jump of 0.30 m off the predicted place, 0.00 m is usual"
     assert doubt.sigma_m == pytest.approx(0.3, rel=0.01)
     assert not doubt.repeats
 
@@ -142,7 +145,7 @@ def test_a_frozen_camera_before_white_walls_is_doubted(frames, odometry):
     doubts, covariance = FrameDoubts(), np.diag([1e-6] * 6)
     doubts.assess(last, covariance, odometry._before_last, None, NOT_DISPLACED, 0.0)
     doubt = doubts.assess(now, covariance, last, None, NOT_DISPLACED, 0.0)
-    assert doubt.phrases == ("the image has been the same for 0.20 s",)
+    assert doubts_text(doubt.doubts) == "the image has been the same for 0.20 s"
     assert doubt.repeats
 
 
@@ -162,24 +165,25 @@ def test_where_much_moves_the_farther_surfaces_decide_also_of_frames_shortly_bef
     assert not doubt(1.0, moving=0.0, ratio=0.3, far_ratio=0.6)
     assert not doubt(2.5, moving=0.0, ratio=0.3, far_ratio=0.6)
     assert not doubt(2.6, moving=0.0, ratio=0.3, far_ratio=0.1)
-    assert not surfaces.doubt_of_earlier(2_500_000_000).phrases
+    assert not surfaces.doubt_of_earlier(2_500_000_000).doubts
     assert not doubt(4.0, moving=0.4, ratio=0.6, far_ratio=0.1)
-    assert doubt(4.1, moving=0.0, ratio=0.3, far_ratio=0.6).startswith("60% of the farther surfaces")
+    assert doubt(4.1, moving=0.0, ratio=0.3, far_ratio=0.6).kind == "displaced farther surfaces"
 
     earlier = surfaces.doubt_of_earlier(2_500_000_000)
-    assert earlier.phrases == ("60% of the farther surfaces lie elsewhere than 0.4 s before",)
+    assert doubts_text(earlier.doubts) == "60% of the farther surfaces lie elsewhere than 0.4 s before"
     assert earlier.sigma_m == 0.15
-    assert not any(surfaces.doubt_of_earlier(ns).phrases for ns in (1_000_000_000, 2_600_000_000))
+    assert not any(surfaces.doubt_of_earlier(ns).doubts for ns in (1_000_000_000, 2_600_000_000))
 
 
 def test_what_later_frames_say_against_a_frame_is_in_its_result_and_its_factors(source, monkeypatch):
+    elsewhere = Assessment((Doubt("elsewhere", "elsewhere"),), 0.0, 0.3)
     config = load_config(None, ["loops.kind=none"], sensor="rgbd")
     before = track_log(source, config, progress=SILENT)
     keyframe = next(track for track in before.tracks if track.node == 1)
     monkeypatch.setattr(
         FrameDoubts,
         "in_hindsight",
-        lambda _, ns: Doubt(("elsewhere",), 0.0, 0.3) if ns == keyframe.stamp_ns else NO_DOUBT,
+        lambda _, ns: elsewhere if ns == keyframe.stamp_ns else UNDOUBTED,
     )
     after = track_log(source, config, progress=SILENT)
 

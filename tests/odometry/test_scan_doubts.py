@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from mapper.core.doubts import doubts_text
 from mapper.core.frames import Scan
 from mapper.core.geometry import apply, exp, inverse
 from mapper.odometry.scan_to_map.config import GicpOdometryConfig
@@ -86,7 +87,7 @@ def test_what_a_tunnel_does_not_show_is_predicted_and_doubted():
 
     blind, clear = tracks[56:], tracks[10:40]
     assert all("translation along x" in track.diagnostics.unobservable for track in blind)
-    assert all(any("predicted" in doubt for doubt in track.doubts) for track in blind[3:])
+    assert all(any("predicted" in doubt.text for doubt in track.doubts) for track in blind[3:])
     assert not any(track.doubts for track in clear)
     travelled_m = tracks[-1].T_world_body[0, 3] - tracks[40].T_world_body[0, 3]
     assert travelled_m == pytest.approx(places_m[-1] - places_m[40], abs=1.0)
@@ -163,7 +164,7 @@ def test_a_log_in_rain_is_tracked_once_its_first_scans_have_told_what_is_usual()
 
     doubtful = [bool(track.doubts) for track in tracks]
     assert doubtful == [False, True, True, True, *[False] * 8]
-    assert "where earlier rays passed" in tracks[1].doubts[0]
+    assert "where earlier rays passed" in tracks[1].doubts[0].text
     assert np.linalg.norm(tracks[-1].T_world_body[:3, 3] - poses[-1][:3, 3]) < 0.04
 
 
@@ -289,7 +290,8 @@ def test_a_direction_that_disagrees_is_a_doubt_where_the_motion_was_predicted(is
         PoseCandidate(key, OFF, fit, Shares(1.0, 0.3, 0.0), jump_between(OFF, OFF, None), MEASURED, "map")
     )
 
-    assert doubts == (() if is_shown else ("30% agree in the weakest direction, 90% is usual",))
+    said = "" if is_shown else "30% agree in the weakest direction, 90% is usual"
+    assert doubts_text(doubts) == said
 
 
 @pytest.mark.parametrize(

@@ -83,7 +83,7 @@ def tracks(count, **road):
 
 def test_the_way_along_such_a_road_is_doubtful_from_the_first_scan_on():
     for track in tracks(40)[1:]:
-        assert any("translation along x" in doubt and "unknown" in doubt for doubt in track.doubts)
+        assert any("translation along x" in doubt.text and "unknown" in doubt.text for doubt in track.doubts)
         assert np.sqrt(track.covariance[3, 3]) > 1.0
 
 

@@ -178,6 +178,6 @@ def test_sudden_turns_are_tracked_or_doubtful(sweep_s, least_undoubted):
 def test_sweeps_that_turn_at_an_unknown_rate_are_doubtful():
     results = tracked_turns(0.5)
 
-    doubts = [doubt for result in results for doubt in result.doubts]
+    doubts = [doubt.text for result in results for doubt in result.doubts]
     assert any("points may be displaced by" in doubt and "its sweep of 0.5 s" in doubt for doubt in doubts)
     assert not any(result.doubts for result in results[:8])

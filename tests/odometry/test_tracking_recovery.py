@@ -6,8 +6,9 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 
+from mapper.core.doubts import Doubt
 from mapper.core.geometry import exp, inverse, log
-from mapper.odometry.local_map.doubt import Doubt
+from mapper.odometry.local_map.assessment import Assessment
 from mapper.odometry.local_map.earlier_depth import Displacement
 from mapper.odometry.local_map.pose_tracker import unmatched
 from tests.support.desk_frames import odometry_after
@@ -45,7 +46,7 @@ def test_a_pose_that_displaces_most_surfaces_is_recognised_where_it_is(odometry)
     found, then = odometry._recovery.relocalised(wrong, displaced, STILL)
     assert miss_m(found, right) < 0.02
     assert max(then.ratio, then.far_ratio) < 0.25
-    assert "recognised 0.3" in found.doubts[-1]
+    assert "recognised 0.3" in found.doubts[-1].text
 
 
 def test_what_follows_from_a_doubtful_keyframe_is_recognised_until_it_is_linked(odometry):
@@ -66,7 +67,7 @@ def test_a_recognised_frame_is_doubtful_no_keyframe_and_where_it_is(odometry, fr
     result = odometry.track(observation)
     monkeypatch.undo()
     assert not result.is_keyframe
-    assert any("recognised" in doubt for doubt in result.doubts)
+    assert any("recognised" in doubt.text for doubt in result.doubts)
     after = odometry.track(odometry.observe(frames[NOW + 1]))
     assert not after.doubts
     assert np.linalg.norm(log(inverse(result.T_world_body) @ after.T_world_body)[1]) < 0.03
@@ -84,9 +85,8 @@ def test_an_implausible_pose_of_few_features_is_lost(odometry, frames, monkeypat
 
     monkeypatch.setattr(odometry._tracker, "track", with_inliers)
     monkeypatch.setattr(odometry._depth, "supported", lambda *arguments: arguments[-1])
-    monkeypatch.setattr(
-        odometry._doubts, "assess", lambda *_: Doubt(("jump",), 0.1, 0.5, is_implausible=True)
-    )
+    implausible = Assessment((Doubt("jump", "jump"),), 0.1, 0.5, is_implausible=True)
+    monkeypatch.setattr(odometry._doubts, "assess", lambda *_: implausible)
     before = odometry._last
     result = odometry.track(odometry.observe(frames[NOW]))
     assert (result.node is None) == (outcome == "lost")

@@ -35,8 +35,8 @@ def test_a_velocity_that_no_scan_showed_is_unknown_and_so_is_the_way_it_goes():
     tracks = tracks_along_the_tunnel(30)
 
     for track in tracks[1:]:
-        assert any("translation along x" in doubt for doubt in track.doubts)
-        assert any("its velocity is unknown" in doubt for doubt in track.doubts)
+        assert any("translation along x" in doubt.text for doubt in track.doubts)
+        assert any("its velocity is unknown" in doubt.text for doubt in track.doubts)
     sigmas_m = [np.sqrt(track.covariance[3, 3]) for track in tracks[1:]]
     assert sigmas_m[0] > 1.0  # within the first tenth of a second
     assert sigmas_m[-1] > 30.0  # in three seconds

@@ -8,6 +8,7 @@ import pytest
 
 from mapper.config.loading import load_config
 from mapper.core.deskew import deskewed, twist_between
+from mapper.core.doubts import Doubt
 from mapper.core.frames import Scan
 from mapper.odometry.base import Diagnostics, FrameResult
 from mapper.pipeline.sweep_check import sweep_warnings
@@ -133,7 +134,7 @@ def test_a_wrong_duration_of_turns_is_corrected():
 
 def test_nothing_is_said_where_poses_or_the_order_of_points_tell_nothing():
     bent = changed(scans(), backwards)
-    assert warnings(bent, doubts=("jump",)) == []
+    assert warnings(bent, doubts=(Doubt("jump", "jump"),)) == []
     assert warnings(bent, unobservable="translation along x") == []
     assert sweep_warnings(bent, tracks(bent)[:4], LIDAR) == []
     assert (

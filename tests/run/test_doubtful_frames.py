@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from mapper.core.doubts import Doubt
 from mapper.core.geometry import exp, inverse, log
 from mapper.core.trajectory import Trajectory
 from mapper.graph.model import PoseGraph
@@ -43,7 +44,7 @@ def tracks_of(count, doubted, *, sigma=0.5, period=10, repeats=False):
                 T,
                 k % period == 0,
                 replace(DIAGNOSTICS, method=REPEATED) if is_doubted and repeats else DIAGNOSTICS,
-                doubts=("jump of 0.6 m where 0.1 m was predicted",) if is_doubted else (),
+                doubts=(Doubt("jump", "jump of 0.6 m where 0.1 m was predicted"),) if is_doubted else (),
                 covariance=None if sigma is None else np.eye(6) * (sigma if is_doubted else 1e-3) ** 2,
             )
         )

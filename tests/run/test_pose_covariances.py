@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from mapper.core.doubts import Doubt
 from mapper.core.errors import DataError, RunError
 from mapper.core.geometry import adjoint, exp, inverse
 from mapper.core.trajectory import trajectory_from
@@ -66,7 +67,7 @@ def test_what_a_lever_arm_does_to_an_angle():
 
 def test_it_is_read_as_it_was_written(tmp_path):
     trajectory, graph, records = run_of()
-    records[3] = replace(records[3], outcome="doubtful", doubts=("jump",))
+    records[3] = replace(records[3], outcome="doubtful", doubts=(Doubt("jump", "jump"),))
     records[5] = replace(records[5], node=None, outcome="lost")  # its pose was given by a user
     poses = uncertain_poses(trajectory, graph, records)
     assert np.isnan(poses.covariances[5]).all()

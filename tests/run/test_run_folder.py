@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from mapper.config.build import BuildConfig
+from mapper.core.doubts import Doubt
 from mapper.core.errors import DataError, FrameError, RunError, TrackingError
 from mapper.export.ply import write_ply
 from mapper.loops.closure import read_closures
@@ -20,6 +21,8 @@ from mapper.run.writer import write_run
 from mapper.runtime.atomic import atomic_folder, partial_of
 
 MANIFEST = Manifest(status="building", input=Input(path="/log", kind="tum", fingerprint="sha256:0"))
+
+DOUBTS = (Doubt("jump", "jump of 0.3 m"), Doubt("another pose", "another pose fits as well"))
 
 
 def draft_of(out, *, overwrite=False):
@@ -142,6 +145,7 @@ def test_records_survive_the_disk(tmp_path):
         FrameRecord(10, "tracked", 0, is_keyframe=True, diagnostics=how),
         FrameRecord(20, "skipped", None, is_keyframe=False, diagnostics=nothing),
         FrameRecord(30, "lost", None, is_keyframe=False, diagnostics=how),
+        FrameRecord(40, "doubtful", 0, is_keyframe=False, diagnostics=how, doubts=DOUBTS),
     ]
 
     write_records(tmp_path / "frames.csv", records)
@@ -161,6 +165,20 @@ def test_records_of_older_runs_are_read(tmp_path, column, expected):
     (record,) = read_records(tmp_path / "frames.csv")
 
     assert record.diagnostics.unobservable == expected
+
+
+def test_doubts_of_older_runs_have_no_kinds(tmp_path):
+    how = Diagnostics(9, 8, 7, 0.5, "m", "map")
+    write_records(tmp_path / "frames.csv", [FrameRecord(10, "doubtful", 0, False, how, DOUBTS)])
+    header, row = (tmp_path / "frames.csv").read_text().splitlines()
+    assert (header.rpartition(",")[2], row.rpartition(",")[2]) == ("doubt_kinds", "jump; another pose")
+    older = "\n".join(line.rpartition(",")[0] for line in (header, row))
+    (tmp_path / "frames.csv").write_text(older + "\n")
+
+    (record,) = read_records(tmp_path / "frames.csv")
+
+    assert [doubt.text for doubt in record.doubts] == [doubt.text for doubt in DOUBTS]
+    assert [doubt.kind for doubt in record.doubts] == [doubt.text for doubt in DOUBTS]
 
 
 @pytest.mark.parametrize(

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from mapper.core.doubts import Doubt
 from mapper.core.geometry import exp, inverse
 from mapper.core.trajectory import Trajectory
 from mapper.graph.model import BetweenFactor, PoseSigmas
@@ -88,8 +89,8 @@ def test_a_part_that_is_left_out_breaks_a_run():
 
 
 def test_doubtful_frames_and_their_main_reasons():
-    jumps = {k: doubted(f"jump of 0.{k} m where 0.09 m was predicted") for k in range(11, 19)}
-    some = {k: doubted("12 inliers on one side of the image") for k in range(51, 54)}
+    jumps = {k: doubted(Doubt("jump", f"jump of 0.{k} m where 0.09 m was predicted")) for k in range(11, 19)}
+    some = {k: doubted(Doubt("one side", "12 inliers on one side of the image")) for k in range(51, 54)}
     warning = only(results_of(changed=jumps | some))
     assert (warning.kind, warning.weight) == ("doubtful", "doubt")
     assert "11 of 200 placed frames are doubtful, 5.5% (at most 2% are usual)" in warning.sentence

@@ -7,11 +7,15 @@ from typing import Any
 import numpy as np
 import pytest
 
+from mapper.core.doubts import Doubt
 from mapper.core.geometry import Transform
 from mapper.odometry.factory import odometry_for
 from mapper.pipeline import track
 
-DOUBT = "jump of 0.50 m where 0.02 m was predicted"
+DOUBTS = (
+    Doubt("jump", "jump of 0.50 m where 0.02 m was predicted"),
+    Doubt("one side", "12 inliers on one side of the image"),
+)
 SIGMAS = np.array([0.1, 0.1, 0.1, 0.5, 0.5, 0.5])
 
 
@@ -38,7 +42,7 @@ class DoubtingOdometry:
         self._index += 1
         result = self._odometry.track(observation)
         if self._index in self._doubted and result.is_keyframe:
-            return replace(result, doubts=(DOUBT,), covariance=np.diag(SIGMAS**2))
+            return replace(result, doubts=DOUBTS[:1], covariance=np.diag(SIGMAS**2))
         if self._index not in self._moved or result.is_keyframe:
             return result
         T_body_moved = self._moved[self._index]
@@ -46,7 +50,7 @@ class DoubtingOdometry:
             result,
             T_node_body=result.T_node_body @ T_body_moved,
             T_world_body=result.T_world_body @ T_body_moved,
-            doubts=(DOUBT, "12 inliers on one side of the image"),
+            doubts=DOUBTS,
             covariance=np.diag(SIGMAS**2),
         )
 

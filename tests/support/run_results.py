@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from mapper.core.doubts import Doubt
 from mapper.core.geometry import exp
 from mapper.core.trajectory import Trajectory, trajectory_from
 from mapper.graph.model import BetweenFactor, PoseGraph, PoseSigmas
@@ -23,6 +24,7 @@ MANIFEST = Manifest(
     input=Input(path="/log", kind="tum", fingerprint="sha256:0"),
     levelling=Levelling(method="planes", detail="floor seen in 40 of 90 patches"),
 )
+JUMP = Doubt("jump", "jump of 0.31 m where 0.09 m was predicted")
 _HOW = Diagnostics(100, 50, 40, 0.01, "m", "map")
 
 
@@ -75,10 +77,10 @@ def lost(method: str = "lost") -> dict[str, Any]:
     }
 
 
-def doubted(*doubts: str, unobservable: str = "") -> dict[str, Any]:
+def doubted(doubt: Doubt = JUMP, *, unobservable: str = "") -> dict[str, Any]:
     """Return the changed fields of a doubtful frame's record, in which a motion may be unobservable."""
     return {
         "outcome": "doubtful",
-        "doubts": doubts or ("jump of 0.31 m where 0.09 m was predicted",),
+        "doubts": (doubt,),
         "diagnostics": replace(_HOW, unobservable=unobservable),
     }

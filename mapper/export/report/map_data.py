@@ -242,7 +242,7 @@ def _frames(chapter: Chapter, image_stamps_ns: Sequence[int]) -> Iterator[dict[s
             "residual": four_digits(how.residual),
             "residual_unit": how.residual_unit,
             "method": how.method,
-            "doubts": list(record.doubts),
+            "doubts": [doubt.text for doubt in record.doubts],
             "ms": four_digits(results.frame_ms.get(record.stamp_ns)),
             "image": image,
         }

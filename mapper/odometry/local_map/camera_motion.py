@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from mapper.core.doubts import Doubt
 from mapper.core.geometry import Array, Points, Transform
 from mapper.odometry.local_map.image_observation import ImageObservation
 from mapper.odometry.local_map.pose_tracker import refined
@@ -38,13 +39,13 @@ class CameraMotion:
         T_camera_world: (4, 4).
         agree: (M,) which pairs agree with it.
         moving: (M,) which pairs contradict it while another motion is in view; none if there is no other.
-        doubts: Why it may be the motion of something else, a phrase each.
+        doubts: Why it may be the motion of something else.
     """
 
     T_camera_world: Transform
     agree: NDArray[np.bool_]
     moving: NDArray[np.bool_]
-    doubts: tuple[str, ...] = ()
+    doubts: tuple[Doubt, ...] = ()
 
 
 def camera_motion(
@@ -91,7 +92,7 @@ def camera_motion(
     others = int((agree_other & ~agree).sum())
     if spread_other_m < _WIDE * _spread_m(points_world) and others < agree.sum():
         return CameraMotion(T_found, agree, ~agree)
-    doubt = f"{others} of {len(features)} features show another motion"
+    doubt = Doubt("another motion", f"{others} of {len(features)} features show another motion")
     return CameraMotion(T_found, agree, ~agree, (doubt,))
 
 

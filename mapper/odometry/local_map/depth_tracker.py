@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from mapper.core.doubts import Doubt
 from mapper.core.geometry import Transform
 from mapper.core.timebase import NS_PER_S
 from mapper.odometry.config import KeyframeOdometryConfig
@@ -234,9 +235,11 @@ class DepthTracker:
         doubts = self._doubts(observation, alignment, predicted)
         if not self._is_confirmed and expected >= 2 * self._config.min_inliers:
             # What moves with the camera, such as a hand before the lens, is consistent from frame to frame.
-            doubts = (*doubts, f"{expected} features, but none where the depth image has them")
+            text = f"{expected} features, but none where the depth image has them"
+            doubts = (*doubts, Doubt("missing features", text))
         if predicted.gap_s > _MAX_GAP_S:
-            doubts = (*doubts, f"found by depth alone after {predicted.gap_s:.1f} s")
+            text = f"found by depth alone after {predicted.gap_s:.1f} s"
+            doubts = (*doubts, Doubt("depth alone", text))
         return TrackedPose(
             observation,
             alignment.T_camera_world,
@@ -261,8 +264,8 @@ class DepthTracker:
         """Return the pose of an alignment with landmarks, unless most of these contradict it."""
         agree = int(alignment.is_landmark_inlier.sum())
         if agree < _MIN_KEPT_RATIO * found.inliers:
-            doubt = f"{agree} of {found.inliers} features agree with the depth image"
-            return replace(found, doubts=(*found.doubts, doubt))
+            text = f"{agree} of {found.inliers} features agree with the depth image"
+            return replace(found, doubts=(*found.doubts, Doubt("contradicted by depth", text)))
         landmark_of_feature = found.landmark_of_feature.copy()
         features = np.flatnonzero(landmark_of_feature >= 0)
         landmark_of_feature[features[~alignment.is_landmark_inlier]] = -1
@@ -277,7 +280,7 @@ class DepthTracker:
 
     def _doubts(
         self, observation: ImageObservation, alignment: DepthAlignment, predicted: _Prediction
-    ) -> tuple[str, ...]:
+    ) -> tuple[Doubt, ...]:
         """Return which motions were not observed and for how long, and record when all were."""
         if not alignment.unobservable:
             self._observed_ns = observation.stamp_ns
@@ -285,7 +288,8 @@ class DepthTracker:
         unobserved_s = self._unobserved_s(observation)
         if unobserved_s <= predicted.sure_s:
             return ()
-        return (f"neither depth nor features show {alignment.unobservable} for {unobserved_s:.1f} s",)
+        text = f"neither depth nor features show {alignment.unobservable} for {unobserved_s:.1f} s"
+        return (Doubt("unobserved motion", text),)
 
     def _unobserved_s(self, observation: ImageObservation) -> float:
         return (observation.stamp_ns - self._observed_ns) / NS_PER_S

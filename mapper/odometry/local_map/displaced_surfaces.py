@@ -3,8 +3,9 @@
 from collections import deque
 from dataclasses import dataclass
 
+from mapper.core.doubts import Doubt
 from mapper.core.timebase import NS_PER_S
-from mapper.odometry.local_map.doubt import NO_DOUBT, Doubt
+from mapper.odometry.local_map.assessment import UNDOUBTED, Assessment
 from mapper.odometry.local_map.earlier_depth import Displacement
 from mapper.odometry.local_map.image_observation import FEW_MOVING
 from mapper.odometry.local_map.pose_tracker import TrackedPose
@@ -37,8 +38,8 @@ class DisplacedSurfaces:
         self._earlier: dict[int, Displacement] = {}  # of frames made doubtful, as much moved after them
         self._frames: deque[_Frame] = deque()
 
-    def doubt_of(self, tracked_pose: TrackedPose, displaced: Displacement) -> str:
-        """Return that surfaces lie elsewhere by the next frame's pose; empty if they may."""
+    def doubt_of(self, tracked_pose: TrackedPose, displaced: Displacement) -> Doubt | None:
+        """Return that surfaces lie elsewhere by the next frame's pose; None if they may."""
         moving_ratio = len(tracked_pose.moving) / max(len(tracked_pose.observation), 1)
         frame = _Frame(tracked_pose.stamp_ns, moving_ratio, displaced)
         self._frames.append(frame)
@@ -50,20 +51,23 @@ class DisplacedSurfaces:
                     self._earlier[there.stamp_ns] = there.displaced
                 there.among_movers = True
         if frame.among_movers:
-            return _far_phrase(displaced) if displaced.far_ratio > _MOST_FAR else ""
-        return _phrase(displaced.ratio, "", displaced) if displaced.ratio > _MOST else ""
+            return _far_doubt(displaced) if displaced.far_ratio > _MOST_FAR else None
+        return _doubt(displaced.ratio, "", displaced) if displaced.ratio > _MOST else None
 
-    def doubt_of_earlier(self, stamp_ns: int) -> Doubt:
+    def doubt_of_earlier(self, stamp_ns: int) -> Assessment:
         """Return the doubt that later frames add to an earlier one."""
         displaced = self._earlier.get(stamp_ns)
         if displaced is None:
-            return NO_DOUBT
-        return Doubt((_far_phrase(displaced),), 0.0, displaced.distance_m)
+            return UNDOUBTED
+        return Assessment((_far_doubt(displaced),), 0.0, displaced.distance_m)
 
 
-def _far_phrase(displaced: Displacement) -> str:
-    return _phrase(displaced.far_ratio, "farther ", displaced)
+def _far_doubt(displaced: Displacement) -> Doubt:
+    return _doubt(displaced.far_ratio, "farther ", displaced)
 
 
-def _phrase(ratio: float, which: str, displaced: Displacement) -> str:
-    return f"{ratio:.0%} of the {which}surfaces lie elsewhere than {displaced.since_s:.1f} s before"
+def _doubt(ratio: float, which: str, displaced: Displacement) -> Doubt:
+    return Doubt(
+        f"displaced {which}surfaces",
+        f"{ratio:.0%} of the {which}surfaces lie elsewhere than {displaced.since_s:.1f} s before",
+    )

@@ -6,9 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mapper.core.doubts import Doubt
 from mapper.core.geometry import Array, Transform, inverse, log
+from mapper.odometry.local_map.assessment import UNDOUBTED, Assessment
 from mapper.odometry.local_map.displaced_surfaces import DisplacedSurfaces
-from mapper.odometry.local_map.doubt import NO_DOUBT, Doubt
 from mapper.odometry.local_map.earlier_depth import Displacement
 from mapper.odometry.local_map.pose_information import largest_sigma
 from mapper.odometry.local_map.pose_tracker import TrackedPose
@@ -60,7 +61,7 @@ class FrameDoubts:
         T_camera_world_predicted: Transform | None,
         displaced: Displacement,
         excess_error: float,
-    ) -> Doubt:
+    ) -> Assessment:
         """Return the doubts of a frame; the figures of undoubted ones become part of the usual.
 
         Args:
@@ -86,42 +87,44 @@ class FrameDoubts:
             self._shown_since_ns = observation.stamp_ns
         return 1e-9 * (observation.stamp_ns - self._shown_since_ns)
 
-    def _of_repeated_image(self, tracked_pose: TrackedPose, motion: "_FrameMotion", shown_s: float) -> Doubt:
+    def _of_repeated_image(
+        self, tracked_pose: TrackedPose, motion: "_FrameMotion", shown_s: float
+    ) -> Assessment:
         """Return the doubt of a frame that shows an earlier image: the camera moved on as usual."""
         moved_rad, moved_m = (self._usual(name) * shown_s for name in ("speed_rad_s", "speed_m_s"))
-        phrase = f"the image has been the same for {shown_s:.2f} s"
+        doubt = Doubt("repeated image", f"the image has been the same for {shown_s:.2f} s")
         sigma_rad, sigma_m = max(moved_rad, motion.off_rad), max(moved_m, motion.off_m)
-        return Doubt((*tracked_pose.doubts, phrase), sigma_rad, sigma_m, repeats=True)
+        return Assessment((*tracked_pose.doubts, doubt), sigma_rad, sigma_m, repeats=True)
 
-    def _of_depth(self, tracked_pose: TrackedPose, last: TrackedPose, motion: "_FrameMotion") -> Doubt:
+    def _of_depth(self, tracked_pose: TrackedPose, last: TrackedPose, motion: "_FrameMotion") -> Assessment:
         """Return the doubts of a pose by depth: landmarks were few, so their usual figures do not apply."""
-        phrases = tracked_pose.doubts
+        doubts = tracked_pose.doubts
         # A motion that is predicted alone predicts no other.
         is_unobserved = _is_unobserved(tracked_pose) or _is_unobserved(last)
         if not is_unobserved and (jumps := self._jumps(motion)):
-            return Doubt((*phrases, *jumps), motion.off_rad, motion.off_m)
-        if phrases:
-            return Doubt(phrases, motion.sigma_rad, motion.sigma_m)
+            return Assessment((*doubts, *jumps), motion.off_rad, motion.off_m)
+        if doubts:
+            return Assessment(doubts, motion.sigma_rad, motion.sigma_m)
         if not is_unobserved:
             self._add_motion(motion)
-        return NO_DOUBT
+        return UNDOUBTED
 
     def _of_landmarks(
         self, tracked_pose: TrackedPose, motion: "_FrameMotion", displaced: Displacement, excess_error: float
-    ) -> Doubt:
+    ) -> Assessment:
         """Return the doubts of a pose by landmarks."""
         usual_m, usual_agreement = self._usual("sigma_m"), self._usual("agreement")
         agreement, sigma_m = tracked_pose.agreement, motion.sigma_m
-        phrases = list(tracked_pose.doubts)
+        doubts = list(tracked_pose.doubts)
         is_loose = sigma_m > max(_LOOSE_M, _LOOSE_RATIO * usual_m)
         if is_loose:
-            phrases.append(
-                f"{tracked_pose.inliers} features agree, which tell the translation to {sigma_m:.3f} m"
-                + (f", {usual_m:.3f} m is usual" if usual_m else "")
-            )
+            usual = f", {usual_m:.3f} m is usual" if usual_m else ""
+            text = f"{tracked_pose.inliers} features agree, which tell the translation to {sigma_m:.3f} m"
+            doubts.append(Doubt("uncertain translation", text + usual))
         is_contradicted = agreement < _LOW_AGREEMENT * usual_agreement
         if is_contradicted:
-            phrases.append(f"{agreement:.0%} of the matches agree, {usual_agreement:.0%} is usual")
+            text = f"{agreement:.0%} of the matches agree, {usual_agreement:.0%} is usual"
+            doubts.append(Doubt("disagreeing matches", text))
         is_supported = (
             agreement >= _SUPPORT_AGREEMENT * usual_agreement
             and sigma_m <= _SUPPORT_RATIO * usual_m
@@ -130,27 +133,26 @@ class FrameDoubts:
         many_move = len(tracked_pose.moving) > _MANY_MOVING * len(tracked_pose.observation)
         ratio = _JUMP_RATIO_AMONG_MOVING if many_move else _JUMP_RATIO
         jumps = [] if is_supported else self._jumps(motion, ratio)
-        phrases += jumps
+        doubts += jumps
         if elsewhere := self._surfaces.doubt_of(tracked_pose, displaced):
-            phrases.append(elsewhere)
+            doubts.append(elsewhere)
             sigma_m = max(sigma_m, displaced.distance_m)
         if excess_error > _MIN_EXCESS and self._is_apart(motion):
             is_contradicted = True
-            phrases.append(
-                f"the image fits the predicted motion better by {excess_error:.0f} standard errors"
-            )
-        if phrases:
-            return Doubt(
-                tuple(phrases),
+            text = f"the image fits the predicted motion better by {excess_error:.0f} standard errors"
+            doubts.append(Doubt("image error", text))
+        if doubts:
+            return Assessment(
+                tuple(doubts),
                 motion.off_rad,
                 max(motion.off_m, sigma_m),
                 is_implausible=is_loose and is_contradicted and bool(jumps),
             )
         self._add(sigma_m=sigma_m, agreement=agreement)
         self._add_motion(motion)
-        return NO_DOUBT
+        return UNDOUBTED
 
-    def in_hindsight(self, stamp_ns: int) -> Doubt:
+    def in_hindsight(self, stamp_ns: int) -> Assessment:
         """Return the doubt that later frames add to an earlier one."""
         return self._surfaces.doubt_of_earlier(stamp_ns)
 
@@ -160,17 +162,17 @@ class FrameDoubts:
         exceeds = any(miss > _APART * expected > 0.0 for miss, expected in zip(jump, usual, strict=True))
         return exceeds and (jump[0] > _LOOSE_RAD or jump[1] > _LOOSE_M)
 
-    def _jumps(self, motion: "_FrameMotion", ratio: float = _JUMP_RATIO) -> list[str]:
+    def _jumps(self, motion: "_FrameMotion", ratio: float = _JUMP_RATIO) -> list[Doubt]:
         jump, (usual_rad, usual_m) = motion.jump, self._usual_jump(motion.elapsed_s)
-        phrases = []
+        doubts = []
         if usual_rad and jump[0] > ratio * usual_rad:
-            phrases.append(
-                f"turn {math.degrees(jump[0]):.1f}° off the predicted one, "
-                f"{math.degrees(usual_rad):.1f}° is usual"
-            )
+            turn_deg, usual_deg = math.degrees(jump[0]), math.degrees(usual_rad)
+            text = f"turn {turn_deg:.1f}° off the predicted one, {usual_deg:.1f}° is usual"
+            doubts.append(Doubt("turn", text))
         if usual_m and jump[1] > ratio * usual_m:
-            phrases.append(f"jump of {jump[1]:.2f} m off the predicted place, {usual_m:.2f} m is usual")
-        return phrases
+            text = f"jump of {jump[1]:.2f} m off the predicted place, {usual_m:.2f} m is usual"
+            doubts.append(Doubt("jump", text))
+        return doubts
 
     def _usual_jump(self, elapsed_s: float) -> tuple[float, float]:
         """Return the usual angle and distance to the predicted pose after a time; 0 while unknown."""

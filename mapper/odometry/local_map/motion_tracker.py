@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from mapper.core.doubts import Doubt
 from mapper.core.geometry import Points, Transform, apply, inverse
 from mapper.odometry.config import LocalMapConfig
 from mapper.odometry.local_map.camera_motion import agreeing, camera_motion
@@ -95,8 +96,8 @@ class MotionPoseTracker:
         )
         if len(features) < _RIVAL_RATIO * best.inliers or agree.mean() >= _SAME_RATIO:
             return best
-        doubt = f"{len(features)} features show another pose than these {best.inliers}"
-        return replace(best, doubts=(*best.doubts, doubt))
+        text = f"{len(features)} features show another pose than these {best.inliers}"
+        return replace(best, doubts=(*best.doubts, Doubt("another pose", text)))
 
     def _by_motion(
         self, observation: ImageObservation, last: TrackedPose, T_predicted: Transform | None

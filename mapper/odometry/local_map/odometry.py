@@ -23,9 +23,9 @@ from mapper.odometry.base import (
     lost_frame,
 )
 from mapper.odometry.config import KeyframeOdometryConfig
+from mapper.odometry.local_map.assessment import UNDOUBTED, Assessment
 from mapper.odometry.local_map.calibration_checks import CalibrationChecks
 from mapper.odometry.local_map.depth_tracker import DepthTracker
-from mapper.odometry.local_map.doubt import NO_DOUBT, Doubt
 from mapper.odometry.local_map.earlier_depth import EarlierDepth
 from mapper.odometry.local_map.frame_doubts import FrameDoubts
 from mapper.odometry.local_map.gap_check import GapCheck
@@ -147,30 +147,30 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
             return self._not_found(observation)
         information = frame_information(self._map, tracked_pose)
         covariance = covariance_of(information)
-        doubt = self._doubts.assess(
+        assessed = self._doubts.assess(
             tracked_pose, covariance, last, expected, displaced, excess_error(tracked_pose, last, expected)
         )
-        if doubt.is_implausible and tracked_pose.inliers < self._config.weak_inliers:
+        if assessed.is_implausible and tracked_pose.inliers < self._config.weak_inliers:
             return self._lost(observation)
         # The motion before a gap does not predict the motion after it.
         self._before_last = None if self._lost_frames else last
         if self._before_last is not None and recognised is None:
-            self._velocity.add(tracked_pose, covariance, last, is_doubtful=bool(doubt.phrases))
+            self._velocity.add(tracked_pose, covariance, last, is_doubtful=bool(assessed.doubts))
         self._lost_frames = self._unknown_frames = 0
         is_keyframe = self._decision.is_due(tracked_pose) and recognised is None
-        if doubt.repeats or (doubt.phrases and tracked_pose.inliers >= self._config.weak_inliers):
+        if assessed.repeats or (assessed.doubts and tracked_pose.inliers >= self._config.weak_inliers):
             is_keyframe = False  # tracking goes on without it
-        return self._tracked(tracked_pose, information, doubt, is_keyframe=is_keyframe)
+        return self._tracked(tracked_pose, information, assessed, is_keyframe=is_keyframe)
 
     def _tracked(
-        self, tracked_pose: TrackedPose, information: Array, doubt: Doubt, *, is_keyframe: bool
+        self, tracked_pose: TrackedPose, information: Array, assessed: Assessment, *, is_keyframe: bool
     ) -> FrameResult:
         """Return the result of a tracked frame with its covariance, and extend the map by a keyframe."""
         reference, inliers = tracked_pose.reference, tracked_pose.inliers
         self._agreeing = tracked_pose.landmark_of_feature >= 0
         links = []
         if is_keyframe:
-            tracked_pose = self._add_keyframe(tracked_pose, neighbour=reference, doubt=doubt)
+            tracked_pose = self._add_keyframe(tracked_pose, neighbour=reference, assessed=assessed)
             links = [self._factor(reference, tracked_pose.reference)]
         self._last = tracked_pose
         result = self._result(tracked_pose, inliers=inliers, is_keyframe=is_keyframe, links=links)
@@ -179,12 +179,12 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         else:
             information = self._residuals.rescaled(_OWN_SHARE * information, result.T_node_body)
             information = with_systematic(information, tracked_pose)
-            if doubt.phrases:
-                information = inflated(information, sigma_rad=doubt.sigma_rad, sigma_m=doubt.sigma_m)
-        if doubt.repeats:
+            if assessed.doubts:
+                information = inflated(information, sigma_rad=assessed.sigma_rad, sigma_m=assessed.sigma_m)
+        if assessed.repeats:
             result = replace(result, diagnostics=replace(result.diagnostics, method=REPEATED))
         shutter = self._shutter.pose_covariance(tracked_pose.observation.T_body_camera)
-        return replace(result, doubts=doubt.phrases, covariance=covariance_of(information) + shutter)
+        return replace(result, doubts=assessed.doubts, covariance=covariance_of(information) + shutter)
 
     def view(self, observation: ImageObservation, twist: Twist | None = None, /) -> ImageView:
         """Return the view for place recognition, by the readout time as it is known now.
@@ -229,11 +229,11 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
 
     def in_hindsight(self, result: FrameResult) -> FrameResult:
         """Return the result of an earlier frame with the doubts that later ones add to it."""
-        doubt = self._doubts.in_hindsight(result.stamp_ns)
-        if not doubt.phrases or result.covariance is None:
+        later = self._doubts.in_hindsight(result.stamp_ns)
+        if not later.doubts or result.covariance is None:
             return result
-        covariance = result.covariance + np.diag([doubt.sigma_rad**2] * 3 + [doubt.sigma_m**2] * 3)
-        return replace(result, doubts=(*result.doubts, *doubt.phrases), covariance=covariance)
+        covariance = result.covariance + np.diag([later.sigma_rad**2] * 3 + [later.sigma_m**2] * 3)
+        return replace(result, doubts=(*result.doubts, *later.doubts), covariance=covariance)
 
     def finish(self) -> Sequence[BetweenFactor]:
         """Return a factor from every keyframe to those earlier ones that share most landmarks with it.
@@ -339,7 +339,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         return not self._gap_check.agrees_in_part(tracked_pose, last)
 
     def _add_keyframe(
-        self, tracked_pose: TrackedPose, *, neighbour: int | None, doubt: Doubt = NO_DOUBT
+        self, tracked_pose: TrackedPose, *, neighbour: int | None, assessed: Assessment = UNDOUBTED
     ) -> TrackedPose:
         """Turn a tracked frame into a keyframe, refine the map around it, and return its refined pose.
 
@@ -374,7 +374,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
             self._residuals.add_disparity_ratio(ratio)
         self._decision.restart()
         keyframe = self._map.keyframes[index]
-        keyframe.doubt_rad, keyframe.doubt_m = doubt.sigma_rad, doubt.sigma_m
+        keyframe.doubt_rad, keyframe.doubt_m = assessed.sigma_rad, assessed.sigma_m
         return replace(
             tracked_pose,
             observation=self._map.observation(index),

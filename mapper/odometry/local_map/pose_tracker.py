@@ -7,6 +7,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from mapper.core.doubts import Doubt
 from mapper.core.geometry import Array, Points, Transform, apply, inverse
 from mapper.odometry.base import Diagnostics
 from mapper.odometry.local_map.depth_alignment import DepthAlignment
@@ -36,7 +37,7 @@ class TrackedPose:
         residual_px: Root mean square image residual of the inliers.
         method: Step that found the pose, e.g. "map", "fallback" or "relocalised".
         depth: Alignment of the depth image that took part in the pose; None if landmarks alone gave it.
-        doubts: Why the pose may be wrong, a phrase each.
+        doubts: Why the pose may be wrong.
         moving: (M,) int32 features in the free space of earlier depth images, or that contradict the
             pose while something else moves in view.
     """
@@ -51,7 +52,7 @@ class TrackedPose:
     residual_px: float
     method: str
     depth: DepthAlignment | None = None
-    doubts: tuple[str, ...] = ()
+    doubts: tuple[Doubt, ...] = ()
     moving: Ids = field(default_factory=lambda: np.empty(0, np.int32))
 
     @property

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from mapper.core.doubts import Doubt
 from mapper.core.geometry import Array
 from mapper.core.timebase import NS_PER_S
 from mapper.odometry.config import KeyframeOdometryConfig
@@ -77,11 +78,11 @@ class TrackingRecovery:
         if found is None:
             return None
         apart_m = float(np.linalg.norm(found.body_pose[:3, 3] - tracked_pose.body_pose[:3, 3]))
-        doubt = f"recognised {apart_m:.2f} m from where the frames before it led"
+        text = f"recognised {apart_m:.2f} m from where the frames before it led"
         displaced = self._earlier_depth.displacement(
             observation, found.T_camera_world, found.reference, twist_camera
         )
-        return replace(found, doubts=(*found.doubts, doubt)), displaced
+        return replace(found, doubts=(*found.doubts, Doubt("recognised elsewhere", text))), displaced
 
     def is_contradicted(self, tracked_pose: TrackedPose, displaced: Displacement) -> bool:
         """Return whether the depth image contradicts a pose that few landmarks agree with, after a gap.

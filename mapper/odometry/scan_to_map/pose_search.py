@@ -6,6 +6,7 @@ from functools import cached_property
 
 import numpy as np
 
+from mapper.core.doubts import Doubt
 from mapper.core.geometry import Array, Transform, exp, inverse, rotation_exp, transform, turn_to_z
 from mapper.odometry.scan_to_map.config import ScanOdometryConfig
 from mapper.odometry.scan_to_map.motion_model import MotionModel, Spread
@@ -255,8 +256,8 @@ class PoseSearch:
         )
         return is_near and bool(np.isfinite(jump.limit_m)) and not jump.is_unusual
 
-    def doubts(self, candidate: PoseCandidate) -> tuple[str, ...]:
-        """Return the evidence against a pose, a phrase each; empty if there is too little.
+    def doubts(self, candidate: PoseCandidate) -> tuple[Doubt, ...]:
+        """Return the evidence against a pose; empty if there is too little.
 
         Little overlap alone is a new room, and a jump alone a sudden turn. A direction that disagrees alone
         is a doubt where part of the motion was predicted, and another pose that fits as well where the pose
@@ -278,23 +279,25 @@ class PoseSearch:
         )
         if is_alone and not suffices_alone:
             return ()
-        phrases = []
+        doubts = []
         if little:
-            phrases.append(f"{shares.overlap:.0%} of the points agree, {usual.usual.overlap:.0%} is usual")
+            text = f"{shares.overlap:.0%} of the points agree, {usual.usual.overlap:.0%} is usual"
+            doubts.append(Doubt("little overlap", text))
         if contradicts:
-            phrases.append(
+            text = (
                 f"{shares.contradicting:.1%} of the points lie where earlier rays passed, "
                 f"{usual.usual.contradicting:.1%} is usual"
             )
+            doubts.append(Doubt("points in free space", text))
         if disagrees:
-            phrases.append(
-                f"{shares.agreement:.0%} agree in the weakest direction, {usual.usual.agreement:.0%} is usual"
-            )
+            usual_text = f"{usual.usual.agreement:.0%} is usual"
+            text = f"{shares.agreement:.0%} agree in the weakest direction, {usual_text}"
+            doubts.append(Doubt("weak direction", text))
         if candidate.is_one_of_two:
-            phrases.append("another pose fits as well")
+            doubts.append(Doubt("another pose", "another pose fits as well"))
         if jumps:
-            phrases.append(candidate.jump.text)
-        return tuple(phrases)
+            doubts.append(Doubt("jump", candidate.jump.text))
+        return tuple(doubts)
 
     def _nearby(self, scan: UnplacedScan, keyframe: ScanKeyframe) -> Iterator[_Attempt]:
         """Yield poses that are found from the predicted one, from no motion, and from turns of both."""

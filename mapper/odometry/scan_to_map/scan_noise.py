@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mapper.core.doubts import Doubt
 from mapper.core.geometry import Array, Transform, adjoint, inverse
 from mapper.odometry.scan_to_map.observed_part import Blend
 from mapper.odometry.scan_to_map.scan_fit import ScanFit
@@ -48,7 +49,7 @@ class PoseNoise:
 
     covariance: Array
     independent: Array
-    doubts: tuple[str, ...] = ()
+    doubts: tuple[Doubt, ...] = ()
 
     def inflated(self, jump: Jump) -> Array:
         """Return the covariance of a doubtful pose: wrong by as much as it lies off the prediction."""
@@ -108,14 +109,15 @@ class ScanNoise:
         predicted = _along(fit, np.hypot(predicted_m, blend.unknown_mps * self._unseen_s))
         rates = _largest(step) / max(elapsed_s, _SHORTEST_S)
         (sigma_rad, sigma_m), (rate_radps, rate_mps) = _largest(unseen), rates
-        doubts: tuple[str, ...] = ()
+        doubts: tuple[Doubt, ...] = ()
         turns = rate_radps > _TRUSTED_RADPS and sigma_rad > _TRUSTED_RAD
         if turns or (rate_mps > _TRUSTED_MPS and sigma_m > _TRUSTED_M):
             name = fit.unobservable or "a motion"
             known = f"±{rate_mps:.2f} m and {np.degrees(rate_radps):.1f}° a second"
-            doubts = (f"{name} is not seen but predicted, to {known}",)
+            doubts = (Doubt("predicted motion", f"{name} is not seen but predicted, to {known}"),)
             if blend.unknown_mps.any():
-                doubts = (f"{name} is not seen, and was not before: its velocity is unknown",)
+                text = f"{name} is not seen, and was not before: its velocity is unknown"
+                doubts = (Doubt("unknown velocity", text),)
         return PoseNoise(covariance + predicted, independent, doubts)
 
 

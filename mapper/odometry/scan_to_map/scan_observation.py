@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mapper.core.deskew import STILL, Twist, deskewed
+from mapper.core.doubts import Doubt
 from mapper.core.errors import FrameError
 from mapper.core.frames import Frame, Scan
 from mapper.core.geometry import Array
@@ -64,16 +65,17 @@ class ScanObservation:
         """Return whether a change of the rotation, rad/s, displaces the sweep's points noticeably."""
         return self.displacement(turning_radps) > _NEGLIGIBLE
 
-    def doubts(self, velocity_covariance: Array) -> tuple[str, ...]:
+    def doubts(self, velocity_covariance: Array) -> tuple[Doubt, ...]:
         """Return that the points may be displaced, if they may, by the (6, 6) covariance of the velocity."""
         turning_radps = float(np.sqrt(np.linalg.eigvalsh(velocity_covariance[:3, :3])[-1]))
         voxels = self.displacement(turning_radps)
         if voxels <= _DISPLACED:
             return ()
-        return (
+        text = (
             f"its points may be displaced by {voxels * self.voxel_m:.2f} m: the sensor turned during "
-            f"its sweep of {2.0 * self.half_s:.2g} s, known to {np.degrees(turning_radps):.0f}° a second",
+            f"its sweep of {2.0 * self.half_s:.2g} s, known to {np.degrees(turning_radps):.0f}° a second"
         )
+        return (Doubt("displaced points", text),)
 
     def view(self, twist: Twist | None) -> ScanView:
         """Return the points as taken all at once at the stamp, one per voxel; no twist is no motion."""
