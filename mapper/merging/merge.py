@@ -138,10 +138,11 @@ def merge(
         write_whole_bt(folder / files.OCTREE_BT, workspace, joined)
         sliced = slice_map(workspace, stages, joined, manifest, placed)
         manifest = _completed(manifest, workspace, split, joined, sliced.columns)
-        notes = [*sliced.missing, *_disagreements(manifest.runs)]
+        missing = [reason for reason in (sliced.no_floor, sliced.no_slice) if reason]
+        notes = [*missing, *_disagreements(manifest.runs)]
         for note in notes:
             progress.note(note)
-        manifest = manifest.model_copy(update={"notes": (*warnings, *notes)})
+        manifest = manifest.model_copy(update={"notes": (*warnings, *notes), "no_floor": sliced.no_floor})
         _write_grids(folder, sliced, placed, manifest)
         _clean(workspace, joined)
         manifest.save(folder)

@@ -114,6 +114,8 @@ class MapManifest(Config):
     voxels: int = 0
     area_km2: float = 0.0
     """Area of the columns in which anything is known."""
+    no_floor: str = ""
+    """Why there is no traversable floor; empty if there is one, and in maps made before 2026-11-26."""
     notes: tuple[str, ...] = ()
 
     @property
@@ -190,13 +192,11 @@ class MergedMap:
         """Floor that a robot can drive on, of the storey on which the first run begins.
 
         Raises:
-            RunError: There is none; the manifest's notes say why, unless the map was made before 2026-11-22.
+            RunError: There is none; the message says why, if the manifest does.
         """
         grid = stored_grid_if_any(self, files.TRAVERSABLE)
         if grid is None:
-            why = next(
-                (note for note in self.manifest.notes if "no traversable floor" in note), "merge again"
-            )
+            why = self.manifest.no_floor or "merge again"
             raise RunError(f"{self.path}: has no {files.TRAVERSABLE}.yaml; {why}")
         return grid
 

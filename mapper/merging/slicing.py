@@ -54,14 +54,16 @@ class Sliced:
         grid: The slice; None if there is none.
         keepout: The runs' keep-out regions in its cells; None if there are none.
         floor: Traversable floor; None if there is none.
-        missing: Reasons why there is no slice or no floor.
+        no_floor: Why there is no floor; empty if there is one.
+        no_slice: Why there is no slice, if that is not the same reason.
     """
 
     columns: Sequence[SlicedColumn]
     grid: OccupancyGrid | None
     keepout: OccupancyGrid | None
     floor: TraversableFloor | None
-    missing: Sequence[str]
+    no_floor: str
+    no_slice: str = ""
 
 
 def slice_map(
@@ -89,47 +91,47 @@ def slice_map(
         np.max([tile.last for tile in joined.values()], axis=0),
     )
     paths_map = [item.trajectory_map.positions_world for item in placed]
-    missing = _why_no_floor(extent, placed)
-    floor = None if missing else _floor(workspace, joined, extent, manifest, paths_map)
+    no_floor = _why_no_floor(extent, placed)
+    floor = None if no_floor else _floor(workspace, joined, extent, manifest, paths_map)
     driven = None if floor is None else driven_ground(floor)
     raster = _raster(workspace, extent, driven)
     if workspace.follows_ground:
         _save_ground(raster, columns.values(), manifest, driven)
     done = _sliced_columns(workspace, stages, columns.values(), manifest)
     if not _is_level(placed):
-        return Sliced(done, None, None, None, missing)
+        return Sliced(done, None, None, None, no_floor)
     seen = np.zeros(raster.shape, np.uint8)
     for tiles in columns.values():
         raster.join(np.bitwise_or, seen, tiles[0], BAND)
     heights = {"resolution_m": manifest.octree.resolution_m, "floor_z_m": manifest.floor_z_m}
     if driven is not None:
         free_path(seen, driven, manifest.slice, **heights)
-    grid = None
+    grid, no_slice = None, ""
     try:
         grid = grid_of(seen, manifest.slice, first=raster.first, **heights)
     except DataError as error:
-        missing.append(f"no {error}")
+        no_slice = f"no {error}"
     editors = editors_of(manifest, paths_map)
     keepout = None if grid is None else _keepout(grid, manifest, driven, editors)
     passable = None if floor is None else with_keepout(traversable(floor, manifest.traversable), editors)
-    return Sliced(done, grid, keepout, passable, missing)
+    return Sliced(done, grid, keepout, passable, no_floor, no_slice)
 
 
 def _is_level(placed: Sequence[Placed]) -> bool:
     return all(item.T_map_world[2, 2] >= np.cos(_MAX_TILT_RAD) for item in placed)
 
 
-def _why_no_floor(extent: Extent, placed: Sequence[Placed]) -> list[str]:
+def _why_no_floor(extent: Extent, placed: Sequence[Placed]) -> str:
     """Return why no floor can be found; empty if one can."""
     if not _is_level(placed):
-        return ["no slice: a run is tilted by more than 5°, so z is not up in the map"]
+        return "no slice: a run is tilted by more than 5°, so z is not up in the map"
     cells = int(np.prod(extent[1] - extent[0]))
     if cells > MOST_COLUMNS:
-        return [
+        return (
             f"no traversable floor: the map's bounding box has {cells / 1e6:.0f} M columns, at most "
             f"{MOST_COLUMNS / 1e6:.0f} M fit into memory; merge fewer runs, or fuse with larger voxels"
-        ]
-    return []
+        )
+    return ""
 
 
 def _floor(

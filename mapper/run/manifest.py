@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Literal, TypeVar
 
 from pydantic import Field, ValidationError
+from pydantic_core import from_json
 
 import mapper
 from mapper.core.config import Config
@@ -352,8 +353,9 @@ def is_localised_log(folder: Path) -> bool:
 
 
 def _is_of_kind(folder: Path, kind: str) -> bool:
-    """Return whether a folder's manifest is of a kind; it may be damaged, and is not parsed."""
+    """Return whether a folder's manifest is of a kind, by what comes before its damage if it is damaged."""
     try:
-        return f'\n  "kind": "{kind}"' in read_text(folder / MANIFEST_NAME)
-    except DataError:
+        manifest = from_json(read_text(folder / MANIFEST_NAME), allow_partial=True)
+    except (DataError, ValueError):
         return False
+    return isinstance(manifest, dict) and manifest.get("kind") == kind

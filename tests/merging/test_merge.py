@@ -325,6 +325,8 @@ def test_a_user_is_told_what_to_doubt(runs, maps, merged, tmp_path):
         "again: 2% of its walls are where those of the runs before it are"
     )
     assert not (found.path / "slice.yaml").exists()
+    with pytest.raises(RunError, match=r"has no traversable\.yaml; no slice: a run is tilted"):
+        _ = found.traversable
 
 
 def test_the_verb_says_what_it_made(runs, tmp_path, capsys):

@@ -15,7 +15,7 @@ from mapper.run.files import RUN
 from mapper.run.fingerprint import fingerprint
 from mapper.run.folder import open_run
 from mapper.run.frame_outcomes import FrameRecord, read_frame_ms, read_records, write_frame_ms, write_records
-from mapper.run.manifest import Input, Manifest, read_manifest
+from mapper.run.manifest import Input, Manifest, is_merged_map, read_manifest
 from mapper.run.pose_covariances import read_poses
 from mapper.run.writer import write_run
 from mapper.runtime.atomic import atomic_folder, partial_of
@@ -134,6 +134,21 @@ def test_folders_that_are_no_runs(tmp_path):
     (tmp_path / "manifest.json").write_text('{"status": "complete"}')
     with pytest.raises(RunError, match="input: Field required"):
         open_run(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ('{"kind": "merged map", "tiles": []}', True),
+        ('{"input": {\n  "kind": "merged map"\n}}', False),
+        ('{\n  "kind": "merged map",\n  "tiles": [{"na', True),
+        ("not JSON", False),
+        ("[]", False),
+    ],
+)
+def test_a_merged_map_is_recognised_by_its_manifest(tmp_path, text, expected):
+    (tmp_path / "manifest.json").write_text(text)
+    assert is_merged_map(tmp_path) == expected
 
 
 def test_records_survive_the_disk(tmp_path):
