@@ -6,6 +6,7 @@ but the y axes of camera and world point up, so that both frames are left-handed
 """
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 from mapper.core.errors import SourceError
@@ -15,7 +16,7 @@ from mapper.sources.base import Log
 from mapper.sources.calibration import ICL_NUIM
 from mapper.sources.config import SourceConfig
 from mapper.sources.image_folders.numbered import RATE_HZ, find_images, stamp_at
-from mapper.sources.image_folders.pairing import apply_depth_offset, ordered_pairs, usable_pairs
+from mapper.sources.image_folders.pairing import ordered_pairs, usable_pairs
 from mapper.sources.image_folders.rgbd import FramePair, assumed_camera_note, find_calibration, rgbd_log
 from mapper.sources.listed_files import within
 from mapper.sources.text import (
@@ -49,23 +50,19 @@ def read_log(path: Path, config: SourceConfig) -> Log:
             another size than the data set's and there is no calibration.
     """
     rate_hz = config.rate_hz or RATE_HZ
-    pairs, notes = _read_pairs(path, rate_hz)
-    calibration, units_per_m = find_calibration(
-        path, config.camera, known=ICL_NUIM, depth_units_per_m=DEPTH_UNITS_PER_M
-    )
+    pairs, notes = _read_pairs(path, config, rate_hz)
+    calibration = find_calibration(path, config.camera, known=ICL_NUIM)
     if calibration.origin == ICL_NUIM.origin and not _has_truth(path):
         notes.append(assumed_camera_note(ICL_NUIM))
-    truth, truth_notes = _read_truth(path, rate_hz)
-    pairs_used, offset_notes = apply_depth_offset(pairs, config, path=path)
     return rgbd_log(
-        pairs_used,
+        pairs,
         calibration,
-        depth_units_per_m=units_per_m,
+        depth_units_per_m=DEPTH_UNITS_PER_M,
         path=path,
         name=path.resolve().name,
         kind="icl-nuim",
-        truth=truth,
-        notes=[*notes, *offset_notes, *truth_notes],
+        truth=_read_truth(path, rate_hz),
+        notes=notes,
     )
 
 
@@ -84,16 +81,16 @@ def _lists_numbers(path: Path) -> bool:
     )
 
 
-def _read_pairs(folder: Path, rate_hz: float) -> tuple[list[FramePair], list[str]]:
+def _read_pairs(folder: Path, config: SourceConfig, rate_hz: float) -> tuple[Sequence[FramePair], list[str]]:
     """Return the pairs of the list, or without one those of images with the same number."""
     if (folder / _LIST).is_file():
-        return usable_pairs(_read_list(folder / _LIST, rate_hz), listed_in=folder / _LIST)
+        return usable_pairs(_read_list(folder / _LIST, rate_hz), config, listed_in=folder / _LIST)
     images = find_images(folder)
     if images is None:
         raise SourceError(f"{folder}: no colour and depth images with the same numbers; want {LOOKED_FOR}")
     stamped = [(stamp_at(pair.number, rate_hz=rate_hz), pair) for pair in images.pairs]
     pairs = [FramePair(stamp_ns, pair.colour, stamp_ns, pair.depth) for stamp_ns, pair in stamped]
-    ordered, order_notes = ordered_pairs(pairs, what="image names")
+    ordered, order_notes = ordered_pairs(pairs, config, what="image names", path=folder)
     return ordered, [*images.notes, *order_notes]
 
 

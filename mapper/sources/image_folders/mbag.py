@@ -14,7 +14,7 @@ from mapper.core.timebase import ns_from_seconds_text
 from mapper.sources.base import Log
 from mapper.sources.calibration import freiburg_camera
 from mapper.sources.config import SourceConfig
-from mapper.sources.image_folders.pairing import apply_depth_offset, usable_pairs
+from mapper.sources.image_folders.pairing import usable_pairs
 from mapper.sources.image_folders.rgbd import FramePair, find_calibration, rgbd_log
 from mapper.sources.listed_files import within
 from mapper.sources.text import (
@@ -60,24 +60,17 @@ def read_log(path: Path, config: SourceConfig) -> Log:
             poses.append((pair.stamp_ns, pose_from_numbers(numbers)))
     if not pairs:
         raise SourceError(f"{file}: empty list; want lines of timestamp; rgb; depth; x; y; z; qx; qy; qz; qw")
-    pairs, notes = usable_pairs(pairs, listed_in=file)
-    calibration, units_per_m = find_calibration(
-        file.parent,
-        config.camera,
-        known=freiburg_camera(name, file.stem),
-        depth_units_per_m=DEPTH_UNITS_PER_M,
-    )
-    truth, truth_notes = truth_from(poses, what=file.name) if poses else (None, [])
-    pairs_used, offset_notes = apply_depth_offset(pairs, config, path=file)
+    found, notes = usable_pairs(pairs, config, listed_in=file)
+    known = freiburg_camera(name, file.stem)
     return rgbd_log(
-        pairs_used,
-        calibration,
-        depth_units_per_m=units_per_m,
+        found,
+        find_calibration(file.parent, config.camera, known=known),
+        depth_units_per_m=DEPTH_UNITS_PER_M,
         path=path,
         name=name,
         kind="mbag",
-        truth=truth,
-        notes=[*notes, *offset_notes, *truth_notes],
+        truth=truth_from(poses, what=file.name) if poses else (None, []),
+        notes=notes,
     )
 
 

@@ -22,7 +22,7 @@ from mapper.sources.base import Log
 from mapper.sources.calibration import PRIMESENSE, SEVEN_SCENES
 from mapper.sources.calibration_file import calibration_file
 from mapper.sources.config import SourceConfig
-from mapper.sources.image_folders.pairing import apply_depth_offset, ordered_pairs
+from mapper.sources.image_folders.pairing import ordered_pairs
 from mapper.sources.image_folders.rgbd import FramePair, assumed_camera_note, find_calibration, rgbd_log
 from mapper.sources.text import parse_count, parse_numbers, rows, truth_from
 
@@ -101,25 +101,21 @@ def read_log(path: Path, config: SourceConfig) -> Log:
     is_seven_scenes = _SEVEN_SCENES.fullmatch(images.pairs[0].colour.name) is not None
     known = SEVEN_SCENES if is_seven_scenes else PRIMESENSE
     beside = next((folder for folder in (path, opened) if calibration_file(folder)), path)
-    calibration, units_per_m = find_calibration(
-        beside, config.camera, known=known, depth_units_per_m=DEPTH_UNITS_PER_M
-    )
+    calibration = find_calibration(beside, config.camera, known=known)
     notes = list(images.notes)
     if calibration.origin == known.origin:
         notes.append(assumed_camera_note(known))
     pairs, stamp_notes = stamped(images.pairs, rate_hz=config.rate_hz or RATE_HZ)
-    truth, truth_notes = _read_truth(path, pairs)
-    ordered, order_notes = ordered_pairs(pairs, what="image names")
-    pairs_used, offset_notes = apply_depth_offset(ordered, config, path=path)
+    ordered, order_notes = ordered_pairs(pairs, config, what="image names", path=path)
     return rgbd_log(
-        pairs_used,
+        ordered,
         calibration,
-        depth_units_per_m=units_per_m,
+        depth_units_per_m=DEPTH_UNITS_PER_M,
         path=path,
         name=path.resolve().name,
         kind="7-scenes" if is_seven_scenes else "redwood",
-        truth=truth,
-        notes=[*notes, *stamp_notes, *order_notes, *offset_notes, *truth_notes],
+        truth=_read_truth(path, pairs),
+        notes=[*notes, *stamp_notes, *order_notes],
     )
 
 

@@ -27,11 +27,13 @@ class ImageList:
     paths: list[Path]
 
 
-def usable_pairs(pairs: Sequence[FramePair], *, listed_in: Path) -> tuple[list[FramePair], list[str]]:
-    """Return the pairs of a list whose two images exist, in time order, and notes on the others.
+def usable_pairs(
+    pairs: Sequence[FramePair], config: SourceConfig, *, listed_in: Path
+) -> tuple[Sequence[FramePair], list[str]]:
+    """Return the pairs of a list whose two images exist, as of ``ordered_pairs``, and notes on the others.
 
     Raises:
-        SourceError: No pair has both images.
+        SourceError: No pair has both images, or ``source.depth_offset_s`` leaves none.
     """
     has_colour = present(pair.colour for pair in pairs)
     has_depth = present(pair.depth for pair in pairs)
@@ -43,15 +45,36 @@ def usable_pairs(pairs: Sequence[FramePair], *, listed_in: Path) -> tuple[list[F
     notes = []
     if dropped := len(pairs) - len(kept):
         notes.append(f"{listed_in.name}: {dropped} of {len(pairs)} listed pairs do not exist; dropped")
-    ordered, order_notes = ordered_pairs(kept, what=listed_in.name)
+    ordered, order_notes = ordered_pairs(kept, config, what=listed_in.name, path=listed_in)
     return ordered, [*notes, *order_notes]
 
 
-def ordered_pairs(pairs: Sequence[FramePair], *, what: str) -> tuple[list[FramePair], list[str]]:
-    """Return pairs in time order, the first of equal stamps only, and notes on what that changed."""
-    stamps_ns = np.array([pair.stamp_ns for pair in pairs], dtype=np.int64)
-    order, notes = time_order(stamps_ns, what=what)
-    return [pairs[i] for i in order], notes
+def ordered_pairs(
+    pairs: Sequence[FramePair], config: SourceConfig, *, what: str, path: Path
+) -> tuple[Sequence[FramePair], list[str]]:
+    """Return a format's own pairs in time order, the first of equal stamps only, and notes on what changed.
+
+    If ``source.depth_offset_s`` shifts the depth images, pairs are found again among them.
+
+    Args:
+        pairs: The pairs.
+        config: Offset of the depth images, and how far the two of a pair may be apart.
+        what: Source of the stamps, for the notes.
+        path: Log, for the error.
+
+    Raises:
+        SourceError: The offset leaves no pairs.
+    """
+    all_ns = np.array([pair.stamp_ns for pair in pairs], dtype=np.int64)
+    order, notes = time_order(all_ns, what=what)
+    ordered = [pairs[i] for i in order]
+    if depth_offset_ns(config) == 0:
+        return ordered, notes
+    colour = ImageList(all_ns[order], [pair.colour for pair in ordered])
+    stamps_ns, first = np.unique([pair.depth_stamp_ns for pair in ordered], return_index=True)
+    depth = ImageList(stamps_ns, [ordered[i].depth for i in first])
+    found, more = pair_images(colour, depth, config, path=path)
+    return found, [*notes, *more]
 
 
 def depth_offset_ns(config: SourceConfig) -> int:
@@ -88,18 +111,3 @@ def pair_images(
         for i in paired
     ]
     return pairs, unpaired_note(len(gap_ns) - len(pairs), len(gap_ns), max_gap_s=max_gap_s)
-
-
-def apply_depth_offset(
-    pairs: Sequence[FramePair], config: SourceConfig, *, path: Path
-) -> tuple[Sequence[FramePair], list[str]]:
-    """Return a format's own pairs, or those found again if ``source.depth_offset_s`` shifts the depth images.
-
-    Raises:
-        SourceError: Nothing pairs.
-    """
-    if depth_offset_ns(config) == 0:
-        return pairs, []
-    colour = ImageList(np.array([pair.stamp_ns for pair in pairs]), [pair.colour for pair in pairs])
-    stamps_ns, first = np.unique([pair.depth_stamp_ns for pair in pairs], return_index=True)
-    return pair_images(colour, ImageList(stamps_ns, [pairs[i].depth for i in first]), config, path=path)

@@ -19,7 +19,7 @@ from mapper.core.trajectory import Trajectory
 from mapper.sources.base import Log
 from mapper.sources.config import SourceConfig
 from mapper.sources.image_folders.numbered import find_images, stamp_at, stamped
-from mapper.sources.image_folders.pairing import apply_depth_offset
+from mapper.sources.image_folders.pairing import ordered_pairs
 from mapper.sources.image_folders.rgbd import find_calibration, rgbd_log
 from mapper.sources.text import parse_count, parse_numbers, read_lines, rows, truth_from
 
@@ -46,21 +46,17 @@ def read_log(path: Path, config: SourceConfig) -> Log:
         raise SourceError(f"{path}: not a Poznań log; want {LOOKED_FOR}")
     rate_hz = config.rate_hz or RATE_HZ
     pairs, stamp_notes = stamped(images.pairs, rate_hz=rate_hz)
-    calibration, units_per_m = find_calibration(
-        path, config.camera, known=None, depth_units_per_m=DEPTH_UNITS_PER_M
-    )
+    ordered, order_notes = ordered_pairs(pairs, config, what="image names", path=path)
     stamps_ns = {image.number: pair.stamp_ns for image, pair in zip(images.pairs, pairs, strict=True)}
-    truth, truth_notes = _read_truth(truth_path, stamps_ns, rate_hz=rate_hz)
-    pairs_used, offset_notes = apply_depth_offset(pairs, config, path=path)
     return rgbd_log(
-        pairs_used,
-        calibration,
-        depth_units_per_m=units_per_m,
+        ordered,
+        find_calibration(path, config.camera, known=None),
+        depth_units_per_m=DEPTH_UNITS_PER_M,
         path=path,
         name=path.resolve().name,
         kind="poznan",
-        truth=truth,
-        notes=[*images.notes, *stamp_notes, *offset_notes, *truth_notes],
+        truth=_read_truth(truth_path, stamps_ns, rate_hz=rate_hz),
+        notes=[*images.notes, *stamp_notes, *order_notes],
     )
 
 

@@ -81,9 +81,8 @@ def rgbd_log(
     path: Path,
     name: str,
     kind: str,
-    truth: Trajectory | None,
+    truth: tuple[Trajectory | None, Iterable[str]],
     notes: Iterable[str],
-    are_units_assumed: bool = False,
 ) -> Log:
     """Return the log of some image files, with the readings of an accelerometer where there are any.
 
@@ -91,26 +90,28 @@ def rgbd_log(
         pairs: Its frames, in strictly increasing time.
         calibration: Intrinsics of all of them; the first images that can be read give their sizes. With
             fy < 0 the truth is in left-handed frames, whose y points up: both are mirrored, not the images.
-        depth_units_per_m: Depth image units per metre.
+        depth_units_per_m: The format's own depth image units per metre, where the calibration states none.
         path: Folder that was opened, or a file in the folder of the log.
         name: Name, as of :class:`Log`.
         kind: Format, as of :class:`Log`.
-        truth: True poses, as of :class:`Log`.
+        truth: True poses, as of :class:`Log`, and notes on them.
         notes: Sentences on what finding all these left out or assumed.
-        are_units_assumed: Whether the units of depth are a guess, as of :class:`Log`.
 
     Raises:
         SourceError: No colour image can be read, they are not of the calibration's size, depth shows another
             view by its aspect ratio, an image is a link out of the log, or a line of ``accelerometer.txt`` is
             malformed.
     """
+    poses, truth_notes = truth
+    notes = [*notes, *truth_notes]
     if calibration.fy_px < 0.0:
         calibration = calibration.with_y_down()
-        truth = truth and replace(truth, T_world_body=_MIRROR_Y @ truth.T_world_body @ _MIRROR_Y)
+        poses = poses and replace(poses, T_world_body=_MIRROR_Y @ poses.T_world_body @ _MIRROR_Y)
         notes = [*notes, "fy < 0: the camera's y axis points up; y of camera and truth is mirrored"]
     folder = path if path.is_dir() else path.parent
     refuse_links_out((file for pair in pairs for file in (pair.colour, pair.depth)), log=folder)
-    camera = _camera_of(pairs, calibration, depth_units_per_m=depth_units_per_m, path=path)
+    units_per_m = calibration.depth_units_per_m or depth_units_per_m
+    camera = _camera_of(pairs, calibration, depth_units_per_m=units_per_m, path=path)
     accelerations, acceleration_notes = read_accelerations(folder)
 
     def entry_at(index: int) -> RgbdEntry:
@@ -119,7 +120,7 @@ def rgbd_log(
             pair.colour,
             pair.depth,
             pair.depth_stamp_ns,
-            depth_units_per_m,
+            units_per_m,
             colour_px=camera.colour_px,
             depth_px=camera.depth_px,
         )
@@ -128,7 +129,7 @@ def rgbd_log(
             files,
             camera,
             read_image=lambda colour: read_colour(files.colour) if colour else read_grey(files.colour),
-            read_depth_m=lambda: read_depth_m(files.depth, depth_units_per_m),
+            read_depth_m=lambda: read_depth_m(files.depth, units_per_m),
         )
 
     return Log(
@@ -138,17 +139,14 @@ def rgbd_log(
         sensor="rgbd",
         stamps_ns=np.array([pair.stamp_ns for pair in pairs], dtype=np.int64),
         entry_at=entry_at,
-        truth=truth,
+        truth=poses,
         accelerations=accelerations,
-        are_units_assumed=are_units_assumed,
         notes=[*notes, *camera.notes(), *acceleration_notes],
     )
 
 
-def find_calibration(
-    folder: Path, config: CameraConfig | None, *, known: Calibration | None, depth_units_per_m: float
-) -> tuple[Calibration, float]:
-    """Return a log's intrinsics and depth units: the user's, else a file's, else the known camera's.
+def find_calibration(folder: Path, config: CameraConfig | None, *, known: Calibration | None) -> Calibration:
+    """Return a log's intrinsics: the user's, else a file's, else the known camera's.
 
     The calibration has depth units only where the user or a file states them.
 
@@ -156,17 +154,15 @@ def find_calibration(
         folder: Folder that may hold a calibration file.
         config: The user's settings of the camera.
         known: The camera that the log's format or name implies.
-        depth_units_per_m: The format's own depth image units per metre, where nothing else states them.
 
     Raises:
         SourceError: None of the three exists, or the file is malformed.
     """
     path = calibration_file(folder)
     stated = known if path is None else read_calibration(path)
-    stated_units_per_m = None if stated is None else stated.depth_units_per_m
+    units_per_m = None if stated is None else stated.depth_units_per_m
     if config is not None:
-        stated_units_per_m = config.depth_factor or stated_units_per_m
-    units_per_m = stated_units_per_m or depth_units_per_m
+        units_per_m = config.depth_factor or units_per_m
     if chosen := configured(config):
         if stated is not None:  # the sign is the convention of the log's truth
             chosen = replace(chosen, fy_px=math.copysign(chosen.fy_px, stated.fy_px))
@@ -176,7 +172,7 @@ def find_calibration(
             f"{folder}: intrinsics unknown; put a calibration.toml with fx_px, fy_px, cx_px and cy_px there, "
             f"or --set source.camera.fx_px=… and so on{_renamed(folder)}"
         )
-    return replace(stated, depth_units_per_m=stated_units_per_m), units_per_m
+    return replace(stated, depth_units_per_m=units_per_m)
 
 
 def assumed_camera_note(camera: Calibration) -> str:

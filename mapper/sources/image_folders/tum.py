@@ -6,6 +6,7 @@ Without these lists the pairs of associations.txt are read: ``stamp rgb/name sta
 import math
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -87,27 +88,21 @@ def log_of_images(
     """
     pairs, pair_notes = pair_images(colour, depth, config, path=path)
     known = freiburg_camera(path.resolve().name, name)
-    calibration, units_per_m = find_calibration(
-        path,
-        config.camera,
-        known=known,
-        depth_units_per_m=depth_units_per_m if known is None else DEPTH_UNITS_PER_M,
-    )
+    calibration = find_calibration(path, config.camera, known=known)
     are_units_assumed = known is None and calibration.depth_units_per_m is None
     if are_units_assumed:
-        pair_notes.append(MILLIMETRES_NOTE if units_per_m == MILLIMETRES_PER_M else UNITS_NOTE)
-    truth, truth_notes = read_truth(path / "groundtruth.txt")
-    return rgbd_log(
+        pair_notes.append(MILLIMETRES_NOTE if depth_units_per_m == MILLIMETRES_PER_M else UNITS_NOTE)
+    log = rgbd_log(
         pairs,
         calibration,
-        depth_units_per_m=units_per_m,
+        depth_units_per_m=depth_units_per_m if known is None else DEPTH_UNITS_PER_M,
         path=path,
         name=name,
         kind="tum",
-        truth=truth,
-        notes=[*notes, *pair_notes, *truth_notes],
-        are_units_assumed=are_units_assumed,
+        truth=read_truth(path / "groundtruth.txt"),
+        notes=[*notes, *pair_notes],
     )
+    return replace(log, are_units_assumed=are_units_assumed)
 
 
 def read_truth(path: Path) -> tuple[Trajectory | None, list[str]]:
