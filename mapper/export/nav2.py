@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from mapper.core.errors import DataError
 from mapper.export.grid import write_grid, write_values
 from mapper.navigation.config import CostmapConfig
-from mapper.navigation.distance_transform import NONE, squares_to_centres
+from mapper.navigation.distance_transform import plane_distances
 from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, overlap_of, with_obstacles
 from mapper.run.map_folder import MapFolder
 from mapper.runtime.atomic import MANIFEST_NAME, FolderKind, atomic_folder, write_text
@@ -75,8 +75,7 @@ def slowed_percent(grid: OccupancyGrid, keepout: OccupancyGrid, config: CostmapC
     The speed falls linearly from full, at the inflation radius, to 30 % at the robot's own radius.
     """
     obstacles = (grid.cells == OCCUPIED) | (keepout.cells == OCCUPIED)
-    squares = squares_to_centres(obstacles[np.newaxis])[0]
-    distances_m = np.where(squares == NONE, np.inf, np.sqrt(squares)) * grid.resolution_m
+    distances_m = plane_distances(obstacles) * grid.resolution_m
     span_m = max(config.inflation_radius_m - config.robot_radius_m, grid.resolution_m)
     nearness = np.clip((config.inflation_radius_m - distances_m) / span_m, 0.0, 1.0)
     slowed = np.rint((100.0 - _SLOWEST_PERCENT) * nearness).astype(np.uint8)

@@ -24,11 +24,15 @@ from mapper.loops.odometry_chain import OdometryChain
 from mapper.loops.online_pose_estimator import Correction, build_pose_estimator
 from mapper.loops.place_file import AnyPlace
 
-LOOPS_OF: Mapping[Sensor, PlaceLoopsConfig | ScanLoopsConfig] = {
+_LOOPS_OF: Mapping[Sensor, PlaceLoopsConfig | ScanLoopsConfig] = {
     "rgbd": PlaceLoopsConfig(),
     "lidar": ScanLoopsConfig(),
 }
-"""Settings by which keyframes are compared where a run was built without loops."""
+
+
+def keyframe_loops(config: AnyLoops, sensor: Sensor) -> PlaceLoopsConfig | ScanLoopsConfig:
+    """Return how keyframes are compared: by the settings, or as usual where these compare none."""
+    return config if isinstance(config, PlaceLoopsConfig | ScanLoopsConfig) else _LOOPS_OF[sensor]
 
 
 def build_loop_detector(

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from mapper.core.errors import DataError
 from mapper.core.geometry import Array
-from mapper.navigation.distance_transform import NONE, squares_to_centres
+from mapper.navigation.distance_transform import plane_distances
 from mapper.octree.grid import OCCUPIED, UNKNOWN, OccupancyGrid
 
 NO_INFORMATION, LETHAL, INSCRIBED, FREE_SPACE = 255, 254, 253, 0
@@ -54,8 +54,7 @@ def inflate(
         raise DataError(
             f"costmap: inflation radius {inflation_radius_m} m, want at least the robot's {robot_radius_m} m"
         )
-    squares = squares_to_centres((grid.cells == OCCUPIED)[np.newaxis])[0]
-    cells = np.where(squares == NONE, np.inf, np.sqrt(squares))
+    cells = plane_distances(grid.cells == OCCUPIED)
     distances_m = cells * grid.resolution_m
     decay = np.exp(-cost_scaling * np.maximum(distances_m - robot_radius_m, 0.0))
     costs = ((INSCRIBED - 1) * decay).astype(np.uint8)

@@ -36,6 +36,15 @@ def squares_to_centres(targets: NDArray[np.bool_]) -> Squares:
     return _squares(targets, solid=False)
 
 
+def plane_distances(targets: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Return (H, W) distance of every cell's centre to that of the nearest target of (H, W), in cells.
+
+    It is +inf where there is no target. Errors as of ``squares_to_centres``.
+    """
+    squares = squares_to_centres(targets[np.newaxis])[0]
+    return np.where(squares == NONE, np.inf, np.sqrt(squares))
+
+
 def squares_to_boxes(targets: NDArray[np.bool_]) -> Squares:
     """Return the squared distance of every cell's centre to the nearest target's surface, in quarter cells².
 

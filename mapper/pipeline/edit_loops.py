@@ -12,8 +12,7 @@ from mapper.graph.model import PoseGraph
 from mapper.graph.odometry_poses import by_odometry
 from mapper.loops.base import Proposal, Verifier, verify_proposal
 from mapper.loops.closure import LoopClosure, accepted_loops
-from mapper.loops.config import NoLoopsConfig
-from mapper.loops.factory import LOOPS_OF, build_verifier
+from mapper.loops.factory import build_verifier, keyframe_loops
 from mapper.pipeline.floor import above_level_floor, tracked_stamps
 from mapper.pipeline.fuse import fuse_changed
 from mapper.pipeline.reobserve import reobserve
@@ -119,7 +118,7 @@ def _measured(
 
 
 def _verifier(config: BuildConfig, sensor: Sensor) -> Verifier[Any]:
-    loops = LOOPS_OF[sensor] if isinstance(config.loops, NoLoopsConfig) else config.loops
+    loops = keyframe_loops(config.loops, sensor) if config.loops.kind == "none" else config.loops
     return build_verifier(loops.verification)
 
 

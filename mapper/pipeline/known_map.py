@@ -13,8 +13,8 @@ from mapper.core.errors import RunError
 from mapper.core.frames import Sensor
 from mapper.core.geometry import Transform
 from mapper.features.frame_view import ImageView
-from mapper.loops.config import AnyLoops, KeyframeLoopsConfig, PlaceLoopsConfig, ScanLoopsConfig
-from mapper.loops.factory import LOOPS_OF, build_verifier
+from mapper.loops.config import AnyLoops, PlaceLoopsConfig, ScanLoopsConfig
+from mapper.loops.factory import build_verifier, keyframe_loops
 from mapper.loops.map_constraints import KnownPlaces
 from mapper.loops.place_file import AnyPlace, read_places
 from mapper.merging.extending import runs_of
@@ -104,7 +104,7 @@ def sensor_of(places: KnownPlaces[Any]) -> Sensor:
 
 def loops_between_days(config: AnyLoops, sensor: Sensor) -> PlaceLoopsConfig | ScanLoopsConfig:
     """Return how keyframes are compared with those of another day, on which some things stood elsewhere."""
-    loops = config if isinstance(config, PlaceLoopsConfig | ScanLoopsConfig) else LOOPS_OF[sensor]
+    loops = keyframe_loops(config, sensor)
     if isinstance(loops, PlaceLoopsConfig):
         return loops
     moved = max(loops.verification.max_moved_ratio, _MAX_MOVED_RATIO)
@@ -133,7 +133,7 @@ def places_of(run: Run, *, progress: Progress = SILENT) -> Mapping[int, AnyPlace
     if (run.path / files.PLACES).exists():
         return read_places(run.file(files.PLACES))
     log = run.open_log()
-    loops = run.config.loops if isinstance(run.config.loops, KeyframeLoopsConfig) else LOOPS_OF[log.sensor]
-    verifier, graph = build_verifier(loops.verification), run.graph
+    verifier = build_verifier(keyframe_loops(run.config.loops, log.sensor).verification)
+    graph = run.graph
     views = reobserve(log, run.trajectory, set(graph.stamps_ns.values()), run.config, progress=progress)
     return {node: verifier.describe(views[stamp_ns]) for node, stamp_ns in graph.stamps_ns.items()}

@@ -1,7 +1,5 @@
 """Frame records: the outcome of every frame of a log, and the time it took."""
 
-import csv
-import io
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,12 +8,10 @@ from typing import Literal, get_args
 import numpy as np
 
 from mapper.core.doubts import Doubt, doubts_of, doubts_text, kinds_text
-from mapper.core.errors import DataError, RunError
 from mapper.core.rotations import row_of_pose
 from mapper.core.timebase import Stamps
 from mapper.odometry.base import Diagnostics, FrameResult
-from mapper.runtime.atomic import write_text
-from mapper.runtime.regular_files import read_text
+from mapper.run.csv_file import read_csv, write_csv
 from mapper.sources.base import Skipped
 
 Outcome = Literal["tracked", "doubtful", "lost", "skipped"]
@@ -47,6 +43,7 @@ _COLUMNS = (
     *_POSE,
     "doubt_kinds",
 )
+_MS_COLUMNS = ("stamp_ns", "ms")
 DISCONNECTED = "disconnected"
 """``Diagnostics.method`` of a frame that was placed, but in a part of the path that is left out."""
 
@@ -107,31 +104,7 @@ def stamps_of(records: Iterable[FrameRecord]) -> Stamps:
 
 def write_records(path: Path, records: Iterable[FrameRecord]) -> None:
     """Write CSV with a header; numbers keep every digit."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(_COLUMNS)
-    for record in records:
-        how = record.diagnostics
-        writer.writerow(
-            [
-                record.stamp_ns,
-                record.outcome,
-                "" if record.node is None else record.node,
-                int(record.is_keyframe),
-                how.method,
-                how.features,
-                how.matches,
-                how.inliers,
-                repr(float(how.residual)),
-                how.residual_unit,
-                how.unobservable,
-                doubts_text(record.doubts),
-                *_cells(record.sigmas, len(_SIGMAS)),
-                *_cells(record.pose_in_node, len(_POSE)),
-                kinds_text(record.doubts),
-            ]
-        )
-    write_text(path, text.getvalue())
+    write_csv(path, _COLUMNS, map(_row, records))
 
 
 def read_records(path: Path) -> list[FrameRecord]:
@@ -141,17 +114,12 @@ def read_records(path: Path) -> list[FrameRecord]:
         RunError: The file cannot be read.
         DataError: It is not what ``write_records`` writes.
     """
-    text = read_text(path, error=RunError)
-    try:
-        return [_record(row) for row in csv.DictReader(io.StringIO(text))]
-    except (KeyError, ValueError, TypeError, csv.Error) as error:
-        raise DataError(f"{path}: not a list of frames with columns {', '.join(_COLUMNS)}: {error}") from None
+    return read_csv(path, _COLUMNS, lambda rows: [_record(row) for row in rows], of="frames")
 
 
 def write_frame_ms(path: Path, frame_ms: Mapping[int, float]) -> None:
     """Write how many milliseconds each frame took, by stamp."""
-    lines = [f"{stamp_ns},{ms:.3f}" for stamp_ns, ms in frame_ms.items()]
-    write_text(path, "\n".join(["stamp_ns,ms", *lines]) + "\n")
+    write_csv(path, _MS_COLUMNS, ((stamp_ns, f"{ms:.3f}") for stamp_ns, ms in frame_ms.items()))
 
 
 def read_frame_ms(path: Path) -> dict[int, float]:
@@ -161,11 +129,9 @@ def read_frame_ms(path: Path) -> dict[int, float]:
         RunError: The file cannot be read.
         DataError: It is something else.
     """
-    lines = read_text(path, error=RunError).splitlines()[1:]
-    try:
-        return {int(stamp_ns): float(ms) for stamp_ns, ms in (line.split(",") for line in lines)}
-    except ValueError as error:
-        raise DataError(f"{path}: not a list of stamp_ns,ms: {error}") from None
+    return read_csv(
+        path, _MS_COLUMNS, lambda rows: {int(row["stamp_ns"]): float(row["ms"]) for row in rows}, of="times"
+    )
 
 
 def _outcome(track: FrameResult) -> Outcome:
@@ -190,7 +156,28 @@ def _numbers(row: Mapping[str, str], names: Sequence[str]) -> tuple[float, ...] 
     return tuple(map(float, cells)) if all(cells) else None
 
 
-def _record(row: dict[str, str]) -> FrameRecord:
+def _row(record: FrameRecord) -> list[object]:
+    how = record.diagnostics
+    return [
+        record.stamp_ns,
+        record.outcome,
+        "" if record.node is None else record.node,
+        int(record.is_keyframe),
+        how.method,
+        how.features,
+        how.matches,
+        how.inliers,
+        repr(float(how.residual)),
+        how.residual_unit,
+        how.unobservable,
+        doubts_text(record.doubts),
+        *_cells(record.sigmas, len(_SIGMAS)),
+        *_cells(record.pose_in_node, len(_POSE)),
+        kinds_text(record.doubts),
+    ]
+
+
+def _record(row: Mapping[str, str]) -> FrameRecord:
     return FrameRecord(
         stamp_ns=int(row["stamp_ns"]),
         outcome=_OUTCOMES[row["outcome"]],

@@ -1,24 +1,21 @@
 """Poses of a run with their covariance: ``poses.csv``."""
 
-import csv
-import io
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.core.errors import DataError, GraphError, RunError
+from mapper.core.errors import GraphError
 from mapper.core.geometry import Array, adjoint, inverse
 from mapper.core.rotations import pose_of_row, row_of_pose
 from mapper.core.trajectory import Trajectory
 from mapper.graph.marginals import marginals_of
 from mapper.graph.model import PoseGraph
+from mapper.run.csv_file import read_csv, write_csv
 from mapper.run.doubtful_frames import estimates_of_doubtful
 from mapper.run.frame_outcomes import FrameRecord
-from mapper.runtime.atomic import write_text
-from mapper.runtime.regular_files import read_text
 
 _AXES = ("roll", "pitch", "yaw", "x", "y", "z")
 _UPPER = np.triu_indices(6)
@@ -111,22 +108,7 @@ def uncertain_poses(
 
 def write_poses(path: Path, poses: UncertainPoses) -> None:
     """Write CSV with a header: poses with every digit, the covariance's upper triangle row by row."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(_COLUMNS)
-    for (stamp_ns, T), is_doubtful, covariance in zip(
-        poses.trajectory.items(), poses.is_doubtful.tolist(), poses.covariances, strict=True
-    ):
-        upper = covariance[_UPPER].tolist()
-        writer.writerow(
-            [
-                stamp_ns,
-                "doubtful" if is_doubtful else "tracked",
-                *map(repr, row_of_pose(T).tolist()),
-                *(f"{value:.9g}" if np.isfinite(value) else "" for value in upper),
-            ]
-        )
-    write_text(path, text.getvalue())
+    write_csv(path, _COLUMNS, _rows(poses))
 
 
 def read_poses(path: Path) -> UncertainPoses:
@@ -136,17 +118,29 @@ def read_poses(path: Path) -> UncertainPoses:
         RunError: The file cannot be read.
         DataError: It is something else.
     """
-    text = read_text(path, error=RunError)
-    try:
-        rows = list(csv.DictReader(io.StringIO(text)))
-        covariances = np.empty((len(rows), 6, 6))
-        poses = np.array([[float(row[name]) for name in _POSE] for row in rows]).reshape(-1, 7)
-        stamps_ns = np.array([int(row["stamp_ns"]) for row in rows], np.int64)
-        trajectory = Trajectory(stamps_ns, pose_of_row(poses))
-        for row, covariance in zip(rows, covariances, strict=True):
-            covariance[_UPPER] = [np.nan if row[name] == "" else float(row[name]) for name in _COVARIANCE]
-            covariance.T[_UPPER] = covariance[_UPPER]
-        is_doubtful = np.array([row["outcome"] == "doubtful" for row in rows], np.bool_)
-    except (KeyError, ValueError, TypeError, csv.Error, DataError) as error:
-        raise DataError(f"{path}: not a list of poses with columns {', '.join(_COLUMNS)}: {error}") from None
+    return read_csv(path, _COLUMNS, _poses_of, of="poses")
+
+
+def _rows(poses: UncertainPoses) -> Iterator[list[object]]:
+    for (stamp_ns, T), is_doubtful, covariance in zip(
+        poses.trajectory.items(), poses.is_doubtful.tolist(), poses.covariances, strict=True
+    ):
+        yield [
+            stamp_ns,
+            "doubtful" if is_doubtful else "tracked",
+            *map(repr, row_of_pose(T).tolist()),
+            *(f"{value:.9g}" if np.isfinite(value) else "" for value in covariance[_UPPER].tolist()),
+        ]
+
+
+def _poses_of(table: Iterable[Mapping[str, str]]) -> UncertainPoses:
+    rows = list(table)
+    poses = np.array([[float(row[name]) for name in _POSE] for row in rows]).reshape(-1, 7)
+    stamps_ns = np.array([int(row["stamp_ns"]) for row in rows], np.int64)
+    trajectory = Trajectory(stamps_ns, pose_of_row(poses))
+    covariances = np.empty((len(rows), 6, 6))
+    for row, covariance in zip(rows, covariances, strict=True):
+        covariance[_UPPER] = [np.nan if row[name] == "" else float(row[name]) for name in _COVARIANCE]
+        covariance.T[_UPPER] = covariance[_UPPER]
+    is_doubtful = np.array([row["outcome"] == "doubtful" for row in rows], np.bool_)
     return UncertainPoses(trajectory, is_doubtful, covariances)

@@ -206,7 +206,7 @@ def test_damaged_records_are_named(tmp_path, damage):
     with pytest.raises(DataError, match=r"frames\.csv: not a list of frames with columns stamp_ns, "):
         read_records(path)
     path.write_bytes(b"stamp_ns,ms\n" + damage)
-    with pytest.raises(DataError, match=r"frames\.csv: not a list of stamp_ns,ms: "):
+    with pytest.raises(DataError, match=r"frames\.csv: not a list of times with columns stamp_ns, ms: "):
         read_frame_ms(path)
 
 
