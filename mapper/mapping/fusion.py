@@ -26,7 +26,7 @@ from mapper.octree.map import OctreeMap
 from mapper.octree.moving_objects import MovingObjects, remove_moving_objects
 from mapper.octree.scan_update import ScanUpdate, pack
 from mapper.octree.scan_update_file import CachedUpdate, ScanUpdateFile, ScanUpdateWriter, cache_update
-from mapper.octree.slice import cut_slice, floor_below
+from mapper.octree.slice import Band, cut_slice
 from mapper.runtime.ordered_map import ordered_map
 from mapper.runtime.progress import Progress
 from mapper.sources.base import Log, Skipped
@@ -174,6 +174,7 @@ def fuse_log(
     erased = editor.erase(octree)
     floor = reachable_floor(octree, config.traversable, positions_world=trajectory.positions_world)
     driven = editor.crop_ground(driven_ground(floor), floor.columns)
+    floor_below = Band(config.slice, octree.resolution_m).floor_below(grid, driven)
     cropped = editor.crop(octree)
     grid = cut_slice(octree, config.slice, driven=driven)
     octree.drop_unknown()  # the slice has the columns of all blocks, as the floor
@@ -196,7 +197,7 @@ def fuse_log(
         grid=grid,
         traversable=passable.home.grid,
         storeys=passable.over_each_other,
-        keepout=editor.keepout(grid, floor_below(grid, config.slice, driven=driven)),
+        keepout=editor.keepout(grid, floor_below),
         has_path=len(floor.path) > 0,
         edits=made,
     )

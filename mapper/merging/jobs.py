@@ -23,14 +23,14 @@ from mapper.merging.tiling import Tiling
 from mapper.octree.attributes import UNSET
 from mapper.octree.color_tree import colored
 from mapper.octree.columns import block_extent, occupied_voxels
-from mapper.octree.config import OctreeConfig, SliceConfig
+from mapper.octree.config import OctreeConfig
 from mapper.octree.ground_height import lowest_occupied
 from mapper.octree.map import OctreeMap
 from mapper.octree.map_file import write_map
 from mapper.octree.reading import read_octree
 from mapper.octree.resampling import blocks_reached, resampled
 from mapper.octree.scan_update_file import ScanUpdateWriter, open_scan_updates
-from mapper.octree.slice import band_flags
+from mapper.octree.slice import Band
 from mapper.octree.summing import Overlap
 from mapper.octree.tree import children_in, nodes_in_preorder, words_in_preorder
 from mapper.run.folder import open_run
@@ -286,23 +286,22 @@ def _described(
 
 
 def slice_column(
-    workspace: Workspace, tiles: Sequence[int], config: SliceConfig, *, ground: Path | None, floor_z_m: float
+    workspace: Workspace, tiles: Sequence[int], band: Band, *, ground: Path | None
 ) -> SlicedColumn:
     """Flatten the slice's band in tiles that lie over each other, and write the raster.
 
     Args:
         workspace: Files of the merge.
         tiles: Codes of the tiles, the lowest first.
-        config: Settings of the slice.
+        band: Heights that the slice shows.
         ground: File of the ground below the column of tiles, which the band follows; None if it is level.
-        floor_z_m: Height of the floor in the map.
     """
     first, shape = workspace.window(tiles[0])
     ground_m = None if ground is None else np.load(ground)
     seen, known = np.zeros(shape, np.uint8), np.zeros(shape, np.bool_)
     for tile in tiles:
         octree = read_octree(workspace.tile(tile))
-        seen |= band_flags(octree, config, first=first, shape=shape, ground_m=ground_m, floor_z_m=floor_z_m)
+        seen |= band.flags(octree, first=first, shape=shape, ground_m=ground_m)
         x, y = (octree.leaves().keys[:, :2] - first).T
         known[y, x] = True
     save_array(workspace.piece(tiles[0], BAND), seen)

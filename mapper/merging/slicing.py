@@ -40,7 +40,7 @@ from mapper.octree.ground_height import (
     nearest_heights,
     snap_to_floor,
 )
-from mapper.octree.slice import floor_below, free_path, grid_of
+from mapper.octree.slice import Band
 
 _MAX_TILT_RAD = np.deg2rad(5.0)
 
@@ -97,22 +97,22 @@ def slice_map(
     raster = _raster(workspace, extent, driven)
     if workspace.follows_ground:
         _save_ground(raster, columns.values(), manifest, driven)
-    done = _sliced_columns(workspace, stages, columns.values(), manifest)
+    band = Band(manifest.slice, manifest.octree.resolution_m, manifest.floor_z_m)
+    done = _sliced_columns(workspace, stages, columns.values(), band)
     if not _is_level(placed):
         return Sliced(done, None, None, None, no_floor)
     seen = np.zeros(raster.shape, np.uint8)
     for tiles in columns.values():
         raster.join(np.bitwise_or, seen, tiles[0], BAND)
-    heights = {"resolution_m": manifest.octree.resolution_m, "floor_z_m": manifest.floor_z_m}
     if driven is not None:
-        free_path(seen, driven, manifest.slice, **heights)
+        band.free_path(seen, driven)
     grid, no_slice = None, ""
     try:
-        grid = grid_of(seen, manifest.slice, first=raster.first, **heights)
+        grid = band.grid_of(seen, first=raster.first)
     except DataError as error:
         no_slice = f"no {error}"
     editors = editors_of(manifest, paths_map)
-    keepout = None if grid is None else _keepout(grid, manifest, driven, editors)
+    keepout = None if grid is None else _keepout(grid, band, driven, editors)
     passable = None if floor is None else with_keepout(traversable(floor, manifest.traversable), editors)
     return Sliced(done, grid, keepout, passable, no_floor, no_slice)
 
@@ -152,7 +152,7 @@ def _floor(
 
 
 def _sliced_columns(
-    workspace: Workspace, stages: Stages, columns: Collection[Sequence[int]], manifest: MapManifest
+    workspace: Workspace, stages: Stages, columns: Collection[Sequence[int]], band: Band
 ) -> list[SlicedColumn]:
     """Slice every column of tiles, several at once."""
     jobs = {
@@ -160,9 +160,8 @@ def _sliced_columns(
             slice_column,
             workspace,
             tiles,
-            manifest.slice,
+            band,
             ground=workspace.piece(tiles[0], GROUND) if workspace.follows_ground else None,
-            floor_z_m=manifest.floor_z_m,
         )
         for tiles in columns
     }
@@ -170,12 +169,12 @@ def _sliced_columns(
 
 
 def _keepout(
-    grid: OccupancyGrid, manifest: MapManifest, driven: DrivenGround | None, editors: Sequence[MapEditor]
+    grid: OccupancyGrid, band: Band, driven: DrivenGround | None, editors: Sequence[MapEditor]
 ) -> OccupancyGrid | None:
     """Return where any run's keep-out regions are, in the slice's cells; None if there are none."""
     if not editors:
         return None
-    level = floor_below(grid, manifest.slice, floor_z_m=manifest.floor_z_m, driven=driven)
+    level = band.floor_below(grid, driven)
     first, *others = (editor.keepout(grid, level) for editor in editors)
     return None if first is None else reduce(with_obstacles, others, first)
 

@@ -1,5 +1,6 @@
 """2D navigation map: a horizontal band of the octree projected onto the ground plane."""
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import cv2
@@ -22,25 +23,123 @@ if TYPE_CHECKING:
 _SEEN_FREE, _SEEN_OCCUPIED = 1, 2
 
 
-def floor_below(
-    grid: OccupancyGrid, config: SliceConfig, *, floor_z_m: float = 0.0, driven: DrivenGround | None = None
-) -> NDArray[np.int32]:
-    """Return the (H, W) heights of the floor below a slice's cells, in voxels above z = 0.
+@dataclass(frozen=True, slots=True)
+class Band:
+    """Band of heights above the floor that a slice shows.
 
-    That of a level band is the floor; below another it is the nearest floor that is connected to the path.
-
-    Args:
-        grid: The slice, from ``cut_slice``.
-        config: Settings by which it was cut.
+    Attributes:
+        config: Heights of the band, and the smallest group of occupied cells.
+        resolution_m: Edge of a voxel.
         floor_z_m: Height of the floor in the world.
-        driven: The ground that was driven on, of the same map; None if none is known.
     """
-    known = known_floor(driven) if config.above == "ground" else None
-    if driven is None or known is None:
-        return np.full(grid.cells.shape, round(floor_z_m / grid.resolution_m), np.int32)
-    first = np.rint(grid.origin_world_m / grid.resolution_m).astype(np.int64) + KEY_ZERO
-    (x, y), (height, width) = first - driven.first, grid.cells.shape
-    return nearest_heights(known)[0][y : y + height, x : x + width]
+
+    config: SliceConfig
+    resolution_m: float
+    floor_z_m: float = 0.0
+
+    def flags(
+        self,
+        octree: "OctreeMap",
+        *,
+        first: NDArray[np.int64],
+        shape: tuple[int, int],
+        ground_m: Array | None,
+    ) -> NDArray[np.uint8]:
+        """Return (H, W) uint8 flags of the states of the band's voxels in each column; ``or`` joins maps.
+
+        Args:
+            octree: A map, or a part of one, that lies inside the grid.
+            first: (2,) x and y keys of the column of row 0 and column 0.
+            shape: H, W.
+            ground_m: (H, W) height of the ground that the band follows; None if it is level.
+
+        Raises:
+            DataError: The band has no voxels.
+        """
+        lowest, highest = self._keys()
+        slots = octree.blocks.sorted_slots()
+        codes = octree.blocks.codes[slots]
+        bases = np.zeros(shape, dtype=np.int64)
+        if ground_m is None:
+            z = block_keys(codes)[:, 2]
+            inside = (z + (1 << BLOCK_BITS) > lowest) & (z <= highest)
+            codes, slots = codes[inside], slots[inside]
+        else:
+            bases += np.rint((ground_m - self.floor_z_m) / self.resolution_m).astype(np.int64)
+        seen = np.zeros(shape, dtype=np.uint8)
+        values, threshold = octree.blocks.table.values, octree.occupied_log_odds
+        _flatten(codes, slots, values, threshold, first, lowest, highest, bases, seen)
+        return seen
+
+    def free_path(self, seen: NDArray[np.uint8], driven: DrivenGround) -> None:
+        """Flag the columns as free that what carried the sensor passed; of a level band, those of its storey.
+
+        Args:
+            seen: (H, W) flags in the columns of ``driven``; changed in place.
+            driven: The ground that was driven on.
+        """
+        swept = driven.swept
+        if self.config.above == "floor":
+            above_floor_m = driven.heights * self.resolution_m - self.floor_z_m
+            swept = swept & (np.abs(above_floor_m) <= self.config.min_height_m)
+        seen[swept] = _SEEN_FREE
+
+    def grid_of(self, seen: NDArray[np.uint8], *, first: NDArray[np.int64]) -> OccupancyGrid:
+        """Return flags as a grid, cropped to its known cells.
+
+        Args:
+            seen: (H, W) the flags.
+            first: (2,) x and y keys of the column of row 0 and column 0.
+
+        Raises:
+            DataError: No voxel of the band is known.
+        """
+        config = self.config
+        if not seen.any():
+            raise DataError(
+                f"slice: nothing is known {config.min_height_m:g} to {config.max_height_m:g} m above the "
+                f"floor at z = {self.floor_z_m:g} m; set slice.min_height_m and slice.max_height_m to where "
+                "the map is"
+            )
+        rows, columns = np.flatnonzero(seen.any(axis=1)), np.flatnonzero(seen.any(axis=0))
+        seen = _without_speckles(
+            seen[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1], min_cells=config.min_cluster_cells
+        )
+        cells = np.full(seen.shape, UNKNOWN, dtype=np.int8)
+        cells[seen & _SEEN_FREE != 0] = FREE
+        cells[seen & _SEEN_OCCUPIED != 0] = OCCUPIED
+        corner = np.array([first[0] + columns[0], first[1] + rows[0]]) - KEY_ZERO
+        return OccupancyGrid(cells, corner * self.resolution_m, self.resolution_m)
+
+    def floor_below(self, grid: OccupancyGrid, driven: DrivenGround | None) -> NDArray[np.int32]:
+        """Return the (H, W) heights of the floor below a slice's cells, in voxels above z = 0.
+
+        That of a level band is the floor; below another it is the nearest floor connected to the path.
+
+        Args:
+            grid: The slice.
+            driven: The ground that was driven on, of the same map; None if none is known.
+        """
+        known = known_floor(driven) if self.config.above == "ground" else None
+        if driven is None or known is None:
+            return np.full(grid.cells.shape, round(self.floor_z_m / grid.resolution_m), np.int32)
+        first = np.rint(grid.origin_world_m / grid.resolution_m).astype(np.int64) + KEY_ZERO
+        (x, y), (height, width) = first - driven.first, grid.cells.shape
+        return nearest_heights(known)[0][y : y + height, x : x + width]
+
+    def _keys(self) -> tuple[int, int]:
+        """Return the lowest and the highest z key whose voxel centres lie in the band."""
+        config, resolution_m = self.config, self.resolution_m
+        bottom_m, top_m = self.floor_z_m + config.min_height_m, self.floor_z_m + config.max_height_m
+        # The allowance includes centres on the edge, such as 0.075 m at 5 cm, whatever the rounding.
+        lowest = int(np.ceil(bottom_m / resolution_m - 0.5 - 1e-9)) + KEY_ZERO
+        highest = int(np.floor(top_m / resolution_m - 0.5 + 1e-9)) + KEY_ZERO
+        if lowest > highest:
+            raise DataError(
+                f"slice: no voxel of {resolution_m:g} m has its centre {config.min_height_m:g} to "
+                f"{config.max_height_m:g} m above the floor; raise slice.max_height_m"
+            )
+        return lowest, highest
 
 
 def cut_between(octree: "OctreeMap", z_min: float, z_max: float | None) -> OccupancyGrid:
@@ -59,9 +158,9 @@ def cut_between(octree: "OctreeMap", z_min: float, z_max: float | None) -> Occup
 
 
 def cut_slice(
-    octree: "OctreeMap", config: SliceConfig, *, floor_z_m: float = 0.0, driven: DrivenGround | None = None
+    octree: "OctreeMap", config: SliceConfig, *, driven: DrivenGround | None = None
 ) -> OccupancyGrid:
-    """Return the band between two heights above the floor as a grid just large enough for it.
+    """Return the band between two heights above the floor, z = 0, as a grid just large enough for it.
 
     A voxel belongs to the band if its centre does. A cell is occupied if any voxel of its column is, else
     free if any is, else unknown. In too small a group of occupied cells, occupied voxels do not count. Where
@@ -70,7 +169,6 @@ def cut_slice(
     Args:
         octree: The map in a world with z up.
         config: Heights and the smallest group.
-        floor_z_m: Height of the floor in the world.
         driven: The ground that was driven on, of the same map; None if none is known.
 
     Raises:
@@ -81,124 +179,13 @@ def cut_slice(
         shape = int(last[1] - first[1]), int(last[0] - first[0])
     else:
         first, shape = driven.first, driven.swept.shape
-    ground_m = None
+    band, ground_m = Band(config, octree.resolution_m), None
     if config.above == "ground":
-        ground_m = ground_heights(octree, first=first, shape=shape, floor_z_m=floor_z_m, driven=driven)
-    seen = band_flags(octree, config, first=first, shape=shape, ground_m=ground_m, floor_z_m=floor_z_m)
+        ground_m = ground_heights(octree, first=first, shape=shape, floor_z_m=band.floor_z_m, driven=driven)
+    seen = band.flags(octree, first=first, shape=shape, ground_m=ground_m)
     if driven is not None:
-        free_path(seen, driven, config, resolution_m=octree.resolution_m, floor_z_m=floor_z_m)
-    return grid_of(seen, config, first=first, resolution_m=octree.resolution_m, floor_z_m=floor_z_m)
-
-
-def free_path(
-    seen: NDArray[np.uint8],
-    driven: DrivenGround,
-    config: SliceConfig,
-    *,
-    resolution_m: float,
-    floor_z_m: float,
-) -> None:
-    """Flag the columns as free that what carried the sensor passed; of a level band, those of its storey.
-
-    Args:
-        seen: (H, W) flags of ``band_flags`` in the columns of ``driven``; changed in place.
-        driven: The ground that was driven on.
-        config: Heights of the band.
-        resolution_m: Edge of a voxel.
-        floor_z_m: Height of the floor in the world.
-    """
-    swept = driven.swept
-    if config.above == "floor":
-        swept = swept & (np.abs(driven.heights * resolution_m - floor_z_m) <= config.min_height_m)
-    seen[swept] = _SEEN_FREE
-
-
-def band_flags(
-    octree: "OctreeMap",
-    config: SliceConfig,
-    *,
-    first: NDArray[np.int64],
-    shape: tuple[int, int],
-    ground_m: Array | None,
-    floor_z_m: float,
-) -> NDArray[np.uint8]:
-    """Return (H, W) uint8 flags of the states of the band's voxels in each column; ``or`` joins several maps.
-
-    Args:
-        octree: A map, or a part of one, that lies inside the grid.
-        config: Heights.
-        first: (2,) x and y keys of the column of row 0 and column 0.
-        shape: H, W.
-        ground_m: (H, W) height of the ground that the band follows; None if it is level.
-        floor_z_m: Height of the floor in the world.
-
-    Raises:
-        DataError: The band has no voxels.
-    """
-    lowest, highest = _band(config, octree.resolution_m, floor_z_m)
-    slots = octree.blocks.sorted_slots()
-    codes = octree.blocks.codes[slots]
-    bases = np.zeros(shape, dtype=np.int64)
-    if ground_m is None:
-        z = block_keys(codes)[:, 2]
-        inside = (z + (1 << BLOCK_BITS) > lowest) & (z <= highest)
-        codes, slots = codes[inside], slots[inside]
-    else:
-        bases += np.rint((ground_m - floor_z_m) / octree.resolution_m).astype(np.int64)
-    seen = np.zeros(shape, dtype=np.uint8)
-    values, threshold = octree.blocks.table.values, octree.occupied_log_odds
-    _flatten(codes, slots, values, threshold, first, lowest, highest, bases, seen)
-    return seen
-
-
-def grid_of(
-    seen: NDArray[np.uint8],
-    config: SliceConfig,
-    *,
-    first: NDArray[np.int64],
-    resolution_m: float,
-    floor_z_m: float,
-) -> OccupancyGrid:
-    """Return the flags of ``band_flags`` as a grid, cropped to its known cells.
-
-    Args:
-        seen: (H, W) the flags.
-        config: Heights of the band, for the error, and the smallest group of occupied cells.
-        first: (2,) x and y keys of the column of row 0 and column 0.
-        resolution_m: Edge of a voxel.
-        floor_z_m: Height of the floor in the world, for the error.
-
-    Raises:
-        DataError: No voxel of the band is known.
-    """
-    if not seen.any():
-        raise DataError(
-            f"slice: nothing is known {config.min_height_m:g} to {config.max_height_m:g} m above the floor "
-            f"at z = {floor_z_m:g} m; set slice.min_height_m and slice.max_height_m to where the map is"
-        )
-    rows, columns = np.flatnonzero(seen.any(axis=1)), np.flatnonzero(seen.any(axis=0))
-    seen = _without_speckles(
-        seen[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1], min_cells=config.min_cluster_cells
-    )
-    cells = np.full(seen.shape, UNKNOWN, dtype=np.int8)
-    cells[seen & _SEEN_FREE != 0] = FREE
-    cells[seen & _SEEN_OCCUPIED != 0] = OCCUPIED
-    corner = np.array([first[0] + columns[0], first[1] + rows[0]]) - KEY_ZERO
-    return OccupancyGrid(cells, corner * resolution_m, resolution_m)
-
-
-def _band(config: SliceConfig, resolution_m: float, floor_z_m: float) -> tuple[int, int]:
-    """Return the lowest and the highest z key whose voxel centres lie in the band."""
-    bottom_m, top_m = floor_z_m + config.min_height_m, floor_z_m + config.max_height_m
-    # The allowance includes centres on the edge, such as 0.075 m at 5 cm, whatever the rounding.
-    lowest = int(np.ceil(bottom_m / resolution_m - 0.5 - 1e-9)) + KEY_ZERO
-    highest = int(np.floor(top_m / resolution_m - 0.5 + 1e-9)) + KEY_ZERO
-    if lowest > highest:
-        raise DataError(
-            f"slice: no voxel of {resolution_m:g} m has its centre {config.min_height_m:g} to "
-            f"{config.max_height_m:g} m above the floor; raise slice.max_height_m"
-        )
-    return lowest, highest
+        band.free_path(seen, driven)
+    return band.grid_of(seen, first=first)
 
 
 @njit(cache=True, nogil=True)

@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 
 from mapper.core.errors import DataError
+from mapper.octree.columns import block_extent
 from mapper.octree.config import OctreeConfig, SliceConfig
 from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, overlap_of, shrunk
 from mapper.octree.map import OctreeMap
-from mapper.octree.slice import cut_slice
+from mapper.octree.slice import Band, cut_slice
 from tests.support.grids import state_at
 
 CELL = 0.05
@@ -78,7 +79,10 @@ def test_the_band_is_measured_from_the_floor(height_m, inside):
     origin = [0.025, 0.025, floor_z_m + 0.3]
     octree = scanned([[1.025, 0.025, floor_z_m + 0.275], [1.225, 0.025, floor_z_m + height_m]], origin)
 
-    grid = cut_slice(octree, SliceConfig(min_height_m=0.1, max_height_m=0.5), floor_z_m=floor_z_m)
+    band = Band(SliceConfig(min_height_m=0.1, max_height_m=0.5), CELL, floor_z_m)
+    first, last = block_extent(octree)
+    shape = int(last[1] - first[1]), int(last[0] - first[0])
+    grid = band.grid_of(band.flags(octree, first=first, shape=shape, ground_m=None), first=first)
 
     assert (grid.cells == OCCUPIED).sum() == 1 + inside
 
@@ -110,8 +114,8 @@ def test_groups_are_8_connected():
     "octree", [OctreeMap(OctreeConfig()), scanned([[1.0, 0.0, 0.5]])], ids=["empty", "above"]
 )
 def test_a_band_in_which_nothing_is_known_is_refused(octree):
-    with pytest.raises(DataError, match=r"nothing is known 1 to 2 m above the floor at z = 5 m"):
-        cut_slice(octree, SliceConfig(min_height_m=1.0, max_height_m=2.0), floor_z_m=5.0)
+    with pytest.raises(DataError, match=r"nothing is known 1 to 2 m above the floor at z = 0 m"):
+        cut_slice(octree, SliceConfig(min_height_m=1.0, max_height_m=2.0))
 
 
 def test_a_band_thinner_than_a_voxel_is_refused():
