@@ -40,7 +40,7 @@ class MapQuality:
 
 
 def map_quality(
-    run: Run, reference: Reference, *, world: World | None = None, voxels: int = 1, register: bool = False
+    run: Run, reference: Reference, *, world: World | None, voxels: int, register: bool
 ) -> MapQuality:
     """Return how right a run's octree and cloud are.
 

@@ -77,7 +77,7 @@ def draw_summary(
     trajectory: Trajectory,
     truth: Trajectory | None,
     loops_world: Array,
-    poses: UncertainPoses | None = None,
+    poses: UncertainPoses | None,
 ) -> None:
     """Draw what ``write_summary`` writes on axes in metres, whose limits follow."""
     positions = trajectory.positions_world
@@ -153,7 +153,7 @@ def write_localised(
     begins_ns: Sequence[int],
     recognised_world: Array,
     title: str,
-    lines: Sequence[str] = (),
+    lines: Sequence[str],
 ) -> None:
     """Draw where a log lies in a map, over the map's slice.
 
@@ -185,7 +185,7 @@ def write_path(
     waypoints_world: Array,
     radius_m: float,
     title: str,
-    lines: Sequence[str] = (),
+    lines: Sequence[str],
 ) -> None:
     """Draw a planned path over a grid, as wide as the robot that takes it.
 
@@ -212,7 +212,7 @@ def write_merged(
     paths_world: Mapping[str, Array],
     tile_m: float,
     title: str,
-    lines: Sequence[str] = (),
+    lines: Sequence[str],
 ) -> None:
     """Draw the paths of several runs over the slice of the map that they make together.
 
@@ -241,7 +241,7 @@ def write_layers(
     grid: OccupancyGrid,
     layers: Mapping[str, tuple[Points, Rgb]],
     title: str,
-    lines: Sequence[str] = (),
+    lines: Sequence[str],
 ) -> None:
     """Draw voxels over the slice, seen from above, one colour for each layer; later ones cover earlier ones.
 

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from mapper.run.folder import Run
 
 
-def plot_run(run: "Run", axes: "Axes | None" = None) -> "Axes":
+def plot_run(run: "Run", axes: "Axes | None") -> "Axes":
     """Draw a run's path over its slice, seen from above; axes are in metres.
 
     Args:

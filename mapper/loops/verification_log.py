@@ -19,8 +19,8 @@ class LoopSearch:
         found: Result of comparing two places, by their stamps (i, j).
     """
 
-    place: Archived[Any] | None = None
-    found: Mapping[tuple[int, int], Verification] = field(default_factory=dict)
+    place: Archived[Any] | None
+    found: Mapping[tuple[int, int], Verification]
 
 
 class VerificationLog:

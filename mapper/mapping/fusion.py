@@ -31,8 +31,6 @@ from mapper.runtime.ordered_map import ordered_map
 from mapper.runtime.progress import Progress
 from mapper.sources.base import Log, Skipped
 
-_NO_EDITS = Edits()
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Snapshot:
@@ -89,8 +87,8 @@ class Maps:
     dynamic_colors: Colors
     grid: OccupancyGrid
     traversable: OccupancyGrid
-    storeys: tuple[OccupancyGrid, ...] = ()
-    keepout: OccupancyGrid | None = None
+    storeys: tuple[OccupancyGrid, ...]
+    keepout: OccupancyGrid | None
     has_path: bool = True
     edits: tuple[AppliedEdit, ...] = ()
 
@@ -138,9 +136,9 @@ def fuse_log(
     *,
     progress: Progress,
     on_snapshot: Callable[[Snapshot | ScanSnapshot], None],
-    before: ScanUpdateFile | None,
-    after: ScanUpdateWriter,
-    edits: Edits = _NO_EDITS,
+    cached: ScanUpdateFile | None,
+    updates: ScanUpdateWriter,
+    edits: Edits,
 ) -> Maps:
     """Fuse every frame of the trajectory, in time order; decoding and casting run ahead in threads.
 
@@ -153,15 +151,15 @@ def fuse_log(
         config: Settings of the maps and of the MCAP log.
         progress: Receives progress and notes.
         on_snapshot: Receives every ``mcap.image_stride``-th frame's image, or its points if it has no image.
-        before: The frames' updates from the last time they were fused.
-        after: Receives the frames' updates.
+        cached: The frames' updates from the last time they were fused; None reads and casts all.
+        updates: Receives the frames' updates.
         edits: Regions to erase, to keep and to block.
 
     Raises:
         DataError: The edits leave nothing of the map, or nothing in the height of the slice.
     """
     octree, objects = _fuse_scans(
-        source, trajectory, config, progress, on_snapshot=on_snapshot, before=before, after=after
+        source, trajectory, config, progress, on_snapshot=on_snapshot, cached=cached, updates=updates
     )
     (points_world, colors), (dynamic_points_world, dynamic_colors) = fuse_clouds(
         source, trajectory, config, objects, progress=progress
@@ -174,9 +172,9 @@ def fuse_log(
     erased = editor.erase(octree)
     floor = reachable_floor(octree, config.traversable, positions_world=trajectory.positions_world)
     driven = editor.crop_ground(driven_ground(floor), floor.columns)
-    floor_below = Band(config.slice, octree.resolution_m).floor_below(grid, driven)
     cropped = editor.crop(octree)
     grid = cut_slice(octree, config.slice, driven=driven)
+    floor_below = Band(config.slice, octree.resolution_m).floor_below(grid, driven)
     octree.drop_unknown()  # the slice has the columns of all blocks, as the floor
     passable, blocked = editor.edit_floor(traversable(floor, config.traversable))
     kept = octree.are_occupied(points_world)
@@ -209,9 +207,9 @@ def fuse_octree(
     config: FuseSettings,
     *,
     progress: Progress,
-    before: ScanUpdateFile | None,
-    after: ScanUpdateWriter,
-    edits: Edits = _NO_EDITS,
+    cached: ScanUpdateFile | None,
+    updates: ScanUpdateWriter,
+    edits: Edits,
 ) -> OctreeMap:
     """Return the octree of ``fuse_log`` alone; frames whose cached update still holds are not read.
 
@@ -220,14 +218,14 @@ def fuse_octree(
         trajectory: Final body poses in the levelled world.
         config: Settings of the maps.
         progress: Receives progress and notes.
-        before: The frames' updates from the last time.
-        after: Receives the frames' updates.
+        cached: The frames' updates from the last time.
+        updates: Receives the frames' updates.
         edits: Regions to erase and to keep.
 
     Raises:
         DataError: The edits leave nothing of the map.
     """
-    octree, _ = _fuse_scans(source, trajectory, config, progress, before=before, after=after)
+    octree, _ = _fuse_scans(source, trajectory, config, progress, cached=cached, updates=updates)
     editor = MapEditor(edits, trajectory.positions_world, config.traversable.head_room_m)
     editor.erase(octree)
     editor.crop(octree)
@@ -241,16 +239,16 @@ def _fuse_scans(
     config: FuseSettings,
     progress: Progress,
     *,
-    before: ScanUpdateFile | None,
-    after: ScanUpdateWriter,
+    cached: ScanUpdateFile | None,
+    updates: ScanUpdateWriter,
     on_snapshot: Callable[[Snapshot | ScanSnapshot], None] | None = None,
 ) -> tuple[OctreeMap, MovingObjects | None]:
     """Return the octree of all frames, and what moved, which is removed from it; None if it is kept."""
-    octree = OctreeMap(config.octree, folder=after.folder)
-    if before is not None and (config.octree.attributes or not before.holds_for(config.octree)):
-        before = None  # updates have no colours
+    octree = OctreeMap(config.octree, folder=updates.folder)
+    if cached is not None and (config.octree.attributes or not cached.holds_for(config.octree)):
+        cached = None  # updates have no colours
     log_stride = 0 if on_snapshot is None else config.mcap.image_stride
-    jobs = _jobs(source, trajectory, config, before, log_stride=log_stride)
+    jobs = _jobs(source, trajectory, config, cached, log_stride=log_stride)
     casters, moved, unreached = _Casters(config.octree), 0, 0
     prepared = ordered_map(lambda job: _prepared(job, config, casters.caster), jobs, workers=config.workers)
     with progress.stage("fuse") as report:
@@ -263,7 +261,7 @@ def _fuse_scans(
                 octree.insert(one.scan, one.job.frame.T_world_body)
             else:
                 octree.merge(one.update)
-            after.add(one.cached)
+            updates.add(one.cached)
             moved += one.job.cached is None
             unreached += one.unreached
             if one.snapshot is not None and on_snapshot is not None:
@@ -273,13 +271,13 @@ def _fuse_scans(
             f"{unreached} points lie farther than {reach_m(config.octree.resolution_m):g} m from the map's "
             f"origin, beyond the reach of {config.octree.resolution_m:g} m voxels; left out"
         )
-    if before is not None:
+    if cached is not None:
         progress.note(f"fused again: {moved} of {len(trajectory)} frames, which had moved or were not known")
     if config.octree.moving != "removed":
         return octree, None
-    with after.reopened() as updates:
+    with updates.reopened() as written:
         return octree, remove_moving_objects(
-            octree, lambda: ordered_map(CachedUpdate.update, updates.entries(), workers=config.workers)
+            octree, lambda: ordered_map(CachedUpdate.update, written.entries(), workers=config.workers)
         )
 
 
@@ -294,25 +292,25 @@ def _jobs(
     source: Log,
     trajectory: Trajectory,
     config: FuseSettings,
-    before: ScanUpdateFile | None,
+    cached: ScanUpdateFile | None,
     *,
     log_stride: int,
 ) -> Iterator[_Job]:
     for frame in placed_frames(source, trajectory):
-        cached = None
-        if before is not None and (
-            source.sensor == "rgbd" or _neighbours_hold(before, trajectory, frame.index, config.octree)
+        update = None
+        if cached is not None and (
+            source.sensor == "rgbd" or _neighbours_hold(cached, trajectory, frame.index, config.octree)
         ):
-            cached = before.lookup(frame.entry.stamp_ns, frame.T_world_body, config=config.octree)
-        yield _Job(frame, cached, is_logged=log_stride > 0 and frame.index % log_stride == 0)
+            update = cached.lookup(frame.entry.stamp_ns, frame.T_world_body, config=config.octree)
+        yield _Job(frame, update, is_logged=log_stride > 0 and frame.index % log_stride == 0)
 
 
 def _neighbours_hold(
-    before: ScanUpdateFile, trajectory: Trajectory, index: int, config: OctreeConfig
+    cached: ScanUpdateFile, trajectory: Trajectory, index: int, config: OctreeConfig
 ) -> bool:
     """Return whether the poses before and after one still hold: a scan is deskewed between them."""
     return all(
-        before.holds(int(trajectory.stamps_ns[neighbour]), trajectory.T_world_body[neighbour], config=config)
+        cached.holds(int(trajectory.stamps_ns[neighbour]), trajectory.T_world_body[neighbour], config=config)
         for neighbour in (index - 1, index + 1)
         if 0 <= neighbour < len(trajectory)
     )

@@ -80,7 +80,7 @@ class Level:
     T_level_world: Transform
     method: str
     detail: str
-    has_floor: bool = True
+    has_floor: bool
 
 
 def find_level(
@@ -89,7 +89,7 @@ def find_level(
     trajectory: Trajectory,
     accelerations: Accelerations | None,
     config: LevelConfig,
-    axes: BodyAxes = AXES["rgbd"],
+    axes: BodyAxes,
 ) -> Level:
     """Return the level frame of a log.
 

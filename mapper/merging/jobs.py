@@ -162,8 +162,8 @@ def fuse_run(workspace: Workspace, run: int, path: Path, trajectory: Trajectory,
             trajectory,
             config,
             progress=SILENT,
-            before=known,
-            after=updates,
+            cached=known,
+            updates=updates,
             edits=edits_of(built.manifest.edits),
         )
     written.unlink()

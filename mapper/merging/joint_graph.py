@@ -49,7 +49,7 @@ class JointGraph:
     graph: PoseGraph
     first_nodes: Mapping[int, int]
     loops: Sequence[LoopClosure]
-    own_rejected: int = 0
+    own_rejected: int
 
     def run_of(self, node: int) -> int:
         """Return the number of the run of a joint node."""

@@ -46,16 +46,13 @@ class Floor:
     limits: Limits
 
 
-def reachable_floor(
-    octree: OctreeMap, config: TraversableConfig, *, positions_world: Points, floor_z_m: float = 0.0
-) -> Floor:
-    """Return the floor of a map that a robot can reach from the ground under a path; see ``floor_of``.
+def reachable_floor(octree: OctreeMap, config: TraversableConfig, *, positions_world: Points) -> Floor:
+    """Return the floor of a run's map that a robot can reach from the ground under a path; see ``floor_of``.
 
     Args:
-        octree: The map in a world with z up.
+        octree: The map in a world with z up and the floor at 0.
         config: Limits of the robot.
         positions_world: (N, 3) of the sensor, in the order in which it passed.
-        floor_z_m: Height of the floor in the world.
 
     Raises:
         DataError: The map is empty.
@@ -63,7 +60,7 @@ def reachable_floor(
     if not len(octree):
         raise DataError("traversable floor: the map is empty; fuse scans into it first")
     columns = occupied_columns(octree, margin=margin_for(config, octree.resolution_m))
-    return floor_of(columns, config, paths_world=[positions_world], floor_z_m=floor_z_m)
+    return floor_of(columns, config, paths_world=[positions_world])
 
 
 def margin_for(config: TraversableConfig, resolution_m: float) -> int:

@@ -49,8 +49,8 @@ class TraversableFloor:
     """
 
     storeys: tuple[Storey, ...]
-    home_number: int = 0
-    links: tuple[Storey, ...] = ()
+    home_number: int
+    links: tuple[Storey, ...]
 
     @property
     def home(self) -> Storey:

@@ -79,7 +79,7 @@ def block_extent(octree: "OctreeMap") -> tuple[NDArray[np.int64], NDArray[np.int
     return keys.min(axis=0), keys.max(axis=0) + (1 << BLOCK_BITS)
 
 
-def occupied_columns(octree: "OctreeMap", *, margin: int = 0) -> Columns:
+def occupied_columns(octree: "OctreeMap", *, margin: int) -> Columns:
     """Return the occupied voxels of a map by column, with a margin of some columns around its blocks."""
     return columns_of(
         occupied_voxels(octree), block_extent(octree), margin=margin, resolution_m=octree.resolution_m

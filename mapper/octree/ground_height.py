@@ -173,7 +173,7 @@ def ground_from_lowest(
     first: NDArray[np.int64],
     resolution_m: float,
     floor_z_m: float,
-    floor: NDArray[np.int32] | None = None,
+    floor: NDArray[np.int32] | None,
 ) -> GroundHeights:
     """Return the ground in cells of a few metres; see ``ground_heights``.
 

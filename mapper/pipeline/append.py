@@ -98,7 +98,7 @@ def append(
         save_solved(writer, before.solved(solved.graph, solved.loops).then(later, truth=source.truth))
         writer.update(solve=solved.report)
         write_edits(writer.folder, edits)
-        fuse_into(writer, source, whole, progress, observer=observer, before=run.scan_updates(), edits=wanted)
+        fuse_into(writer, source, whole, progress, observer=observer, cached=run.scan_updates(), edits=wanted)
     return open_run(out)
 
 

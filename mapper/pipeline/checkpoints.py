@@ -78,7 +78,7 @@ class Checkpoints:
         identity: Mapping[str, Any],
         progress: Progress,
         *,
-        every_s: float = EVERY_S,
+        every_s: float,
     ) -> None:
         """Begin, or resume from what is in the folder.
 

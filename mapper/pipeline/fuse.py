@@ -124,7 +124,7 @@ def fuse_changed(
                 (writer.folder / name).unlink(missing_ok=True)
         if solve is not None:
             writer.update(solve=solve)
-        fuse_into(writer, source, run.config, progress, before=run.scan_updates(), edits=wanted)
+        fuse_into(writer, source, run.config, progress, cached=run.scan_updates(), edits=wanted)
     return open_run(run.path)
 
 
@@ -176,7 +176,7 @@ def fuse_into(
     config: BuildConfig,
     progress: Progress,
     *,
-    before: Path | None = None,
+    cached: Path | None = None,
     edits: Edits | None = None,
     observer: Observer = NULL_OBSERVER,
     checkpoints: Checkpoints | None = None,
@@ -188,10 +188,10 @@ def fuse_into(
         source: The log that was tracked.
         config: All settings.
         progress: Receives stages, counts and notes.
-        before: File of the frames' updates from the last time; None casts every frame.
+        cached: File of the frames' updates from the last time; None casts every frame.
         edits: Edits by hand.
         observer: Receives the results.
-        checkpoints: Keep the updates that are cast; ``before`` is then theirs.
+        checkpoints: Keep the updates that are cast; ``cached`` is then theirs.
 
     Raises:
         DataError: The edits leave nothing of the map, or nothing in the height of the slice.
@@ -204,11 +204,11 @@ def fuse_into(
         _warn_of_distortion(writer, source, progress)
         settings = _with_depth_noise(writer, source, config, progress)
         if checkpoints is not None:
-            before = known_updates(checkpoints, settings.octree)
+            cached = known_updates(checkpoints, settings.octree)
     with McapLog(writer.folder / files.MCAP) as log:
         with (
             writer.clock.stage("fuse"),
-            open_scan_updates(before) if before is not None else nullcontext() as known,
+            open_scan_updates(cached) if cached is not None else nullcontext() as known,
             make_writer(writer.folder / files.SCAN_UPDATES, settings.octree) as updates,
         ):
             maps = fuse_log(
@@ -217,8 +217,8 @@ def fuse_into(
                 settings,
                 progress=progress,
                 on_snapshot=lambda snapshot: log_snapshot(log, snapshot),
-                before=known,
-                after=updates,
+                cached=known,
+                updates=updates,
                 edits=edits or Edits(),
             )
         with writer.clock.stage("write"):

@@ -35,7 +35,7 @@ class RunResults:
     loops: Sequence[LoopClosure]
     frame_ms: Mapping[int, float]
     truth: Trajectory | None
-    poses: UncertainPoses | None = None
+    poses: UncertainPoses | None
 
     @property
     def tracked(self) -> Trajectory:

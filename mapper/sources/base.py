@@ -43,19 +43,19 @@ class ImageFiles:
         depth: 16-bit depth image.
         depth_stamp_ns: Time of the depth image, nanoseconds.
         depth_units_per_m: Depth image units per metre.
-        recorded_units_per_m: Units per metre of the recording that it is encoded from; None if they are the
-            same.
         colour_px: Width and height of the colour image; None if they are the frame's.
         depth_px: As ``colour_px``, of the depth image.
+        recorded_units_per_m: Units per metre of the recording that it is encoded from; None if they are the
+            same.
     """
 
     colour: ImageFile
     depth: ImageFile
     depth_stamp_ns: int
     depth_units_per_m: float
+    colour_px: tuple[int, int] | None
+    depth_px: tuple[int, int] | None
     recorded_units_per_m: float | None = None
-    colour_px: tuple[int, int] | None = None
-    depth_px: tuple[int, int] | None = None
 
 
 class FrameRef(Protocol):

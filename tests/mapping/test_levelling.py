@@ -87,8 +87,8 @@ def around(*, x=0.0, down_deg=25.0, n=12, height_m=1.4, span_deg=90.0):
     ]
 
 
-def level_of(scans, trajectory, accelerations=None, config=_DEFAULTS, **body):
-    return find_level(scans, trajectory=trajectory, accelerations=accelerations, config=config, **body)
+def level_of(scans, trajectory, accelerations=None, config=_DEFAULTS, axes=AXES["rgbd"]):
+    return find_level(scans, trajectory=trajectory, accelerations=accelerations, config=config, axes=axes)
 
 
 def tilt_deg(level, T_world_room):

@@ -6,6 +6,7 @@ from mapper.config.build import BuildConfig
 from mapper.config.loading import overridden
 from mapper.core.frames import Scan
 from mapper.core.trajectory import Trajectory
+from mapper.mapping.config import Edits
 from mapper.mapping.fusion import fuse_log
 from mapper.octree.scan_update_file import ScanUpdateWriter
 from mapper.runtime.progress import SILENT
@@ -18,8 +19,17 @@ def snapshots(log, trajectory, tmp_path, *settings):
     """Return those of every frame."""
     config = overridden(BuildConfig(), ["workers=0", "mcap.image_stride=1", "octree.moving=kept", *settings])
     seen = []
-    with ScanUpdateWriter(tmp_path / "updates.bin", config.octree) as after:
-        fuse_log(log, trajectory, config, progress=SILENT, on_snapshot=seen.append, before=None, after=after)
+    with ScanUpdateWriter(tmp_path / "updates.bin", config.octree) as updates:
+        fuse_log(
+            log,
+            trajectory,
+            config,
+            progress=SILENT,
+            on_snapshot=seen.append,
+            cached=None,
+            updates=updates,
+            edits=Edits(),
+        )
     return seen
 
 

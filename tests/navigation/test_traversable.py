@@ -3,9 +3,10 @@ import pytest
 
 from mapper.core.errors import DataError, MapSizeError
 from mapper.navigation.config import TraversableConfig
-from mapper.navigation.floor import driven_ground, reachable_floor
+from mapper.navigation.floor import driven_ground, floor_of, margin_for, reachable_floor
 from mapper.navigation.traversable import traversable
 from mapper.octree import blocks
+from mapper.octree.columns import occupied_columns
 from mapper.octree.config import OctreeConfig, SliceConfig
 from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN
 from mapper.octree.map import OctreeMap
@@ -32,7 +33,8 @@ NO_PATH = np.empty((0, 3))
 
 def traversable_grid(octree, config, *, path=NO_PATH, floor_z_m=0.0):
     """Return the grid of the only storey; without a path it begins at all floor at the floor's height."""
-    floor = reachable_floor(octree, config, positions_world=np.asarray(path), floor_z_m=floor_z_m)
+    columns = occupied_columns(octree, margin=margin_for(config, CELL))
+    floor = floor_of(columns, config, paths_world=[np.asarray(path)], floor_z_m=floor_z_m)
     (storey,) = traversable(floor, config).storeys
     return storey.grid
 
@@ -175,7 +177,7 @@ def test_the_grid_does_not_depend_on_the_order_of_the_blocks(tmp_path):
 
 def test_an_empty_map_has_no_floor():
     with pytest.raises(DataError, match="the map is empty"):
-        traversable_grid(OctreeMap(OctreeConfig()), TraversableConfig())
+        reachable_floor(OctreeMap(OctreeConfig()), TraversableConfig(), positions_world=NO_PATH)
 
 
 def test_a_path_without_a_width_begins_at_the_ground_below_it():

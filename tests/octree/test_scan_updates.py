@@ -11,6 +11,7 @@ from mapper.core.errors import DataError, MapFileError
 from mapper.core.frames import Scan
 from mapper.core.geometry import exp
 from mapper.core.trajectory import Trajectory
+from mapper.mapping.config import Edits
 from mapper.mapping.fusion import fuse_log
 from mapper.octree.casting import Caster
 from mapper.octree.config import OctreeConfig
@@ -75,8 +76,9 @@ def fused(source, trajectory, path, *, before=None, config=CONFIG):
             config,
             progress=SILENT,
             on_snapshot=lambda _snapshot: None,
-            before=before,
-            after=after,
+            cached=before,
+            updates=after,
+            edits=Edits(),
         )
     return maps.octree
 

@@ -38,7 +38,7 @@ def most_clouds(folder: Path) -> int:
     return max(map(len, _by_ending(folder).values()))
 
 
-def clouds_in(folder: Path, pattern: str | None = None) -> tuple[list[Path], list[str]]:
+def clouds_in(folder: Path, pattern: str | None) -> tuple[list[Path], list[str]]:
     """Return a folder's clouds in order, and notes on what is left out.
 
     Args:
