@@ -153,6 +153,10 @@ class PoseGraph:
         """Return the graph with the factors of odometry and wheels alone."""
         return self.with_factors(factor for factor in self.factors if factor.origin != "loop")
 
+    def with_loops(self, loops: Iterable[BetweenFactor]) -> "PoseGraph":
+        """Return the graph with these loops in place of its own, after all other factors."""
+        return self.with_factors([*self.without_loops().factors, *loops])
+
     def part(self, nodes: Container[int]) -> "PoseGraph":
         """Return the graph of some nodes, with the factors between them."""
         return PoseGraph(

@@ -87,6 +87,10 @@ class LoopClosure:
         if self.verdict == "accepted" and (self.T_i_j is None or self.information is None):
             raise DataError(f"loop {self.i} → {self.j}: accepted without a measurement")
 
+    def rejected(self, step: str, why: str) -> "LoopClosure":
+        """Return it as a loop that a step has rejected, and what that found."""
+        return replace(self, verdict="rejected", reason=f"{step}: {why}")
+
     @property
     def rejected_by(self) -> str:
         """Step that rejected it, e.g. "isvd", "gate" or ``SOLVER``; empty when accepted."""
@@ -175,9 +179,7 @@ def _apply_solution(
     )
     if weight >= MIN_WEIGHT:
         return solved
-    return replace(
-        solved, verdict="rejected", reason=f"{SOLVER}: contradicts the rest of the graph, weight {weight:.2f}"
-    )
+    return solved.rejected(SOLVER, f"contradicts the rest of the graph, weight {weight:.2f}")
 
 
 def write_closures(path: Path, closures: Iterable[LoopClosure]) -> None:

@@ -2,7 +2,7 @@
 
 from bisect import bisect_right
 from collections.abc import Callable, Mapping, Sequence, Set
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from itertools import compress
 from typing import Generic, Protocol
@@ -29,8 +29,8 @@ from mapper.runtime.archived import Archived, ArchivedMapping, archived
 
 ViewOf = Callable[[], FrameView]
 
-ALONE = "alone: no loop from a keyframe nearby agrees"
-"""Reason of a measured loop that no other has confirmed yet."""
+ALONE = ("alone", "no loop from a keyframe nearby agrees")
+"""Step and reason of a measured loop that no other has confirmed yet."""
 
 
 class LoopDetector(Protocol):
@@ -248,7 +248,7 @@ class KeyframeLoopDetector(Generic[Place]):
 
     def _add_hypothesis(self, closure: LoopClosure) -> None:
         """Keep a measured loop as a hypothesis, and accept all that are confirmed now."""
-        self._closures[closure.i, closure.j] = replace(closure, verdict="rejected", reason=ALONE)
+        self._closures[closure.i, closure.j] = closure.rejected(*ALONE)
         for confirmed in self._consistency.add(closure):
             self._closures[confirmed.i, confirmed.j] = confirmed
             self._estimator.close(confirmed)

@@ -1,6 +1,5 @@
 """Drift gate: loops that odometry and wheels rule out are rejected, and many that agree are reported."""
 
-from dataclasses import replace
 from statistics import median
 
 import numpy as np
@@ -67,8 +66,7 @@ class DriftGate:
         for agreeing in self._rejected.add(closure):
             self._conflicts[self._compared[agreeing.i, agreeing.j][1]].append(agreeing)
         source = "wheels and odometry" if drift.by_wheels else "odometry"
-        reason = f"gate: {comparison}, after {drift.path.path_m:.1f} m of path by {source}"
-        return replace(closure, verdict="rejected", reason=reason)
+        return closure.rejected("gate", f"{comparison}, after {drift.path.path_m:.1f} m of path by {source}")
 
     def notes(self) -> list[str]:
         """Return a sentence about the rejected loops that agree with each other, if there are many."""

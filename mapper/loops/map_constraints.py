@@ -173,7 +173,7 @@ class MapConstraintDetector(Generic[Place]):
 
     def _add_hypothesis(self, place: int, closure: LoopClosure) -> None:
         """Keep a measured constraint as a hypothesis, and accept all that are confirmed now."""
-        self._closures[place, closure.j] = replace(closure, verdict="rejected", reason=ALONE)
+        self._closures[place, closure.j] = closure.rejected(*ALONE)
         self._place_of[closure.j] = place
         for confirmed in self._consistency.add(closure):
             self._failed = 0

@@ -1,7 +1,6 @@
 """Reach gate: loops between parts of a path that the sensor cannot have reached in the time between them."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -49,7 +48,5 @@ def checked_reach(
     if not between or max(between)[0] <= fastest:
         return closure
     _, distance_m, elapsed_s = max(between)
-    reason = (
-        f"reach: {distance_m:.1f} m apart with {elapsed_s:.1f} s between, at most {fastest:.1f} m/s is likely"
-    )
-    return replace(closure, verdict="rejected", reason=reason)
+    apart = f"{distance_m:.1f} m apart with {elapsed_s:.1f} s between"
+    return closure.rejected("reach", f"{apart}, at most {fastest:.1f} m/s is likely")

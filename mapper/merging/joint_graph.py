@@ -15,8 +15,6 @@ from mapper.graph.optimize import optimize
 from mapper.loops.closure import MIN_WEIGHT, LoopClosure, accepted_loops, apply_solution
 from mapper.loops.shared_places import SharedPlace
 
-_DISAGREES = "consensus: disagrees with most places that the two runs share"
-
 
 class Tie(Config):
     """Loops between two runs."""
@@ -129,7 +127,7 @@ def solve_jointly(
     factors = [factor for factor, is_kept in zip(joint.factors, kept, strict=True) if is_kept]
     whole = PoseGraph(solution.T_world_node, joint.stamps_ns, factors)
     refused = [
-        replace(loop, verdict="rejected", reason=_DISAGREES)
+        loop.rejected("consensus", "disagrees with most places that the two runs share")
         for loop in (
             _between(place, first_nodes) for place in others if {place.first, place.second} <= graphs.keys()
         )

@@ -68,4 +68,4 @@ def disconnected(track: FrameResult) -> FrameResult:
 def _refused_unless(loop: LoopClosure, kept: Set[int]) -> LoopClosure:
     if loop.verdict == "rejected" or loop.i in kept:
         return loop
-    return replace(loop, verdict="rejected", reason="disconnected: in a part of the path that is left out")
+    return loop.rejected("disconnected", "in a part of the path that is left out")

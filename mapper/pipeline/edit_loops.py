@@ -1,7 +1,6 @@
 """Loops that a user adds to a finished run or takes from it: solved and fused again, but not tracked."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 from mapper.config.build import BuildConfig
@@ -24,8 +23,6 @@ from mapper.sources.base import Log
 
 Pair = tuple[int, int]
 """Two nodes."""
-
-_REMOVED = "hand: removed"
 
 
 def edit_loops(
@@ -62,7 +59,7 @@ def edit_loops(
         place = _held(loops, pair)
         if place is None:
             raise LoopError(f"loop {_text(pair)}: no loop of {run.path} to remove; mapper loops lists them")
-        loops[place] = replace(loops[place], verdict="rejected", reason=_REMOVED)
+        loops[place] = loops[place].rejected("hand", "removed")
     pairs = [_in_time_order(graph, pair) for pair in add]
     for pair in pairs:
         if _held(loops, pair) is not None or pairs.count(pair) > 1:
@@ -70,8 +67,8 @@ def edit_loops(
     if pairs:
         found = _measured(source, tracked, pairs, run.config)
         loops = [loop for loop in loops if (loop.i, loop.j) not in pairs] + found
-    held = [loop.factor for loop in accepted_loops(loops)]
-    edited = graph.with_poses(by_odometry(graph)).with_factors([*graph.without_loops().factors, *held])
+    held = (loop.factor for loop in accepted_loops(loops))
+    edited = graph.with_poses(by_odometry(graph)).with_loops(held)
     solved = solve(edited, loops, run.config.graph)
     for loop in solved.loops[len(loops) - len(pairs) :]:
         _refuse_rejected(loop)

@@ -145,26 +145,21 @@ def _refuse_unplaced(source: Log, known: KnownMap, tracking: TrackingResult) -> 
 
 def _supported(tracking: TrackingResult) -> TrackingResult:
     """Return the result without the constraints of parts that too few tie to the map."""
-    graph = tracking.graph
-    odometry = graph.without_loops()
-    part_of = component_numbers(odometry)
+    part_of = component_numbers(tracking.graph.without_loops())
     tied = Counter(part_of[loop.j] for loop in accepted_loops(tracking.loops))
     weak = {part for part, count in tied.items() if count < _LEAST_CONSTRAINTS}
     if not weak:
         return tracking
     loops = tuple(
-        replace(
-            loop,
-            verdict="rejected",
-            reason=f"few: {tied[part_of[loop.j]]} constraints tie its part of the path, want "
-            f"{_LEAST_CONSTRAINTS}",
+        loop.rejected(
+            "few", f"{tied[part_of[loop.j]]} constraints tie its part of the path, want {_LEAST_CONSTRAINTS}"
         )
         if loop.verdict == "accepted" and part_of[loop.j] in weak
         else loop
         for loop in tracking.loops
     )
-    factors = [*odometry.factors, *(loop.factor for loop in accepted_loops(loops))]
-    return replace(tracking, graph=graph.with_factors(factors), loops=loops)
+    graph = tracking.graph.with_loops(loop.factor for loop in accepted_loops(loops))
+    return replace(tracking, graph=graph, loops=loops)
 
 
 def _with_scaled_constraints(graph: PoseGraph, config: GraphConfig) -> PoseGraph:
@@ -180,8 +175,7 @@ def _with_scaled_constraints(graph: PoseGraph, config: GraphConfig) -> PoseGraph
     scale = 1.0 / max(1.0, float(np.median(chi2)) / MEDIAN_CHI2)
     constraints = compress(graph.factors, is_constraint)
     scaled = [replace(factor, information=scale * factor.information) for factor in constraints]
-    graph = graph.with_poses(solution.T_world_node)
-    graph = graph.with_factors([*graph.without_loops().factors, *scaled])
+    graph = graph.with_poses(solution.T_world_node).with_loops(scaled)
     return graph.with_poses(optimize(graph, exact).T_world_node)
 
 

@@ -66,7 +66,7 @@ def solve(graph: PoseGraph, loops: Sequence[LoopClosure], config: GraphConfig) -
                 "loop_residual_sigma": float(np.median(np.sqrt(innovations(others, factors)))),
             }
         )
-    graph = graph.with_poses(_moved(graph, solution)).with_factors([*others, *factors])
+    graph = graph.with_poses(_moved(graph, solution)).with_loops(factors)
     return Solved(graph, loops, report)
 
 
