@@ -10,6 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import hypothesis
 import pytest
 
 from tests.support.paths import ROOT
@@ -18,6 +19,9 @@ from tests.support.tum_logs import write_tiny_log
 
 if TYPE_CHECKING:
     from mapper.run.folder import Run  # heavy to import: tests of small things do without
+
+hypothesis.settings.register_profile("no deadline", deadline=None)  # the machine may be busy
+hypothesis.settings.load_profile("no deadline")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -24,7 +24,7 @@ def test_undamaged_inputs_are_read(runner, tmp_path):
 
 
 @hypothesis.given(case=cases())
-@hypothesis.settings(max_examples=CASES, derandomize=True, deadline=None)
+@hypothesis.settings(max_examples=CASES, derandomize=True)
 def test_damaged_inputs_are_read_or_refused(runner, case):
     reading = runner.run_case(case)
     assert not reading.is_fault, f"{reading.file}\n{reading.command}\n{reading.outcome}: {reading.detail}"

@@ -24,7 +24,7 @@ def dif_by_the_book(depth_m):
     return filtered
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=80)
 @given(DEPTHS)
 def test_equals_the_thesis_algorithm(depth_m):
     before = depth_m.copy()
@@ -32,7 +32,7 @@ def test_equals_the_thesis_algorithm(depth_m):
     np.testing.assert_array_equal(depth_m, before, err_msg="the input is not changed")
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(DEPTHS)
 def test_stays_within_the_measured_neighbours(depth_m):
     filtered = dif(depth_m)

@@ -12,7 +12,7 @@ def indices_of(source, everything):
     return [stamps.index(entry.stamp_ns) for entry in source.entries()]
 
 
-@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(first=st.integers(0, 9), last=st.one_of(st.none(), st.integers(0, 12)), stride=st.integers(1, 5))
 def test_selects_like_a_slice(tiny_tum_log, first, last, stride):
     log = tiny_tum_log(7)

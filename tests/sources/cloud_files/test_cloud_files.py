@@ -223,7 +223,7 @@ def test_a_ply_header_that_counts_wrongly_is_refused(tmp_path, text, says):
     assert refusal_of(path).startswith(f"not a sound PLY file: {says}")
 
 
-@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     kinds=st.lists(st.sampled_from(["i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8"]), min_size=1, max_size=6),
     count=st.integers(0, 5),

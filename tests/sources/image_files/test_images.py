@@ -43,7 +43,7 @@ def test_png_equals_opencv_for_every_row_filter(filters, kind):
     np.testing.assert_array_equal(got[:, :, ::-1] if kind == "rgb" else got, want)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     st.one_of(
         arrays(np.uint16, st.tuples(st.integers(1, 9), st.integers(1, 9))),

@@ -76,7 +76,7 @@ def test_opencvs_jpegs_pass(kind, quality):
             assert passes(data)
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(
     st.integers(1, 90),
     st.integers(1, 90),
@@ -255,7 +255,7 @@ def test_impossible_headers_are_the_decoders(data):
         jpeg.decode(data, colour=True)
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(st.data())
 def test_damaged_headers_are_refused_or_taken(data):
     whole = bytearray(WHOLE[data.draw(st.sampled_from(sorted(WHOLE)))])
