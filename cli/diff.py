@@ -74,8 +74,8 @@ def diff(
     found = differences_of(*placing.placed, tolerance_m=tolerance_m, min_voxels=min_voxels)
     placed = placing.placed[-1].how
     write_differences(out, found, earlier, later, placed=placed, overwrite=overwrite)
-    if found.doubt:
-        progress.note(found.doubt)
+    if found.warning:
+        progress.note(found.warning)
     table = _table(found, earlier.config.octree.resolution_m)
     return Answer(record_in(out), f"{summary(found)}\nplaced {placed}\n{table}\n{out}")
 

@@ -73,12 +73,12 @@ def solve(
     overrides = merged(assignments({"robust": robust, "initial": initial}), set_)
     overrides = [override.removeprefix("graph.") for override in overrides]
     config = overridden(GraphConfig(), overrides)
-    doubts = config.robust != "none" and any(override.startswith("robust=") for override in overrides)
+    guess_loops = config.robust != "none" and any(override.startswith("robust=") for override in overrides)
     out = place_of(out, RUNS / name_of(graph))
     refuse_existing_result(out)
     progress = output.progress()
     began = time.perf_counter()
-    given = read_g2o(graph, guess_loops=doubts, progress=progress)
+    given = read_g2o(graph, guess_loops=guess_loops, progress=progress)
     read = time.perf_counter()
     solution = optimize(given, config, progress=progress)
     seconds = {"read": read - began, "solve": time.perf_counter() - read}

@@ -77,7 +77,7 @@ class Differences:
         return self.same + sum(len(cluster.centres_world) for cluster in self.vanished)
 
     @property
-    def doubt(self) -> str:
+    def warning(self) -> str:
         """Reason why the runs may not lie as they were placed; empty if there is none."""
         if self.same >= _LEAST_SAME * self.seen_again:
             return ""

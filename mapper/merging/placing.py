@@ -98,19 +98,19 @@ class Placing:
     Attributes:
         placed: Runs in the order in which they were given.
         left_out: Why each of the others is not in the map, by the run's path.
-        doubts: Warnings about the poses, a line each.
+        warnings: What may be wrong with the poses, a line each.
         joint: The pose graph of all of them; None if they are placed as rigid bodies.
     """
 
     placed: Sequence[Placed]
     left_out: Mapping[str, str] = field(default_factory=dict)
-    doubts: Sequence[str] = ()
+    warnings: Sequence[str] = ()
     joint: JointGraph | None = None
 
     @property
     def notes(self) -> list[str]:
         """Notes for the user, a line each."""
-        return [*(f"{path}: left out, {reason}" for path, reason in self.left_out.items()), *self.doubts]
+        return [*(f"{path}: left out, {reason}" for path, reason in self.left_out.items()), *self.warnings]
 
 
 def as_built(runs: Sequence[Run]) -> list[Placed]:

@@ -59,7 +59,7 @@ def place_by_shared_places(
         )
         for number, world in found.solved.worlds.items()
     ]
-    return Placing(placed, found.left_out(runs), found.doubts(runs))
+    return Placing(placed, found.left_out(runs), found.warnings(runs))
 
 
 def place_jointly(
@@ -103,9 +103,9 @@ def place_jointly(
     left_out = found.left_out(runs) | {
         str(runs[number].path): _REJECTED for number in worlds if number not in joint.first_nodes
     }
-    doubts = found.doubts(runs)
+    warnings = found.warnings(runs)
     if joint.own_rejected:
-        doubts.append(f"the joint graph rejected {joint.own_rejected} loops that single runs had accepted")
+        warnings.append(f"the joint graph rejected {joint.own_rejected} loops that single runs had accepted")
     held = Counter[int]()
     for tie in joint.ties:
         held.update(dict.fromkeys((tie.first, tie.second), tie.held))
@@ -113,7 +113,7 @@ def place_jointly(
         _placed(runs[number], number, joint, held[place]) for place, number in enumerate(joint.first_nodes)
     ]
     _refuse_alone(runs, len(placed), left_out)
-    return Placing(placed, left_out, doubts, joint)
+    return Placing(placed, left_out, warnings, joint)
 
 
 def _placed(run: Run, number: int, joint: JointGraph, held: int) -> Placed:
@@ -151,7 +151,7 @@ class _Recognised:
             if number not in self.solved.worlds
         }
 
-    def doubts(self, runs: Sequence[Run]) -> list[str]:
+    def warnings(self, runs: Sequence[Run]) -> list[str]:
         """Return what is suspicious about the shared places, a line each."""
         return [
             f"{runs[first].path} and {runs[second].path}: the places that they share contradict those that "

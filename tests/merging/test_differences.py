@@ -89,8 +89,8 @@ def test_weak_evidence_is_no_change(hits, misses, differs):
 
 def test_maps_of_two_places_are_doubted():
     found = compared(room(CHAIR), room(SHELF), exp(np.array([0.0, 0.0, 0.8]), np.array([1.5, 1.0, 0.0])))
-    assert "--place auto" in found.doubt
-    assert not compared(room(CHAIR), room(SHELF)).doubt
+    assert "--place auto" in found.warning
+    assert not compared(room(CHAIR), room(SHELF)).warning
 
 
 def test_what_was_not_looked_at_again_has_not_vanished():
