@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mapper.core.doubts import Doubt
 from mapper.core.frames import Frame
-from mapper.core.geometry import Array, Transform
+from mapper.core.geometry import Array, Transform, adjoint, inverse
 from mapper.core.timebase import NS_PER_S
 from mapper.graph.model import BetweenFactor
 from mapper.sources.base import FrameRef
@@ -45,6 +45,31 @@ class Diagnostics:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class UnseenMotions:
+    """Motions of a frame that surfaces show in part or not at all, and whose prediction is poor.
+
+    Attributes:
+        motions: (K, 6) tangents of the body (rotation, translation) as rows; each displaces the points by 1 m
+            root mean square.
+        parts: (K, 6) rows whose product with a tangent is its part along each motion, metres.
+        sigmas_m: (K,) standard deviation with which surfaces show each.
+        covariance: (6, 6) of the pose, as ``FrameResult.covariance``, by what surfaces show.
+        doubts: Those of the frame that are due to these motions.
+    """
+
+    motions: Array
+    parts: Array
+    sigmas_m: Array
+    covariance: Array
+    doubts: tuple[Doubt, ...] = ()
+
+    def at(self, T_body_other: Transform) -> UnseenMotions:
+        """Return the motions as tangents of another pose (4, 4) of the body."""
+        Ad = adjoint(inverse(T_body_other))
+        return replace(self, motions=self.motions @ Ad.T, parts=self.parts @ adjoint(T_body_other))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class FrameResult:
     """One tracked frame.
 
@@ -63,6 +88,7 @@ class FrameResult:
         doubts: Why the pose may be wrong; empty if there is no reason.
         covariance: (6, 6) of the pose in the body's tangent (rotation, translation), rad² and m²: relative to
             ``node``, or for a keyframe to the keyframe before it. None if nothing measured it.
+        unseen: Motions that were predicted, if this is doubtful, or if no velocity was measured before.
     """
 
     stamp_ns: int
@@ -77,6 +103,7 @@ class FrameResult:
     is_sharp: bool = True
     doubts: tuple[Doubt, ...] = ()
     covariance: Array | None = None
+    unseen: UnseenMotions | None = None
 
 
 def lost_frame(
@@ -201,10 +228,13 @@ class SensorCheck(Protocol):
 
 @runtime_checkable
 class HindsightOdometry(Protocol):
-    """Odometry in which later frames can make the poses of earlier ones doubtful."""
+    """Odometry in which later frames change the results of earlier ones."""
 
-    def in_hindsight(self, result: FrameResult, /) -> FrameResult:
-        """Return the result of a frame with the doubts that later ones add to it, once the log has ended."""
+    def in_hindsight(self, results: Sequence[FrameResult], /) -> list[FrameResult]:
+        """Return the results of all frames once the log has ended, with all factors, as later ones show them.
+
+        Nodes, keyframes, and the nodes that factors connect stay as they are.
+        """
         ...
 
 

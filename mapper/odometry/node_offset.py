@@ -34,12 +34,12 @@ class NodeOffset(Generic[Observation]):
         """Return the matches of the frame tracked last."""
         return self._odometry.matches()
 
-    def in_hindsight(self, result: FrameResult, /) -> FrameResult:
-        """Return the result of a frame with the doubts that later ones add to it."""
+    def in_hindsight(self, results: Sequence[FrameResult], /) -> list[FrameResult]:
+        """Return the results of all frames as later ones show them."""
         if not isinstance(self._odometry, HindsightOdometry):
-            return result
-        own = _numbered(result, -self._first_node)
-        return _numbered(self._odometry.in_hindsight(own), self._first_node)
+            return list(results)
+        own = [_numbered(result, -self._first_node) for result in results]
+        return [_numbered(result, self._first_node) for result in self._odometry.in_hindsight(own)]
 
     def finish(self) -> Sequence[BetweenFactor]:
         """Return the measurements that were still being refined when the log ended."""

@@ -189,11 +189,9 @@ class _FirstPass:
     def add(self, track: FrameResult, view: Callable[[], FrameView]) -> None:
         """Add a tracked frame; loops are searched from keyframes, whose views are made where needed."""
         if track.is_keyframe and track.node is not None:
-            self._graph.add_node(track.node, track.stamp_ns, track.T_world_body)
             driven = self._wheels.link(track.node, track.stamp_ns)
             self._start.detector.add(track.node, replace(track, links=(*track.links, *driven)), view)
             self._wheel_factors.extend(driven)
-        self._graph.add_factors(track.factors)
         self.tracks.append(track)
 
     def repeat(self, frames: Iterable[FrameCheckpoint], searches: VerificationLog) -> None:
@@ -216,7 +214,10 @@ class _FirstPass:
     ) -> TrackingResult:
         """Return the result of all frames, with more warnings; nothing is added afterwards."""
         tracks = _in_hindsight(self.tracks, odometry, checks)
-        self._graph.add_factors(odometry.finish())
+        for track in tracks:
+            if track.is_keyframe and track.node is not None:
+                self._graph.add_node(track.node, track.stamp_ns, track.T_world_body)
+            self._graph.add_factors(track.factors)
         warnings = [*self._warnings(odometry, checks), *more]
         for warning in warnings:
             progress.note(warning.sentence)
@@ -253,11 +254,13 @@ class _FirstPass:
 
 
 def _in_hindsight(
-    tracks: Iterable[FrameResult], odometry: Odometry[Any], checks: ReadingChecks
+    tracks: Sequence[FrameResult], odometry: Odometry[Any], checks: ReadingChecks
 ) -> list[FrameResult]:
-    """Return the frames' results with the doubts that later frames and the readings add."""
+    """Return the frames' results with all factors, and with what later frames and the readings add."""
+    if tracks:
+        tracks = [*tracks[:-1], replace(tracks[-1], factors=(*tracks[-1].factors, *odometry.finish()))]
     if isinstance(odometry, HindsightOdometry):
-        tracks = map(odometry.in_hindsight, tracks)
+        tracks = odometry.in_hindsight(tracks)
     doubts = checks.doubts()
     return [
         replace(track, doubts=track.doubts or tuple(doubts.get(track.stamp_ns, ())))

@@ -95,7 +95,7 @@ def test_a_factor_comes_when_both_its_nodes_are_there():
 
 def test_corrected_scans_have_their_own_covariance_in_hindsight():
     odometry, tracks = tracked()
-    later = [odometry.in_hindsight(track) for track in tracks]
+    later = odometry.in_hindsight(tracks)
 
     changed = [t.covariance is not h.covariance for t, h in zip(tracks, later, strict=True)]
     assert 2 <= sum(changed) < len(tracks)
@@ -178,7 +178,7 @@ def test_a_sweep_whose_velocity_three_poses_contradict_is_less_certain(monkeypat
     monkeypatch.setattr(PlacedScan, "turns_otherwise", lambda *_: True)
     odometry = build_frame_odometry(GicpOdometryConfig().scaled(SCALE))
     tracks = [odometry.track(odometry.observe(entry.load())) for entry in source().entries()]
-    later = [odometry.in_hindsight(track) for track in tracks]
+    later = odometry.in_hindsight(tracks)
     factors = {f.j: f for f in [f for track in tracks for f in track.factors] + list(odometry.finish())}
 
     changed = [
@@ -195,11 +195,11 @@ def test_a_sweep_whose_velocity_three_poses_contradict_is_less_certain(monkeypat
 
 def test_a_later_session_has_its_doubts_and_covariances_in_hindsight_too():
     odometry, tracks = tracked()
-    own = [odometry.in_hindsight(track) for track in tracks]
+    own = odometry.in_hindsight(tracks)
     after_others = NodeOffset(build_frame_odometry(GicpOdometryConfig().scaled(SCALE)), first_node=7)
     results = [after_others.track(after_others.read(entry)) for entry in source().entries()]
 
-    later = [after_others.in_hindsight(track) for track in results]
+    later = after_others.in_hindsight(results)
 
     assert [t.node for t in later] == [t.node + 7 for t in own]
     assert [t.doubts for t in later] == [t.doubts for t in own]

@@ -227,8 +227,11 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         """Return what in the images contradicts their focal length, and the stamps of their depth."""
         return self._calibration.contradictions()
 
-    def in_hindsight(self, result: FrameResult) -> FrameResult:
-        """Return the result of an earlier frame with the doubts that later ones add to it."""
+    def in_hindsight(self, results: Sequence[FrameResult]) -> list[FrameResult]:
+        """Return the frames' results with the doubts that later ones add to them."""
+        return [self._with_later_doubts(result) for result in results]
+
+    def _with_later_doubts(self, result: FrameResult) -> FrameResult:
         later = self._doubts.in_hindsight(result.stamp_ns)
         if not later.doubts or result.covariance is None:
             return result

@@ -9,6 +9,7 @@ from mapper.odometry.scan_to_map.motion_model import Spread
 from mapper.odometry.scan_to_map.scan_fit import ScanFit
 
 _UNSHOWN_VOXELS = 0.5  # error of a measured motion that next to no surface shows
+_LEAST_SHOWN = 1e-6  # keeps the error of a motion that is not shown finite
 _MOST_SIGMAS = 3.0
 _UNKNOWN_PARTS = 0.1  # share of the extent by which a prediction is off before any could be compared
 _EXTENTS_PER_S = 1.0  # plausible speed through what is seen: 20 m/s on a road, 4 m/s in a room
@@ -24,6 +25,8 @@ class Blend:
         predicted: (6, 6) covariance of a pose predicted from known ones.
         open_m: (6,) standard deviation of each of the fit's motions beyond that of what was measured: how far
             it displaces the points, metres.
+        shown_m: (6,) standard deviation with which surfaces show each of these motions, beyond that of what
+            was measured.
         unknown_mps: (6,) standard deviation of the velocity of each of these motions, as it displaces the
             points, where it is not shown and no velocity was measured before.
     """
@@ -32,6 +35,7 @@ class Blend:
     found: Array
     predicted: Array
     open_m: Array
+    shown_m: Array = field(default_factory=lambda: np.zeros(6))
     unknown_mps: Array = field(default_factory=lambda: np.zeros(6))
 
 
@@ -84,5 +88,7 @@ def observed_part(
     unshown_m = (1.0 - shown) * gains * found_m
     gain = motions.T @ np.diag(weights) @ to_motions
     open_m = (1.0 - shown) * np.sqrt(1.0 - gains) * predicted_m
-    blend = Blend(gain, motions.T @ np.diag(unshown_m**2) @ motions, predicted, open_m, unknown_mps)
+    shown_m = found_m * np.sqrt((1.0 - shown) / np.maximum(shown, _LEAST_SHOWN))
+    shown_m = np.minimum(shown_m, fit.degeneracy.extent_m)
+    blend = Blend(gain, motions.T @ np.diag(unshown_m**2) @ motions, predicted, open_m, shown_m, unknown_mps)
     return T_world_predicted @ exp(kept[:3], kept[3:]), blend

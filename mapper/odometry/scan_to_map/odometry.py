@@ -19,10 +19,11 @@ from mapper.odometry.scan_to_map.motion_model import MotionModel, covariance_unm
 from mapper.odometry.scan_to_map.pose_search import PoseSearch
 from mapper.odometry.scan_to_map.scan_fit import ScanKeyframe
 from mapper.odometry.scan_to_map.scan_matcher import DeskewedScan, ScanMatcher
-from mapper.odometry.scan_to_map.scan_noise import ScanNoise
+from mapper.odometry.scan_to_map.scan_noise import ScanNoise, doubtful_covariance
 from mapper.odometry.scan_to_map.scan_observation import ScanObservation, observe_scan
 from mapper.odometry.scan_to_map.scan_placement import ScanPlacement
 from mapper.odometry.scan_to_map.tracked_scan import PlacedScan, ScanState, TrackedScan
+from mapper.odometry.scan_to_map.unseen_motion_smoothing import smooth_unseen_motions
 
 _KEYFRAMES = 5  # so many last ones are compared with
 _CLEAR = 0.5  # score of a log's second scan; in rooms 0.6 to 0.8 is usual, in fields less
@@ -97,13 +98,21 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
         """Return the factor of the last scan, if it waits for another scan."""
         return self._waiting
 
-    def in_hindsight(self, result: FrameResult) -> FrameResult:
+    def in_hindsight(self, results: Sequence[FrameResult]) -> list[FrameResult]:
+        """Return all results: those of scans tracked again as these are, and unseen motions smoothed."""
+        return smooth_unseen_motions([self._corrected(result) for result in results])
+
+    def _corrected(self, result: FrameResult) -> FrameResult:
         """Return the result of a scan; if it was tracked again, with the pose and the doubts of that."""
         again = self._again.get(result.stamp_ns)
         if again is None:
             return result
         return replace(
-            result, T_node_body=again.T_node_body, doubts=again.doubts, covariance=again.covariance
+            result,
+            T_node_body=again.T_node_body,
+            doubts=again.doubts,
+            covariance=again.covariance,
+            unseen=again.unseen,
         )
 
     def view(self, observation: ScanObservation, twist: Twist | None = None, /) -> ScanView:
@@ -231,9 +240,10 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
         of_sweep = () if self._config.usual_ratio == 0.0 else observation.doubts(placed.velocity_covariance)
         doubts = (*self._search.doubts(found), *of_sweep)
         fits = not doubts
-        covariance = noise.covariance if fits else noise.inflated(found.jump)
-        if fits and self._search.usual.is_weak(found.shares):
-            covariance = covariance + found.fit.weak_covariance(deskewed.prepared.voxel_m)
+        if not fits:
+            noise = noise.with_more(doubtful_covariance(found.jump))
+        elif self._search.usual.is_weak(found.shares):
+            noise = noise.with_more(found.fit.weak_covariance(deskewed.prepared.voxel_m))
         if fits and keyframe is self._state.doubtful:
             self._state.matcher.clear()
             self._state.matcher.add(keyframe.deskewed, keyframe.T_world_middle, is_keyframe=True)
@@ -246,14 +256,15 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
             pose_covariance=noise.independent,
             measured=None if placed.twist is None else (placed.twist, placed.velocity_covariance),
         )
-        T_world_body = found.T_world_middle @ self._state.motion.twist.over(-observation.middle_s)
+        T_middle_body = self._state.motion.twist.over(-observation.middle_s)
+        T_world_body = found.T_world_middle @ T_middle_body
         T_key_body = inverse(keyframe.T_world_body) @ T_world_body
         is_keyframe = is_far(
             T_key_body,
             distance_m=self._config.keyframe_distance_m,
             angle_rad=self._config.keyframe_angle_rad,
         )
-        node = keyframe.node
+        node, covariance = keyframe.node, noise.covariance
         factors: tuple[BetweenFactor, ...] = ()
         scan = ScanKeyframe(self._state.next_node, deskewed, found.T_world_middle, T_world_body, at_stamp)
         if fits:
@@ -266,9 +277,9 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
             node = self._state.next_node
             self._state.next_node += 1
             self._state.noise.restart()
-            information = np.linalg.inv(covariance)
+            information = np.linalg.inv(noise.covariance)
             factors = (BetweenFactor(keyframe.node, node, T_key_body, 0.5 * (information + information.T)),)
-            covariance = self._state.tree.add(node, keyframe.node, T_world_body, covariance)
+            covariance = self._state.tree.add(node, keyframe.node, T_world_body, noise.covariance)
             if fits:
                 self._state.keyframes.appendleft(scan)
             else:
@@ -295,6 +306,7 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
             twist=self._state.motion.twist,
             doubts=(*doubts, *noise.doubts),
             covariance=covariance,
+            unseen=None if noise.unseen is None else noise.unseen.at(T_middle_body),
         )
 
     def _start(self, observation: ScanObservation, T_world_body: Transform, *, method: str) -> FrameResult:

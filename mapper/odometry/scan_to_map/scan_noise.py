@@ -1,11 +1,12 @@
 """Covariance of a scan's pose relative to its keyframe, from what the log itself shows."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from mapper.core.doubts import Doubt
 from mapper.core.geometry import Array, Transform, adjoint, inverse
+from mapper.odometry.base import UnseenMotions
 from mapper.odometry.scan_to_map.observed_part import Blend
 from mapper.odometry.scan_to_map.scan_fit import ScanFit
 from mapper.odometry.scan_to_map.usual_fit import Jump
@@ -44,19 +45,30 @@ class PoseNoise:
     Attributes:
         covariance: (6, 6) relative to the keyframe.
         independent: (6, 6) of what the last pose does not have alike.
-        doubts: Why it may be more than that.
+        unseen: Motions whose prediction is doubtful, or made without a velocity; None if there are none.
     """
 
     covariance: Array
     independent: Array
-    doubts: tuple[Doubt, ...] = ()
+    unseen: UnseenMotions | None = None
 
-    def inflated(self, jump: Jump) -> Array:
-        """Return the covariance of a doubtful pose: wrong by as much as it lies off the prediction."""
-        sigmas = np.array(
-            [max(jump.rotation_rad, _DOUBTFUL_RAD)] * 3 + [max(jump.translation_m, _DOUBTFUL_M)] * 3
-        )
-        return self.covariance + np.diag(sigmas**2)
+    @property
+    def doubts(self) -> tuple[Doubt, ...]:
+        """Why it may be more than that."""
+        return () if self.unseen is None else self.unseen.doubts
+
+    def with_more(self, covariance: Array) -> "PoseNoise":
+        """Return the noise with a (6, 6) covariance added to what surfaces show."""
+        unseen = self.unseen
+        if unseen is not None:
+            unseen = replace(unseen, covariance=unseen.covariance + covariance)
+        return replace(self, covariance=self.covariance + covariance, unseen=unseen)
+
+
+def doubtful_covariance(jump: Jump) -> Array:
+    """Return the (6, 6) covariance that a doubtful pose has more: as much as it lies off the prediction."""
+    sigmas = [max(jump.rotation_rad, _DOUBTFUL_RAD)] * 3 + [max(jump.translation_m, _DOUBTFUL_M)] * 3
+    return np.diag(np.square(sigmas))
 
 
 class ScanNoise:
@@ -96,8 +108,8 @@ class ScanNoise:
         off_m, moved_m = float(np.median(np.abs(fit.residuals_m))), float(np.linalg.norm(T_key_scan[:3, 3]))
         least_rad = _LEAST_RAD + _MODEL_RAD_M * off_m
         least_m = np.hypot(_LEAST_M + _MODEL_M_M * off_m, _MODEL_SHARE_M * off_m * moved_m)
-        covariance = surface + np.diag(np.square([least_rad] * 3 + [least_m] * 3)) + at_stamps
-        covariance += _along(fit, fit.observability * fit.shown_m)
+        measured = surface + np.diag(np.square([least_rad] * 3 + [least_m] * 3)) + at_stamps
+        covariance = measured + _along(fit, fit.observability * fit.shown_m)
         unseen, step = self._since_seen.add(blend, T_last_scan, elapsed_s)
         if fit.observability.min() >= 1.0:
             self._unseen, self._unseen_s = 0, 0.0
@@ -118,7 +130,31 @@ class ScanNoise:
             if blend.unknown_mps.any():
                 text = f"{name} is not seen, and was not before: its velocity is unknown"
                 doubts = (Doubt("unknown velocity", text),)
-        return PoseNoise(covariance + predicted, independent, doubts)
+        poor = None
+        if doubts or blend.unknown_mps.any():
+            poor = _unseen_motions(fit, blend, measured, doubts)
+        return PoseNoise(covariance + predicted, independent, poor)
+
+
+def _unseen_motions(fit: ScanFit, blend: Blend, measured: Array, doubts: tuple[Doubt, ...]) -> UnseenMotions:
+    """Return the motions of a fit that surfaces do not show in full.
+
+    Args:
+        fit: The fit.
+        blend: Of what was found and what was predicted.
+        measured: (6, 6) covariance without what few pairs show.
+        doubts: Because of these motions.
+    """
+    motions, is_unseen = fit.degeneracy.motions, fit.observability < 1.0
+    parts = np.asarray(np.linalg.inv(motions.T), np.float64)
+    few_m = fit.observability * fit.shown_m
+    return UnseenMotions(
+        motions[is_unseen],
+        parts[is_unseen],
+        np.hypot(blend.shown_m, few_m)[is_unseen],
+        measured + _along(fit, np.where(is_unseen, 0.0, few_m)),
+        doubts,
+    )
 
 
 class PredictedPart:
