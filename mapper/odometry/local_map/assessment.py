@@ -4,6 +4,9 @@ from dataclasses import dataclass
 
 from mapper.core.doubts import Doubt
 
+UNOBSERVED_MOTION = "unobserved motion"
+"""Kind of the doubt about a motion that nothing shows. Unlike others, it is measured by the covariance."""
+
 
 @dataclass(frozen=True, slots=True)
 class Assessment:

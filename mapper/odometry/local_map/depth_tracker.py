@@ -8,6 +8,7 @@ from mapper.core.doubts import Doubt
 from mapper.core.geometry import Transform
 from mapper.core.timebase import NS_PER_S
 from mapper.odometry.config import KeyframeOdometryConfig
+from mapper.odometry.local_map.assessment import UNOBSERVED_MOTION
 from mapper.odometry.local_map.depth_alignment import (
     DEPTH_ONLY,
     DepthAlignment,
@@ -289,7 +290,7 @@ class DepthTracker:
         if unobserved_s <= predicted.sure_s:
             return ()
         text = f"neither depth nor features show {alignment.unobservable} for {unobserved_s:.1f} s"
-        return (Doubt("unobserved motion", text),)
+        return (Doubt(UNOBSERVED_MOTION, text),)
 
     def _unobserved_s(self, observation: ImageObservation) -> float:
         return (observation.stamp_ns - self._observed_ns) / NS_PER_S

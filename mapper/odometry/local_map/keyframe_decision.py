@@ -1,6 +1,7 @@
 """Keyframe decision of the local map: by the inliers of a frame's pose."""
 
 from mapper.odometry.config import KeyframeOdometryConfig
+from mapper.odometry.local_map.assessment import UNOBSERVED_MOTION
 from mapper.odometry.local_map.landmarks import LandmarkMap
 from mapper.odometry.local_map.pose_tracker import TrackedPose
 
@@ -34,10 +35,9 @@ class KeyframeDecision:
         config, inliers = self._config, tracked_pose.inliers
         self._frames += 1
         self._most_inliers = max(self._most_inliers, inliers)
-        # A motion that was not observed is uncertain in the factor too; other doubts have no measure.
-        unobserved = tracked_pose.depth is not None and bool(tracked_pose.depth.unobservable)
-        if len(tracked_pose.doubts) > unobserved:
+        if any(doubt.kind != UNOBSERVED_MOTION for doubt in tracked_pose.doubts):
             return False
+        unobserved = tracked_pose.depth is not None and bool(tracked_pose.depth.unobservable)
         if unobserved and tracked_pose.depth is not None and tracked_pose.depth.observes_next:
             return True
         if self._frames >= config.max_keyframe_gap:

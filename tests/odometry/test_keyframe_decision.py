@@ -1,0 +1,33 @@
+"""Which doubts keep a frame from becoming a keyframe."""
+
+from types import SimpleNamespace
+
+import pytest
+
+from mapper.core.doubts import Doubt
+from mapper.odometry.config import LocalMapConfig
+from mapper.odometry.local_map.assessment import UNOBSERVED_MOTION
+from mapper.odometry.local_map.keyframe_decision import KeyframeDecision
+
+UNOBSERVED = Doubt(UNOBSERVED_MOTION, "neither depth nor features show translation along x for 0.4 s")
+JUMP = Doubt("jump", "jump of 0.3 m")
+
+
+@pytest.mark.parametrize(
+    ("unobservable", "doubts", "is_due"),
+    [
+        ("translation along x", (UNOBSERVED,), True),
+        ("translation along x", (UNOBSERVED, JUMP), False),
+        ("translation along x", (JUMP,), False),  # not observed too briefly for a doubt of its own
+        ("", (JUMP,), False),
+        ("", (), True),
+    ],
+)
+def test_only_a_doubt_that_the_covariance_measures_lets_a_frame_become_a_keyframe(
+    unobservable, doubts, is_due
+):
+    config = LocalMapConfig(max_keyframe_gap=1)
+    depth = SimpleNamespace(unobservable=unobservable, observes_next=False)
+    decision = KeyframeDecision(config, landmark_map=None)
+
+    assert decision.is_due(SimpleNamespace(inliers=100, depth=depth, doubts=doubts)) is is_due
