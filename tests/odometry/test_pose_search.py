@@ -55,6 +55,18 @@ def test_a_scan_that_is_turned_and_tilted_beyond_the_other_guesses_is_found(turn
     assert angle_between(np.eye(3), miss[:3, :3]) < 0.02
 
 
+def test_a_turn_that_takes_longer_than_the_time_between_two_scans_is_not_found():
+    odometry = ScanOdometry(INDOOR, GicpMatcher(INDOOR))
+    for k in range(8):
+        odometry.track(odometry.observe(room_scan(k * 100_000_000, seed=k, more=CRATES)))
+    turned = exp(np.array([0.25, 0.0, 3.0]), np.array([0.7, 0.3, 0.0]))
+
+    track = odometry.track(odometry.observe(room_scan(800_000_000, turned, seed=8, more=CRATES)))
+
+    assert angle_between(np.eye(3), track.T_world_body[:3, :3]) < 4.0 * np.pi * 0.1
+    assert track.node is None or track.doubts
+
+
 class CountingMatcher(GicpMatcher):
     """GICP that counts the guesses it is given."""
 

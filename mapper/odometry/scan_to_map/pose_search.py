@@ -7,7 +7,16 @@ from functools import cached_property
 import numpy as np
 
 from mapper.core.doubts import Doubt
-from mapper.core.geometry import Array, Transform, exp, inverse, rotation_exp, transform, turn_to_z
+from mapper.core.geometry import (
+    Array,
+    Transform,
+    angle_between,
+    exp,
+    inverse,
+    rotation_exp,
+    transform,
+    turn_to_z,
+)
 from mapper.odometry.scan_to_map.config import ScanOdometryConfig
 from mapper.odometry.scan_to_map.motion_model import MotionModel, Spread
 from mapper.odometry.scan_to_map.observed_part import MEASURED, observed_part
@@ -33,6 +42,7 @@ _PAIR_DISTANCES = (4.0, 2.0, 1.0)  # of a scan to the last keyframe or scan, in 
 _MAX_POINTS = 2500  # of the scan; fewer than twice as many are used
 _GOOD = 0.75  # a score of this part of the usual one ends the search
 _FAIR, _GUESSES = 0.5, 3  # and so does one of this part to which so many guesses lead
+_FASTEST_RADPS = 4.0 * np.pi  # two turns a second; heads and drones that turn faster are not scanned with
 _LEAST_AGREEMENT = 0.1  # of a pose that is searched for: where scans hardly overlap, nothing contradicts
 
 _Attempt = tuple[int, Transform | None, str]
@@ -68,6 +78,11 @@ class UnplacedScan:
     def spread(self) -> Spread | None:
         """Errors of earlier predictions."""
         return self.motion.spread(self.time_ns)
+
+    def can_have_turned_to(self, T_world_middle: Transform) -> bool:
+        """Return whether the sensor can have turned to a pose (4, 4) since the last scan that was placed."""
+        turn_rad = angle_between(self.motion.T_world_last[:3, :3], T_world_middle[:3, :3])
+        return turn_rad <= _FASTEST_RADPS * self.motion.elapsed_s(self.time_ns)
 
     @cached_property
     def directions(self) -> int:
@@ -157,7 +172,7 @@ class PoseSearch:
                 break
             for key in keys:
                 for guess, T_world_middle, method in way(scan, key):
-                    if T_world_middle is None:
+                    if T_world_middle is None or not scan.can_have_turned_to(T_world_middle):
                         continue
                     if answers[key is scan.doubtful].add(T_world_middle, guess):
                         candidate = self._assessed(scan, T_world_middle, key, method)
