@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.frames import Image
-from mapper.features.base import Features
+from mapper.features.base import Descriptors, Features
 from mapper.features.config import UniformOrbConfig
-from mapper.features.fast import Pixels, corners, fast_scores, orientations
+from mapper.features.fast import Pixels, corners, fast_scores, orientations, peaks_of
 from mapper.features.quadtree import spread
 
 _MARGIN_PX = 19  # reach of the rotated descriptor's tests
@@ -41,7 +41,7 @@ class UniformOrb:
         parts: list[Features] = []
         for octave in reversed(range(len(levels))):
             wanted += self._config.max_features * shares[octave] / shares.sum()
-            part = self._describe(levels[octave], octave, *self._corners(levels[octave], round(wanted)))
+            part = self._features_of(levels[octave], octave, round(wanted), gray.shape)
             wanted -= len(part)
             parts.append(part)
         return _joined(parts[::-1])
@@ -59,30 +59,37 @@ class UniformOrb:
                 level = cv2.resize(level, size, interpolation=cv2.INTER_LINEAR_EXACT)
             yield level
 
-    def _corners(self, level: Image, wanted: int) -> tuple[Pixels, NDArray[np.uint8]]:
+    def _features_of(self, level: Image, octave: int, wanted: int, shape: tuple[int, ...]) -> Features:
+        """Return the features of a level of an image of that shape."""
         config = self._config
         scores = fast_scores(level, config.min_threshold, _MARGIN_PX)
         pixels, strength = corners(scores, config.threshold, config.cell_px, _MARGIN_PX)
         kept = spread(pixels, strength, level.shape[1], level.shape[0], wanted)
-        return pixels[kept], strength[kept]
-
-    def _describe(self, level: Image, octave: int, pixels: Pixels, strength: NDArray[np.uint8]) -> Features:
+        pixels, strength = pixels[kept], strength[kept]
         angle_rad = orientations(level, pixels)
-        degrees = np.degrees(angle_rad).tolist()
-        keypoints = [
-            cv2.KeyPoint(x, y, _PATCH_PX, angle)
-            for (x, y), angle in zip(pixels.astype(np.float32).tolist(), degrees, strict=True)
-        ]
-        # One level at a time, as OpenCV would build the pyramid again.
-        orb = cv2.ORB.create(nlevels=1, edgeThreshold=_MARGIN_PX, patchSize=_PATCH_PX)
-        descriptors = orb.compute(level, keypoints)[1] if keypoints else None
+        # A level has whole pixels, so its size is not the image's by the scale factor: 0.4 px in its middle.
+        pixel_px = np.array([shape[1] / level.shape[1], shape[0] / level.shape[0]])
         return Features(
-            pixels=((pixels + 0.5) * self._config.scale_factor**octave - 0.5).astype(np.float32),
+            pixels=((peaks_of(scores, pixels) + 0.5) * pixel_px - 0.5).astype(np.float32),
             octave=np.full(len(pixels), octave, np.int32),
             angle_rad=angle_rad,
             response=strength.astype(np.float32),
-            descriptors=np.empty((0, _DESCRIPTOR_BYTES), np.uint8) if descriptors is None else descriptors,
+            descriptors=_descriptors(level, pixels, angle_rad),
         )
+
+
+def _descriptors(level: Image, pixels: Pixels, angle_rad: NDArray[np.float32]) -> Descriptors:
+    keypoints = [
+        cv2.KeyPoint(x, y, _PATCH_PX, angle)
+        for (x, y), angle in zip(
+            pixels.astype(np.float32).tolist(), np.degrees(angle_rad).tolist(), strict=True
+        )
+    ]
+    if not keypoints:
+        return np.empty((0, _DESCRIPTOR_BYTES), np.uint8)
+    # One level at a time, as OpenCV would build the pyramid again.
+    orb = cv2.ORB.create(nlevels=1, edgeThreshold=_MARGIN_PX, patchSize=_PATCH_PX)
+    return np.asarray(orb.compute(level, keypoints)[1])
 
 
 def _joined(parts: list[Features]) -> Features:

@@ -83,6 +83,42 @@ def test_features_follow_a_shifted_image(config):
     assert (gaps < 1.5).mean() > 0.6
 
 
+def nearest(a: np.ndarray, b: np.ndarray, *, within_px: float) -> np.ndarray:
+    """Differences of pixels from their nearest ones among others, where these are close: (K, 2)."""
+    apart = b[None] - a[:, None]
+    best = np.linalg.norm(apart, axis=2).argmin(axis=1)
+    difference = apart[np.arange(len(a)), best]
+    return difference[np.linalg.norm(difference, axis=1) < within_px]
+
+
+def test_uniform_orb_finds_mirrored_features_at_mirrored_pixels_in_every_octave():
+    image = texture(5)
+    detector = build_detector(UniformOrbConfig(max_features=2000))
+
+    straight, mirrored = detector.detect(image), detector.detect(image[::-1, ::-1].copy())
+
+    back = np.float32([319, 239]) - mirrored.pixels
+    for octave in range(8):
+        a, b = straight.pixels[straight.octave == octave], back[mirrored.octave == octave]
+        differences = nearest(a, b, within_px=1.5 * 1.2**octave)
+        assert len(differences) > 30
+        # Levels of whole pixels taken for the scale factor's put them up to a pixel apart.
+        assert (np.abs(np.median(differences, axis=0)) < 0.1).all()
+
+
+def test_uniform_orb_finds_corners_to_a_part_of_a_pixel():
+    fine = cv2.resize(texture(6), (1280, 960), interpolation=cv2.INTER_CUBIC)
+    detector = build_detector(UniformOrbConfig(levels=1))
+
+    still = detector.detect(cv2.resize(fine, (320, 240), interpolation=cv2.INTER_AREA))
+    moved = detector.detect(cv2.resize(np.roll(fine, 2, axis=1), (320, 240), interpolation=cv2.INTER_AREA))
+
+    differences = nearest(still.pixels, moved.pixels, within_px=1.5) - [0.5, 0.0]  # whole pixels miss by 0.5
+    assert len(differences) > 300
+    assert np.median(np.abs(differences[:, 0])) < 0.2
+    assert np.median(np.abs(differences[:, 1])) < 0.1
+
+
 @pytest.mark.parametrize("kind", ["surf", "sift", "orb", "akaze"])
 def test_threshold_falls_until_a_faint_image_gives_enough(kind):
     config = next(c for c in EVERY_DETECTOR if c.kind == kind)
