@@ -3,9 +3,10 @@
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mapper.core.geometry import Array, Transform, adjoint, inverse
-from mapper.odometry.local_map.landmarks import MIN_SHARED_LANDMARKS, LandmarkMap
+from mapper.odometry.local_map.landmarks import MIN_SHARED_LANDMARKS, Ids, LandmarkMap
 from mapper.odometry.local_map.pose_tracker import TrackedPose
 from mapper.odometry.local_map.triangulation import weights_with_landmarks
 from mapper.registration.reprojection import normal_matrix
@@ -68,19 +69,18 @@ def relative_information(landmark_map: LandmarkMap, target: int, source: int) ->
 
 def keyframe_residuals(landmark_map: LandmarkMap, index: int) -> ResidualStatistics | None:
     """Return the statistics of a keyframe's residuals; None where few landmarks have another observer."""
-    ids = landmark_map.landmark_of_feature(index)
-    observers = landmark_map.landmarks["observers"][ids]
-    features = np.flatnonzero((ids >= 0) & (observers > 1))
+    features, ids = _seen_by_others(landmark_map, index)
     if len(features) < MIN_SHARED_LANDMARKS:
         return None
     observation = landmark_map.observation(index)
     return residual_statistics(
         landmark_map.keyframes[index].T_camera_world,
-        landmark_map.landmarks["position"][ids[features]],
+        landmark_map.landmarks["position"][ids],
         observation.measured[features],
         observation.weights[features],
         observation.intrinsics,
-        redundancy=1.0 - 1.0 / observers[features],  # a landmark is the mean of what its observers saw
+        # A landmark is the mean of what its observers saw.
+        redundancy=1.0 - 1.0 / landmark_map.landmarks["observers"][ids],
     )
 
 
@@ -89,20 +89,27 @@ def disparity_ratio(landmark_map: LandmarkMap, index: int) -> float | None:
 
     None where few landmarks with depth have another observer.
     """
-    ids = landmark_map.landmark_of_feature(index)
-    observers = landmark_map.landmarks["observers"][ids]
+    features, ids = _seen_by_others(landmark_map, index)
     observation = landmark_map.observation(index)
-    is_measured = (ids >= 0) & (observers > 1) & (landmark_map.landmarks["ray_sigma_m"][ids] == 0.0)
-    features = np.flatnonzero(is_measured & ~np.isnan(observation.measured[:, 2]))
+    is_measured = landmark_map.landmarks["ray_sigma_m"][ids] == 0.0
+    is_measured &= ~np.isnan(observation.measured[features, 2])
+    features, ids = features[is_measured], ids[is_measured]
     if len(features) < MIN_SHARED_LANDMARKS:
         return None
     return disparity_variance_ratio(
         landmark_map.keyframes[index].T_camera_world,
-        landmark_map.landmarks["position"][ids[features]],
+        landmark_map.landmarks["position"][ids],
         observation.measured[features],
         observation.weights[features, 0] ** -0.5,
         observation.intrinsics,
     )
+
+
+def _seen_by_others(landmark_map: LandmarkMap, index: int) -> tuple[NDArray[np.intp], Ids]:
+    """Return a keyframe's features of landmarks that others observe as well, and these."""
+    ids = landmark_map.landmark_of_feature(index)
+    features = np.flatnonzero((ids >= 0) & (landmark_map.landmarks["observers"][ids] > 1))
+    return features, ids[features]
 
 
 def with_systematic(information: Array, tracked_pose: TrackedPose) -> Array:
