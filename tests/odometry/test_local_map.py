@@ -104,6 +104,37 @@ def test_keyframes_in_which_much_moves_keep_the_usual_weight(frames):
     assert relative_weights(moving=len(odometry._last.observation) // 2) == 1.0
 
 
+def test_bundles_have_the_usual_variances_until_a_window_of_keyframes_is_still(frames, monkeypatch):
+    odometry = build_frame_odometry(LocalMapConfig(bundle_keyframes=3))
+    for frame in frames:
+        odometry.track(odometry.observe(frame))
+    factors = []
+    monkeypatch.setattr(odometry._map, "refine", lambda _, **given: factors.append(given["variance_factor"]))
+    for moving in (0, len(odometry._last.observation) // 2, 0, 0, 0):
+        last = replace(odometry._last, moving=np.arange(moving, dtype=np.int32))
+        odometry._add_keyframe(last, neighbour=last.reference)
+    assert factors[1:4] == [1.0, 1.0, 1.0]
+    assert factors[0] < 1.0
+    assert factors[4] < 1.0
+
+
+def test_the_residuals_of_a_log_decide_what_is_an_outlier_of_a_bundle(frames):
+    odometry = build_frame_odometry(LocalMapConfig())
+    for frame in frames:
+        odometry.track(odometry.observe(frame))
+    landmark_map, index = odometry._map, odometry._last.reference
+    ids, octave = landmark_map.landmark_of_feature(index), landmark_map.observation(index).octave
+    feature = np.flatnonzero((octave == 0) & (landmark_map.landmarks["observers"][ids] > 2) & (ids >= 0))[0]
+    landmark_map._observations["measured"][landmark_map._first_observation[index] + feature, 0] += 2.0
+
+    def is_kept(variance_factor):
+        landmark_map.refine(index, window=10, variance_factor=variance_factor)
+        return landmark_map.landmark_of_feature(index)[feature] >= 0
+
+    assert is_kept(1.0)
+    assert not is_kept(0.1)
+
+
 def test_the_same_frames_give_the_same_bytes(frames):
     first, second = (track(frames[:20])[1] for _ in range(2))
     assert first.T_world_body.tobytes() == second.T_world_body.tobytes()

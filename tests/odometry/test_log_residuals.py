@@ -54,6 +54,19 @@ def test_the_variance_of_features_is_the_usual_one_within_limits():
     assert variance(*[4.0] * 9) == 1.0
 
 
+def test_the_variance_factor_counts_what_neighbours_share_within_limits():
+    def factor(*statistics):
+        residuals = LogResiduals()
+        for one in statistics:
+            residuals.add(one)
+        return residuals.variance_factor
+
+    assert factor(*[ResidualStatistics(0.2, 2.0)] * 4) == USUAL_VARIANCE
+    assert factor(*[ResidualStatistics(0.2, 2.0)] * 8, ResidualStatistics(50.0, 9.0)) == 0.4
+    assert factor(*[ResidualStatistics(0.01, 0.9)] * 9) == 0.05
+    assert factor(*[ResidualStatistics(0.9, 2.0)] * 9) == 1.0
+
+
 def disparity_sigma(*ratios, most=1.0):
     residuals = LogResiduals(disparity_sigma=most)
     for ratio in ratios:

@@ -121,7 +121,7 @@ def test_surfaces_shift_while_the_depth_image_is_not_measured_yet(
 ):
     """Depth that is late shifts by the time times the difference of the velocities in the two images."""
     pose, keyframes = odometry._last, odometry._map.keyframes
-    late = exp(np.zeros(3), np.array([0.0, 0.0, 0.06])) @ pose.T_camera_world
+    late = exp(np.zeros(3), np.array([0.0, 0.0, 0.07])) @ pose.T_camera_world
     for keyframe in keyframes:
         keyframe.twist_camera = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
     twist_camera = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 1.0 + change_mps])

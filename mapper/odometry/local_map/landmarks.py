@@ -276,11 +276,12 @@ class LandmarkMap:
         order = np.lexsort((-others, -counts[others]))
         return [(int(k), int(counts[k])) for k in others[order]]
 
-    def refine(self, index: int, *, window: int) -> None:
+    def refine(self, index: int, *, window: int, variance_factor: float = 1.0) -> None:
         """Adjust a keyframe, its most covisible ones and their landmarks; drop observations that disagree.
 
         Keyframes outside the window that observe these landmarks take part but stay fixed, as does the first
-        of a sub-map. Depth links constrain keyframes of few landmarks.
+        of a sub-map. Depth links constrain keyframes of few landmarks. All observations' variances are
+        multiplied by a factor.
         """
         members = self._window(index, window)
         movable = sorted(k for k in members if k != self.keyframes[k].origin)
@@ -298,7 +299,7 @@ class LandmarkMap:
         edges = np.column_stack([local, rows]).astype(np.int32)
         measured, weights = self._measured(observations), self._observations["weights"][observations]
         intrinsics = self.observation(index).intrinsics
-        observed = Observations(first, edges, measured, weights, intrinsics)
+        observed = Observations(first, edges, measured, weights / variance_factor, intrinsics)
         links = np.searchsorted(keyframe_ids, linked).astype(np.int32), T_links, link_information
         start = np.array([self.keyframes[k].T_camera_world for k in keyframe_ids])
         poses, points, agree = adjust(

@@ -21,6 +21,8 @@ USUAL_VARIANCE = 0.25
 """Variance of features as long as too few keyframes show it: real and synthetic logs have 0.1 to 0.35."""
 _LEAST_VARIANCE = 0.15
 """Landmarks err as well, while a keyframe's residuals are those to its own."""
+_LEAST_VARIANCE_FACTOR = 0.05
+"""Simulated logs have 0.03 to 0.1, and fr1_xyz 0.35 to 0.45."""
 _LEAST_DISPARITY_SIGMA = 1.0 / 3.0
 """Disparities are not taken as more certain than this share of a pixel's: logs of a simulated Kinect have
 residuals of 0.15 to 0.5, with distortion of depth 0.3 to 1.6, and fr1_xyz has 1.5."""
@@ -69,6 +71,16 @@ class LogResiduals:
         if len(self._variances) < _FEWEST:
             return USUAL_VARIANCE
         return float(np.clip(median(self._variances), _LEAST_VARIANCE, 1.0))
+
+    @property
+    def variance_factor(self) -> float:
+        """Factor on features' variances that makes them those of a log's residuals, at most 1.
+
+        Errors that neighbours share count for more, so that it is no outlier that the lens moves.
+        """
+        if len(self._factors) < _FEWEST:
+            return USUAL_VARIANCE
+        return float(np.clip(self._factor, _LEAST_VARIANCE_FACTOR, 1.0))
 
     def rescaled(self, information: Array, T_i_j: Transform) -> Array:
         """Return the (6, 6) information of a relative pose by what the residuals show.

@@ -104,6 +104,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         self._residuals = LogResiduals(disparity_sigma=config.disparity_sigma_px)
         self._calibration = CalibrationChecks(self._map)
         self._agreeing = np.zeros(0, np.bool_)  # features by which the last frame was tracked
+        self._still_keyframes = config.bundle_keyframes  # the newest ones, in which few features move
         self._lost_frames = 0  # since the last tracked one
         self._unknown_frames = 0  # those of them with enough features to begin a sub-map
 
@@ -352,6 +353,9 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         # A measured noise is taken as it is; where much moves, more weight would prefer passers-by's motion.
         if config.depth_noise is None and tracked_pose.few_move:
             observation = observation.with_disparity_sigma(self._residuals.disparity_sigma)
+        self._still_keyframes = self._still_keyframes + 1 if tracked_pose.few_move else 0
+        is_still = self._still_keyframes >= config.bundle_keyframes  # all of the window
+        variance_factor = self._residuals.variance_factor if is_still else 1.0
         is_new = observation.has_depth & (tracked_pose.landmark_of_feature < 0)
         is_new[tracked_pose.moving] = False
         index = self._map.add_keyframe(
@@ -366,7 +370,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         if config.triangulate and tracked_pose.few_move:  # without depth nothing shows what moves
             add_triangulated(self._map, index, except_for=tracked_pose.moving)
         self._relocalizer.add(index)
-        self._map.refine(index, window=config.bundle_keyframes)
+        self._map.refine(index, window=config.bundle_keyframes, variance_factor=variance_factor)
         self._map.follow_readout()
         self._map.cull()
         self._calibration.pass_keyframe()
