@@ -58,6 +58,18 @@ def test_what_follows_from_a_doubtful_keyframe_is_recognised_until_it_is_linked(
     assert odometry._recovery.relocalised(found, nothing, STILL) is None  # rests on landmarks of before
 
 
+@pytest.mark.parametrize(("off_m", "is_recognised"), [(0.3, True), (5.0, False)])
+def test_nothing_is_recognised_farther_off_than_doubtful_keyframes_can_have_led(
+    odometry, off_m, is_recognised
+):
+    """What hangs on two walls alike agrees with a pose before the other one."""
+    odometry._map.keyframes[-1].doubt_m = 0.3
+    pose = astray(odometry._last)
+    pose = replace(pose, T_camera_world=exp(np.zeros(3), np.array([0.0, 0.0, off_m])) @ pose.T_camera_world)
+    found = odometry._recovery.relocalised(pose, Displacement(), STILL)
+    assert (found is not None) == is_recognised
+
+
 def test_a_recognised_frame_is_doubtful_no_keyframe_and_where_it_is(odometry, frames, monkeypatch):
     observation = odometry.observe(frames[NOW])
     track = odometry._tracker.track

@@ -17,6 +17,10 @@ _MOST = 0.5
 """Share of displaced surfaces from which another pose is sought."""
 _LESS = 0.5
 """Another pose displaces at most this share of what the tracked one does."""
+_FASTEST_M_S = 3.0
+"""Speed of someone who runs: tracking that followed them is no farther off than that leads in the time around
+doubtful keyframes. Things that look alike have been recognised 3 m away while 300 features agreed with the
+right pose."""
 _SINCE_NS = 5 * NS_PER_S
 """After a doubtful keyframe the keyframes before it are searched for so long."""
 
@@ -69,6 +73,8 @@ class TrackingRecovery:
                 return (
                     there.ratio <= _LESS * displaced.ratio and there.far_ratio <= _LESS * displaced.far_ratio
                 )
+            if before is not None and _distance_m(pose, tracked_pose) > self._reach_m(tracked_pose, before):
+                return False
             enough = 2 * pose.inliers >= self._config.weak_inliers
             return enough and max(there.ratio, there.far_ratio) <= _MOST
 
@@ -77,8 +83,7 @@ class TrackingRecovery:
         )
         if found is None:
             return None
-        apart_m = float(np.linalg.norm(found.body_pose[:3, 3] - tracked_pose.body_pose[:3, 3]))
-        text = f"recognised {apart_m:.2f} m from where the frames before it led"
+        text = f"recognised {_distance_m(found, tracked_pose):.2f} m from where the frames before it led"
         displaced = self._earlier_depth.displacement(
             observation, found.T_camera_world, found.reference, twist_camera
         )
@@ -113,8 +118,20 @@ class TrackingRecovery:
                 first = k
         return first
 
+    def _reach_m(self, tracked_pose: TrackedPose, before: int) -> float:
+        """Return how far off poses may be since a first doubtful keyframe, by the time next to such ones."""
+        since = self._map.keyframes[before - 1 :]
+        doubtful = np.array([keyframe.doubt_m > 0.0 for keyframe in since])
+        stamps_ns = np.array([keyframe.stamp_ns for keyframe in since] + [tracked_pose.stamp_ns])
+        counts = doubtful | np.append(doubtful[1:], False)
+        return _FASTEST_M_S * float(np.diff(stamps_ns)[counts].sum()) / NS_PER_S
+
     def _is_linked(self, tracked_pose: TrackedPose, before: int) -> bool:
         """Return whether a pose rests on landmarks that a keyframe before another one observes."""
         ids = tracked_pose.landmark_of_feature
         counts = self._map.shared_counts(ids[ids >= 0])
         return bool(counts[:before].max(initial=0) >= MIN_SHARED_LANDMARKS)
+
+
+def _distance_m(a: TrackedPose, b: TrackedPose) -> float:
+    return float(np.linalg.norm(a.body_pose[:3, 3] - b.body_pose[:3, 3]))
