@@ -114,6 +114,23 @@ def test_established_landmarks_at_an_edge_of_the_view_do_not_turn_it(observation
     assert agree[60:].mean() > 0.9
 
 
+@pytest.mark.parametrize("variance", [0.05, 0.1, 0.15])
+def test_pixels_found_better_than_their_weights_say_leave_depth_its_own_errors(observation, variance):
+    """Depth that is as good as its weights say was rejected, so that fewer and fewer points gave the pose."""
+    misses_m = []
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        points = room(60, rng)
+        disparity = observation.intrinsics[4] / apply(T_CAMERA_WORLD, points)[:, 2] + rng.standard_normal(60)
+        pixels = project(T_CAMERA_WORLD, points, observation.intrinsics) + 0.2 * rng.standard_normal((60, 2))
+        seen = replace(observation, measured=np.column_stack([pixels, disparity]))
+        found, _ = refined_by_established(
+            T_CAMERA_WORLD, points, seen, np.arange(60), np.zeros(60, int), np.ones((60, 3)), variance
+        )
+        misses_m.append(np.linalg.norm(log(found @ inverse(T_CAMERA_WORLD))[1]))
+    assert np.mean(misses_m) < 0.0044
+
+
 def test_mismatches_are_no_other_motion(observation):
     rng = np.random.default_rng(2)
     motion = motion_of(observation, rng, still=room(200, rng), moved=room(1, rng), observers=(2, 0))

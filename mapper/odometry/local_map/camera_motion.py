@@ -69,7 +69,7 @@ def camera_motion(
         features: (M,) the feature of each point.
         observers: (M,) number of keyframes that observe each point, 0 for those that are no landmarks.
         weights: (N, 3) inverse variances of the frame's features by which pairs agree.
-        variance: Usual square of residuals, relative to that of the weights. Features are found better than
+        variance: Usual square of residuals, relative to that of the weights. Pixels are found better than
             that, so that a compromise between still walls and someone near by, whose features all pass the
             test, has residuals that are too large.
     """
@@ -114,18 +114,20 @@ def refined_by_established(
     ``camera_motion``; by default the weights are taken as they are.
     """
     is_established = _established(observers)
+    # However well pixels are found, depth has the errors of its sensor.
+    fitted = weights / np.array([variance, variance, 1.0])
     if is_established is not None:
         T_found, _ = refined(
             T_camera_world,
             points_world[is_established],
             observation,
             features[is_established],
-            weights / variance,
+            fitted,
         )
         agree = agreeing(T_found, points_world, observation, features, weights)
         if agree[is_established].sum() >= _MIN_KEPT_RATIO * is_established.sum():
             if _MORE * agree.mean() < 1.0:
-                T_all, _ = refined(T_camera_world, points_world, observation, features, weights / variance)
+                T_all, _ = refined(T_camera_world, points_world, observation, features, fitted)
                 agree_all = agreeing(T_all, points_world, observation, features, weights)
                 if (
                     agree_all.sum() > _MORE * agree.sum()
@@ -133,11 +135,9 @@ def refined_by_established(
                     and _spread_m(points_world[agree_all & ~agree]) > _WIDER * _spread_m(points_world[agree])
                 ):
                     return T_all, agree_all
-            T_found, _ = refined(
-                T_found, points_world[agree], observation, features[agree], weights / variance
-            )
+            T_found, _ = refined(T_found, points_world[agree], observation, features[agree], fitted)
             return T_found, agreeing(T_found, points_world, observation, features, weights)
-    T_found, _ = refined(T_camera_world, points_world, observation, features, weights / variance)
+    T_found, _ = refined(T_camera_world, points_world, observation, features, fitted)
     return T_found, agreeing(T_found, points_world, observation, features, weights)
 
 
