@@ -77,7 +77,8 @@ def test_disparities_weigh_what_the_residuals_of_a_log_show(frames):
         for frame in frames:
             odometry.track(odometry.observe(frame))
         assert len(odometry._map.keyframes) > 10
-        weights = odometry._last.observation.weights[odometry._last.observation.has_depth]
+        observation = odometry._last.observation
+        weights = observation.weights[observation.has_depth & ~observation.on_outline]
         return weights[:, 2] / weights[:, 0], odometry._residuals.disparity_sigma**-2
 
     weight, expected = relative_weight()
@@ -97,7 +98,7 @@ def test_keyframes_in_which_much_moves_keep_the_usual_weight(frames):
     def relative_weights(moving):
         last = replace(odometry._last, moving=np.arange(moving, dtype=np.int32))
         observation = odometry._add_keyframe(last, neighbour=last.reference).observation
-        weights = observation.weights[observation.has_depth]
+        weights = observation.weights[observation.has_depth & ~observation.on_outline]
         return np.unique(np.round(weights[:, 2] / weights[:, 0], 6))
 
     assert relative_weights(moving=0) == 4.0

@@ -20,10 +20,13 @@ from mapper.odometry.local_map.pixel_motion import of_middle_row, row_shift
 from mapper.places.vocabulary import Vocabulary
 from mapper.runtime.archived import Archivable
 from mapper.sensing.config import KINECT_NOISE
+from mapper.sensing.depth_edges import lies_behind_edge
 from mapper.sensing.depth_noise import depth_sigma_m, feature_depth_m, feature_depth_sigma_m
 
 FEW_MOVING = 0.05
 """Share of the features below which nothing moves by itself: depths at edges are mistaken for it."""
+_OUTLINE_WEIGHT = 0.01
+"""Share of a disparity's weight on outlines: its error is ten times the usual one."""
 _SCALE_ERROR = 0.02
 """Error of depths beside the sensor's noise, as a share: its scale, and the slope where a feature lies."""
 
@@ -47,6 +50,7 @@ class ImageObservation(Archivable):
         sensor_weights: (N, 3) likewise, by the depth sensor's noise where that is smaller than the virtual
             disparity's: for tests of a common motion, without errors of its calibration.
         points_camera: (N, 3) metres, of ``measured``; NaN without depth.
+        on_outline: (N,) features close to something nearer, with which they may move.
         grid: Index of the features, which are sorted by its cells.
         intrinsics: (5,) fx, fy, cx, cy, bf in pixels (bf in pixel metres).
         size_px: Image width and height.
@@ -70,6 +74,7 @@ class ImageObservation(Archivable):
     weights: Array
     sensor_weights: Array
     points_camera: Points
+    on_outline: NDArray[np.bool_]
     grid: FeatureGrid
     intrinsics: Array
     size_px: tuple[int, int]
@@ -107,9 +112,13 @@ class ImageObservation(Archivable):
         return self.sensor_weights if moved.sum() > FEW_MOVING * len(self) else self.weights
 
     def with_disparity_sigma(self, relative: float) -> "ImageObservation":
-        """Return the observation with virtual disparities whose error is this share of a pixel's."""
+        """Return the observation with virtual disparities whose error is this share of a pixel's.
+
+        Those on outlines may be of the background: their landmarks are placed by the views of them instead.
+        """
         weights = self.weights.copy()
         weights[:, 2] = weights[:, 0] / relative**2
+        weights[self.on_outline, 2] *= _OUTLINE_WEIGHT
         return replace(self, weights=weights)
 
     def mask_of(self, features: NDArray[np.integer]) -> NDArray[np.bool_]:
@@ -223,6 +232,7 @@ def observe_image(
         "words": vocabulary.words_of(bits),
         "weights": np.column_stack([sigma_px, sigma_px, disparity_sigma_px]) ** -2.0,
         "sensor_weights": np.column_stack([sigma_px, sigma_px, sensor_px]) ** -2.0,
+        "on_outline": lies_behind_edge(frame.depth_m, column, row, sigma_px),
         "grid": grid,
         "intrinsics": intrinsics,
         "size_px": (camera.width_px, camera.height_px),

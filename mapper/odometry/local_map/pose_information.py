@@ -92,7 +92,7 @@ def disparity_ratio(landmark_map: LandmarkMap, index: int) -> float | None:
     features, ids = _seen_by_others(landmark_map, index)
     observation = landmark_map.observation(index)
     is_measured = landmark_map.landmarks["ray_sigma_m"][ids] == 0.0
-    is_measured &= ~np.isnan(observation.measured[features, 2])
+    is_measured &= ~np.isnan(observation.measured[features, 2]) & ~observation.on_outline[features]
     features, ids = features[is_measured], ids[is_measured]
     if len(features) < MIN_SHARED_LANDMARKS:
         return None
