@@ -19,7 +19,7 @@ from mapper.odometry.scan_to_map.motion_model import MotionModel, covariance_unm
 from mapper.odometry.scan_to_map.pose_search import PoseSearch
 from mapper.odometry.scan_to_map.scan_fit import ScanKeyframe
 from mapper.odometry.scan_to_map.scan_matcher import DeskewedScan, ScanMatcher
-from mapper.odometry.scan_to_map.scan_noise import ScanNoise, doubtful_covariance
+from mapper.odometry.scan_to_map.scan_noise import ScanNoise, doubtful_covariance, information_of
 from mapper.odometry.scan_to_map.scan_observation import ScanObservation, observe_scan
 from mapper.odometry.scan_to_map.scan_placement import ScanPlacement
 from mapper.odometry.scan_to_map.tracked_scan import PlacedScan, ScanState, TrackedScan
@@ -277,8 +277,7 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
             node = self._state.next_node
             self._state.next_node += 1
             self._state.noise.restart()
-            information = np.linalg.inv(noise.covariance)
-            factors = (BetweenFactor(keyframe.node, node, T_key_body, 0.5 * (information + information.T)),)
+            factors = (BetweenFactor(keyframe.node, node, T_key_body, information_of(noise.covariance)),)
             covariance = self._state.tree.add(node, keyframe.node, T_world_body, noise.covariance)
             if fits:
                 self._state.keyframes.appendleft(scan)

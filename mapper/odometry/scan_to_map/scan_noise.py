@@ -18,10 +18,11 @@ of rotation, of translation and of the share of the way. KITTI's scans lie 25 mm
 7 mm on a metre, an error of 0.2° of the beams' elevations; synthetic ones lie 6 mm off, and are exact."""
 _DOUBTFUL_RAD, _DOUBTFUL_M = 0.1, 0.5
 _TRUSTED_RADPS, _TRUSTED_MPS = 0.088, 0.2
-_TRUSTED_RAD, _TRUSTED_M = 0.044, 0.1
+TRUSTED_RAD, TRUSTED_M = 0.044, 0.1
 """A prediction is doubtful when its rotation or its translation may be off by more than both: with two sigmas
 by 5 degrees or 0.2 m, which is wrong. With a half, 1 to 4 % more of the right scans of fields are flagged."""
 _SHORTEST_S = 0.01
+_A_MOTION = "a motion"
 
 
 def independent_covariance(fit: ScanFit, blend: Blend) -> Array:
@@ -119,21 +120,38 @@ class ScanNoise:
         self._steps += self._unseen
         predicted_m = np.minimum(blend.open_m * self._steps, fit.degeneracy.extent_m)
         predicted = _along(fit, np.hypot(predicted_m, blend.unknown_mps * self._unseen_s))
-        rates = _largest(step) / max(elapsed_s, _SHORTEST_S)
-        (sigma_rad, sigma_m), (rate_radps, rate_mps) = _largest(unseen), rates
+        rates = largest_sigmas(step) / max(elapsed_s, _SHORTEST_S)
+        (sigma_rad, sigma_m), (rate_radps, rate_mps) = largest_sigmas(unseen), rates
         doubts: tuple[Doubt, ...] = ()
-        turns = rate_radps > _TRUSTED_RADPS and sigma_rad > _TRUSTED_RAD
-        if turns or (rate_mps > _TRUSTED_MPS and sigma_m > _TRUSTED_M):
-            name = fit.unobservable or "a motion"
-            known = f"±{rate_mps:.2f} m and {np.degrees(rate_radps):.1f}° a second"
-            doubts = (Doubt("predicted motion", f"{name} is not seen but predicted, to {known}"),)
+        turns = rate_radps > _TRUSTED_RADPS and sigma_rad > TRUSTED_RAD
+        if turns or (rate_mps > _TRUSTED_MPS and sigma_m > TRUSTED_M):
+            doubts = (predicted_motion(fit.unobservable, rate_radps, rate_mps),)
             if blend.unknown_mps.any():
+                name = fit.unobservable or _A_MOTION
                 text = f"{name} is not seen, and was not before: its velocity is unknown"
                 doubts = (Doubt("unknown velocity", text),)
         poor = None
         if doubts or blend.unknown_mps.any():
             poor = _unseen_motions(fit, blend, measured, doubts)
         return PoseNoise(covariance + predicted, independent, poor)
+
+
+def predicted_motion(unobservable: str, sigma_rad: float, sigma_m: float) -> Doubt:
+    """Return the doubt about a motion that is predicted.
+
+    Args:
+        unobservable: Its name; empty if it has none.
+        sigma_rad: Standard deviation of the rotation in a second.
+        sigma_m: Of the translation.
+    """
+    known = f"±{sigma_m:.2f} m and {np.degrees(sigma_rad):.1f}° a second"
+    return Doubt("predicted motion", f"{unobservable or _A_MOTION} is not seen but predicted, to {known}")
+
+
+def information_of(covariance: Array) -> Array:
+    """Return the (6, 6) information of a covariance, symmetric to the last digit."""
+    information = np.asarray(np.linalg.inv(covariance), np.float64)
+    return 0.5 * (information + information.T)
 
 
 def _unseen_motions(fit: ScanFit, blend: Blend, measured: Array, doubts: tuple[Doubt, ...]) -> UnseenMotions:
@@ -183,6 +201,6 @@ class PredictedPart:
         return self._covariance[:6, :6].copy(), self._covariance[6:, 6:].copy()
 
 
-def _largest(covariance: Array) -> Array:
+def largest_sigmas(covariance: Array) -> Array:
     """Return the largest standard deviation of a (6, 6) covariance's rotation and of its translation."""
     return np.sqrt([np.linalg.eigvalsh(covariance[part, part])[-1] for part in (slice(3), slice(3, 6))])

@@ -1,17 +1,24 @@
 """Fixed-interval smoothing of the motions that no surface showed, by the velocities before and after."""
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from mapper.core.deskew import twist_between
 from mapper.core.doubts import Doubt
-from mapper.core.geometry import Array, Transform, adjoint, exp, inverse, log
+from mapper.core.geometry import Array, Transform, adjoint, exp, inverse
 from mapper.core.timebase import NS_PER_S
 from mapper.graph.model import BetweenFactor
 from mapper.odometry.base import FrameResult
 from mapper.odometry.scan_to_map.keyframe_tree import KeyframeTree
+from mapper.odometry.scan_to_map.scan_noise import (
+    TRUSTED_M,
+    TRUSTED_RAD,
+    information_of,
+    largest_sigmas,
+    predicted_motion,
+)
 
 _AROUND_S = 1.0
 """Frames so long before and after a stretch tell its velocities at both ends, and stretches nearer to each
@@ -19,9 +26,6 @@ other are one. Over as long, the log's accelerations are measured: over less the
 _WINDOWS, _FEWEST_WINDOWS = 200, 10
 _LEAST_DENSITY = 1e-6  # rad²/s³ and m²/s³: keeps a synthetic log of one velocity finite
 _MOST_FRAMES = 600  # of a stretch: in a minute a velocity is forgotten
-_PARTS = slice(3), slice(3, 6)  # of a tangent: rotation, translation
-_TRUSTED_RAD, _TRUSTED_M = 0.044, 0.1
-"""Standard deviations of the motion over a second, two of which are 5 degrees and 0.2 m, which is wrong."""
 
 
 def smooth_unseen_motions(tracks: Sequence[FrameResult]) -> list[FrameResult]:
@@ -117,9 +121,9 @@ class _Path:
 
     def velocity(self, begin: int, end: int) -> Array:
         """Return the (6,) mean velocity between two frames, in the tangent of the first: rad/s and m/s."""
-        T_begin_end = inverse(self.T_world_body[begin]) @ self.T_world_body[end]
-        mean: Array = np.concatenate(log(T_begin_end)) / (self.seconds[end] - self.seconds[begin])
-        return mean
+        T_world_begin, T_world_end = self.T_world_body[begin], self.T_world_body[end]
+        duration_s = float(self.seconds[end] - self.seconds[begin])
+        return twist_between(T_world_begin, T_world_end, duration_s=duration_s).vector
 
     def acceleration_density(self) -> Array | None:
         """Return the (6,) power spectral density of the acceleration on the frames whose motion is all seen.
@@ -188,8 +192,7 @@ class _Path:
                 tree.clear()
             elif track.is_keyframe:
                 if number in changes:
-                    information = np.linalg.inv(covariance)
-                    information = 0.5 * (information + information.T)
+                    information = information_of(covariance)
                     factors[track.node] = BetweenFactor(parent, track.node, step.T_parent_body, information)
                 covariance = tree.add(track.node, parent, T_world_body[number], covariance)
             if number >= first and parent is not None:
@@ -353,16 +356,13 @@ class _Stretch:
         ways = [(before, number)] if before >= self._first - 1 else []
         ways += [(number, after)] if after < self._stop else []
         sigmas = [self._sigmas(*way) for way in ways or [(self._first - 1, self._stop - 1)]]
-        if any(rad <= _TRUSTED_RAD and m <= _TRUSTED_M for rad, m in sigmas):
+        if any(rad <= TRUSTED_RAD and m <= TRUSTED_M for rad, m in sigmas):
             return ()
         rad, m = min(sigmas, key=lambda sigma: sigma[1])
-        known = f"±{m:.2f} m and {np.degrees(rad):.1f}° in {_AROUND_S:g} s"
-        text = f"{self._path.names[number] or 'a motion'} is not seen but predicted, to {known}"
-        return (Doubt("predicted motion", text),)
+        return (predicted_motion(self._path.names[number], rad, m),)
 
     def _sigmas(self, begin: int, end: int) -> tuple[float, float]:
         """Return the largest standard deviations of the motion between two frames: rad and m."""
         motion = self._motion(begin, end)
-        covariance = motion @ self._covariance @ motion.T
-        rad, m = (float(np.linalg.eigvalsh(covariance[part, part])[-1]) for part in _PARTS)
-        return math.sqrt(rad), math.sqrt(m)
+        rad, m = largest_sigmas(motion @ self._covariance @ motion.T).tolist()
+        return rad, m
