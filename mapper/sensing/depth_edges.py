@@ -28,36 +28,42 @@ def lies_behind_edge(
         sigma_px: (N,) standard deviation of a feature's pixel.
     """
     reach_px = np.maximum(np.rint(_REACH_SIGMAS * sigma_px), 1.0).astype(np.intp)
-    return np.asarray(_jumps(depth_m, columns, rows, reach_px, _MIN_JUMP))
+    return np.asarray(_behind_edge(depth_m, columns, rows, reach_px, _MIN_JUMP))
 
 
 @njit(cache=True, nogil=True)
-def _jumps(
+def _behind_edge(
     depth_m: DepthImage,
     columns: NDArray[np.intp],
     rows: NDArray[np.intp],
     reach_px: NDArray[np.intp],
     min_jump: float,
 ) -> NDArray[np.bool_]:
-    """Return (N,) which pixels have a jump to something nearer within their reach, along axes and diagonals.
+    found = np.zeros(len(columns), np.bool_)
+    for n in range(len(columns)):
+        found[n] = _has_nearer(depth_m, columns[n], rows[n], reach_px[n], min_jump)
+    return found
+
+
+@njit(cache=True, nogil=True)
+def _has_nearer(depth_m: DepthImage, column: int, row: int, reach_px: int, min_jump: float) -> bool:
+    """Return whether the depth jumps to something nearer within reach of a pixel, along axes and diagonals.
 
     Inverse depth is affine on a plane: what it grows by on one side, it falls by on the other.
     """
-    found = np.zeros(len(columns), np.bool_)
-    for n in range(len(columns)):
-        here = _inverse_depth(depth_m, columns[n], rows[n])
-        if here == 0.0:
-            continue
-        for step in range(1, reach_px[n] + 1):
-            for right, down in ((1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1)):
-                there = _inverse_depth(depth_m, columns[n] + step * right, rows[n] + step * down)
-                if there - here <= min_jump * here:
-                    continue
-                opposite = _inverse_depth(depth_m, columns[n] - step * right, rows[n] - step * down)
-                slope = max(here - opposite, 0.0) if opposite > 0.0 else 0.0
-                if there - here - slope > min_jump * here:
-                    found[n] = True
-    return found
+    here = _inverse_depth(depth_m, column, row)
+    if here == 0.0:
+        return False
+    for step in range(1, reach_px + 1):
+        for right, down in ((1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1)):
+            rise = _inverse_depth(depth_m, column + step * right, row + step * down) - here
+            if rise <= min_jump * here:
+                continue
+            opposite = _inverse_depth(depth_m, column - step * right, row - step * down)
+            slope = max(here - opposite, 0.0) if opposite > 0.0 else 0.0
+            if rise - slope > min_jump * here:
+                return True
+    return False
 
 
 @njit(cache=True, nogil=True)
