@@ -177,11 +177,9 @@ class _FirstPass:
             start: Graph, loops and loop detector of these.
             wheels: Measurements of the log's wheels.
         """
-        before = start.graph
         self.skipped: list[Skipped] = []
         self.frame_ms: dict[int, float] = {}
         self._start = start
-        self._graph = PoseGraph(dict(before.T_world_node), dict(before.stamps_ns), list(before.factors))
         self.tracks: list[FrameResult] = []
         self._wheels = wheels
         self._wheel_factors: list[BetweenFactor] = []
@@ -214,18 +212,20 @@ class _FirstPass:
     ) -> TrackingResult:
         """Return the result of all frames, with more warnings; nothing is added afterwards."""
         tracks = _in_hindsight(self.tracks, odometry, checks)
+        before = self._start.graph
+        graph = PoseGraph(dict(before.T_world_node), dict(before.stamps_ns), list(before.factors))
         for track in tracks:
             if track.is_keyframe and track.node is not None:
-                self._graph.add_node(track.node, track.stamp_ns, track.T_world_body)
-            self._graph.add_factors(track.factors)
-        warnings = [*self._warnings(odometry, checks), *more]
+                graph.add_node(track.node, track.stamp_ns, track.T_world_body)
+            graph.add_factors(track.factors)
+        warnings = [*self._warnings(graph, odometry, checks), *more]
         for warning in warnings:
             progress.note(warning.sentence)
-        self._graph.add_factors(self._wheel_factors)
+        graph.add_factors(self._wheel_factors)
         detector = self._start.detector
         loops = (*self._start.loops, *detector.closures())
-        self._graph.add_factors(loop.factor for loop in accepted_loops(loops))
-        tracks, graph = without_doubtful_ends(tracks, self._graph)
+        graph.add_factors(loop.factor for loop in accepted_loops(loops))
+        tracks, graph = without_doubtful_ends(tracks, graph)
         return TrackingResult(
             tuple(tracks),
             tuple(self.skipped),
@@ -236,10 +236,10 @@ class _FirstPass:
             detector.places(),
         )
 
-    def _warnings(self, odometry: Odometry[Any], checks: ReadingChecks) -> list[RunWarning]:
-        """Return what is suspicious about the frames that were read."""
+    def _warnings(self, graph: PoseGraph, odometry: Odometry[Any], checks: ReadingChecks) -> list[RunWarning]:
+        """Return what is suspicious about the frames that were read, and their graph without wheels."""
         conflicts = self._start.detector.notes()
-        if conflict := wheel_conflict(self._graph, self._wheel_factors):
+        if conflict := wheel_conflict(graph, self._wheel_factors):
             conflicts = [*conflicts, conflict]
         warnings = [
             *(RunWarning(kind="frozen", sentence=note, weight="doubt") for note in checks.frozen()),
