@@ -32,8 +32,7 @@ class PreparedFrame:
 
     def upright(self, T_body_body: Transform) -> Transform:
         """Return a motion of the body as a motion of the scans' frame."""
-        motion: Transform = inverse(self.T_body_scan) @ T_body_body @ self.T_body_scan
-        return motion
+        return inverse(self.T_body_scan) @ T_body_body @ self.T_body_scan
 
 
 class FrameReader:

@@ -146,12 +146,11 @@ def _are_planes(planes: Planes, depth_m: Array, steps_m: list[float | None]) -> 
     """Return (T,) which tiles a plane explains up to noise."""
     shape_m = _shape_m(np.where(planes.used, depth_m - planes.depth_m, np.nan))
     step_m = np.array([0.0 if step is None else step for step in steps_m])
-    flat: NDArray[np.bool_] = (
+    return (
         planes.explain(depth_m > 0.0)
         & (planes.sigma_m <= MAX_NOISE_RATIO * np.abs(planes.distance_m))
         & (shape_m <= np.maximum(_MAX_SHAPE_RATIO * planes.sigma_m, _MAX_SHAPE_STEPS * step_m))
     )
-    return flat
 
 
 def _shape_m(error_m: Array) -> Array:

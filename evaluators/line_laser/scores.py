@@ -100,8 +100,7 @@ def summed(counts: Iterable[Mapping[Method, Counts]]) -> dict[Method, Counts]:
 
 def is_right(found: Array, true_rows: Array) -> NDArray[np.bool_]:
     """Return in which of (W,) columns the row that was found is the stripe's."""
-    right: NDArray[np.bool_] = np.abs(found - true_rows) <= TOLERANCE_PX  # False where NaN
-    return right
+    return np.abs(found - true_rows) <= TOLERANCE_PX  # False where NaN
 
 
 def detection_table(counts: Mapping[Method, Counts]) -> Table:

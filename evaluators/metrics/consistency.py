@@ -108,8 +108,7 @@ def _own(record: FrameRecord) -> Array:
 def _carried(covariance: Array, T_to_from: Transform) -> Array:
     """Return a covariance in the tangent of another body that is rigidly connected."""
     carry = adjoint(T_to_from)
-    carried: Array = carry @ covariance @ carry.T
-    return carried
+    return carry @ covariance @ carry.T
 
 
 def _relative_covariances(

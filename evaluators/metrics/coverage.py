@@ -63,5 +63,4 @@ def _pauses_s(frames_ns: Stamps, tracked: NDArray[np.bool_]) -> NDArray[np.float
 def _untracked_s(frames_ns: Stamps, tracked: NDArray[np.bool_]) -> NDArray[np.float64]:
     """Return how long each run of frames without a pose lasts, from the pose before it to the one after."""
     ends = np.array(stretches(~tracked, margin=1), np.intp).reshape(-1, 2)
-    lasted_s: NDArray[np.float64] = np.diff(frames_ns[ends], axis=1)[:, 0] / NS_PER_S
-    return lasted_s
+    return np.diff(frames_ns[ends], axis=1)[:, 0] / NS_PER_S

@@ -69,8 +69,7 @@ def revisits_of(keyframes_ns: Stamps, truth: Trajectory) -> NDArray[np.bool_]:
 def _along(keyframes_ns: Stamps, truth: Trajectory) -> Array:
     """Return (N,) metres of true path up to every keyframe."""
     index, _ = nearest(truth.stamps_ns, keyframes_ns)
-    along_m: Array = distances_along(truth.positions_world)[index]
-    return along_m
+    return distances_along(truth.positions_world)[index]
 
 
 def wrong_loops(accepted: Sequence[LoopClosure], truth: Trajectory) -> list[bool]:

@@ -69,8 +69,7 @@ class OccupancyCheck:
         )
 
     def _centres(self, keys: Keys) -> Points:
-        centres: Points = (keys.astype(np.float64) - (KEY_ZERO - 0.5)) * self.resolution_m
-        return centres
+        return (keys.astype(np.float64) - (KEY_ZERO - 0.5)) * self.resolution_m
 
     def seen_at(self, points_world: Points) -> Mask:
         """Return (N,) whether the map saw the voxel of each of (N, 3) points on the reference's surfaces."""

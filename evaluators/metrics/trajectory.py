@@ -266,8 +266,7 @@ def _relative(T_a_i: Array, T_a_j: Array) -> Array:
     T_i_a[:, :3, :3] = R_i_a
     T_i_a[:, :3, 3] = -np.einsum("nij,nj->ni", R_i_a, T_a_i[:, :3, 3])
     T_i_a[:, 3, 3] = 1.0
-    T_i_j: Array = T_i_a @ T_a_j
-    return T_i_j
+    return T_i_a @ T_a_j
 
 
 def _angles_rad(R: Array) -> Array:

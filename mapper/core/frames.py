@@ -112,14 +112,12 @@ class PinholeCamera:
 
     def rays(self, pixels: Array) -> Array:
         """Return the (N, 2) x/z and y/z, camera frame, of the rays of (N, 2) undistorted pixels."""
-        rays: Array = (pixels - [self.cx_px, self.cy_px]) / [self.fx_px, self.fy_px]
-        return rays
+        return (pixels - [self.cx_px, self.cy_px]) / [self.fx_px, self.fy_px]
 
     def project(self, points_camera: Points) -> Array:
         """Return the undistorted pixels (N, 2) of (N, 3) camera-frame points with positive depth."""
         normalised = points_camera[:, :2] / points_camera[:, 2:3]
-        pixels: Array = normalised * [self.fx_px, self.fy_px] + [self.cx_px, self.cy_px]
-        return pixels
+        return normalised * [self.fx_px, self.fy_px] + [self.cx_px, self.cy_px]
 
 
 @lru_cache(maxsize=8)
@@ -251,8 +249,7 @@ class RgbdFrame:
         """(H, W, 3) uint8 RGB; a grey image repeats its one channel."""
         if self.image.ndim == 3:
             return self.image
-        rgb: Image = np.repeat(self.image[:, :, None], 3, axis=2)
-        return rgb
+        return np.repeat(self.image[:, :, None], 3, axis=2)
 
     def scan(self, *, stride_px: int = 1, max_depth_m: float = np.inf) -> Scan:
         """Return the measured pixels as a scan in the body frame, with the colours of a colour image.

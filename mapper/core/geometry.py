@@ -66,8 +66,7 @@ def point_rows(points: ArrayLike, owner: str) -> tuple[tuple[int, ...], Points]:
 
 def apply(T_a_b: Transform, points_b: Points) -> Points:
     """Return the (N, 3) points of frame b in frame a."""
-    points_a: Points = points_b @ T_a_b[:3, :3].T + T_a_b[:3, 3]
-    return points_a
+    return points_b @ T_a_b[:3, :3].T + T_a_b[:3, 3]
 
 
 def distances_along(points: Array) -> Array:

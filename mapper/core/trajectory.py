@@ -96,8 +96,7 @@ class Trajectory:
     @property
     def positions_world(self) -> Array:
         """(N, 3) metres, world frame."""
-        positions: Array = self.T_world_body[:, :3, 3]
-        return positions
+        return self.T_world_body[:, :3, 3]
 
     @property
     def path_length_m(self) -> float:

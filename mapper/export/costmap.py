@@ -43,8 +43,7 @@ def occupancy_values(costmap: Costmap) -> NDArray[np.uint8]:
     inflated = np.arange(1, INSCRIBED)
     table[1:INSCRIBED] = 1 + (_MOST_INFLATED - 1) * (inflated - 1) // (INSCRIBED - 2)
     table[[INSCRIBED, LETHAL, NO_INFORMATION]] = _INSCRIBED, _LETHAL, _UNKNOWN
-    values: NDArray[np.uint8] = table[costmap.costs]
-    return values
+    return table[costmap.costs]
 
 
 def _picture(values: NDArray[np.uint8]) -> bytes:

@@ -68,8 +68,7 @@ class ImageView(Archivable):
 
     def has_depth(self, *, max_depth_m: float) -> NDArray[np.bool_]:
         """Return (N,) which features have depth up to a limit."""
-        near: NDArray[np.bool_] = self.points_camera[:, 2] <= max_depth_m
-        return near
+        return self.points_camera[:, 2] <= max_depth_m
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -95,8 +95,7 @@ def drawing_order(count: int, seed: int) -> NDArray[np.intp]:
     """
     if seed == 0:
         return np.arange(count, dtype=np.intp)
-    shuffled: NDArray[np.intp] = np.random.default_rng(seed).permutation(count)
-    return shuffled
+    return np.random.default_rng(seed).permutation(count)
 
 
 def _words(descriptors: Descriptors) -> NDArray[np.uint64]:
@@ -104,8 +103,7 @@ def _words(descriptors: Descriptors) -> NDArray[np.uint64]:
     n, width = descriptors.shape
     padded = np.zeros((n, -(-width // 8) * 8), np.uint8)
     padded[:, :width] = descriptors
-    words: NDArray[np.uint64] = padded.view(np.uint64)
-    return words
+    return padded.view(np.uint64)
 
 
 def _squares(descriptors: Descriptors) -> NDArray[np.float32]:
@@ -171,5 +169,4 @@ def _match_distances(distances: NDArray[np.float32], max_ratio: float) -> Pairs:
         if distinct[i] and column_row[partner[i]] == i:
             pairs[count] = i, partner[i]
             count += 1
-    mutual: Pairs = pairs[:count].copy()
-    return mutual
+    return pairs[:count].copy()

@@ -68,6 +68,5 @@ def _alignment(
             T_world_new, node = T_world_aligned[factor.j] @ inverse(factor.T_i_j), factor.i
         else:
             continue
-        T_new_old: Transform = T_world_new @ inverse(graph.T_world_node[node])
-        return T_new_old
+        return T_world_new @ inverse(graph.T_world_node[node])
     return None

@@ -112,8 +112,7 @@ class IncrementalSolver:
         if node not in self._T_world_node:
             raise GraphError(f"node {node} is not in the graph")
         if node in self._solved and not self._is_read:
-            T_world_node: Transform = self._isam.calculateEstimatePose3(node).matrix()
-            return T_world_node
+            return self._isam.calculateEstimatePose3(node).matrix()
         return self._T_world_node[node]
 
     def poses(self) -> dict[int, Transform]:

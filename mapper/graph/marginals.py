@@ -163,5 +163,4 @@ def _recover(
 def _scalars(blocks: Sequence[int]) -> NDArray[np.int64]:
     """Return the indices of the rows of some nodes."""
     first = _DIMENSION * np.asarray(blocks, np.int64)
-    scalars: NDArray[np.int64] = (first[:, np.newaxis] + np.arange(_DIMENSION)).ravel()
-    return scalars
+    return (first[:, np.newaxis] + np.arange(_DIMENSION)).ravel()

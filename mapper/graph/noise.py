@@ -34,5 +34,4 @@ def inflated(information: Array, *, sigma_rad: float, sigma_m: float) -> Array:
     """Return the (6, 6) information of a relative pose with an isotropic error added."""
     variances = np.square([sigma_rad] * 3 + [sigma_m] * 3)
     known = np.linalg.inv(np.linalg.inv(information) + np.diag(variances))
-    symmetric: Array = 0.5 * (known + known.T)
-    return symmetric
+    return 0.5 * (known + known.T)

@@ -81,5 +81,4 @@ def _turns(share: Array, rotation_rad: Array) -> Array:
     angle_rad = float(np.linalg.norm(rotation_rad))
     K = skew(rotation_rad / angle_rad) if angle_rad > 0.0 else np.zeros((3, 3))
     angles_rad = share[:, np.newaxis, np.newaxis] * angle_rad
-    turns: Array = np.eye(3) + np.sin(angles_rad) * K + (1.0 - np.cos(angles_rad)) * (K @ K)
-    return turns
+    return np.eye(3) + np.sin(angles_rad) * K + (1.0 - np.cos(angles_rad)) * (K @ K)

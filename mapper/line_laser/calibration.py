@@ -77,16 +77,14 @@ class Fit:
 
 def up_px(height_px: int, rows_px: Array) -> Array:
     """Return the heights of rows above the image's lower edge, in pixels."""
-    above_px: Array = height_px - 0.5 - rows_px
-    return above_px
+    return height_px - 0.5 - rows_px
 
 
 def ahead_m(calibration: LineLaserCalibration, rows_px: Array) -> Array:
     """Return the ranges ahead of a stripe in these rows, metres (Somlyai, PhD thesis, eq. 2.44)."""
     law = calibration.range
     height = 100.0 * up_px(calibration.height_px, rows_px) / calibration.height_px
-    result: Array = 1e-3 * law.scale_mm * height**law.exponent
-    return result
+    return 1e-3 * law.scale_mm * height**law.exponent
 
 
 def row_px(calibration: LineLaserCalibration, range_m: float) -> float:
@@ -100,8 +98,7 @@ def right_m(calibration: LineLaserCalibration, columns_px: Array, rows_px: Array
     """Return its lateral offsets, metres to the right (Somlyai, PhD thesis, eq. 2.45)."""
     law = calibration.lateral
     x = columns_px - 0.5 * (calibration.width_px - 1)
-    result: Array = _CM * x / (law.slope * up_px(calibration.height_px, rows_px) + law.offset)
-    return result
+    return _CM * x / (law.slope * up_px(calibration.height_px, rows_px) + law.offset)
 
 
 def find_board(image: Image, config: StripeConfig) -> Board | None:

@@ -120,8 +120,7 @@ def _first_estimate(track: FrameResult, T_world_node: dict[int, Transform]) -> T
     if not track.links:
         return track.T_world_body
     link = min(track.links, key=lambda link: float(np.trace(np.linalg.inv(link.information))))
-    T_world_new: Transform = T_world_node[link.i] @ link.T_i_j
-    return T_world_new
+    return T_world_node[link.i] @ link.T_i_j
 
 
 def build_pose_estimator(correction: Correction) -> OnlinePoseEstimator:

@@ -311,8 +311,7 @@ def _frame(T_world_first: Transform, up_world: Array, floor_m: float | None, axe
 
 
 def _flattened(direction: Points, up_world: Array) -> Array:
-    flat: Array = direction - (direction @ up_world) * up_world
-    return flat
+    return direction - (direction @ up_world) * up_world
 
 
 def _planes_text(vertical: Vertical, count: int) -> str:

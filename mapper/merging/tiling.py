@@ -56,8 +56,7 @@ class Tiling:
 
     def lower_m(self, tile: int) -> Array:
         """Return the (3,) lower corner of a tile in the map, metres."""
-        corner: Array = (self.first_key(tile) - KEY_ZERO).astype(np.float64) * self.resolution_m
-        return corner
+        return (self.first_key(tile) - KEY_ZERO).astype(np.float64) * self.resolution_m
 
 
 def tiling_for(resolution_m: float, tile_m: float) -> Tiling:

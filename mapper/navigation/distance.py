@@ -38,8 +38,7 @@ class DistanceField:
         Raises:
             DataError: The points are not (N, 3).
         """
-        found: Distances = self._interpolated(points_world)[:, 0]
-        return found
+        return self._interpolated(points_world)[:, 0]
 
     def gradient(self, points_world: Points) -> Distances:
         """Return the (N, 3) gradient of that interpolation, which points away from the nearest obstacle.
@@ -47,8 +46,7 @@ class DistanceField:
         Raises:
             DataError: The points are not (N, 3).
         """
-        gradients: Distances = self._interpolated(points_world)[:, 1:]
-        return gradients
+        return self._interpolated(points_world)[:, 1:]
 
     def _interpolated(self, points_world: Points) -> Distances:
         if points_world.ndim != 2 or points_world.shape[1] != 3:

@@ -171,13 +171,11 @@ class Space:
 
     def in_cells(self, point_world: Array) -> Array:
         """Return a point's z, y, x in cells."""
-        zyx: Array = ((point_world - self.voxels.corner_world_m) / self.voxels.resolution_m)[::-1]
-        return zyx
+        return ((point_world - self.voxels.corner_world_m) / self.voxels.resolution_m)[::-1]
 
     def world(self, zyx: Array) -> Array:
         """Return points from their (N, 3) z, y, x in cells."""
-        points_world: Array = self.voxels.corner_world_m + zyx[:, ::-1] * self.voxels.resolution_m
-        return points_world
+        return self.voxels.corner_world_m + zyx[:, ::-1] * self.voxels.resolution_m
 
     def centre(self, cell: NDArray[np.int64]) -> Array:
         """Return the centre of a cell."""

@@ -34,8 +34,7 @@ class BoxCounts:
     @property
     def any_occupied(self) -> NDArray[np.bool_]:
         """(N,) bool, true where a box overlaps an occupied voxel."""
-        found: NDArray[np.bool_] = self.occupied > 0
-        return found
+        return self.occupied > 0
 
     @property
     def all_free(self) -> NDArray[np.bool_]:

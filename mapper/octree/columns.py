@@ -40,8 +40,7 @@ class Columns(NamedTuple):
     @property
     def column_of(self) -> NDArray[np.int64]:
         """(N,) number of each voxel's column."""
-        column_of: NDArray[np.int64] = np.searchsorted(self.starts, np.arange(len(self.tops)), "right") - 1
-        return column_of
+        return np.searchsorted(self.starts, np.arange(len(self.tops)), "right") - 1
 
     def with_tops(self, columns: NDArray[np.int64], tops: Tops) -> "Columns":
         """Return these columns and further voxels, given by their (M,) column numbers and tops."""
@@ -67,8 +66,7 @@ def starts_of(columns: NDArray[np.int64], count: int) -> NDArray[np.int64]:
 
 def _keys(columns: NDArray[np.int64], tops: Tops) -> NDArray[np.int64]:
     """Return column · 2¹⁷ + top: a top lies one above the highest key at most."""
-    keys: NDArray[np.int64] = (columns << 17) | (tops.astype(np.int64) + KEY_ZERO)
-    return keys
+    return (columns << 17) | (tops.astype(np.int64) + KEY_ZERO)
 
 
 def block_extent(octree: "OctreeMap") -> tuple[NDArray[np.int64], NDArray[np.int64]]:

@@ -227,8 +227,7 @@ class OctreeMap:
 
     def are_occupied(self, points_world: Points | Points32) -> NDArray[np.bool_]:
         """Return the (N,) mask of the (N, 3) points, metres, that lie in occupied voxels."""
-        occupied: NDArray[np.bool_] = self.log_odds_at(points_world) >= self.occupied_log_odds
-        return occupied
+        return self.log_odds_at(points_world) >= self.occupied_log_odds
 
     def are_near_occupied(
         self, points_world: Points | Points32, *, max_distance_m: float

@@ -201,8 +201,7 @@ def _slots_of(blocks: BlockStore, scan: ScanUpdate) -> NDArray[np.int64]:
 def _inside(octree: OctreeMap) -> Words:
     """Return the voxels with nothing unknown among the voxels around."""
     known: Words = _known(octree.blocks.table.values, len(octree.blocks))
-    inside: Words = known & ~dilated(~known, neighbours_of(octree.blocks.codes), absent=ALL_SET)
-    return inside
+    return known & ~dilated(~known, neighbours_of(octree.blocks.codes), absent=ALL_SET)
 
 
 def _codes_below(codes: NDArray[np.int64]) -> NDArray[np.int64]:

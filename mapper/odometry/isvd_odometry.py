@@ -178,8 +178,7 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
 
     def _sigma_px(self, features: Features) -> Array:
         """Return the (N,) standard deviations of features' pixels: one pixel of their pyramid level."""
-        sigma_px: Array = self._detector.scale_factor ** features.octave.astype(np.float64)
-        return sigma_px
+        return self._detector.scale_factor ** features.octave.astype(np.float64)
 
     def _undistorted(self, pixels: NDArray[np.float32], camera: PinholeCamera) -> Array:
         exact: Array = pixels.astype(np.float64)

@@ -236,8 +236,7 @@ def _between_nodes_of(best: _Link, link: _Link, graph: PoseGraph) -> tuple[Trans
 def _carried(information: Array, T_j_k: Transform) -> Array:
     """Return the information of T_i_j · T_j_k from that of T_i_j."""
     to_j = adjoint(T_j_k)
-    carried: Array = to_j.T @ information @ to_j
-    return carried
+    return to_j.T @ information @ to_j
 
 
 def _spread(frames: list[FrameResult], count: int) -> list[FrameResult]:

@@ -115,8 +115,7 @@ def loops_between_days(config: AnyLoops, sensor: Sensor) -> PlaceLoopsConfig | S
 
 def detector_of(config: BuildConfig) -> Config | None:
     """Return the settings of the features by which places are recognised; None of scans."""
-    detector: Config | None = getattr(config.odometry, "detector", None)
-    return detector
+    return getattr(config.odometry, "detector", None)
 
 
 def run_places(run: Run, *, progress: Progress = SILENT) -> KnownPlaces[Any]:

@@ -87,5 +87,4 @@ def _inverse_document_frequency(tree: WordTree, images: Sequence[Bits]) -> NDArr
     having = np.zeros(len(tree.leaves), np.int64)
     for bits in images:
         having[np.unique(tree.words_of(bits))] += 1
-    idf: NDArray[np.float64] = np.log(len(images) / np.maximum(having, 1))
-    return idf
+    return np.log(len(images) / np.maximum(having, 1))

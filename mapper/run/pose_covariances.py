@@ -43,8 +43,7 @@ class UncertainPoses:
     def position_covariances_world(self) -> Array:
         """(N, 3, 3) of the positions along the world's axes, m²; NaN where nothing is known."""
         R_world_body = self.trajectory.T_world_body[:, :3, :3]
-        rotated: Array = R_world_body @ self.covariances[:, 3:, 3:] @ R_world_body.transpose(0, 2, 1)
-        return rotated
+        return R_world_body @ self.covariances[:, 3:, 3:] @ R_world_body.transpose(0, 2, 1)
 
     @property
     def position_sigmas_m(self) -> Array:

@@ -69,8 +69,7 @@ def archived(data: Data) -> Archived[Data]:
 
 def reference_of(data: Archivable) -> Archived[Any] | None:
     """Return the reference to some data; None if there is none yet."""
-    known: Archived[Any] | None = getattr(data, "_archived", None)
-    return known
+    return getattr(data, "_archived", None)
 
 
 def refer(data: Archivable, reference: Archived[Any]) -> None:

@@ -299,8 +299,7 @@ def _coefficients(equations: Sequence[_NormalEquations], removed: Array | None =
 
 def _curved(values: Array, directions: Array) -> Array:
     """Return (N,) values without the part that is affine in the (N, 3) rays."""
-    curved: Array = values - directions @ _fitted(directions, values)
-    return curved
+    return values - directions @ _fitted(directions, values)
 
 
 def _fitted(rows: Array, values: Array) -> Array:

@@ -11,8 +11,7 @@ from mapper.sensing.depth_filter import dif
 
 def depth_sigma_m(noise: DepthNoiseConfig, depth_m: Array) -> Array:
     """Return the standard deviations of depths, both in metres: σ_z = a + b·z + c·z²."""
-    sigma_m: Array = noise.constant_m + depth_m * (noise.linear + depth_m * noise.quadratic_per_m)
-    return sigma_m
+    return noise.constant_m + depth_m * (noise.linear + depth_m * noise.quadratic_per_m)
 
 
 def feature_depth_m(
@@ -63,5 +62,4 @@ def feature_depth_sigma_m(
         there_m = smooth_m[row, column].astype(np.float64)
         squares += np.where(there_m > 0.0, (there_m - here_m) ** 2, 0.0)
     slope_m = np.sqrt(0.5 * squares) * sigma_px / reach_px  # mean of both sides of an axis; the axes add up
-    sigma_m: Array = np.hypot(depth_sigma_m(noise, depth_m[rows, columns].astype(np.float64)), slope_m)
-    return sigma_m
+    return np.hypot(depth_sigma_m(noise, depth_m[rows, columns].astype(np.float64)), slope_m)

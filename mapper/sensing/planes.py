@@ -46,8 +46,7 @@ class Planes:
     @property
     def distance_m(self) -> Array:
         """(T,) depth at which the optical axis meets the plane."""
-        distance: Array = 1.0 / self.coefficients[:, 2]
-        return distance
+        return 1.0 / self.coefficients[:, 2]
 
     @property
     def tilt_rad(self) -> Array:
@@ -134,5 +133,4 @@ def _solved(rows: Array, values: Array, used: NDArray[np.bool_]) -> Array:
     open_ = np.linalg.det(normal) < _SAFE_DETERMINANT * np.trace(normal, axis1=1, axis2=2) ** 3
     normal[open_] = np.eye(3)
     side[open_] = 0.0
-    solution: Array = np.linalg.solve(normal, side[..., None])[..., 0]
-    return solution
+    return np.linalg.solve(normal, side[..., None])[..., 0]

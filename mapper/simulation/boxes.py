@@ -57,8 +57,7 @@ class Boxes:
 
     def occupied(self, points_world: Points) -> NDArray[np.bool_]:
         """Return for each of (N, 3) points whether it is inside or on a solid."""
-        inside: NDArray[np.bool_] = self.signed_distance_m(points_world) <= 0.0
-        return inside
+        return self.signed_distance_m(points_world) <= 0.0
 
     def as_json(self) -> list[dict[str, Any]]:
         """Return one ``{name, center_m, size_m, yaw_rad}`` a box, with every digit."""

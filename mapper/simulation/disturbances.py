@@ -21,8 +21,7 @@ _HAND_BULGE = 0.15
 
 def between(times_s: Array, start_s: float, duration_s: float) -> NDArray[np.bool_]:
     """Return which of (N,) times lie in an interval, its end excluded."""
-    inside: NDArray[np.bool_] = (times_s >= start_s) & (times_s < start_s + duration_s)
-    return inside
+    return (times_s >= start_s) & (times_s < start_s + duration_s)
 
 
 def shown_frames(config: DisturbanceConfig, times_s: Array) -> NDArray[np.intp]:

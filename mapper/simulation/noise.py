@@ -32,8 +32,7 @@ def fractal(
 
 def tinted(color: Color, gain: Field32) -> Image:
     """Return the (H, W, 3) image of one colour whose brightness is multiplied by ``1 + gain``."""
-    image: Image = np.clip(np.array(color, np.float32) * (1.0 + gain)[:, :, None], 0, 255).astype(np.uint8)
-    return image
+    return np.clip(np.array(color, np.float32) * (1.0 + gain)[:, :, None], 0, 255).astype(np.uint8)
 
 
 def shaded(image: Image, gain: Field32) -> Image:

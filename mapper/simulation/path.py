@@ -72,8 +72,7 @@ def frame_stamps(config: SynthConfig, motion: Motion) -> Stamps:
 
 def seconds_of(stamps_ns: Stamps) -> Array:
     """Return (N,) seconds after the start."""
-    seconds: Array = (stamps_ns - START_NS) / NS_PER_S
-    return seconds
+    return (stamps_ns - START_NS) / NS_PER_S
 
 
 def make_path(config: SynthConfig, scene: Scene) -> Trajectory:
@@ -134,8 +133,7 @@ class _Lap:
         """Return the (N,) yaw of the route at (N,) distances."""
         u = self.parameter_at(np.mod(along_m, self.length_m))
         ahead = closed_spline(self.route, u + 0.15) - closed_spline(self.route, u - 0.15)
-        yaw_rad: Array = np.arctan2(ahead[:, 1], ahead[:, 0])
-        return yaw_rad
+        return np.arctan2(ahead[:, 1], ahead[:, 0])
 
     def phase_rad(self, along_m: Array, count: int) -> Array:
         """Return the (N,) phase of a wave that repeats ``count`` times a lap."""

@@ -44,8 +44,7 @@ class Walkers:
     def at(self, time_s: float) -> Array:
         """Return (P, 2) where they are so many seconds after the start."""
         walked_s = time_s - np.clip(time_s - self.stops_s, 0.0, self.stand_s)
-        where: Array = self.positions + self.velocities_mps * walked_s[:, None]
-        return where
+        return self.positions + self.velocities_mps * walked_s[:, None]
 
 
 def make_walkers(config: SynthConfig, motion: Motion) -> Walkers:

@@ -105,8 +105,7 @@ def _light(config: SynthConfig) -> Light:
 
 def _whitened(texture: Image, contrast: float) -> Image:
     """Return a texture of which a share is left, the rest white."""
-    image: Image = np.rint(contrast * texture + (1.0 - contrast) * _WHITE).astype(np.uint8)
-    return image
+    return np.rint(contrast * texture + (1.0 - contrast) * _WHITE).astype(np.uint8)
 
 
 def _flat(config: SynthConfig, studio: Studio, plan: Plan) -> None:

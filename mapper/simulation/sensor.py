@@ -160,8 +160,7 @@ def _unseen(
     edge = depth_m - near > _EDGE_RATIO * depth_m
     chance[edge] = np.maximum(chance[edge], np.float32(_EDGE_CHANCE))
     draws = rng.random(depth_m.shape, dtype=np.float32)
-    is_lost: NDArray[np.bool_] = draws < np.float32(dropout_ratio) * chance
-    return is_lost
+    return draws < np.float32(dropout_ratio) * chance
 
 
 def _in_shadow(depth_m: DepthImage, focal_px: float) -> NDArray[np.bool_]:
@@ -173,5 +172,4 @@ def _in_shadow(depth_m: DepthImage, focal_px: float) -> NDArray[np.bool_]:
     disparity_px = np.float32(focal_px * BASELINE_M) / np.maximum(depth_m, np.float32(0.05))
     seen_at = np.arange(depth_m.shape[1], dtype=np.float32) - disparity_px
     leftmost = np.minimum.accumulate(seen_at[:, ::-1], axis=1)[:, ::-1]
-    shadow: NDArray[np.bool_] = seen_at > leftmost + 0.5
-    return shadow
+    return seen_at > leftmost + 0.5

@@ -146,5 +146,4 @@ class Shutter:
 
 def _spread_s(duration_s: float, count: int) -> Array:
     """Return the middles of equal parts of a time around 0."""
-    middles: Array = duration_s * ((np.arange(count) + 0.5) / count - 0.5)
-    return middles
+    return duration_s * ((np.arange(count) + 0.5) / count - 0.5)

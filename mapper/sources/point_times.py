@@ -76,8 +76,7 @@ def relative_times_s(values: NDArray[np.number], stamp_ns: int) -> NDArray[np.fl
     after_stamp_s = _less(values, first)
     after_stamp_s /= units_per_s
     after_stamp_s += first_after_stamp_ns / NS_PER_S
-    times_s: NDArray[np.float32] = after_stamp_s.astype(np.float32)
-    return times_s
+    return after_stamp_s.astype(np.float32)
 
 
 def azimuth_times_s(

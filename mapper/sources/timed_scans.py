@@ -62,5 +62,4 @@ def _scaled(times_s: NDArray[np.float32], scale: float) -> NDArray[np.float32] |
     if scale == 0.0 or len(times_s) == 0:
         return None
     from_s = times_s.max() if scale < 0.0 else np.float32(0.0)
-    scaled_s: NDArray[np.float32] = np.float32(scale) * (times_s - from_s)
-    return scaled_s
+    return np.float32(scale) * (times_s - from_s)

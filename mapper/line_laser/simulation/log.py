@@ -131,8 +131,7 @@ def _encoders_text(config: LineLaserSynthConfig) -> str:
 
 
 def _steering(config: LineLaserSynthConfig, path_m: Array) -> Array:
-    angle: Array = np.arctan(config.wheelbase_m * curvature_at(path_m))
-    return angle
+    return np.arctan(config.wheelbase_m * curvature_at(path_m))
 
 
 def _at(axle: Trajectory, stamps_ns: Stamps) -> Iterator[tuple[int, Transform]]:

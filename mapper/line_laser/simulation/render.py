@@ -123,8 +123,7 @@ def _looked(room: Room, config: LineLaserSynthConfig, T_world_sensor: Transform)
 
 
 def _cross(a: Array, b: Array) -> Array:
-    product: Array = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
-    return product
+    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
 
 
 def _lit_by_room(

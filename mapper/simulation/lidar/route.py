@@ -59,8 +59,7 @@ class Route:
         """Return (N,) directions of travel."""
         u = self._parameter(along_m)
         ahead = closed_spline(self.control, u + 1e-3) - closed_spline(self.control, u - 1e-3)
-        headings: Array = np.arctan2(ahead[:, 1], ahead[:, 0])
-        return headings
+        return np.arctan2(ahead[:, 1], ahead[:, 0])
 
     def heights_m(self, along_m: Array) -> Array:
         """Return (N,) heights of the way above the ground at (N,) distances from the start."""
@@ -70,8 +69,7 @@ class Route:
 
     def _parameter(self, along_m: Array) -> Array:
         grid = np.linspace(0.0, len(self.control), len(self.travelled_m))
-        parameter: Array = np.interp(np.mod(along_m, self.length_m), self.travelled_m, grid)
-        return parameter
+        return np.interp(np.mod(along_m, self.length_m), self.travelled_m, grid)
 
 
 def make_route(config: LidarSynthConfig) -> Route:

@@ -17,8 +17,7 @@ from mapper.simulation.lidar.traffic import Traffic
 
 def firing_times_s(sensor: LidarSensorConfig) -> Array:
     """Return (A,) seconds after the stamp at which the columns of a sweep are fired."""
-    times: Array = np.linspace(0.0, sensor.sweep_s, sensor.azimuth_steps, endpoint=False)
-    return times
+    return np.linspace(0.0, sensor.sweep_s, sensor.azimuth_steps, endpoint=False)
 
 
 def ray_directions(sensor: LidarSensorConfig) -> Array:

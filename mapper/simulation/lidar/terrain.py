@@ -31,8 +31,7 @@ class Ground:
 
     def height_m(self, points_xy: Array) -> Array:
         """Return (N,) heights above z = 0 at (N, 2) places."""
-        height: Array = points_xy @ self.slope + np.sin(self._angles(points_xy)) @ self.waves[:, 0]
-        return height
+        return points_xy @ self.slope + np.sin(self._angles(points_xy)) @ self.waves[:, 0]
 
     def normals(self, points_xy: Array) -> Array:
         """Return (N, 3) unit normals, upwards, at (N, 2) places."""
@@ -47,8 +46,7 @@ class Ground:
         return {"slope": self.slope.tolist(), "waves": self.waves.tolist()}
 
     def _angles(self, points_xy: Array) -> Array:
-        angles: Array = points_xy @ self.waves[:, 1:3].T + self.waves[:, 3]
-        return angles
+        return points_xy @ self.waves[:, 1:3].T + self.waves[:, 3]
 
 
 def make_ground(rng: np.random.Generator, *, slope_rad: float, undulation_m: float) -> Ground:

@@ -50,8 +50,7 @@ class _Mover:
         """Return (N,) distances along the route at (N,) seconds after the start."""
         cycles, into_s = np.divmod(times_s + self.phase_s, self.go_s + self.stop_s)
         gone_s = cycles * self.go_s + np.minimum(into_s, self.go_s)
-        along: Array = self.start_m + self.speed_mps * (gone_s - min(self.phase_s, self.go_s))
-        return along
+        return self.start_m + self.speed_mps * (gone_s - min(self.phase_s, self.go_s))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -102,8 +102,7 @@ def _coordinates(points: NDArray[np.void]) -> NDArray[np.float32]:
         triples = np.dtype(
             {"names": ["xyz"], "offsets": offsets[:1], "formats": ["3f4"], "itemsize": points.itemsize}
         )
-        view: NDArray[np.float32] = points.view(triples)["xyz"]
-        return view
+        return points.view(triples)["xyz"]
     return np.column_stack([points[name].astype(np.float32) for name in "xyz"])
 
 
