@@ -13,8 +13,6 @@ class MeshConfig(Config):
 
     voxel_m: PositiveFloat = 0.01
     """Edge of a voxel of the signed distances. Smaller shows finer shapes and needs far more memory."""
-    truncation_voxels: Annotated[float, Field(ge=1.0)] = 4.0
-    """How far from the surface distances count; thinner than the depth noise tears holes."""
     max_depth_m: PositiveFloat | None = None
     """Deeper measurements are left out; None uses the octree's limit."""
     frame_stride: PositiveInt = 5

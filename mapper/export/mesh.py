@@ -22,6 +22,8 @@ from mapper.runtime.progress import Progress
 
 _BLOCK_VOXELS = 8
 """Edge of a block. Of Open3D's usual 16 two thirds would lie beyond the truncation, and be computed."""
+_TRUNCATION_VOXELS = 4.0
+"""How far from the surface distances count; thinner than the depth noise tears holes."""
 _VOXEL_BYTES = 4 + 4 + 12  # distance, weight and colour, all float32: integers would round at every frame
 _LIBRARIES = "libgl1 libegl1 libx11-6 libudev1 libusb-1.0-0 libidn2-0 libgomp1"
 
@@ -99,7 +101,7 @@ class Volume:
         depth, color = image(tensor(view.depth_m)), image(tensor(view.colors))
         intrinsic, extrinsic = tensor(view.camera.matrix), tensor(inverse(view.T_world_camera))
         # Depth is in metres already, so Open3D's scale is 1.
-        reach = (1.0, self._max_depth_m, self._config.truncation_voxels)
+        reach = (1.0, self._max_depth_m, _TRUNCATION_VOXELS)
         blocks = self._grid.compute_unique_block_coordinates(depth, intrinsic, extrinsic, *reach)
         self._grid.integrate(blocks, depth, color, intrinsic, extrinsic, *reach)
 
@@ -147,7 +149,7 @@ def _expected_blocks(octree: OctreeMap, config: MeshConfig) -> int:
     """Estimate from the octree how many blocks the surface will fill, and refuse what could not fit."""
     occupied = int((octree.leaves().log_odds >= octree.occupied_log_odds).sum())
     block_m = _BLOCK_VOXELS * config.voxel_m
-    shell_blocks = 1.0 + 2.0 * config.truncation_voxels / _BLOCK_VOXELS
+    shell_blocks = 1.0 + 2.0 * _TRUNCATION_VOXELS / _BLOCK_VOXELS
     blocks = int(occupied * (octree.resolution_m / block_m) ** 2 * shell_blocks) + 1
     check_memory(
         blocks * _BLOCK_VOXELS**3 * _VOXEL_BYTES,

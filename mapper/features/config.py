@@ -6,9 +6,6 @@ from pydantic import Field, PositiveFloat, PositiveInt
 
 from mapper.core.config import Config
 
-ScaleFactor = Annotated[float, Field(gt=1.0)]
-"""Size of a pixel on one pyramid level relative to the next finer one."""
-
 
 class _DetectorConfig(Config):
     """Settings of any detector."""
@@ -72,8 +69,6 @@ class OrbConfig(_AdaptiveConfig):
     """Last threshold; raise it if noise produces features."""
     levels: PositiveInt = 8
     """Number of pyramid levels. More let features be found again over larger changes of distance."""
-    scale_factor: ScaleFactor = 1.2
-    """Size of a pixel on one pyramid level relative to the next finer one."""
 
 
 class UniformOrbConfig(_DetectorConfig):
@@ -88,8 +83,6 @@ class UniformOrbConfig(_DetectorConfig):
     """Edge of the cells in which corners are searched. Smaller cells spread features more evenly."""
     levels: PositiveInt = 8
     """Number of pyramid levels. More let features be found again over larger changes of distance."""
-    scale_factor: ScaleFactor = 1.2
-    """Size of a pixel on one pyramid level relative to the next finer one."""
 
 
 DetectorConfig = Annotated[

@@ -14,6 +14,9 @@ from mapper.core.frames import Image
 from mapper.features.base import Descriptors, Features
 from mapper.features.config import AkazeConfig, OrbConfig, SiftConfig
 
+ORB_SCALE_FACTOR = 1.2
+"""Size of a pixel on one level of ORB's pyramid relative to the next finer one, as published."""
+
 _OCTAVE, _ANGLE, _RESPONSE = (attrgetter(name) for name in ("octave", "angle", "response"))
 
 AnyConfig = TypeVar("AnyConfig", bound=OrbConfig | SiftConfig | AkazeConfig)
@@ -26,13 +29,10 @@ class _OpenCvDetector(Generic[AnyConfig]):
     thread-safe.
     """
 
+    scale_factor = 2.0
+
     def __init__(self, config: AnyConfig) -> None:
         self._config = config
-
-    @property
-    def scale_factor(self) -> float:
-        """Size of a pixel in one octave relative to the next finer one."""
-        return 2.0
 
     def detect(self, gray: Image) -> Features:
         """Return the features of an (H, W) uint8 image; none where it has no texture."""
@@ -52,15 +52,12 @@ class _OpenCvDetector(Generic[AnyConfig]):
 class Orb(_OpenCvDetector[OrbConfig]):
     """ORB (Rublee, Rabaud, Konolige & Bradski 2011)."""
 
-    @property
-    def scale_factor(self) -> float:
-        """Size of a pixel in one octave relative to the next finer one."""
-        return self._config.scale_factor
+    scale_factor = ORB_SCALE_FACTOR
 
     def _attempt(self, gray: Image, threshold: float) -> Features:
         orb = cv2.ORB.create(
             nfeatures=self._config.max_features,
-            scaleFactor=self._config.scale_factor,
+            scaleFactor=ORB_SCALE_FACTOR,
             nlevels=self._config.levels,
             fastThreshold=round(threshold),
         )

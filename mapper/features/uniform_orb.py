@@ -10,6 +10,7 @@ from mapper.core.frames import Image
 from mapper.features.base import Descriptors, Features
 from mapper.features.config import UniformOrbConfig
 from mapper.features.fast import Pixels, corners, fast_scores, orientations, peaks_of
+from mapper.features.opencv import ORB_SCALE_FACTOR
 from mapper.features.quadtree import spread
 
 _MARGIN_PX = 19  # reach of the rotated descriptor's tests
@@ -25,18 +26,15 @@ class UniformOrb:
     level cannot fill goes to the finer ones.
     """
 
+    scale_factor = ORB_SCALE_FACTOR
+
     def __init__(self, config: UniformOrbConfig) -> None:
         self._config = config
-
-    @property
-    def scale_factor(self) -> float:
-        """Size of a pixel in one octave relative to the next finer one."""
-        return self._config.scale_factor
 
     def detect(self, gray: Image) -> Features:
         """Return the features of an (H, W) uint8 image; none where it has no texture."""
         levels = list(self._pyramid(gray))
-        shares = np.power(self._config.scale_factor, -np.arange(len(levels), dtype=np.float64))
+        shares = np.power(ORB_SCALE_FACTOR, -np.arange(len(levels), dtype=np.float64))
         wanted = 0.0
         parts: list[Features] = []
         for octave in reversed(range(len(levels))):
@@ -51,7 +49,7 @@ class UniformOrb:
         height, width = gray.shape
         level = gray
         for octave in range(self._config.levels):
-            scale = self._config.scale_factor**octave
+            scale = ORB_SCALE_FACTOR**octave
             size = round(width / scale), round(height / scale)
             if octave:
                 if min(size) <= 2 * _MARGIN_PX:

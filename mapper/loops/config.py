@@ -141,8 +141,6 @@ class ScanLoopsConfig(KeyframeLoopsConfig):
     min_motion_m: NonNegativeFloat = 3.0
     min_motion_rad: NonNegativeFloat = 1.0
     max_distance_m: PositiveFloat = 10.0
-    max_tilt_rad: PositiveFloat = 0.8
-    """Largest angle between the upright axes of nearby places."""
     max_candidates: PositiveInt = 3
     context: ScanContextConfig = ScanContextConfig()
     verification: ScanVerificationConfig = ScanVerificationConfig()

@@ -20,6 +20,8 @@ from mapper.runtime.archived import Archivable
 
 MAX_SIMILAR = 2
 """Largest number of candidates of a loop that are proposed for their similarity; the others, as near."""
+_MAX_TILT_RAD = 0.8
+"""Largest angle between the upright axes of nearby places; poses that differ more are not of one vehicle."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -99,6 +101,6 @@ def nearby_scans(config: ScanLoopsConfig, poses: NodePoses) -> PoseProposer[Scan
         poses,
         lambda _: np.eye(4),  # a scanner sees all around: its upright axis stands for a viewing direction
         max_distance_m=config.max_distance_m,
-        max_angle_rad=config.max_tilt_rad,
+        max_angle_rad=_MAX_TILT_RAD,
         drift_ratio=config.gate.drift_ratio,
     )
