@@ -116,8 +116,7 @@ def _spanned(block: Array) -> Array:
     if not block.size:
         return np.empty((3, 0))
     lines, weights, _ = np.linalg.svd(block, full_matrices=False)
-    spanned: Array = lines[:, weights**2 >= _PART]
-    return spanned
+    return lines[:, weights**2 >= _PART]
 
 
 def _lines(lines: Array) -> str:

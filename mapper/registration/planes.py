@@ -220,8 +220,7 @@ def flat_cells(points: Points, tolerance_m: float) -> tuple[Points, Array]:
     _, cell_of, counts = np.unique(keys, return_inverse=True, return_counts=True)
 
     def means(values: Array) -> Array:
-        per_cell: Array = np.bincount(cell_of, weights=values, minlength=len(counts)) / counts
-        return per_cell
+        return np.bincount(cell_of, weights=values, minlength=len(counts)) / counts
 
     centres = np.column_stack([means(points[:, axis]) for axis in range(3)])
     offsets = points - centres[cell_of]
@@ -252,12 +251,11 @@ def _cone(axis: Array) -> Array:
     longitude = k * np.pi * (3.0 - np.sqrt(5.0))
     side = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
     side /= np.linalg.norm(side)
-    directions: Array = (
+    return (
         np.outer(cosine, axis)
         + np.outer(sine * np.cos(longitude), side)
         + np.outer(sine * np.sin(longitude), np.cross(axis, side))
     )
-    return directions
 
 
 def _consistency(cosines: Array) -> Array:

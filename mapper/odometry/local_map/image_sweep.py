@@ -62,8 +62,7 @@ class SweepErrors:
         if self._pose_per_motion is None or not self.is_rolling:
             return np.zeros((6, 6))
         mean_square = self._square / self._counted
-        covariance: Array = self._pose_per_motion @ mean_square @ self._pose_per_motion.T
-        return covariance
+        return self._pose_per_motion @ mean_square @ self._pose_per_motion.T
 
     def follow(self, velocity: Array | None) -> None:
         """Take the velocity (6,) since the last image, before the next ``add``; None if it is unknown."""

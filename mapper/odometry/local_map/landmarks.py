@@ -265,8 +265,7 @@ class LandmarkMap:
         """Return the landmark of each feature of some keyframes, one after another, −1 for none."""
         first = self._first_observation
         rows = [np.arange(first[k], first[k + 1]) for k in keyframes]
-        ids: Ids = self._observations["landmark"][np.concatenate([np.empty(0, np.intp), *rows])]
-        return ids
+        return self._observations["landmark"][np.concatenate([np.empty(0, np.intp), *rows])]
 
     def covisible(self, index: int, *, min_shared: int) -> list[tuple[int, int]]:
         """Return (keyframe, shared landmarks) of those that share enough: most first, of equals the newer."""

@@ -136,8 +136,7 @@ class LocalSearch:
         keyframes = self._covisible(matched) or [tracked_pose.reference]
         visible, predicted = self._visible(observation, T_camera_world, keyframes, except_for=matched)
         hidden = hidden_points(observation, T_camera_world, self._map.landmarks["position"][visible])
-        pixels: Array = predicted.pixels[~hidden]
-        return pixels
+        return predicted.pixels[~hidden]
 
     def _covisible(self, landmarks: Ids) -> list[int]:
         """Return the keyframes that observe any of the landmarks, in decreasing order of how many."""

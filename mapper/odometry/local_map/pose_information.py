@@ -134,5 +134,4 @@ def largest_sigma(covariance: Array) -> float:
 def _of_body(H_camera: Array, T_body_camera: Transform) -> Array:
     """Return the information of a camera's tangent in its body's."""
     to_camera = adjoint(inverse(T_body_camera))
-    H_body: Array = to_camera.T @ H_camera @ to_camera
-    return H_body
+    return to_camera.T @ H_camera @ to_camera

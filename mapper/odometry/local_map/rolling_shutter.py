@@ -128,8 +128,7 @@ class RollingShutter:
     def pose_covariance(self, T_body_camera: Transform) -> Array:
         """Return the (6, 6) covariance of the last pose by motion that was not taken out, body tangent."""
         Ad_body_camera = adjoint(T_body_camera)
-        covariance: Array = Ad_body_camera @ self._errors.pose_covariance @ Ad_body_camera.T
-        return covariance
+        return Ad_body_camera @ self._errors.pose_covariance @ Ad_body_camera.T
 
     def twist_body(self, observation: ReadByRows) -> Twist:
         """Return the velocity in the last image, in the body's axes."""

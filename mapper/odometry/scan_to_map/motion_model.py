@@ -196,8 +196,7 @@ def velocities_at(
 
 def covariance_unmeasured(changes: Array) -> Array:
     """Return the (6, 6) covariance of a velocity that is not measured, by (6,) what it may change."""
-    covariance: Array = np.diag((_UNMEASURED * changes) ** 2)
-    return covariance
+    return np.diag((_UNMEASURED * changes) ** 2)
 
 
 def _time_s2(elapsed_s: float, before_s: float) -> float:

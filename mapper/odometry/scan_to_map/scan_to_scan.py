@@ -24,8 +24,7 @@ class ScanToScanMatcher:
         found = aligner.align(deskewed.scan, T_world_body)
         if not found.converged:
             return None
-        T_found: Transform = T_world_last @ found.T_target_source
-        return T_found
+        return T_world_last @ found.T_target_source
 
     def add(self, deskewed: DeskewedScan, T_world_body: Transform, *, is_keyframe: bool) -> None:  # noqa: ARG002
         """Replace the last scan."""

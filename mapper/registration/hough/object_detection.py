@@ -26,8 +26,7 @@ def centres_of(obstacles: Points32, config: CellsConfig | ObjectsConfig) -> Arra
     sizes = np.bincount(component_of)
     sums = np.column_stack([np.bincount(component_of, weights=flat[:, axis]) for axis in range(2)])
     large = sizes >= _min_voxels(flat, config)
-    centres: Array = sums[large] / sizes[large, np.newaxis]
-    return centres
+    return sums[large] / sizes[large, np.newaxis]
 
 
 def _min_voxels(flat: Array, config: CellsConfig | ObjectsConfig) -> float:
@@ -43,8 +42,7 @@ def _objects(flat: Array, config: ObjectsConfig) -> NDArray[np.intp]:
     large = np.bincount(component_of) >= _min_voxels(flat, config)
     divided = np.zeros(group_of.max() + 1, np.bool_)
     divided[group_of[large[component_of]]] = True
-    objects: NDArray[np.intp] = np.where(divided[group_of], component_of, len(large) + group_of)
-    return objects
+    return np.where(divided[group_of], component_of, len(large) + group_of)
 
 
 def _connected(flat: Array, cell_m: float) -> NDArray[np.intp]:
