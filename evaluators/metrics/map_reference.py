@@ -104,8 +104,7 @@ def check_occupancy(
 
 
 def _octree(octree: OctreeMap, voxel_m: float) -> Reference:
-    leaves = octree.leaves()
-    centres = leaves.centres_world[leaves.log_odds >= octree.occupied_log_odds]
+    centres = octree.occupied()
     if not len(centres):
         raise DataError("reference: no voxel of the map is occupied, so it has no surface")
     # A large voxel is as many points as it has of the other map's voxels.

@@ -1,16 +1,15 @@
 """The 2D slice as the PGM + YAML pair that ROS map_server and nav2 load, and as a picture."""
 
 from pathlib import Path
-from typing import Protocol
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.errors import DataError
-from mapper.core.geometry import Array
 from mapper.export.page import round_length
 from mapper.export.palette import FREE_CELL, INK, OCCUPIED_CELL, PAPER, UNKNOWN_CELL
+from mapper.navigation.costmap import Costmap
 from mapper.octree.grid import FREE, OCCUPIED, OccupancyGrid, shrunk
 from mapper.octree.grid_file import (
     FREE_PIXEL,
@@ -42,7 +41,9 @@ def write_grid(folder: Path, stem: str, grid: OccupancyGrid) -> None:
     _write_image(folder, stem, pixels, grid, mode="trinary")
 
 
-def write_values(folder: Path, stem: str, values: NDArray[np.uint8], geometry: "_Geometry") -> None:
+def write_values(
+    folder: Path, stem: str, values: NDArray[np.uint8], geometry: OccupancyGrid | Costmap
+) -> None:
     """Write ``stem.pgm`` and ``stem.yaml`` in map_server's mode "raw", each atomically.
 
     Args:
@@ -55,7 +56,7 @@ def write_values(folder: Path, stem: str, values: NDArray[np.uint8], geometry: "
 
 
 def _write_image(
-    folder: Path, stem: str, pixels: NDArray[np.uint8], geometry: "_Geometry", *, mode: str
+    folder: Path, stem: str, pixels: NDArray[np.uint8], geometry: OccupancyGrid | Costmap, *, mode: str
 ) -> None:
     height, width = pixels.shape
     header = f"P5\n# CREATOR: mapper {geometry.resolution_m:.3f} m/pix\n{width} {height}\n255\n"
@@ -71,16 +72,6 @@ def _write_image(
         "free_thresh": str(FREE_THRESHOLD),
     }
     write_text(folder / f"{stem}.yaml", "".join(f"{key}: {value}\n" for key, value in settings.items()))
-
-
-class _Geometry(Protocol):
-    """Position of the cells of a grid or a costmap."""
-
-    @property
-    def resolution_m(self) -> float: ...
-
-    @property
-    def origin_world_m(self) -> Array: ...
 
 
 def grid_image(grid: OccupancyGrid) -> NDArray[np.uint8]:

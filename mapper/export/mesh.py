@@ -147,10 +147,9 @@ def _max_depth_m(run: Run) -> float:
 
 def _expected_blocks(octree: OctreeMap, config: MeshConfig) -> int:
     """Estimate from the octree how many blocks the surface will fill, and refuse what could not fit."""
-    occupied = int((octree.leaves().log_odds >= octree.occupied_log_odds).sum())
     block_m = _BLOCK_VOXELS * config.voxel_m
     shell_blocks = 1.0 + 2.0 * _TRUNCATION_VOXELS / _BLOCK_VOXELS
-    blocks = int(occupied * (octree.resolution_m / block_m) ** 2 * shell_blocks) + 1
+    blocks = int(octree.count_occupied() * (octree.resolution_m / block_m) ** 2 * shell_blocks) + 1
     check_memory(
         blocks * _BLOCK_VOXELS**3 * _VOXEL_BYTES,
         f"a mesh of {config.voxel_m:g} m voxels",

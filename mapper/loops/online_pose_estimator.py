@@ -9,6 +9,7 @@ from mapper.graph.incremental import IncrementalSolver
 from mapper.graph.model import PoseGraph
 from mapper.graph.proportional_correction import spread
 from mapper.loops.closure import Discrepancy, LoopClosure, discrepancy, exceeds
+from mapper.loops.proposers import NodePoses
 from mapper.odometry.base import FrameResult
 
 Correction = Literal["batch", "proportional", "none"]
@@ -18,16 +19,11 @@ _WORTH_SOLVING = Discrepancy(translation_m=0.02, rotation_rad=0.01)
 """A loop that moves no node farther waits to be solved with the next that does."""
 
 
-class OnlinePoseEstimator(Protocol):
+class OnlinePoseEstimator(NodePoses, Protocol):
     """Online pose estimator: node poses that loops correct.
 
     A new node's pose follows from the current estimate of the node that it was tracked from.
     """
-
-    @property
-    def corrections(self) -> int:
-        """Number of times that the poses of known nodes have changed."""
-        ...
 
     def add(self, node: int, track: FrameResult) -> None:
         """Add a new node, in time order."""
@@ -39,10 +35,6 @@ class OnlinePoseEstimator(Protocol):
 
     def close(self, closure: LoopClosure) -> None:
         """Correct the path by a loop."""
-        ...
-
-    def pose_of(self, node: int) -> Transform:
-        """Return the (4, 4) current estimate of a node's pose."""
         ...
 
 

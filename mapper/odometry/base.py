@@ -221,7 +221,7 @@ class SensorCheck(Protocol):
         """Return what is known about the sensor once the log has ended, a sentence each."""
         ...
 
-    def calibration_doubts(self) -> Sequence[str]:
+    def calibration_warnings(self) -> Sequence[str]:
         """Return what in the log contradicts the sensor's calibration, a sentence each."""
         ...
 

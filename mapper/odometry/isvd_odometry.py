@@ -163,7 +163,7 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
         """Return the estimated readout time of the camera's shutter, if it has any."""
         return [self._readout.sentence] if self._readout.sentence else []
 
-    def calibration_doubts(self) -> Sequence[str]:
+    def calibration_warnings(self) -> Sequence[str]:
         """Return nothing: pairs of images show no focal length."""
         return ()
 

@@ -247,7 +247,7 @@ class _FirstPass:
             *(RunWarning(kind="conflict", sentence=note, weight="doubt") for note in conflicts),
         ]
         if isinstance(odometry, SensorCheck):
-            wrong = odometry.calibration_doubts()
+            wrong = odometry.calibration_warnings()
             warnings += [RunWarning(kind="camera", sentence=sentence, weight="doubt") for sentence in wrong]
             warnings += [RunWarning(kind="shutter", sentence=note) for note in odometry.sensor_notes()]
         return warnings

@@ -19,6 +19,7 @@ _MAX_WHEEL_CHI2, _LEAST_WHEEL_FACTORS = 9.0, 5
 _MAX_SIGMA_M, _MAX_SIGMA_SHARE, _BROKEN_SIGMA_SHARE = 0.1, 0.1, 0.3
 _MAX_STEP_M, _MAX_STEP_RAD = 0.2, np.radians(5.0)
 
+_LOOK_AT_LOOPS = "mapper loops RUN lists them; mapper loops RUN --remove I J takes a wrong one back"
 COME_BACK = "come back to known places, so that loops hold the path"
 """What to try where a path is uncertain."""
 
@@ -33,7 +34,7 @@ def loop_warnings(results: RunResults) -> Iterator[RunWarning]:
             kind="loops",
             sentence=f"{len(contradicting)} of {tried} loops contradict the rest of the graph "
             f"(at most {_MAX_REFUSED_SHARE:.0%} is usual)",
-            suggestion="mapper loops RUN lists them; mapper loops RUN --remove I J takes a wrong one back",
+            suggestion=_LOOK_AT_LOOPS,
             weight="doubt",
         )
     if not held:
@@ -54,7 +55,7 @@ def loop_warnings(results: RunResults) -> Iterator[RunWarning]:
         sentence=f"before the solve the median loop was {miss_m:.2f} m and {np.degrees(miss_rad):.1f}° "
         f"from the odometry, over {path_m:.1f} m of path (at most {limit_m:.2f} m and "
         f"{np.degrees(_MAX_LOOP_RAD):.0f}° are usual): either the odometry is wrong or the loops are",
-        suggestion="mapper loops RUN lists them; mapper loops RUN --remove I J takes a wrong one back",
+        suggestion=_LOOK_AT_LOOPS,
         weight="doubt",
     )
 

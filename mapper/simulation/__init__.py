@@ -2,7 +2,6 @@
 
 from mapper.simulation.boxes import Boxes, read_scene
 from mapper.simulation.log import write_tum_log
-from mapper.simulation.path import make_path
 from mapper.simulation.raycast import Rendering, render
 from mapper.simulation.scene import Scene, make_scene
 from mapper.simulation.sensor import observe
@@ -14,7 +13,6 @@ __all__ = [
     "Rendering",
     "Scene",
     "camera_of",
-    "make_path",
     "make_scene",
     "observe",
     "read_scene",

@@ -8,7 +8,6 @@ import numpy as np
 from mapper.core.errors import SourceError
 from mapper.core.geometry import Array
 from mapper.core.timebase import NS_PER_S, Stamps
-from mapper.core.trajectory import Trajectory
 from mapper.simulation.config import SynthConfig
 from mapper.simulation.plan import DESK_SIZE_M, Plan, closed_spline
 from mapper.simulation.scene import Scene
@@ -73,13 +72,6 @@ def frame_stamps(config: SynthConfig, motion: Motion) -> Stamps:
 def seconds_of(stamps_ns: Stamps) -> Array:
     """Return (N,) seconds after the start."""
     return (stamps_ns - START_NS) / NS_PER_S
-
-
-def make_path(config: SynthConfig, scene: Scene) -> Trajectory:
-    """Return the exact T_world_camera of every frame (optical frame: x right, y down, z forward)."""
-    motion = make_motion(config, scene)
-    stamps_ns = frame_stamps(config, motion)
-    return Trajectory(stamps_ns, motion.poses(seconds_of(stamps_ns)))
 
 
 def _look(angles_rad: Array) -> Array:

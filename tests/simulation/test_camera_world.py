@@ -13,7 +13,6 @@ from mapper.simulation import (
     CameraSimulator,
     Scene,
     camera_of,
-    make_path,
     make_scene,
     read_scene,
     render,
@@ -228,13 +227,13 @@ def test_the_camera_keeps_clear_of_everything(seed):
     config = changed(PLAIN, seed=seed, rooms=4 + 2 * (seed % 2))
     scene = make_scene(config)
     for path in ("loop", "desk", "spin"):
-        trajectory = make_path(changed(config, path=path), scene)
+        trajectory = CameraSimulator(changed(config, path=path), scene).truth
         assert scene.boxes.signed_distance_m(trajectory.positions_world).min() >= 0.3
 
 
 def test_the_loop_visits_every_room_and_comes_back_looking_the_same_way(source):
     motion = make_motion(STEADY, source.scene)
-    trajectory = make_path(STEADY, source.scene)
+    trajectory = CameraSimulator(STEADY, source.scene).truth
     for room in source.scene.plan.rooms:
         x, y, _ = trajectory.positions_world.T
         assert ((room.x0_m < x) & (x < room.x1_m) & (room.y0_m < y) & (y < room.y1_m)).sum() > 60
@@ -248,7 +247,9 @@ def test_the_loop_visits_every_room_and_comes_back_looking_the_same_way(source):
 
 
 def test_three_laps_are_three_times_as_long(source):
-    once, thrice = (make_path(changed(STEADY, laps=laps), source.scene).path_length_m for laps in (1.0, 3.0))
+    once, thrice = (
+        CameraSimulator(changed(STEADY, laps=laps), source.scene).truth.path_length_m for laps in (1.0, 3.0)
+    )
     assert thrice - STEADY.overlap_m == pytest.approx(3.0 * (once - STEADY.overlap_m), rel=1e-3)
     assert thrice > 55.0
 
@@ -271,7 +272,7 @@ def test_the_walker_turns_no_faster_than_told_and_moves_smoothly(source, path, f
 
 
 def test_stamps_are_whole_frames_from_the_start(source):
-    trajectory = make_path(changed(STEADY, path="desk", duration_s=2.0), source.scene)
+    trajectory = CameraSimulator(changed(STEADY, path="desk", duration_s=2.0), source.scene).truth
     assert len(trajectory) == 61
     assert trajectory.stamps_ns[0] == START_NS
     assert trajectory.stamps_ns[30] == START_NS + NS_PER_S

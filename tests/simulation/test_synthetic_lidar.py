@@ -17,13 +17,13 @@ from mapper.simulation.config import (
 from mapper.simulation.lidar import (
     LidarSimulator,
     make_outdoor_scene,
-    render_scan,
     write_lidar_log,
 )
 from mapper.simulation.lidar.solids import Shape
 from mapper.simulation.path import seconds_of
 from mapper.sources import open_source
 from tests.support.ideal_sensors import IDEAL_LIDAR
+from tests.support.street_scans import still_scan
 
 SMALL = {"rings": 16, "lowest_ring_rad": -0.35, "highest_ring_rad": 0.25, "azimuth_steps": 180}
 EXACT = IDEAL_LIDAR.model_copy(update=SMALL)
@@ -138,17 +138,15 @@ def test_noise_dropout_and_range_are_as_configured():
     scene = make_outdoor_scene(STREET)
     T_world_lidar = LidarSimulator(STREET, scene).truth.T_world_body[0]
     sensor = FROZEN.model_copy(update={"azimuth_steps": 900})
-    clean = render_scan(scene, sensor, T_world_lidar, np.random.default_rng(0)).points_body
-    noisy = render_scan(
-        scene, sensor.model_copy(update={"range_noise_m": 0.05}), T_world_lidar, np.random.default_rng(0)
-    ).points_body
+    clean = still_scan(scene, sensor, T_world_lidar)
+    noisy = still_scan(scene, sensor.model_copy(update={"range_noise_m": 0.05}), T_world_lidar)
     error_m = np.linalg.norm(noisy, axis=1) - np.linalg.norm(clean, axis=1)
     assert error_m.std() == pytest.approx(0.05, rel=0.05)
     assert abs(error_m.mean()) < 0.003
     np.testing.assert_allclose(np.cross(noisy, clean), 0.0, atol=1e-3)
 
     lossy = sensor.model_copy(update={"dropout_ratio": 0.3, "min_range_m": 5.0, "max_range_m": 20.0})
-    left = render_scan(scene, lossy, T_world_lidar, np.random.default_rng(0)).points_body
+    left = still_scan(scene, lossy, T_world_lidar)
     ranges_m = np.linalg.norm(left, axis=1)
     in_range = np.linalg.norm(clean, axis=1)
     in_range = in_range[(in_range >= 5.0) & (in_range <= 20.0)]

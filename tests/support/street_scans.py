@@ -4,10 +4,12 @@ from functools import cache
 
 import numpy as np
 
+from mapper.core.frames import Points32
 from mapper.core.geometry import Transform, rotation_exp, transform
 from mapper.features.frame_view import ScanView
 from mapper.simulation.config import STREET, LidarSensorConfig
-from mapper.simulation.lidar import OutdoorScene, make_outdoor_scene, render_scan
+from mapper.simulation.lidar import OutdoorScene, make_outdoor_scene
+from mapper.simulation.lidar.sensor import measure
 
 MOUNT_M = 1.7
 SENSOR = LidarSensorConfig(rings=32, azimuth_steps=360)
@@ -28,7 +30,14 @@ def on_street(scene: OutdoorScene, along_m: float, *, yaw_rad: float = 0.0, left
     return transform(R, np.array([*place[0], height_m]))
 
 
+def still_scan(
+    scene: OutdoorScene, sensor: LidarSensorConfig, T_world_lidar: Transform, *, seed: int = 0
+) -> Points32:
+    """Return the (N, 3) points, sensor frame, that a sensor measures which stands still."""
+    poses = np.broadcast_to(T_world_lidar, (sensor.azimuth_steps, 4, 4))
+    return measure(scene, sensor, poses, np.random.default_rng(seed))[0]
+
+
 def view(scene: OutdoorScene, T_world_body: Transform, *, stamp_ns: int = 0, seed: int = 0) -> ScanView:
     """Return what the scanner sees from there, with its own noise."""
-    scan = render_scan(scene, SENSOR, T_world_body, np.random.default_rng(seed))
-    return ScanView(stamp_ns, scan.points_body)
+    return ScanView(stamp_ns, still_scan(scene, SENSOR, T_world_body, seed=seed))

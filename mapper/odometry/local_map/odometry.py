@@ -224,7 +224,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         """Return the estimated readout time of the camera's shutter, if it has any."""
         return [self._readout.sentence] if self._readout.sentence else []
 
-    def calibration_doubts(self) -> Sequence[str]:
+    def calibration_warnings(self) -> Sequence[str]:
         """Return what in the images contradicts their focal length, and the stamps of their depth."""
         return self._calibration.contradictions()
 

@@ -7,8 +7,8 @@ above; its stamp is when it begins, so times are never negative.
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.core.frames import Points32, Scan
-from mapper.core.geometry import Array, Transform
+from mapper.core.frames import Points32
+from mapper.core.geometry import Array
 from mapper.simulation.config import LidarSensorConfig
 from mapper.simulation.lidar.cast import cast
 from mapper.simulation.lidar.scene import OutdoorScene
@@ -27,14 +27,6 @@ def ray_directions(sensor: LidarSensorConfig) -> Array:
     elevation = np.linspace(sensor.lowest_ring_rad, sensor.highest_ring_rad, sensor.rings)[None, :]
     flat, up = np.cos(elevation), np.broadcast_to(np.sin(elevation), (sensor.azimuth_steps, sensor.rings))
     return np.stack([np.cos(azimuth) * flat, np.sin(azimuth) * flat, up], axis=2)
-
-
-def render_scan(
-    scene: OutdoorScene, sensor: LidarSensorConfig, T_world_lidar: Transform, rng: np.random.Generator
-) -> Scan:
-    """Return the scan of a sensor that stands still at a (4, 4) pose; its points have no times."""
-    poses = np.broadcast_to(T_world_lidar, (sensor.azimuth_steps, 4, 4))
-    return Scan(0, measure(scene, sensor, poses, rng)[0])
 
 
 def column_times_s(sensor: LidarSensorConfig, columns: NDArray[np.intp]) -> NDArray[np.float32]:

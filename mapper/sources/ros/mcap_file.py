@@ -67,10 +67,7 @@ class _Contents(Contents):
         self._schemas: dict[int, str] = {}
         self._topics: dict[int, Topic] = {}
 
-    def add_schema(self, schema: Schema) -> None:
-        self._schemas[schema.id] = schema.name
-
-    def add_channel(self, channel: Channel) -> None:
+    def _add_channel(self, channel: Channel) -> None:
         type_ = self._schemas.get(channel.schema_id, "")
         if channel.message_encoding == "ros1":  # a bag that was converted
             type_ = ros2_name(type_)
@@ -97,9 +94,10 @@ class _Contents(Contents):
         stream = ReadDataStream(BytesIO(record))
         try:
             if opcode == Opcode.SCHEMA:
-                self.add_schema(Schema.read(stream))
+                schema = Schema.read(stream)
+                self._schemas[schema.id] = schema.name
             else:
-                self.add_channel(Channel.read(stream))
+                self._add_channel(Channel.read(stream))
         except (McapError, struct.error, UnicodeDecodeError) as error:
             raise DataError(f"a damaged schema or channel: {error}") from None
 

@@ -18,8 +18,9 @@ from mapper.octree.map import OctreeMap
 from mapper.octree.octomap_file import write_bt
 from mapper.simulation.boxes import Boxes, write_scene
 from mapper.simulation.config import LidarSynthConfig
-from mapper.simulation.lidar import make_outdoor_scene, render_scan
+from mapper.simulation.lidar import make_outdoor_scene
 from tests.support.ideal_sensors import IDEAL_LIDAR
+from tests.support.street_scans import still_scan
 
 EDGE_M = 0.05
 ROW = np.arange(-1.0, 1.0, 0.02) + 0.01
@@ -140,8 +141,7 @@ def test_points_of_an_outdoor_world_lie_on_its_surfaces(kind):
     scene = make_outdoor_scene(config)
     here = scene.route.points(np.zeros(1))
     eye = np.array([*here[0], float(scene.ground.height_m(here)[0]) + 2.0])
-    scan = render_scan(scene, IDEAL_LIDAR, transform(np.eye(3), eye), np.random.default_rng(0))
-    points = scan.points_body[::10].astype(np.float64) + eye
+    points = still_scan(scene, IDEAL_LIDAR, transform(np.eye(3), eye))[::10].astype(np.float64) + eye
     away = scene.ground.normals(points[:, :2])
 
     assert len(points) > 500
