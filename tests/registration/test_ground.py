@@ -60,6 +60,15 @@ def test_levels_a_tilted_scan(rng, tilt_deg, about_rad):
     assert found.T_level_body[2, 3] == pytest.approx(HEIGHT_M, abs=0.05)
 
 
+@pytest.mark.parametrize(("max_tilt_rad", "is_levelled"), [(0.7, False), (1.05, True)])
+def test_a_sensor_tilted_further_than_usual_needs_another_limit(rng, max_tilt_rad, is_levelled):
+    T_body_world = transform(rotation_exp(np.array([0.9, 0.0, 0.0])), np.zeros(3))
+
+    found = level(as_scan(apply(T_body_world, field(rng))), LevellingConfig(max_tilt_rad=max_tilt_rad))
+
+    assert (abs(found.tilt_rad - 0.9) < 0.01) == is_levelled
+
+
 def test_a_small_tilt_is_the_streets_and_stays(rng):
     found = level(as_scan(field(rng, slope=0.05)), LevellingConfig())
 

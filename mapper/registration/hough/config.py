@@ -14,7 +14,7 @@ class LevellingConfig(Config):
     """Level frame of one scan: the plane with most points on it and few below, by random samples."""
 
     max_tilt_rad: Annotated[float, Field(gt=0.0, lt=1.4)] = 0.7
-    """Steeper planes are walls."""
+    """Steeper planes are walls. Raise it for a sensor that is tilted further, such as a hand-held camera."""
     inlier_m: PositiveFloat = 0.12
     """Largest distance of a ground point from the plane."""
     min_height_m: float = 0.3

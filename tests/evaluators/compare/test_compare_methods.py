@@ -215,8 +215,13 @@ def test_lengths_are_fitted_to_the_sensor(sensor):
     assert hough.voting.bin_m == pytest.approx(share * usual.voting.bin_m)
     assert hough.refinement.pair_distances_m[0] == pytest.approx(share * usual.refinement.pair_distances_m[0])
     assert hough.constellation.levelling.max_height_m == usual.constellation.levelling.max_height_m
-    assert kiss.map_voxel_m == pytest.approx(share * KissOdometryConfig().map_voxel_m)
-    assert kiss.rescue is None
+    for name in ("inlier_m", "cell_m", "reach_m"):
+        length_m = getattr(usual.constellation.levelling, name)
+        assert getattr(hough.constellation.levelling, name) == pytest.approx(share * length_m)
+    assert hough.acceptance.pair_m == pytest.approx(share * usual.acceptance.pair_m)
+    for name in ("map_voxel_m", "initial_threshold_m", "min_motion_m"):
+        assert getattr(kiss, name) == pytest.approx(share * getattr(KissOdometryConfig(), name))
+    assert (kiss.rescue, kiss.usual_ratio, kiss.lost_ratio) == (None, 0.0, 0.0)
 
 
 def test_every_method_serves_as_odometry_and_on_pairs(desk_log):

@@ -108,6 +108,14 @@ def test_an_answer_is_right_if_neither_error_is_too_large(offset_m, turn_deg, ou
     assert errors == pytest.approx((offset_m, turn_deg), abs=1e-9)
 
 
+def test_the_limits_of_a_right_answer_are_settings():
+    alignment = Alignment(exp(np.array([0.0, 0.0, 0.1]), np.zeros(3)), True, 1.0, 0.0)
+    config = RgbdCompareConfig()
+    for max_error_rad, outcome in ((config.max_error_rad, "wrong"), (0.11, "right")):
+        lenient = config.model_copy(update={"max_error_rad": max_error_rad})
+        assert outcome_of(alignment, np.eye(4), lenient)["outcome"] == outcome
+
+
 def test_no_answer_is_neither_right_nor_wrong():
     found = outcome_of(failed("no idea"), np.eye(4), LidarCompareConfig())
     assert found == {"outcome": "none", "translation_m": None, "rotation_rad": None}

@@ -144,13 +144,13 @@ def test_given_pairs_are_read_with_their_pose(tmp_path):
     folder = write_pairs(
         tmp_path,
         '[[pair]]\nname = "square"\nscan = "scan.bin"\nmap = "map.npy"\nsensor = "VLP"\n'
-        "pose = [100, 50, 2, 0, 0, 90]\nwithin_m = 0.1\n",
+        "pose = [100, 50, 2, 0, 0, 90]\nwithin_m = 0.1\nwithin_deg = 0.5\n",
     )
 
     (pair,) = find_pairs(folder)
 
     clouds = pair.clouds()
-    assert (pair.name, pair.sensor, pair.within) == ("square", "VLP", (0.1, 1.0))
+    assert (pair.name, pair.sensor, pair.within) == ("square", "VLP", (0.1, 0.5))
     in_map = apply(clouds.T_target_source, clouds.source.points_body.astype(np.float64))
     assert np.allclose(in_map, clouds.target.points_body[:200], atol=1e-4)
     assert np.linalg.norm(clouds.T_target_source[:3, 3]) < 1e-9  # the map's origin is where the scan was
