@@ -224,13 +224,6 @@ class AttributeLayer:
             *_rows_and_voxels(self._blocks.table, self._arrays.rows, codes_of(points, self._resolution_m))
         )
 
-    def of_leaves(self) -> VoxelAttributes:
-        """Return the attributes of all known voxels, in the order of the map's ``leaves()``."""
-        slots = self._blocks.sorted_slots()
-        blocks, voxels = np.nonzero(~np.isnan(self._blocks.table.values[slots]))
-        rows = np.append(self._arrays.rows, np.full(len(slots) - len(self._arrays.rows), -1, np.int32))
-        return self._gather(rows[slots][blocks], voxels)
-
     def _gather(self, rows: NDArray[np.int32], voxels: NDArray[np.int64]) -> VoxelAttributes:
         absent = rows < 0
         weights = self._arrays.color_weights[rows, voxels]

@@ -8,7 +8,7 @@ from mapper.octree.map_file import write_map
 from mapper.octree.octomap_file import write_bt, write_ot
 from mapper.octree.reading import read_octree
 from tests.support.octomap_oracle import voxels
-from tests.support.octree_maps import COLORED, as_dict, mapped
+from tests.support.octree_maps import COLORED, as_dict, attributes_of_leaves, mapped
 
 
 def below(octree, x_m):
@@ -75,7 +75,7 @@ def test_a_map_goes_on_after_blocks_were_dropped():
     octree.add(other)
 
     assert as_dict(octree) == as_dict(other)
-    np.testing.assert_array_equal(octree.attributes.of_leaves().colors, other.attributes.of_leaves().colors)
+    np.testing.assert_array_equal(attributes_of_leaves(octree).colors, attributes_of_leaves(other).colors)
 
 
 def test_attributes_go_with_their_voxels_and_stay_with_the_others(tmp_path):
@@ -84,12 +84,12 @@ def test_attributes_go_with_their_voxels_and_stay_with_the_others(tmp_path):
     octree.drop_unknown()
 
     right = before.leaves().centres_world[:, 0] > 0.0
-    was, now = before.attributes.of_leaves(), octree.attributes.of_leaves()
+    was, now = attributes_of_leaves(before), attributes_of_leaves(octree)
     for name in ("colors", "hits", "last_seen_ns"):
         np.testing.assert_array_equal(getattr(now, name), getattr(was, name)[right])
     write_map(tmp_path / "map.octree", octree)
     read = read_octree(tmp_path / "map.octree")
-    np.testing.assert_array_equal(read.attributes.of_leaves().hits, was.hits[right])
+    np.testing.assert_array_equal(attributes_of_leaves(read).hits, was.hits[right])
     gone = octree.attributes.at(before.leaves().centres_world[~right])
     assert not gone.hits.any()
     assert not gone.colored.any()

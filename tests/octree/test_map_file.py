@@ -12,6 +12,7 @@ from mapper.octree.config import OctreeConfig
 from mapper.octree.map import OctreeMap
 from mapper.octree.map_file import MAGIC, write_map
 from mapper.octree.reading import read_octree
+from tests.support.octree_maps import attributes_of_leaves
 
 HEADER = len(MAGIC) + 12
 
@@ -64,7 +65,7 @@ def test_everything_comes_back(attributes, tmp_path):
     np.testing.assert_array_equal(again.leaves().keys, octree.leaves().keys)
     np.testing.assert_array_equal(again.leaves().log_odds, octree.leaves().log_odds)
     if attributes:
-        found, before = again.attributes.of_leaves(), octree.attributes.of_leaves()
+        found, before = attributes_of_leaves(again), attributes_of_leaves(octree)
         for name in ("colors", "colored", "hits", "last_seen_ns"):
             np.testing.assert_array_equal(getattr(found, name), getattr(before, name))
     else:

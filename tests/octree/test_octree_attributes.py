@@ -12,6 +12,7 @@ from mapper.octree.map import OctreeMap
 from mapper.octree.octomap_file import write_bt, write_ot
 from mapper.octree.reading import read_octree
 from mapper.octree.sensor_model import log_odds
+from tests.support.octree_maps import attributes_of_leaves
 
 BOTH_MODES = pytest.mark.parametrize("discretize", [True, False], ids=["discretize", "every-point"])
 
@@ -52,7 +53,7 @@ def test_every_hit_voxel_has_the_mean_colour_of_its_points(discretize):
         for key, color in zip(keys[near].tolist(), scan.colors[near].astype(int), strict=True):
             total, count, _ = sums.get(tuple(key), (0, 0, 0))
             sums[tuple(key)] = total + color, count + 1, scan.stamp_ns
-    leaves, found = octree.leaves(), octree.attributes.of_leaves()
+    leaves, found = octree.leaves(), attributes_of_leaves(octree)
 
     assert 0 < len(sums) < len(leaves.keys)
     hit = found.hits > 0
@@ -65,7 +66,7 @@ def test_every_hit_voxel_has_the_mean_colour_of_its_points(discretize):
 
 def test_what_no_ray_ended_in_has_no_attributes():
     octree = mapped()
-    found = octree.attributes.of_leaves()
+    found = attributes_of_leaves(octree)
     free = found.hits == 0
 
     assert free.any()
@@ -76,7 +77,7 @@ def test_what_no_ray_ended_in_has_no_attributes():
 
 def test_queries_agree_with_leaves_and_find_nothing_elsewhere():
     octree = mapped()
-    centres, found = octree.leaves().centres_world, octree.attributes.of_leaves()
+    centres, found = octree.leaves().centres_world, attributes_of_leaves(octree)
 
     at = octree.attributes.at(centres)
 
@@ -100,12 +101,12 @@ def test_log_odds_do_not_depend_on_the_layer():
 
 def test_scans_without_colour_leave_the_mean_alone():
     octree = mapped()
-    before = octree.attributes.of_leaves()
+    before = attributes_of_leaves(octree)
     for seed in range(4):
         scan = coloured_scan(seed)
         octree.insert(Scan(5_000, scan.points_body, scan.origin_body), pose(seed))
 
-    after = octree.attributes.of_leaves()
+    after = attributes_of_leaves(octree)
     np.testing.assert_array_equal(after.colors, before.colors)
     np.testing.assert_array_equal(after.hits, 2 * before.hits)
     assert set(after.last_seen_ns[after.hits > 0]) == {5_000}
@@ -169,7 +170,7 @@ def saturated(seed, *, holes):
 def their_tree(octree):
     """The same log-odds and colours in the C++ library's hands."""
     tree = pyoctomap.ColorOcTree(octree.resolution_m)
-    leaves, found = octree.leaves(), octree.attributes.of_leaves()
+    leaves, found = octree.leaves(), attributes_of_leaves(octree)
     for centre, value, color, colored in zip(
         leaves.centres_world, leaves.log_odds, found.colors, found.colored, strict=True
     ):
@@ -198,7 +199,7 @@ def test_colours_come_back_from_a_file(tmp_path):
 
     again = read_octree(tmp_path / "map.ot")
 
-    found, before = again.attributes.of_leaves(), octree.attributes.of_leaves()
+    found, before = attributes_of_leaves(again), attributes_of_leaves(octree)
     np.testing.assert_array_equal(again.leaves().log_odds, octree.leaves().log_odds)
     np.testing.assert_array_equal(found.colors, before.colors)
     assert (found.hits == 0).all()  # a ColorOcTree has no place for them

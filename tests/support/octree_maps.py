@@ -45,3 +45,8 @@ def as_dict(octree):
     """Return {key: log-odds} of a map's leaves."""
     leaves = octree.leaves()
     return {tuple(key): value for key, value in zip(leaves.keys.tolist(), leaves.log_odds, strict=True)}
+
+
+def attributes_of_leaves(octree):
+    """Return the attributes of all known voxels, in the order of the map's leaves."""
+    return octree.attributes.at(octree.leaves().centres_world)
