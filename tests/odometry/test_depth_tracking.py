@@ -263,3 +263,25 @@ def test_depth_takes_part_where_landmarks_tell_too_little(
 
     assert supported.method == method
     assert (supported.depth is None) == (method == "map")
+
+
+def test_a_relocalised_frame_is_not_aligned_to_itself(frames):
+    """Its own surfaces would confirm any pose."""
+    odometry = build_frame_odometry(LocalMapConfig())
+    observations = [odometry.observe(frame) for frame in frames[:4]]
+    for observation in observations[:3]:
+        odometry.track(observation)
+    last = odometry._last
+    right = odometry._tracker.track(observations[3], last, None)
+    found = replace(
+        right,
+        T_camera_world=exp(np.zeros(3), np.array([0.1, 0.0, 0.0])) @ right.T_camera_world,
+        landmark_of_feature=np.full_like(right.landmark_of_feature, -1),
+        method="relocalised",
+    )
+
+    supported = odometry._depth.supported(observations[3], found, None, found)
+
+    assert supported.method == "relocalised+depth"
+    error = inverse(right.T_camera_world) @ supported.T_camera_world
+    assert np.linalg.norm(error[:3, 3]) < 0.02

@@ -198,7 +198,9 @@ class DepthTracker:
         ]
         models = [(self._map.observation(k), keyframes[k].T_camera_world, k) for k in self._keyframes]
         unobserved = last.doubts or (last.depth is not None and last.depth.unobservable)
-        if not unobserved and all(earlier.stamp_ns != last.observation.stamp_ns for earlier, _, _ in models):
+        # A relocalised frame is its own predecessor: aligned to itself, it would confirm any pose.
+        used = {observation.stamp_ns, *(earlier.stamp_ns for earlier, _, _ in models)}
+        if not unobserved and last.stamp_ns not in used:
             models.append((last.observation, last.T_camera_world, last.reference))
         models = [model for model in models if _of_one_camera(model[0].depth_cells, cells)]
         self._surfaces = {
