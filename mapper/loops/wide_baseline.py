@@ -15,8 +15,8 @@ from mapper.features.frame_view import ImageView
 from mapper.features.matching import Pairs, match_mutual
 from mapper.graph.noise import with_model_error
 from mapper.loops.base import Verification
-from mapper.loops.image_agreement import ImageAgreement, image_agreement
 from mapper.loops.image_verification import rms_residual_px
+from mapper.registration.image_agreement import ImageAgreement, image_agreement
 from mapper.registration.p3p import ransac_p3p
 from mapper.registration.reprojection import (
     disparity_sigmas_px,

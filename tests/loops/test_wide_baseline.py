@@ -7,10 +7,10 @@ import pytest
 
 from mapper.core.geometry import inverse
 from mapper.features.config import SiftConfig
-from mapper.loops.image_agreement import image_agreement
 from mapper.loops.wide_baseline import verify_wide
 from mapper.odometry.config import IsvdOdometryConfig
 from mapper.odometry.factory import build_frame_odometry
+from mapper.registration.image_agreement import image_agreement
 from tests.support.stepped_wall import facing, painting, wall_image
 
 NEAR, FAR = facing(0.1, 0.0, -1.6), facing(-0.3, 0.3, -5.5, yaw=0.1)

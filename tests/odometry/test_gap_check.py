@@ -72,3 +72,37 @@ def test_a_frame_after_a_gap_that_a_poster_alone_places_is_lost(odometry, frames
     monkeypatch.setattr(odometry._depth, "supported", lambda *arguments: arguments[-1])
     monkeypatch.setattr(odometry._relocalizer, "candidates", lambda *_: [])
     assert odometry.track(observation).node is None
+
+
+def seen_otherwise(pose, by_ns, change):
+    """Return a later pose whose image and depth are changed, ``change(grey, inverse_depth)``."""
+    observation = pose.observation
+    grey, inverse_depth = change(observation.grey_cells, observation.depth_cells.inverse_depth)
+    cells = replace(observation.depth_cells, inverse_depth=inverse_depth)
+    changed = replace(observation, grey_cells=grey, depth_cells=cells)
+    return later(replace(pose, observation=changed), by_ns)
+
+
+@pytest.mark.parametrize(
+    ("change", "is_different"),
+    [
+        (lambda grey, inverse_depth: (grey, inverse_depth), False),
+        (lambda grey, inverse_depth: ((0.4 * grey + 30.0).astype(np.uint8), inverse_depth), False),
+        (lambda grey, inverse_depth: (np.flip(grey).copy(), inverse_depth), True),
+        (lambda grey, inverse_depth: (grey, 2.0 * inverse_depth), True),
+    ],
+    ids=["the same view", "in other light", "another picture", "nearer surfaces"],
+)
+def test_after_a_gap_the_images_between_the_features_have_to_agree(odometry, change, is_different):
+    check, last = odometry._gap_check, odometry._last
+    assert check.looks_different(seen_otherwise(last, AFTER_NS, change), last) == is_different
+    assert not check.looks_different(seen_otherwise(last, 500_000_000, change), last)
+
+
+def test_a_frame_after_a_gap_whose_image_is_of_another_place_is_lost(odometry, frames, monkeypatch):
+    observation = odometry.observe(replace(frames[NOW], stamp_ns=frames[NOW].stamp_ns + AFTER_NS))
+    changed = replace(observation, grey_cells=np.flip(observation.grey_cells).copy())
+    monkeypatch.setattr(odometry._tracker, "track", lambda *_: replace(odometry._last, observation=changed))
+    monkeypatch.setattr(odometry._depth, "supported", lambda *arguments: arguments[-1])
+    monkeypatch.setattr(odometry._relocalizer, "candidates", lambda *_: [])
+    assert odometry.track(changed).node is None

@@ -1,6 +1,6 @@
 """Surfaces of a depth image: its mean inverse depth in square cells, and planes fitted to these."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import cv2
@@ -41,6 +41,19 @@ class DepthCells:
     cell_px: int
     camera: PinholeCamera
     distortion_per_m: float = 0.0
+
+    @property
+    def reduced_camera(self) -> PinholeCamera:
+        """Intrinsics of an image with one pixel for each cell."""
+        rows, columns = self.inverse_depth.shape
+        whole = replace(self.camera, width_px=columns * self.cell_px, height_px=rows * self.cell_px)
+        return whole.resized(columns, rows)
+
+    @property
+    def depth_m(self) -> NDArray[np.float32]:
+        """(R, C) depth of the cells in metres; 0 where there is no surface."""
+        known = self.inverse_depth > 0.0
+        return np.divide(1.0, self.inverse_depth, out=np.zeros_like(self.inverse_depth), where=known)
 
     @property
     def rays(self) -> Array:

@@ -3,6 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from mapper.core.frames import RgbdFrame
 from mapper.core.geometry import Array, inverse
 from mapper.core.timebase import NS_PER_S
 from mapper.odometry.base import STEADY_NS, MotionCheck, fastest_m_s
@@ -10,6 +11,7 @@ from mapper.odometry.config import KeyframeOdometryConfig
 from mapper.odometry.local_map.landmarks import LandmarkMap
 from mapper.odometry.local_map.local_search import LocalSearch
 from mapper.odometry.local_map.pose_tracker import TrackedPose
+from mapper.registration.image_agreement import NOTHING_COMPARED, ImageAgreement, image_agreement
 
 _COLUMNS, _ROWS = 8, 6
 """Parts of an image in which landmarks are looked for."""
@@ -19,6 +21,12 @@ _MIN_SPREAD = 0.45
 """Least number of parts with inliers, relative to what as many of the landmarks in view give if drawn at
 random. Posters and patches alike on two walls gave 0.17 to 0.43 by the wrong one; right poses after 1.5 to
 6 s give 0.51 and more, one of blurred images 0.47; those of fr1_xyz 0.8 and more."""
+_KEYFRAMES = 3
+"""Keyframes whose images are compared with a frame's: those that share most landmarks with it."""
+_MIN_SAME, _MIN_LOCAL_CORRELATION = 0.3, 0.35
+"""Least share of the compared surfaces at the same depth, and least correlation of what is on them. By wrong
+poses whose few inliers were spread, 0.02 and 0.08 were at the same depth, or the correlation was 0.04 and
+0.19; by right ones at least 0.51 were, and it was 0.5 and more."""
 
 
 class GapCheck:
@@ -70,6 +78,34 @@ class GapCheck:
         share = expected / max(expected.sum(), 1)
         usual = float((1.0 - (1.0 - share) ** inliers.sum()).sum())
         return bool((inliers > 0).sum() < _MIN_SPREAD * usual)
+
+    def looks_different(self, tracked_pose: TrackedPose, last: TrackedPose) -> bool:
+        """Return whether the images of the place contradict a pose after a gap.
+
+        What is between the features counts here as well. An image is compared with that of the keyframe,
+        among those that share most landmarks, which shows most of its surfaces.
+        """
+        frame = tracked_pose.observation.reduced_frame()
+        if tracked_pose.stamp_ns - last.stamp_ns <= STEADY_NS or frame is None:
+            return False
+        agreements = [self._agreement(frame, tracked_pose, k) for k in self._sharing(tracked_pose)]
+        widest = max(agreements, key=lambda agreement: agreement.compared, default=NOTHING_COMPARED)
+        if widest.compared == 0:
+            return False
+        return widest.same_ratio < _MIN_SAME or widest.local_correlation < _MIN_LOCAL_CORRELATION
+
+    def _sharing(self, tracked_pose: TrackedPose) -> list[int]:
+        """Return the keyframes that share most landmarks with a pose."""
+        ids = tracked_pose.landmark_of_feature
+        counts = self._map.shared_counts(ids[ids >= 0])
+        return [int(k) for k in np.argsort(-counts, kind="stable")[:_KEYFRAMES] if counts[k] > 0]
+
+    def _agreement(self, frame: RgbdFrame, tracked_pose: TrackedPose, k: int) -> ImageAgreement:
+        shown = self._map.observation(k).reduced_frame()
+        if shown is None:
+            return NOTHING_COMPARED
+        T_keyframe_camera = self._map.keyframes[k].T_camera_world @ inverse(tracked_pose.T_camera_world)
+        return image_agreement(frame, shown, T_keyframe_camera)
 
 
 def _by_parts(pixels: Array, size_px: tuple[int, int]) -> NDArray[np.intp]:

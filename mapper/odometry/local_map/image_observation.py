@@ -103,6 +103,13 @@ class ImageObservation(Archivable):
         }
         return _unswept, (measured, not np.isnan(self.measured[:, 2]).all())
 
+    def reduced_frame(self) -> RgbdFrame | None:
+        """Return the whole image and its depth with one pixel for each depth cell; None without them."""
+        if self.depth_cells is None or self.grey_cells is None:
+            return None
+        cells = self.depth_cells
+        return RgbdFrame(self.stamp_ns, self.grey_cells, cells.depth_m, cells.reduced_camera)
+
     def weights_among(self, moved: NDArray[np.bool_]) -> Array:
         """Return the (N, 3) inverse variances for the test which features agree on a motion.
 

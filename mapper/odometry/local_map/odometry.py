@@ -340,7 +340,8 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
             # Another place, so that a sub-map may begin at once.
             self._unknown_frames = self._config.max_lost_frames
             return False
-        return not self._gap_check.agrees_in_part(tracked_pose, last)
+        check = self._gap_check
+        return not check.agrees_in_part(tracked_pose, last) and not check.looks_different(tracked_pose, last)
 
     def _add_keyframe(
         self, tracked_pose: TrackedPose, *, neighbour: int | None, assessed: Assessment = UNDOUBTED

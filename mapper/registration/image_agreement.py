@@ -32,19 +32,25 @@ class ImageAgreement:
     """Agreement of the pixels of one image with another one, where both see the same part of the scene.
 
     Attributes:
-        points: Number of pixels on surfaces that the other image shows at the same depth.
-        same_ratio: Their share of all pixels that fall into the other image.
+        compared: Number of pixels that fall into the other image, where that measured a depth.
+        points: Number of those on surfaces that the other image shows at the same depth.
+        same_ratio: Their share of the compared ones.
         through_ratio: Share of the pixels in space that the other image sees through.
         correlation: Correlation of the grey levels on the same surfaces, −1 … 1.
         local_correlation: The same of grey levels without their local mean, in local standard deviations:
             light and one poster of high contrast do not outweigh the rest.
     """
 
+    compared: int
     points: int
     same_ratio: float
     through_ratio: float
     correlation: float
     local_correlation: float
+
+
+NOTHING_COMPARED = ImageAgreement(0, 0, 0.0, 0.0, 0.0, 0.0)
+"""Agreement of images that share next to no view."""
 
 
 def image_agreement(i: RgbdFrame, j: RgbdFrame, T_j_i: Transform) -> ImageAgreement:
@@ -71,7 +77,7 @@ def image_agreement(i: RgbdFrame, j: RgbdFrame, T_j_i: Transform) -> ImageAgreem
     known = z_j > 0.0
     chosen, columns, rows, z_j = in_front[seen][known], columns[known], rows[known], z_j[known]
     if len(chosen) < _MIN_POINTS:
-        return ImageAgreement(0, 0.0, 0.0, 0.0, 0.0)
+        return NOTHING_COMPARED
     predicted, z_i = points_j[chosen, 2], z_i[chosen]
     deepest = np.maximum(predicted, z_i)
     limit = _LEAST_M + _SHARE * predicted + _SIGMAS * depth_sigma_m(KINECT_NOISE, deepest)
@@ -84,6 +90,7 @@ def image_agreement(i: RgbdFrame, j: RgbdFrame, T_j_i: Transform) -> ImageAgreem
         for of_i, of_j in (greys, details)
     ]
     return ImageAgreement(
+        len(chosen),
         int(same.sum()),
         float(same.mean()),
         float((z_j - predicted >= limit).mean()),
