@@ -131,6 +131,40 @@ def test_a_jump_of_a_pose_by_depth_is_doubted_unless_a_motion_was_predicted_alon
     assert not doubt.repeats
 
 
+@pytest.mark.parametrize("by_depth", [False, True])
+def test_after_a_gap_matches_that_disagree_may_be_of_another_place(frames, odometry, by_depth):
+    """The pose is then as uncertain as the way that the camera goes in that time."""
+    doubts = FrameDoubts()
+    track(frames[:2], odometry)
+    pose = odometry._last
+    depth = Mock(spec=DepthAlignment, unobservable="") if by_depth else None
+
+    def assess(time_s, *, since_s, agreement, moved_m=0.01, depth=None):
+        now, last = (
+            replace(
+                pose,
+                observation=replace(
+                    pose.observation, stamp_ns=round(1e9 * at), image_checksum=round(1e9 * at)
+                ),
+                T_camera_world=exp(np.zeros(3), np.array([x, 0.0, 0.0])) @ pose.T_camera_world,
+                agreement=agreement,
+                depth=depth,
+            )
+            for at, x in ((time_s, moved_m), (time_s - since_s, 0.0))
+        )
+        return doubts.assess(now, np.diag([1e-6] * 6), last, None, NOT_DISPLACED, 0.0)
+
+    for k in range(1, 30):  # at 0.1 m/s
+        assess(0.1 * k, since_s=0.1, agreement=0.95)
+    assert not assess(5.0, since_s=2.0, agreement=0.6, depth=depth).doubts
+    doubt = assess(7.0, since_s=2.0, agreement=0.4, depth=depth)
+    assert doubts_text(doubt.doubts) == "40% of the matches agree, 95% is usual"
+    assert doubt.sigma_m == pytest.approx(0.2, rel=0.01)
+    soon = assess(7.5, since_s=0.5, agreement=0.4, depth=depth)
+    assert bool(soon.doubts) == (not by_depth)
+    assert soon.sigma_m < 0.01
+
+
 def test_a_frozen_camera_before_white_walls_is_doubted(frames, odometry):
     track(frames[:2], odometry)
     depth = Mock(spec=DepthAlignment, unobservable="translation along x")

@@ -25,7 +25,9 @@ from mapper.odometry.local_map.local_search import LocalSearch
 from mapper.odometry.local_map.pose_information import covariance_of, frame_information, largest_sigma
 from mapper.odometry.local_map.pose_tracker import TrackedPose, project, unmatched
 
-_MIN_VISIBLE_RATIO = 0.3
+_MIN_VISIBLE_RATIO, _MIN_VISIBLE_RATIO_OF_PLACED = 0.3, 0.15
+"""Share of the points on or before surfaces that depth alone needs, and that a frame needs which landmarks
+have placed: after a gap a quarter is often all that both see; it shows turns better than few landmarks do."""
 _MIN_WEAKEST_RATIO = 0.5
 """A wrong pose can have most points on the floor or on one wall, so every direction of the normals counts."""
 _MAX_CONTRADICTING_RATIO = 0.3
@@ -183,7 +185,10 @@ class DepthTracker:
             ),
             noise=self._config.depth_noise,
         )
-        return alignment if alignment is not None and _agrees(alignment) else None
+        if alignment is None:
+            return None
+        least = _MIN_VISIBLE_RATIO if found is None else _MIN_VISIBLE_RATIO_OF_PLACED
+        return alignment if _agrees(alignment, least) else None
 
     def _reference(self, observation: ImageObservation, last: TrackedPose) -> ReferenceSurfaces:
         """Return the surfaces of the latest keyframes and of the last frame."""
@@ -319,10 +324,10 @@ def _of_one_camera(cells: DepthCells | None, others: DepthCells | None) -> bool:
     return cells is not None and others is not None and cells.camera == others.camera
 
 
-def _agrees(alignment: DepthAlignment) -> bool:
+def _agrees(alignment: DepthAlignment, min_visible_ratio: float) -> bool:
     """Return whether enough of the depth image lies on the keyframes' surfaces, and little contradicts."""
     return (
-        alignment.visible_ratio >= _MIN_VISIBLE_RATIO
+        alignment.visible_ratio >= min_visible_ratio
         and alignment.weakest_ratio >= _MIN_WEAKEST_RATIO
         and alignment.contradicting_ratio <= _MAX_CONTRADICTING_RATIO
     )

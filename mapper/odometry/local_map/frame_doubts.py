@@ -2,12 +2,14 @@
 
 import math
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from mapper.core.doubts import Doubt
 from mapper.core.geometry import Array, Transform, inverse, log
+from mapper.core.timebase import NS_PER_S
+from mapper.odometry.base import STEADY_NS
 from mapper.odometry.local_map.assessment import UNDOUBTED, Assessment
 from mapper.odometry.local_map.displaced_surfaces import DisplacedSurfaces
 from mapper.odometry.local_map.earlier_depth import Displacement
@@ -76,8 +78,18 @@ class FrameDoubts:
         if shown_s := self._shown_s(tracked_pose, last):
             return self._of_repeated_image(tracked_pose, motion, shown_s)
         if tracked_pose.depth is not None:
-            return self._of_depth(tracked_pose, last, motion)
-        return self._of_landmarks(tracked_pose, motion, displaced, excess_error)
+            assessed = self._of_depth(tracked_pose, last, motion)
+        else:
+            assessed = self._of_landmarks(tracked_pose, motion, displaced, excess_error)
+        if not (assessed.doubts and motion.follows_gap):
+            return assessed
+        # Another place that looks alike may have been recognised.
+        reach_rad, reach_m = (self._usual(name) * motion.elapsed_s for name in ("speed_rad_s", "speed_m_s"))
+        return replace(
+            assessed,
+            sigma_rad=max(assessed.sigma_rad, reach_rad),
+            sigma_m=max(assessed.sigma_m, reach_m),
+        )
 
     def _shown_s(self, tracked_pose: TrackedPose, last: TrackedPose) -> float:
         """Return for how long the image has been the same; 0 if it is a new one."""
@@ -99,6 +111,8 @@ class FrameDoubts:
     def _of_depth(self, tracked_pose: TrackedPose, last: TrackedPose, motion: "_FrameMotion") -> Assessment:
         """Return the doubts of a pose by depth: landmarks were few, so their usual figures do not apply."""
         doubts = tracked_pose.doubts
+        if motion.follows_gap:
+            doubts = (*doubts, *self._disagreement(tracked_pose))
         # A motion that is predicted alone predicts no other.
         is_unobserved = _is_unobserved(tracked_pose) or _is_unobserved(last)
         if not is_unobserved and (jumps := self._jumps(motion)):
@@ -115,16 +129,15 @@ class FrameDoubts:
         """Return the doubts of a pose by landmarks."""
         usual_m, usual_agreement = self._usual("sigma_m"), self._usual("agreement")
         agreement, sigma_m = tracked_pose.agreement, motion.sigma_m
+        disagreement = self._disagreement(tracked_pose)
         doubts = list(tracked_pose.doubts)
         is_loose = sigma_m > max(_LOOSE_M, _LOOSE_RATIO * usual_m)
         if is_loose:
             usual = f", {usual_m:.3f} m is usual" if usual_m else ""
             text = f"{tracked_pose.inliers} features agree, which tell the translation to {sigma_m:.3f} m"
             doubts.append(Doubt("uncertain translation", text + usual))
-        is_contradicted = agreement < _LOW_AGREEMENT * usual_agreement
-        if is_contradicted:
-            text = f"{agreement:.0%} of the matches agree, {usual_agreement:.0%} is usual"
-            doubts.append(Doubt("disagreeing matches", text))
+        is_contradicted = bool(disagreement)
+        doubts += disagreement
         is_supported = (
             agreement >= _SUPPORT_AGREEMENT * usual_agreement
             and sigma_m <= _SUPPORT_RATIO * usual_m
@@ -155,6 +168,12 @@ class FrameDoubts:
     def in_hindsight(self, stamp_ns: int) -> Assessment:
         """Return the doubt that later frames add to an earlier one."""
         return self._surfaces.doubt_of_earlier(stamp_ns)
+
+    def _disagreement(self, tracked_pose: TrackedPose) -> list[Doubt]:
+        agreement, usual = tracked_pose.agreement, self._usual("agreement")
+        if agreement >= _LOW_AGREEMENT * usual:
+            return []
+        return [Doubt("disagreeing matches", f"{agreement:.0%} of the matches agree, {usual:.0%} is usual")]
 
     def _is_apart(self, motion: "_FrameMotion") -> bool:
         """Return whether a pose is so far from the predicted one that the two are distinct."""
@@ -226,11 +245,16 @@ class _FrameMotion:
         if T_camera_world_predicted is not None:
             jump = _angle_and_distance(T_camera_world, T_camera_world_predicted)
         return cls(
-            1e-9 * (tracked_pose.stamp_ns - last.stamp_ns),
+            (tracked_pose.stamp_ns - last.stamp_ns) / NS_PER_S,
             _angle_and_distance(T_camera_world, last.T_camera_world),
             jump,
             *(largest_sigma(covariance[k : k + 3, k : k + 3]) for k in (0, 3)),
         )
+
+    @property
+    def follows_gap(self) -> bool:
+        """Whether the last tracked frame is so old that nothing predicts this one."""
+        return self.elapsed_s > STEADY_NS / NS_PER_S
 
     @property
     def off_rad(self) -> float:
