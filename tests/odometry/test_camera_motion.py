@@ -42,7 +42,7 @@ def motion_of(
     moved: Points,
     observers: tuple[int, int],
     T_moved: Transform = T_WALKED,
-    variance: float = 1.0,
+    variance: float = 0.25,
 ) -> CameraMotion:
     """Return the motion from points that stand still and others that moved, each seen so often."""
     points = np.concatenate([still, moved])
@@ -92,6 +92,24 @@ def test_a_turn_and_a_step_before_a_wall_do_not_follow_who_starts_to_walk(
     )
     assert (miss_m(motion) > 0.05) == errs
     assert (motion.agree[500:].mean() > 0.5) == errs
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize(("count", "walked_m"), [(100, 0.07), (150, 0.1)])
+def test_a_log_that_begins_before_a_wall_does_not_follow_who_walks_past(observation, seed, count, walked_m):
+    """Nothing is established yet, and all pairs together fit a turn and a step."""
+    rng = np.random.default_rng(seed)
+    wall = rng.uniform((-1.6, -1.2, 3.0), (1.6, 1.2, 3.3), (300, 3))
+    motion = motion_of(
+        observation,
+        rng,
+        still=wall,
+        moved=person(count, rng),
+        observers=(1, 1),
+        T_moved=exp(np.zeros(3), np.array([walked_m, 0.0, 0.0])),
+    )
+    assert miss_m(motion) < 0.02
+    assert motion.moving[300:].mean() > 0.9
 
 
 @pytest.mark.parametrize("tilt", [0.15, 0.2, 0.25, 0.3])

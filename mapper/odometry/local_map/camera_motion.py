@@ -1,5 +1,6 @@
 """Motion of the camera among several motions in an image, such as those of passers-by."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,23 +10,23 @@ from mapper.core.doubts import Doubt
 from mapper.core.geometry import Array, Points, Transform
 from mapper.odometry.local_map.image_observation import ImageObservation
 from mapper.odometry.local_map.pose_tracker import refined
+from mapper.odometry.local_map.sampled_poses import sampled_pose, shares_of_scene, support
 from mapper.registration.reprojection import classify
 
 _ENOUGH_ESTABLISHED = 30
 """Landmarks that determine which motion is the camera's."""
 _LEAST_OBSERVERS, _MOST_OBSERVERS = 2, 6
 """Keyframes that observe an established landmark, and from how many on all count the same."""
-_MIN_KEPT_RATIO = 0.5
-"""When fewer of them agree, the established landmarks show no motion."""
-_MORE, _AS_WELL = 1.5, 0.9
-"""All pairs together give the pose if so many times as many agree with it as with the one of established
-landmarks, of these themselves so many, and if it is wider as well: landmarks at an edge of the view may fit a
-pose that is metres off as well as the right one."""
+_MOST_CONTRADICT = 1.0 / 3.0
+"""While fewer contradict the pose of established landmarks, it is not compared with that of all pairs."""
+_CLEARLY = 1.1
+"""Another pose is the camera's if it explains so many times as much of the scene."""
+_ENOUGH_PAIRS, _FITS = 80, 0.8
+"""Pairs from which on samples are drawn, unless a larger share of them fits as well as is usual for the log:
+of a few pairs, as over a wide baseline, many are mismatches."""
 _LEAST_OTHERS, _LEAST_OTHER_RATIO = 20, 0.12
 """Pairs that show another motion, in number and as a share of all. Mismatches agree on none;
 the upper and the lower rows of a rolling shutter gave 0.10."""
-_WIDER = 1.5
-"""Another motion is the camera's if its features lie this much farther apart."""
 _WIDE = 0.8
 """Another motion may be the camera's if its features lie this far apart, relative to all: features on a
 passer-by give 0.1 to 0.5."""
@@ -57,10 +58,10 @@ def camera_motion(
     weights: Array,
     variance: float,
 ) -> CameraMotion:
-    """Return the pose that established landmarks agree with, unless a wider part of the scene contradicts.
+    """Return the pose that established landmarks agree with, unless another one explains more of the scene.
 
-    Things that move are small beside the scene they move in. So where the pairs that contradict a pose agree
-    on another one, the motion whose own features lie farther apart is the camera's.
+    Things that move are small beside the scene they move in, however many features they have. The other poses
+    are those of samples of the pairs and of the pairs that contradict.
 
     Args:
         T_camera_world: (4, 4) to begin with.
@@ -76,6 +77,18 @@ def camera_motion(
     T_found, agree = refined_by_established(
         T_camera_world, points_world, observation, features, observers, weights, variance
     )
+    fitted = _fitted(weights, variance)
+    fits = agreeing(T_found, points_world, observation, features, fitted)
+    if len(fits) >= _ENOUGH_PAIRS and fits.mean() < _FITS:
+        T_sampled = sampled_pose(
+            T_camera_world,
+            points_world,
+            observation.measured[features],
+            fitted[features],
+            observation.intrinsics,
+        )
+        T_found = _most_supported([T_found, T_sampled], points_world, observation, features, fitted)
+        agree = agreeing(T_found, points_world, observation, features, weights)
     only_motion = CameraMotion(T_found, agree, np.zeros(len(features), np.bool_))
     least = max(_LEAST_OTHERS, _LEAST_OTHER_RATIO * len(features))
     if (~agree).sum() < least:
@@ -84,15 +97,12 @@ def camera_motion(
     agree_other = agreeing(T_other, points_world, observation, features, weights)
     if (agree_other & ~agree).sum() < least:
         return only_motion
-    spread_m = _spread_m(points_world[agree & ~agree_other])
-    spread_other_m = _spread_m(points_world[agree_other & ~agree])
-    if spread_other_m >= _WIDER * spread_m:
+    if _most_supported([T_found, T_other], points_world, observation, features, fitted) is T_other:
         T_found, agree, agree_other = T_other, agree_other, agree
-        spread_other_m = spread_m
-    others = int((agree_other & ~agree).sum())
-    if spread_other_m < _WIDE * _spread_m(points_world) and others < agree.sum():
+    is_other = agree_other & ~agree
+    if _spread_m(points_world[is_other]) < _WIDE * _spread_m(points_world) and is_other.sum() < agree.sum():
         return CameraMotion(T_found, agree, ~agree)
-    doubt = Doubt("another motion", f"{others} of {len(features)} features show another motion")
+    doubt = Doubt("another motion", f"{int(is_other.sum())} of {len(features)} features show another motion")
     return CameraMotion(T_found, agree, ~agree, (doubt,))
 
 
@@ -109,13 +119,12 @@ def refined_by_established(
 
     What moves soon contradicts the keyframes that saw it, so landmarks that most keyframes observe stand
     still. The pose is theirs first, and is then refined by all pairs that agree with it: however many
-    features a passer-by adds to the view, they have no weight. Only where they agree with the pose of all
-    pairs as well, and that fits a far larger and wider part of the scene, it is that one. Arguments as for
-    ``camera_motion``; by default the weights are taken as they are.
+    features a passer-by adds to the view, they have no weight. Where many contradict it, it is compared with
+    the pose of all pairs. Arguments as for ``camera_motion``; by default the weights are taken as they are.
     """
     is_established = _established(observers)
-    # However well pixels are found, depth has the errors of its sensor.
-    fitted = weights / np.array([variance, variance, 1.0])
+    fitted = _fitted(weights, variance)
+    poses = []
     if is_established is not None:
         T_found, _ = refined(
             T_camera_world,
@@ -125,20 +134,39 @@ def refined_by_established(
             fitted,
         )
         agree = agreeing(T_found, points_world, observation, features, weights)
-        if agree[is_established].sum() >= _MIN_KEPT_RATIO * is_established.sum():
-            if _MORE * agree.mean() < 1.0:
-                T_all, _ = refined(T_camera_world, points_world, observation, features, fitted)
-                agree_all = agreeing(T_all, points_world, observation, features, weights)
-                if (
-                    agree_all.sum() > _MORE * agree.sum()
-                    and agree_all[is_established].sum() >= _AS_WELL * agree[is_established].sum()
-                    and _spread_m(points_world[agree_all & ~agree]) > _WIDER * _spread_m(points_world[agree])
-                ):
-                    return T_all, agree_all
-            T_found, _ = refined(T_found, points_world[agree], observation, features[agree], fitted)
+        contradict = float((~agree).mean())
+        T_found, _ = refined(T_found, points_world[agree], observation, features[agree], fitted)
+        if contradict <= _MOST_CONTRADICT:
             return T_found, agreeing(T_found, points_world, observation, features, weights)
+        poses.append(T_found)
     T_found, _ = refined(T_camera_world, points_world, observation, features, fitted)
+    poses.append(T_found)
+    T_found = _most_supported(poses, points_world, observation, features, fitted)
     return T_found, agreeing(T_found, points_world, observation, features, weights)
+
+
+def _fitted(weights: Array, variance: float) -> Array:
+    """Return the (N, 3) weights by which poses are fitted.
+
+    However well pixels are found, depth has the errors of its sensor.
+    """
+    fitted: Array = weights / np.array([variance, variance, 1.0])
+    return fitted
+
+
+def _most_supported(
+    poses: Sequence[Transform],
+    points_world: Points,
+    observation: ImageObservation,
+    features: NDArray[np.integer],
+    weights: Array,
+) -> Transform:
+    """Return the first pose unless another one explains clearly more of the scene."""
+    pairs = points_world, observation.measured[features], weights[features], observation.intrinsics
+    shares = shares_of_scene(points_world)
+    gains = np.array([support(T, *pairs, shares) for T in poses])
+    gains[0] *= _CLEARLY
+    return poses[int(np.argmax(gains))]
 
 
 def agreeing(
