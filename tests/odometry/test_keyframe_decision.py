@@ -2,6 +2,7 @@
 
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from mapper.core.doubts import Doubt
@@ -31,3 +32,16 @@ def test_only_a_doubt_that_the_covariance_measures_lets_a_frame_become_a_keyfram
     decision = KeyframeDecision(config, landmark_map=None)
 
     assert decision.is_due(SimpleNamespace(inliers=100, depth=depth, doubts=doubts)) is is_due
+
+
+@pytest.mark.parametrize(("with_depth", "is_due"), [(40, False), (80, True)])
+def test_features_with_depth_that_are_no_landmarks_yet_end_tracking_by_depth(with_depth, is_due):
+    decision = KeyframeDecision(LocalMapConfig(), landmark_map=None)
+    tracked_pose = SimpleNamespace(
+        inliers=0,
+        depth=SimpleNamespace(unobservable="rotation about y", observes_next=False, overlap=1.0),
+        doubts=(UNOBSERVED,),
+        observation=SimpleNamespace(has_depth=np.arange(800) < with_depth),
+    )
+    due = [decision.is_due(tracked_pose) for _ in range(4)]
+    assert due == [False, False, False, is_due]

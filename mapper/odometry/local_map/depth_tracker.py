@@ -19,6 +19,7 @@ from mapper.odometry.local_map.depth_alignment import (
 from mapper.odometry.local_map.depth_kernels import Landmarks, PosePrior
 from mapper.odometry.local_map.depth_surfaces import DepthCells, DepthSurface, surface_of
 from mapper.odometry.local_map.earlier_depth import EarlierDepth
+from mapper.odometry.local_map.far_features import turned_by_far_features
 from mapper.odometry.local_map.image_observation import ImageObservation
 from mapper.odometry.local_map.landmarks import LandmarkMap
 from mapper.odometry.local_map.local_search import LocalSearch
@@ -115,7 +116,7 @@ class DepthTracker:
             return found
         if found is None and self._unobserved_s(observation) > _MAX_UNOBSERVED_S:
             return None
-        predicted = _predicted(observation, last, T_predicted)
+        predicted = self._turned(_predicted(observation, last, T_predicted), observation, last)
         starts = [] if found is None else [found.T_camera_world]
         for T_camera_world in (*starts, predicted.T_camera_world):
             alignment = self._aligned(observation, T_camera_world, predicted, last, found)
@@ -140,6 +141,20 @@ class DepthTracker:
             return self._by_depth(observation, alignment, reference, predicted)
         joint = self._aligned(observation, found.T_camera_world, predicted, last, found)
         return found if joint is None else self._by_both(observation, joint, found, predicted)
+
+    def _turned(
+        self, predicted: _Prediction, observation: ImageObservation, last: TrackedPose
+    ) -> _Prediction:
+        """Return a prediction whose rotation features of unknown depth show, if there are enough."""
+        elapsed_s = (observation.stamp_ns - last.stamp_ns) / NS_PER_S
+        T_camera_world = turned_by_far_features(
+            self._search,
+            observation,
+            last,
+            predicted.T_camera_world,
+            sigma_m=predicted.speed_sigma * elapsed_s,
+        )
+        return replace(predicted, T_camera_world=T_camera_world)
 
     def _suffices(self, found: TrackedPose) -> bool:
         """Return whether landmarks alone give a pose: many, or some that determine the translation.

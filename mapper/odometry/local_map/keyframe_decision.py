@@ -10,6 +10,8 @@ _MIN_GAP = 4
 _RECENT_NS = 150_000_000
 """Time for which it is recent at most: four frames at 30 Hz. At 5 Hz four frames may show a whole turn, and
 the landmarks of one keyframe place the last of them badly."""
+_ENOUGH_NEW = 4
+"""Features with depth, relative to ``min_inliers``, by which a keyframe may end tracking by depth alone."""
 _DEPTH_OVERLAP = 0.9
 """With less overlap of the surfaces a frame without landmarks becomes a keyframe: what is left may not show
 every motion."""
@@ -44,7 +46,8 @@ class KeyframeDecision:
             return True
         if tracked_pose.depth is not None and inliers < config.min_inliers:
             textured = (
-                tracked_pose.observation.has_depth.sum() >= config.weak_inliers and self._frames >= _MIN_GAP
+                tracked_pose.observation.has_depth.sum() >= _ENOUGH_NEW * config.min_inliers
+                and self._frames >= _MIN_GAP
             )
             return textured or tracked_pose.depth.overlap < _DEPTH_OVERLAP
         kept_ratio = inliers / self._most_inliers
