@@ -1,6 +1,6 @@
 """Bundles of a few keyframes by themselves, and parameters of the sensor that are common to them."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -67,40 +67,43 @@ Corrected = Callable[[Bundle, Array], tuple[Bundle, Array]]
 
 
 def estimated(
-    bundle: Bundle, corrected: Corrected, *, parameters: int, steps: int, max_step: float
+    bundle: Bundle, corrected: Corrected, *, prior_sigmas: Array, max_steps: Array, sigmas: Sequence[float]
 ) -> tuple[Array, Array]:
-    """Return the (N,) values of parameters of the sensor and their (N, N) information.
+    """Return the (N,) values of parameters of the sensor and their (N, N) information without the prior.
 
-    Both are 0 if one of them is not observable.
+    Both are 0 if the bundle tells nothing.
 
     They are more unknowns of a bundle adjustment (Triggs et al. 2000, §2.2), whose first keyframe stays where
     it is.
 
     Args:
         bundle: Keyframes that share their points.
-        corrected: How the parameters change the bundle.
-        parameters: Their number N.
-        steps: Largest number of Gauss–Newton steps, each after an adjustment.
-        max_step: Largest change of a parameter at each of them; all steps are scaled by the same factor.
+        corrected: How the parameters, and perhaps more, change the bundle.
+        prior_sigmas: (N,) standard deviations of the values before; they keep what is not observable near 0.
+        max_steps: (N,) largest changes of the parameters at a step, which is scaled as a whole.
+        sigmas: Factor on all standard deviations at each Gauss–Newton step, which follows an adjustment: with
+            larger ones at first, what the parameters displace is no outlier (graduated non-convexity, Yang et
+            al. 2020). Where it is 1 it may be the last step.
     """
+    parameters = len(prior_sigmas)
     values, nothing = np.zeros(parameters), np.zeros((parameters, parameters))
-    information = nothing
+    prior, information = np.diag(prior_sigmas**-2.0), nothing
     if not len(bundle.edges):
         return values, nothing
     first_edge = np.searchsorted(bundle.edges[:, 1], np.arange(len(bundle.points) + 1)).astype(np.int32)
     free = np.arange(-1, len(bundle.poses) - 1, dtype=np.int32)
-    for _ in range(steps):
+    for factor in sigmas:
         at, slopes = corrected(bundle, values)
-        observed = Observations(first_edge, at.edges, at.measured, at.weights, at.intrinsics)
+        observed = Observations(first_edge, at.edges, at.measured, at.weights / factor**2, at.intrinsics)
         poses, points, agree = adjust(at.poses, free, at.points, observed, _NO_LINKS, _ROUNDS, _ITERATIONS)
         bundle = replace(bundle, poses=poses, points=points)
         information, gradient = common_parameters(poses, free, points, observed, agree, slopes)
-        if np.linalg.eigvalsh(information)[0] <= 0.0:
+        if np.linalg.eigvalsh(information + prior)[0] <= 0.0:
             return np.zeros(parameters), nothing
-        step = -np.linalg.solve(information, gradient)
-        step *= min(1.0, max_step / max(np.abs(step).max(), 1e-12))
+        step = -np.linalg.solve(information + prior, gradient + prior @ values)
+        step /= max(1.0, (np.abs(step) / max_steps).max())
         values = values + step
-        if step @ information @ step < parameters * _CONVERGED_SIGMAS**2:
+        if factor == 1.0 and step @ (information + prior) @ step < parameters * _CONVERGED_SIGMAS**2:
             break
     return values, information
 
@@ -108,12 +111,16 @@ def estimated(
 class WindowEstimates:
     """Estimates of parameters in windows that share no observation, whose spread gives the uncertainty."""
 
-    def __init__(self, *, least: int) -> None:
+    def __init__(self, prior_sigmas: Array, max_steps: Array, *, sigmas: Sequence[float], least: int) -> None:
         """Start without any.
 
         Args:
+            prior_sigmas: As for ``estimated``.
+            max_steps: As for ``estimated``.
+            sigmas: As for ``estimated``.
             least: With fewer windows there is no estimate.
         """
+        self._prior_sigmas, self._max_steps, self._sigmas = prior_sigmas, max_steps, sigmas
         self._least = least
         self._values: list[Array] = []
         self._information: list[Array] = []
@@ -123,8 +130,15 @@ class WindowEstimates:
         """Whether enough windows were added."""
         return len(self._values) >= _MAX_WINDOWS
 
-    def add(self, values: Array, information: Array) -> None:
-        """Add a window's (N,) estimate, unless it has no (N, N) information."""
+    def add(self, bundle: Bundle, corrected: Corrected) -> None:
+        """Add the estimate of a window's bundle, unless that tells nothing."""
+        values, information = estimated(
+            bundle,
+            corrected,
+            prior_sigmas=self._prior_sigmas,
+            max_steps=self._max_steps,
+            sigmas=self._sigmas,
+        )
         if information.any():
             self._values.append(values)
             self._information.append(information)
@@ -134,9 +148,61 @@ class WindowEstimates:
         if len(self._values) < self._least:
             return None
         values, information = np.array(self._values), np.array(self._information)
-        total = information.sum(axis=0)
+        total = information.sum(axis=0) + np.diag(self._prior_sigmas**-2.0)
         mean: Array = np.linalg.solve(total, np.einsum("kij,kj->i", information, values))
         apart = values - mean
         excess = float(np.einsum("ki,kij,kj->", apart, information, apart)) / (values.size - len(mean))
         sigma: Array = np.sqrt(max(excess, 1.0) * np.diag(np.linalg.inv(total)))
         return mean, sigma
+
+
+class NestedEstimates:
+    """Estimates of some parameters with more of them, which are dropped where they may be nothing.
+
+    Those hardly differ from the first ones in what they do, so that these are less certain with them.
+    """
+
+    def __init__(
+        self, prior_sigmas: Array, max_steps: Array, *, first: int, sigmas: Sequence[float], least: int
+    ) -> None:
+        """Start without any.
+
+        Args:
+            prior_sigmas: (N,) as for ``estimated``.
+            max_steps: (N,) as for ``estimated``.
+            first: The number of parameters that are estimated without the others.
+            sigmas: As for ``estimated``.
+            least: As for ``WindowEstimates``.
+        """
+        self._first, self._more = first, len(prior_sigmas) - first
+        self._all = WindowEstimates(prior_sigmas, max_steps, sigmas=sigmas, least=least)
+        self._some = WindowEstimates(prior_sigmas[:first], max_steps[:first], sigmas=sigmas, least=least)
+
+    @property
+    def are_complete(self) -> bool:
+        """Whether enough windows were added."""
+        return self._all.are_complete
+
+    def add(self, bundle: Bundle, corrected: Corrected) -> None:
+        """Add the estimates of a window's bundle, unless that tells nothing."""
+
+        def corrected_by_first(bundle: Bundle, values: Array) -> tuple[Bundle, Array]:
+            changed, slopes = corrected(bundle, np.append(values, np.zeros(self._more)))
+            return changed, slopes[: self._first]
+
+        self._all.add(bundle, corrected)
+        self._some.add(bundle, corrected_by_first)
+
+    def mean(self, is_off: Callable[[Array, Array], NDArray[np.bool_]]) -> tuple[Array, Array] | None:
+        """Return the (N,) means and their standard deviations; None where windows are too few.
+
+        Args:
+            is_off: Returns which of (N,) values with such standard deviations are not 0. If none but first
+                ones are, the others are 0.
+        """
+        found = self._all.mean()
+        if found is None or is_off(*found)[self._first :].any():
+            return found
+        some = self._some.mean()
+        nothing = np.zeros(self._more)
+        return None if some is None else (np.append(some[0], nothing), np.append(some[1], nothing))

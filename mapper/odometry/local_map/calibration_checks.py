@@ -3,22 +3,20 @@
 from collections.abc import Sequence
 
 from mapper.odometry.local_map.bundle import WINDOW_KEYFRAMES
-from mapper.odometry.local_map.depth_offset import DepthOffsetCheck
+from mapper.odometry.local_map.depth_image_check import DepthImageCheck
 from mapper.odometry.local_map.intrinsics_check import IntrinsicsCheck
 from mapper.odometry.local_map.landmarks import LandmarkMap
 from mapper.odometry.local_map.pose_tracker import TrackedPose
-from mapper.odometry.local_map.registration_check import RegistrationCheck
 
 
 class CalibrationChecks:
-    """Checks of the intrinsics, of the registration of depth, and of the time between the two images."""
+    """Checks of the intrinsics, and of where and when depth images show what colour images do."""
 
     def __init__(self, landmark_map: LandmarkMap) -> None:
         """Start with an empty map."""
         self._map = landmark_map
         self._intrinsics = IntrinsicsCheck()
-        self._registration = RegistrationCheck()
-        self._depth_offset = DepthOffsetCheck()
+        self._depth_images = DepthImageCheck()
 
     def pass_frame(self, before: TrackedPose | None, last: TrackedPose, now: TrackedPose) -> None:
         """Estimate the velocity of a keyframe from the frames about it, unless something moves by itself."""
@@ -26,7 +24,7 @@ class CalibrationChecks:
             return
         if all(pose.few_move for pose in (before, last, now)):
             around = ((pose.stamp_ns, pose.T_camera_world) for pose in (before, now))
-            self._depth_offset.pass_keyframe(last.reference, *around)
+            self._depth_images.pass_keyframe(last.reference, *around)
 
     def pass_keyframe(self) -> None:
         """Check the newest keyframes of a sub-map together, once there are enough since the last check."""
@@ -35,24 +33,19 @@ class CalibrationChecks:
         origins = {keyframes[k].origin for k in newest if k >= 0}
         if len(keyframes) % WINDOW_KEYFRAMES or len(origins) > 1:
             return
-        checks = self._intrinsics, self._registration, self._depth_offset
-        if all(check.is_complete for check in checks):
+        if self._intrinsics.is_complete and self._depth_images.is_complete:
             return
         bundle = self._map.bundle(newest)
         if not self._intrinsics.is_complete:
             self._intrinsics.add(bundle)
-        if not self._registration.is_complete:
-            self._registration.add(bundle, map(self._map.observation, newest))
-        if not self._depth_offset.is_complete:
-            self._depth_offset.add(bundle, newest, map(self._map.observation, newest))
+        if not self._depth_images.is_complete:
+            self._depth_images.add(bundle, newest, map(self._map.observation, newest))
 
     def contradictions(self) -> Sequence[str]:
         """Return what contradicts the calibration and the stamps of depth images, a sentence each."""
         if not self._map.keyframes:
             return ()
-        found = (
-            self._intrinsics.contradiction(self._map.observation(0).intrinsics),
-            self._registration.contradiction(),
-            self._depth_offset.contradiction(),
-        )
-        return [sentence for sentence in found if sentence]
+        doubts = self._depth_images.contradictions()
+        if self._depth_images.are_registered:  # else depth of other pixels falsifies the intrinsics
+            doubts += self._intrinsics.contradictions(self._map.observation(0).intrinsics)
+        return doubts
