@@ -89,3 +89,14 @@ def test_the_way_along_such_a_road_is_doubtful_from_the_first_scan_on():
 
 def test_a_sensor_that_stands_between_houses_is_tracked():
     assert not any(track.doubts for track in tracks(12, has_houses=True))
+
+
+def test_far_rings_have_the_normal_of_the_road():
+    config = GicpOdometryConfig()
+    deskewed = ScanOdometry(config, GicpMatcher(config)).observe(road_scan(0, seed=1)).deskewed
+    assert deskewed is not None
+    points, normals = deskewed.prepared.points, deskewed.prepared.normals
+    distance_m = np.hypot(points[:, 0], points[:, 1])
+    is_far = (points[:, 2] < 0.1 - SENSOR_M) & (distance_m > 8.0) & (distance_m < 12.0)
+    assert is_far.sum() > 100
+    assert np.degrees(np.median(np.arccos(np.minimum(normals[is_far, 2], 1.0)))) < 0.5

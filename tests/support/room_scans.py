@@ -41,5 +41,5 @@ def room_scan(stamp_ns, T_world_body=None, *, seed=0, points=6000, noise_m=0.02,
 
 
 def keyframe(scan, *, voxel_m=0.2):
-    deskewed = DeskewedScan(scan, prepared(scan.points_body, voxel_m=voxel_m))
+    deskewed = DeskewedScan(scan, prepared(scan.points_body, voxel_m=voxel_m, origin=scan.origin_body))
     return ScanKeyframe(0, deskewed, np.eye(4), np.eye(4))

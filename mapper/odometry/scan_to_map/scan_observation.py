@@ -119,4 +119,4 @@ def observe_scan(frame: Frame, config: ScanOdometryConfig) -> ScanObservation:
 
 
 def _prepared(scan: Scan, voxel_m: float) -> DeskewedScan:
-    return DeskewedScan(scan, prepared(scan.points_body, voxel_m=voxel_m))
+    return DeskewedScan(scan, prepared(scan.points_body, voxel_m=voxel_m, origin=scan.origin_body))
