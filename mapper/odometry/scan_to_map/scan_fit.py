@@ -164,7 +164,8 @@ def _checked(deskewed: DeskewedScan) -> Points32:
     is_surface = prepared.spacing_m[::step] <= apart_m
     facing = np.abs(np.einsum("ni,ni->n", prepared.normals[::step], rays))
     sine = np.clip(facing / np.maximum(ranges_m, _MARGIN_M), _GRAZING, 1.0)
-    beyond = _PIXELS * _DIRECTION_RAD * np.sqrt(1.0 - sine**2) / sine
+    turned = _PIXELS * _DIRECTION_RAD * np.sqrt(1.0 - sine**2)
+    beyond = turned / np.maximum(sine - turned, _GRAZING)
     hit = origin + rays * (1.0 + beyond[:, None])
     return np.ascontiguousarray(hit[is_surface].astype(np.float32))
 
