@@ -27,13 +27,11 @@ class KdTree:
         points: (N, 3) in the order of the leaves; queries return indices into it.
         axes: (M,) axes of the inner nodes' cuts; node i has the children 2i and 2i + 1, the root is 1.
         cuts: (M,) coordinates of the cuts on these axes.
-        order: (N,) numbers that the points had before.
     """
 
     points: Points
     axes: NDArray[np.int8]
     cuts: Array
-    order: NDArray[np.int64]
 
     def nearest(self, queries: Points) -> tuple[NDArray[np.int64], Array]:
         """Return the (Q,) indices of the points nearest to (Q, 3) positions, and their distances, metres."""
@@ -63,13 +61,12 @@ def kd_tree(points: Points | Points32) -> KdTree:
     ordered = np.array(points, np.float64)
     levels = max(0, (len(ordered) - 1) // _LEAF_POINTS).bit_length()
     axes, cuts = np.zeros(1 << levels, np.int8), np.zeros(1 << levels)
-    order = np.arange(len(ordered))
-    _grow(ordered, order, axes, cuts)
-    return KdTree(ordered, axes, cuts, order)
+    _grow(ordered, axes, cuts)
+    return KdTree(ordered, axes, cuts)
 
 
 @njit(cache=True, nogil=True)
-def _grow(points, order, axes, cuts):  # type: ignore[no-untyped-def]
+def _grow(points, axes, cuts):  # type: ignore[no-untyped-def]
     """Order the points, and fill in the inner nodes level by level."""
     inner = len(axes)
     begins, ends = np.zeros(2 * inner, np.int64), np.zeros(2 * inner, np.int64)
@@ -78,7 +75,7 @@ def _grow(points, order, axes, cuts):  # type: ignore[no-untyped-def]
         begin, end = begins[node], ends[node]
         middle = (begin + end) // 2
         axis = _widest_axis(points, begin, end)
-        _part(points, order, axis, begin, end, middle)
+        _part(points, axis, begin, end, middle)
         axes[node], cuts[node] = axis, points[middle, axis]
         begins[2 * node], ends[2 * node] = begin, middle
         begins[2 * node + 1], ends[2 * node + 1] = middle, end
@@ -97,7 +94,7 @@ def _widest_axis(points, begin, end):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _part(points, order, axis, begin, end, middle):  # type: ignore[no-untyped-def]
+def _part(points, axis, begin, end, middle):  # type: ignore[no-untyped-def]
     """Move what is smaller than the ``middle``-th along an axis before it, the rest behind (Hoare 1961)."""
     low, high = begin, end - 1
     while low < high:
@@ -112,7 +109,6 @@ def _part(points, order, axis, begin, end, middle):  # type: ignore[no-untyped-d
             if i <= j:
                 for k in range(3):
                     points[i, k], points[j, k] = points[j, k], points[i, k]
-                order[i], order[j] = order[j], order[i]
                 i += 1
                 j -= 1
         if middle <= j:

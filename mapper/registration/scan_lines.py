@@ -13,7 +13,6 @@ from numba import njit
 from numpy.typing import NDArray
 
 from mapper.core.geometry import Array
-from mapper.registration.kd_tree import STACK, KdTree, kd_tree, search
 
 _LINE = 12.0
 """Ratio of the two largest variances of a point's neighbours, from which on they lie on a line."""
@@ -27,15 +26,18 @@ _STRAIGHT = 0.9  # least cosine of a surface's bend from one line to the next, 2
 _STRAIGHT_BESIDE = 0.95  # 18 degrees, where both lines are on one side, as at the end of a wall
 _ALONG_BEAM = 0.1  # least sine of the angle between a beam and a line that was scanned across it
 _SQUARINGS = 3  # of a covariance: its second axis is left with a part of _LINE⁻⁸
+_CELL = 0.05  # edge of the cells that beams are sorted into, about the angles that are searched
+_CELLS = 48  # along each axis, from -_EDGE: they hold all unit vectors
+_EDGE = 1.2
 
 
 def fit_across_lines(
-    tree: KdTree, about: NDArray[np.int64], elongation: Array, origin: Array, normals: Array, breadth: Array
+    points: Array, about: NDArray[np.int64], elongation: Array, origin: Array, normals: Array, breadth: Array
 ) -> None:
     """Replace the normals of points on scan lines, and the breadths of their planes.
 
     Args:
-        tree: Of the points.
+        points: (N, 3).
         about: (N, K) numbers of the points nearest to each.
         elongation: (N,) ratio of the two largest variances of these.
         origin: (3,) where the beams begin, metres.
@@ -45,10 +47,10 @@ def fit_across_lines(
     numbers = np.flatnonzero(elongation > _LINE)
     if len(numbers) == 0:
         return
-    beams = tree.points - origin
+    beams = points - origin
     ranges_m = np.sqrt(_dots(beams, beams))
     beams /= np.maximum(ranges_m, np.finfo(float).tiny)[:, None]
-    lines = _ScanLines(tree.points, beams, kd_tree(beams), about, numbers, _FARTHEST * ranges_m[numbers])
+    lines = _ScanLines(points, beams, about, numbers, _FARTHEST * ranges_m[numbers])
     one, other = lines.next_lines(1.0), lines.next_lines(-1.0)
     way = one.offsets_m - other.offsets_m
     off = one.offsets_m.copy()
@@ -64,7 +66,7 @@ def fit_across_lines(
     is_known &= lengths > 0.0
     kept = numbers[is_known]
     across = across[is_known] / lengths[is_known, None]
-    across *= np.where(_dots(across, tree.points[kept]) > 0.0, -1.0, 1.0)[:, None]
+    across *= np.where(_dots(across, points[kept]) > 0.0, -1.0, 1.0)[:, None]
     normals[kept] = across
     apart = 0.25 * _dots(way, way)[is_known]
     off_plane = _dots(across, off[is_known]) ** 2 + lines.variances[is_known] / about.shape[1]
@@ -98,7 +100,6 @@ class _ScanLines:
         self,
         points: Array,
         beams: Array,
-        of_beams: KdTree,
         about: NDArray[np.int64],
         numbers: NDArray[np.intp],
         farthest_m: Array,
@@ -108,12 +109,11 @@ class _ScanLines:
         Args:
             points: (N, 3).
             beams: (N, 3) their directions from the sensor.
-            of_beams: Tree of these.
             about: (N, K) numbers of the points nearest to each.
             numbers: (L,) of the points on lines.
             farthest_m: (L,) largest distance of the lines beside them.
         """
-        self._points, self._beams, self._tree = points, beams, of_beams
+        self._points, self._beams, self._sorted = points, beams, _sorted_by_cell(beams)
         self._own, self._farthest_m = beams[numbers], farthest_m
         self._centres, self.along, self.variances = _fitted(points, about, numbers)
         across = np.cross(self._own, self.along)
@@ -142,9 +142,10 @@ class _ScanLines:
     ) -> NDArray[np.int64]:
         """Return the points whose beams are nearest to directions beside some lines; -1 if none is near."""
         queries = self._own[ones] + np.reshape(angles, (-1, 1)) * self._across[ones]
-        tree, limits = self._tree, np.broadcast_to(within, len(ones))
-        found = _nearest_within(tree.points, tree.axes, tree.cuts, queries, limits)
-        return np.where(found < 0, -1, tree.order[found])
+        found: NDArray[np.int64] = _nearest_within(
+            *self._sorted, queries, np.broadcast_to(np.asarray(within, np.float64), len(ones))
+        )
+        return found
 
     def _beside(self, numbers: NDArray[np.int64], sign: float) -> _LinesBeside:
         """Return where scan lines lie by one point of each; -1 is none."""
@@ -167,18 +168,48 @@ def _is_straight(one: Array, other: Array, cosine: float) -> NDArray[np.bool_]:
 
 
 @njit(cache=True, nogil=True)
-def _nearest_within(beams, axes, cuts, queries, limits):  # type: ignore[no-untyped-def]
-    """Return the (Q,) indices of the beams nearest to directions; -1 if none is within a distance."""
-    found = np.full(len(queries), -1)
-    branches, offsets = np.empty((STACK, 3), np.int64), np.empty((STACK, 4))
-    query, index, squared = np.empty(3), np.zeros(1, np.int64), np.empty(1)
-    for q in range(len(queries)):
+def _sorted_by_cell(beams):  # type: ignore[no-untyped-def]
+    """Return unit vectors in the order of their cells, their numbers, and where each cell begins."""
+    begins = np.zeros(_CELLS**3 + 1, np.int64)
+    cells = np.empty(len(beams), np.int64)
+    for i in range(len(beams)):
+        cell = 0
         for k in range(3):
-            query[k] = queries[q, k]
-        squared[0] = limits[q] * limits[q]
-        search(beams, axes, cuts, query, index, squared, branches, offsets)
-        if squared[0] < limits[q] * limits[q]:
-            found[q] = index[0]
+            cell = cell * _CELLS + int((beams[i, k] + _EDGE) / _CELL)
+        cells[i] = cell
+        begins[cell + 1] += 1
+    for cell in range(_CELLS**3):
+        begins[cell + 1] += begins[cell]
+    ends = begins.copy()
+    ordered, order = np.empty_like(beams), np.empty(len(beams), np.int64)
+    for i in range(len(beams)):
+        at = ends[cells[i]]
+        ends[cells[i]] += 1
+        order[at] = i
+        for k in range(3):
+            ordered[at, k] = beams[i, k]
+    return ordered, order, begins
+
+
+@njit(cache=True, nogil=True)
+def _nearest_within(beams, order, begins, queries, limits):  # type: ignore[no-untyped-def]
+    """Return the (Q,) numbers of the beams nearest to directions; -1 if none is within a distance."""
+    found = np.full(len(queries), -1)
+    low, high = np.empty(3, np.int64), np.empty(3, np.int64)
+    for q in range(len(queries)):
+        least = limits[q] * limits[q]
+        for k in range(3):
+            low[k] = max(int((queries[q, k] - limits[q] + _EDGE) / _CELL), 0)
+            high[k] = min(int((queries[q, k] + limits[q] + _EDGE) / _CELL), _CELLS - 1)
+        for x in range(low[0], high[0] + 1):
+            for y in range(low[1], high[1] + 1):
+                column = (x * _CELLS + y) * _CELLS
+                for i in range(begins[column + low[2]], begins[column + high[2] + 1]):
+                    squared = 0.0
+                    for k in range(3):
+                        squared += (beams[i, k] - queries[q, k]) ** 2
+                    if squared < least:
+                        least, found[q] = squared, order[i]
     return found
 
 

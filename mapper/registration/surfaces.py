@@ -98,7 +98,7 @@ def _surroundings(tree: KdTree, neighbours: int, origin: Array | None) -> tuple[
         elongation = np.ones(len(tree.points))
         _fit_normals(tree.points, about, normals, breadth, elongation)
         if origin is not None:
-            fit_across_lines(tree, about, elongation, origin, normals, breadth)
+            fit_across_lines(tree.points, about, elongation, origin, normals, breadth)
         spacing_m = np.sqrt(squared[:, _SPACING_NEIGHBOUR])
     return normals, spacing_m, breadth
 
