@@ -295,6 +295,28 @@ def test_a_direction_that_disagrees_is_a_doubt_where_the_motion_was_predicted(is
 
 
 @pytest.mark.parametrize(
+    ("method", "shares", "is_doubted"),
+    [
+        ("rescued", Shares(0.5, 0.28, 0.008), True),
+        ("keyframe", Shares(0.5, 0.28, 0.008), False),
+        ("rescued", Shares(0.5, 0.5, 0.008), False),  # more agrees
+        ("rescued", Shares(0.5, 0.28, 0.0035), False),  # about as usual
+    ],
+)
+def test_a_pose_that_only_a_wide_search_found_has_to_agree_more(method, shares, is_doubted):
+    key, scan = keyframe(room_scan(0, seed=1)), keyframe(room_scan(1, OFF, seed=2)).deskewed
+    fit = fit_of(key, scan, OFF, max_pair_distance_m=0.5)
+    search = PoseSearch(GicpOdometryConfig(), GicpMatcher(GicpOdometryConfig()))
+    for _ in range(6):
+        search.usual.add(Shares(0.5, 0.9, 0.001))
+
+    candidate = PoseCandidate(key, OFF, fit, shares, jump_between(OFF, OFF, None), MEASURED, method)
+
+    kinds = [doubt.kind for doubt in search.doubts(candidate)]
+    assert ("points in free space" in kinds) == is_doubted
+
+
+@pytest.mark.parametrize(
     ("usual_contradicting", "shares", "contradicts"),
     [
         (0.001, Shares(0.5, 0.15, 0.0105), True),

@@ -282,8 +282,8 @@ class PoseSearch:
             return ()
         usual, shares = self.usual, candidate.shares
         little = usual.has_little_overlap(shares, usual_ratio=self._config.usual_ratio)
-        contradicts, disagrees = usual.contradicts(shares), usual.disagrees(shares)
-        jumps = candidate.jump.is_unusual
+        contradicts = usual.contradicts(shares, is_rescued=candidate.method == "rescued")
+        disagrees, jumps = usual.disagrees(shares), candidate.jump.is_unusual
         if not usual.is_known:
             little = disagrees = False
         is_alone = not contradicts and little + disagrees + jumps < 2

@@ -26,6 +26,9 @@ wrong ones 0.013 to 0.03 and more. It may be so many times the usual one where p
 _LEAST_SCORE = 0.1
 """Part of the usual score below which fewer contradictions are too many: scans 1.5 s apart had 0.6 and more
 under right poses, and less than 0 under wrong ones. 0 serves as well; with 0.25 right scans are doubtful."""
+_LEAST_RESCUED_SCORE = 0.25
+"""That part for poses of a wide search: all 3 below it that contradict were wrong by 3.5 to 7 degrees. 0.2
+and 0.4 serve as well."""
 _FIRST_SCANS, _FIRST_OVERLAP, _FIRST_AGREEMENT, _FIRST_SPREAD = 3, 0.7, 0.4, 1.5
 """The first scans of a map that all contradict, by shares within this factor of each other, while so much
 overlaps and agrees, do so by rain, dust or a crowd: under wrong poses they agree less and differ more."""
@@ -164,14 +167,16 @@ class UsualFit:
         excess = max(shares.contradicting - self.usual.contradicting, 0.0)
         return shares.agreement - _CONTRADICTION_WEIGHT * excess < _LITTLE * usual
 
-    def contradicts(self, shares: Shares) -> bool:
-        """Return whether too much stands where rays passed: at all, or for the little that agrees."""
+    def contradicts(self, shares: Shares, *, is_rescued: bool = False) -> bool:
+        """Return whether too much stands where rays passed: at all, or for the little that agrees.
+
+        A pose that only a wide search found has to agree more.
+        """
         usual = self.usual
+        least_score = (_LEAST_RESCUED_SCORE if is_rescued else _LEAST_SCORE) * usual.score
         if shares.contradicting <= _TIMES_CONTRADICTING * usual.contradicting:
             return False
-        return shares.contradicting > _MAX_CONTRADICTING or (
-            usual.score > 0.0 and shares.score < _LEAST_SCORE * usual.score
-        )
+        return shares.contradicting > _MAX_CONTRADICTING or (usual.score > 0.0 and shares.score < least_score)
 
     def excludes(self, shares: Shares) -> bool:
         """Return whether it is another place: much stands where rays passed, a direction hardly agrees."""
