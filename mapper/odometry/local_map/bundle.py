@@ -193,16 +193,32 @@ class NestedEstimates:
         self._all.add(bundle, corrected)
         self._some.add(bundle, corrected_by_first)
 
-    def mean(self, is_off: Callable[[Array, Array], NDArray[np.bool_]]) -> tuple[Array, Array] | None:
+    def mean(self, *, least: Array, min_sigmas: float) -> tuple[Array, Array] | None:
         """Return the (N,) means and their standard deviations; None where windows are too few.
 
         Args:
-            is_off: Returns which of (N,) values with such standard deviations are not 0. If none but first
-                ones are, the others are 0.
+            least: As for ``are_significant``, of those that are not first ones: where none is, they are 0.
+            min_sigmas: Likewise.
         """
         found = self._all.mean()
-        if found is None or is_off(*found)[self._first :].any():
+        if found is None:
+            return None
+        values, sigmas = (figures[self._first :] for figures in found)
+        if are_significant(values, sigmas, least=least, min_sigmas=min_sigmas).any():
             return found
         some = self._some.mean()
         nothing = np.zeros(self._more)
         return None if some is None else (np.append(some[0], nothing), np.append(some[1], nothing))
+
+
+def are_significant(values: Array, sigmas: Array, *, least: Array, min_sigmas: float) -> NDArray[np.bool_]:
+    """Return (N,) which values are large enough to count, and certainly not 0.
+
+    Args:
+        values: (N,).
+        sigmas: (N,) their standard deviations.
+        least: (N,) from where on they count.
+        min_sigmas: Number of standard deviations from which on they are not 0.
+    """
+    significant: NDArray[np.bool_] = np.abs(values) >= np.maximum(least, min_sigmas * sigmas)
+    return significant

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from mapper.core.geometry import Array, Transform, inverse, log
 from mapper.core.timebase import NS_PER_S
-from mapper.odometry.local_map.bundle import Bundle, NestedEstimates
+from mapper.odometry.local_map.bundle import Bundle, NestedEstimates, are_significant
 from mapper.odometry.local_map.depth_surfaces import surface_of
 from mapper.odometry.local_map.image_observation import ImageObservation
 from mapper.odometry.local_map.pixel_motion import depth_velocity, pixel_velocity
@@ -79,7 +79,7 @@ class DepthImageCheck:
         as a share of the colour images' focal length. The last three are taken as 0 where the images may be
         registered.
         """
-        return self._found.mean(_is_off)
+        return self._found.mean(least=_LEAST[1:], min_sigmas=_MIN_SIGMAS)
 
     @property
     def are_registered(self) -> bool:
@@ -114,8 +114,7 @@ class DepthImageCheck:
 
 def _is_off(values: Array, sigmas: Array) -> NDArray[np.bool_]:
     """Return (4,) which values are more than usual ones."""
-    is_off: NDArray[np.bool_] = np.abs(values) >= np.maximum(_LEAST, _MIN_SIGMAS * sigmas)
-    return is_off
+    return are_significant(values, sigmas, least=_LEAST, min_sigmas=_MIN_SIGMAS)
 
 
 class DepthElsewhere:

@@ -1,13 +1,11 @@
 """Check of a camera's intrinsics against its images: wrong ones stretch and shear a map without a loss."""
 
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mapper.core.geometry import Array
-from mapper.odometry.local_map.bundle import Bundle, NestedEstimates
+from mapper.odometry.local_map.bundle import Bundle, NestedEstimates, are_significant
 
 _MIN_WINDOWS, _MIN_OBSERVERS = 3, 3
 _PRIOR_SIGMAS = np.array([1.0, 1.0, 1.0, 1.0, 0.3])
@@ -18,8 +16,8 @@ _LEAST, _MIN_SIGMAS = np.array([0.03, 0.03, 0.035, 0.035, 0.03]), 5.0
 """Least errors that are told. Simulated logs with right intrinsics give a focal length within 0.002 of it,
 but a real depth image has errors, too: fr1_xyz gives 0.020 ± 0.006, parts of it 0.025 ± 0.007, and a k1 of
 0.015 ± 0.003."""
-_DISTORTED = np.array([np.inf, np.inf, np.inf, np.inf, 0.02])
-"""Least errors with which k1 is estimated."""
+_LEAST_K1 = np.array([0.02])
+"""Least error of k1 with which it is estimated."""
 _NAMES = ("fx", "fy", "cx", "cy")
 
 
@@ -52,7 +50,7 @@ class IntrinsicsCheck:
         cx and cy lack as a share of the focal length, and what the distortion's k1 lacks. Where that may be
         nothing it is taken as 0: it is hardly told from a focal length.
         """
-        return self._errors.mean(partial(_exceed, _DISTORTED))
+        return self._errors.mean(least=_LEAST_K1, min_sigmas=_MIN_SIGMAS)
 
     def contradictions(self, given_px: Array) -> list[str]:
         """Return in words that the images contradict the intrinsics.
@@ -64,7 +62,7 @@ class IntrinsicsCheck:
         if found is None:
             return []
         errors, sigmas = found
-        is_off = _exceed(_LEAST, errors, sigmas)
+        is_off = are_significant(errors, sigmas, least=_LEAST, min_sigmas=_MIN_SIGMAS)
         if not is_off.any():
             return []
         fitting_px = _moved(given_px[:4], errors)
@@ -92,12 +90,6 @@ class IntrinsicsCheck:
             f"the images fit {', '.join(wrong)}; distances across the view are wrong by as much: check the "
             f"log's calibration, or {' '.join(settings)} ({lens})"
         ]
-
-
-def _exceed(least: Array, errors: Array, sigmas: Array) -> NDArray[np.bool_]:
-    """Return (5,) which errors are at least so large, and certainly not 0."""
-    exceeds: NDArray[np.bool_] = np.abs(errors) >= np.maximum(least, _MIN_SIGMAS * sigmas)
-    return exceeds
 
 
 class _Intrinsics:
