@@ -28,9 +28,9 @@ def test_a_room_outweighs_a_person_with_more_features(seed, on_person):
     points = np.concatenate([room, person])
     seen = measured(apply(T_CAMERA_WORLD, np.concatenate([room, walked])), rng)
     weights = np.tile(np.array(WEIGHTS) ** -2.0, (len(points), 1))
-    found = sampled_pose(np.eye(4), points, seen, weights, INTRINSICS)
+    found = sampled_pose(np.eye(4), points, seen, weights, INTRINSICS, shares_of_scene(points))
     assert np.linalg.norm(log(found @ inverse(T_CAMERA_WORLD))[1]) < 0.02
-    again = sampled_pose(np.eye(4), points, seen, weights, INTRINSICS)
+    again = sampled_pose(np.eye(4), points, seen, weights, INTRINSICS, shares_of_scene(points))
     np.testing.assert_array_equal(found, again)
 
 

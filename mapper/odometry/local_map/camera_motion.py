@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,16 +80,10 @@ def camera_motion(
         T_camera_world, points_world, observation, features, observers, weights, variance
     )
     fitted = _fitted(weights, variance)
+    scene = _Scene(points_world, observation, features, fitted)
     fits = agreeing(T_found, points_world, observation, features, fitted)
     if len(fits) >= _ENOUGH_PAIRS and fits.mean() < _FITS:
-        T_sampled = sampled_pose(
-            T_camera_world,
-            points_world,
-            observation.measured[features],
-            fitted[features],
-            observation.intrinsics,
-        )
-        T_found = _most_supported([T_found, T_sampled], points_world, observation, features, fitted)
+        T_found = scene.most_supported([T_found, scene.sampled_pose(T_camera_world)])
         agree = agreeing(T_found, points_world, observation, features, weights)
     only_motion = CameraMotion(T_found, agree, np.zeros(len(features), np.bool_))
     least = max(_LEAST_OTHERS, _LEAST_OTHER_RATIO * len(features))
@@ -98,7 +93,7 @@ def camera_motion(
     agree_other = agreeing(T_other, points_world, observation, features, weights)
     if (agree_other & ~agree).sum() < least:
         return only_motion
-    if _most_supported([T_found, T_other], points_world, observation, features, fitted) is T_other:
+    if scene.most_supported([T_found, T_other]) is T_other:
         T_found, agree, agree_other = T_other, agree_other, agree
     is_other = agree_other & ~agree
     if _spread_m(points_world[is_other]) < _WIDE * _spread_m(points_world) and is_other.sum() < agree.sum():
@@ -142,7 +137,7 @@ def refined_by_established(
         poses.append(T_found)
     T_found, _ = refined(T_camera_world, points_world, observation, features, fitted)
     poses.append(T_found)
-    T_found = _most_supported(poses, points_world, observation, features, fitted)
+    T_found = _Scene(points_world, observation, features, fitted).most_supported(poses)
     return T_found, agreeing(T_found, points_world, observation, features, weights)
 
 
@@ -155,19 +150,34 @@ def _fitted(weights: Array, variance: float) -> Array:
     return fitted
 
 
-def _most_supported(
-    poses: Sequence[Transform],
-    points_world: Points,
-    observation: ImageObservation,
-    features: NDArray[np.integer],
-    weights: Array,
-) -> Transform:
-    """Return the first pose unless another one explains clearly more of the scene."""
-    pairs = points_world, observation.measured[features], weights[features], observation.intrinsics
-    shares = shares_of_scene(points_world)
-    gains = np.array([support(T, *pairs, shares) for T in poses])
-    gains[0] *= _CLEARLY
-    return poses[int(np.argmax(gains))]
+class _Scene:
+    """The matched part of a scene, and how much of it poses explain."""
+
+    def __init__(
+        self,
+        points_world: Points,
+        observation: ImageObservation,
+        features: NDArray[np.integer],
+        weights: Array,
+    ) -> None:
+        measured = observation.measured[features]
+        self._pairs = points_world, measured, weights[features], observation.intrinsics
+
+    @cached_property
+    def _shares(self) -> Array:
+        return shares_of_scene(self._pairs[0])
+
+    def sampled_pose(self, T_camera_world: Transform) -> Transform:
+        """Return the pose by samples, which begin with a (4, 4) pose."""
+        return sampled_pose(T_camera_world, *self._pairs, self._shares)
+
+    def most_supported(self, poses: Sequence[Transform]) -> Transform:
+        """Return the first pose unless another one explains clearly more of the scene."""
+        if len(poses) == 1:
+            return poses[0]
+        gains = np.array([support(T, *self._pairs, self._shares) for T in poses])
+        gains[0] *= _CLEARLY
+        return poses[int(np.argmax(gains))]
 
 
 def agreeing(

@@ -57,14 +57,18 @@ def support(T_camera_world, points, measured, weights, intrinsics, shares):  # t
 
 
 def sampled_pose(
-    T_camera_world: Transform, points: Points, measured: Array, weights: Array, intrinsics: Array
+    T_camera_world: Transform,
+    points: Points,
+    measured: Array,
+    weights: Array,
+    intrinsics: Array,
+    shares: Array,
 ) -> Transform:
     """Return the pose with most support among those of samples of the pairs.
 
     Locally optimised RANSAC (Chum, Matas & Kittler 2003) that draws pairs by their shares of the scene. The
-    draws are the same every time. Arguments as for ``refine_pose``.
+    draws are the same every time. Arguments as for ``support``.
     """
-    shares = shares_of_scene(points)
     ends = np.cumsum(shares)
     samples = np.minimum(np.searchsorted(ends, _TABLE * ends[-1]), len(points) - 1)
     T_best: Transform = _best_of_samples(
