@@ -17,8 +17,8 @@ from mapper.loops.closure import accepted_loops
 from mapper.loops.factory import build_loop_detector
 from mapper.odometry.base import FrameResult
 from mapper.odometry.config import IsvdOdometryConfig, MatchConfig
-from mapper.odometry.isvd_odometry import IsvdOdometry
-from mapper.odometry.isvd_registration import (
+from mapper.odometry.isvd.odometry import IsvdOdometry
+from mapper.odometry.isvd.registration import (
     IsvdObservation,
     PairAlignment,
     PairRegistration,

@@ -91,7 +91,7 @@ def build_frame_odometry(
     """Return the odometry that the settings choose among those that use the frames' images or scans."""
     match config:
         case IsvdOdometryConfig():
-            from mapper.odometry.isvd_odometry import IsvdOdometry
+            from mapper.odometry.isvd.odometry import IsvdOdometry
 
             return IsvdOdometry(config, motion_check=motion_check)
         case LocalMapConfig():

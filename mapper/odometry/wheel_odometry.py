@@ -17,7 +17,7 @@ from mapper.graph.wheel_factors import WheelNode, wheel_factor
 from mapper.odometry.base import Diagnostics, FrameResult, lost_frame
 from mapper.odometry.config import GivenOdometryConfig, LocalMapConfig, WheelsOdometryConfig
 from mapper.odometry.keyframe_distance import is_far
-from mapper.odometry.local_map.image_observation import observe_image
+from mapper.odometry.local_map.observation.image_observation import observe_image
 from mapper.odometry.scan_to_map.config import GicpOdometryConfig
 from mapper.odometry.scan_to_map.scan_observation import observe_scan
 from mapper.places.vocabulary import Vocabulary, load_vocabulary

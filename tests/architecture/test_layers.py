@@ -38,6 +38,20 @@ LAYERS = (
 )
 """The folders of mapper/. Each may import those before it, so there is no circle."""
 
+SUBFOLDERS = {
+    "odometry": ("local_map", "isvd", "scan_to_map"),
+    "odometry/local_map": (
+        "observation",
+        "bundle",
+        "landmarks",
+        "depth",
+        "pose",
+        "recovery",
+        "calibration",
+    ),
+}
+"""Folders in folders of mapper/ that are layers as well; the modules beside them combine them."""
+
 NO_RUN = {"config", "run", "export", "pipeline"}
 FORBIDDEN = {
     "sensing": NO_RUN,
@@ -138,6 +152,17 @@ def test_folders_depend_one_way():
     for where, folder, imported, module in folder_imports():
         assert LAYERS.index(imported) < LAYERS.index(folder), f"{where}: {folder} imports {module}"
         assert imported not in FORBIDDEN.get(folder, ()), f"{where}: {folder} imports {module}"
+
+
+@pytest.mark.parametrize("folder", SUBFOLDERS)
+def test_subfolders_depend_one_way(folder):
+    layers, prefix = SUBFOLDERS[folder], f"mapper.{folder.replace('/', '.')}."
+    assert {path.parent.name for path in (ROOT / "mapper" / folder).glob("*/__init__.py")} == set(layers)
+    for path, line, module in imports_of("mapper"):
+        inner, imported = path.removeprefix(f"mapper/{folder}/"), module.removeprefix(prefix)
+        if inner != path and "/" in inner and imported != module and "." in imported:
+            own, other = inner.split("/")[0], imported.split(".")[0]
+            assert layers.index(other) <= layers.index(own), f"{path}:{line}: {own} imports {module}"
 
 
 def test_the_lowest_layers_import_only_the_errors():

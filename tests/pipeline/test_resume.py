@@ -13,7 +13,7 @@ import pytest
 
 from mapper.cli.summary import summary_text
 from mapper.core.errors import RunError, TrackingError
-from mapper.odometry.local_map import paged_table
+from mapper.odometry.local_map.landmarks import paged_table
 from mapper.odometry.local_map.odometry import KeyframeOdometry
 from mapper.pipeline.checkpoint_identity import write_identity
 from mapper.places.vocabulary import SHIPPED

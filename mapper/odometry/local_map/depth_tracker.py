@@ -8,23 +8,23 @@ from mapper.core.doubts import Doubt
 from mapper.core.geometry import Transform
 from mapper.core.timebase import NS_PER_S
 from mapper.odometry.config import KeyframeOdometryConfig
-from mapper.odometry.local_map.assessment import UNOBSERVED_MOTION
-from mapper.odometry.local_map.depth_alignment import (
+from mapper.odometry.local_map.depth.depth_alignment import (
     DEPTH_ONLY,
     DepthAlignment,
     ReferenceSurfaces,
     align_depth,
     observes_all,
 )
-from mapper.odometry.local_map.depth_kernels import Landmarks, PosePrior
-from mapper.odometry.local_map.depth_surfaces import DepthCells, DepthSurface, surface_of
-from mapper.odometry.local_map.earlier_depth import EarlierDepth
-from mapper.odometry.local_map.far_features import turned_by_far_features
-from mapper.odometry.local_map.image_observation import ImageObservation
-from mapper.odometry.local_map.landmarks import LandmarkMap
-from mapper.odometry.local_map.local_search import LocalSearch
-from mapper.odometry.local_map.pose_information import covariance_of, frame_information, largest_sigma
-from mapper.odometry.local_map.pose_tracker import TrackedPose, project, unmatched
+from mapper.odometry.local_map.depth.depth_kernels import Landmarks, PosePrior
+from mapper.odometry.local_map.depth.earlier_depth import EarlierDepth
+from mapper.odometry.local_map.landmarks.landmark_map import LandmarkMap
+from mapper.odometry.local_map.observation.depth_surfaces import DepthCells, DepthSurface, surface_of
+from mapper.odometry.local_map.observation.image_observation import ImageObservation
+from mapper.odometry.local_map.pose.assessment import UNOBSERVED_MOTION
+from mapper.odometry.local_map.pose.far_features import turned_by_far_features
+from mapper.odometry.local_map.pose.local_search import LocalSearch
+from mapper.odometry.local_map.pose.pose_information import covariance_of, frame_information, largest_sigma
+from mapper.odometry.local_map.pose.pose_tracker import TrackedPose, project, unmatched
 
 _MIN_VISIBLE_RATIO, _MIN_VISIBLE_RATIO_OF_PLACED = 0.3, 0.15
 """Share of the points on or before surfaces that depth alone needs, and that a frame needs which landmarks

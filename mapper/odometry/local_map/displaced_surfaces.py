@@ -5,10 +5,10 @@ from dataclasses import dataclass
 
 from mapper.core.doubts import Doubt
 from mapper.core.timebase import NS_PER_S
-from mapper.odometry.local_map.assessment import UNDOUBTED, Assessment
-from mapper.odometry.local_map.earlier_depth import Displacement
-from mapper.odometry.local_map.image_observation import FEW_MOVING
-from mapper.odometry.local_map.pose_tracker import TrackedPose
+from mapper.odometry.local_map.depth.earlier_depth import Displacement
+from mapper.odometry.local_map.observation.image_observation import FEW_MOVING
+from mapper.odometry.local_map.pose.assessment import UNDOUBTED, Assessment
+from mapper.odometry.local_map.pose.pose_tracker import TrackedPose
 
 _MOST, _MOST_FAR = 0.5, 0.2
 """When a larger share of the surfaces that two images have in common lies elsewhere, the pose is doubtful: a

@@ -10,11 +10,11 @@ from mapper.core.doubts import Doubt
 from mapper.core.geometry import Array, Transform, inverse, log
 from mapper.core.timebase import NS_PER_S
 from mapper.odometry.base import STEADY_NS
-from mapper.odometry.local_map.assessment import UNDOUBTED, Assessment
+from mapper.odometry.local_map.depth.earlier_depth import Displacement
 from mapper.odometry.local_map.displaced_surfaces import DisplacedSurfaces
-from mapper.odometry.local_map.earlier_depth import Displacement
-from mapper.odometry.local_map.pose_information import largest_sigma
-from mapper.odometry.local_map.pose_tracker import TrackedPose
+from mapper.odometry.local_map.pose.assessment import UNDOUBTED, Assessment
+from mapper.odometry.local_map.pose.pose_information import largest_sigma
+from mapper.odometry.local_map.pose.pose_tracker import TrackedPose
 
 _MEMORY = 100
 """Undoubted frames whose medians are the usual."""

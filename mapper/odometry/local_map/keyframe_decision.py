@@ -1,9 +1,9 @@
 """Keyframe decision of the local map: by the inliers of a frame's pose."""
 
 from mapper.odometry.config import KeyframeOdometryConfig
-from mapper.odometry.local_map.assessment import UNOBSERVED_MOTION
-from mapper.odometry.local_map.landmarks import LandmarkMap
-from mapper.odometry.local_map.pose_tracker import TrackedPose
+from mapper.odometry.local_map.landmarks.landmark_map import LandmarkMap
+from mapper.odometry.local_map.pose.assessment import UNOBSERVED_MOTION
+from mapper.odometry.local_map.pose.pose_tracker import TrackedPose
 
 _MIN_GAP = 4
 """Frames for which the last keyframe is recent."""

@@ -8,15 +8,15 @@ from numpy.typing import NDArray
 from mapper.core.doubts import Doubt
 from mapper.core.geometry import Points, Transform, apply, inverse
 from mapper.odometry.config import LocalMapConfig
-from mapper.odometry.local_map.camera_motion import agreeing, camera_motion
-from mapper.odometry.local_map.earlier_depth import EarlierDepth
-from mapper.odometry.local_map.image_observation import ImageObservation
-from mapper.odometry.local_map.landmarks import Ids, LandmarkMap
-from mapper.odometry.local_map.local_search import LocalSearch, PredictedFeatures
-from mapper.odometry.local_map.moving_feature_tracker import MovingFeatureTracker
-from mapper.odometry.local_map.pose_tracker import TrackedPose, project, unmatched
-from mapper.odometry.local_map.relocalizer import Relocalizer
-from mapper.odometry.local_map.triangulation import weights_with_landmarks
+from mapper.odometry.local_map.depth.earlier_depth import EarlierDepth
+from mapper.odometry.local_map.landmarks.landmark_map import Ids, LandmarkMap
+from mapper.odometry.local_map.observation.image_observation import ImageObservation
+from mapper.odometry.local_map.pose.camera_motion import agreeing, camera_motion
+from mapper.odometry.local_map.pose.local_search import LocalSearch, PredictedFeatures
+from mapper.odometry.local_map.pose.moving_feature_tracker import MovingFeatureTracker
+from mapper.odometry.local_map.pose.pose_tracker import TrackedPose, project, unmatched
+from mapper.odometry.local_map.pose.triangulation import weights_with_landmarks
+from mapper.odometry.local_map.recovery.relocalizer import Relocalizer
 
 _MAX_RATIO = 0.9
 _LEAST_STILL_RATIO = 0.2

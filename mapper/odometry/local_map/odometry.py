@@ -23,18 +23,19 @@ from mapper.odometry.base import (
     lost_frame,
 )
 from mapper.odometry.config import KeyframeOdometryConfig
-from mapper.odometry.local_map.assessment import UNDOUBTED, Assessment
-from mapper.odometry.local_map.calibration_checks import CalibrationChecks
+from mapper.odometry.local_map.bundle.log_residuals import LogResiduals
+from mapper.odometry.local_map.calibration.calibration_checks import CalibrationChecks
+from mapper.odometry.local_map.calibration.rolling_shutter import RollingShutter
+from mapper.odometry.local_map.depth.earlier_depth import EarlierDepth
 from mapper.odometry.local_map.depth_tracker import DepthTracker
-from mapper.odometry.local_map.earlier_depth import EarlierDepth
 from mapper.odometry.local_map.frame_doubts import FrameDoubts
-from mapper.odometry.local_map.gap_check import GapCheck
-from mapper.odometry.local_map.image_observation import ImageObservation, observe_image
 from mapper.odometry.local_map.keyframe_decision import KeyframeDecision
-from mapper.odometry.local_map.landmarks import MIN_SHARED_LANDMARKS, LandmarkMap
-from mapper.odometry.local_map.log_residuals import LogResiduals
+from mapper.odometry.local_map.landmarks.landmark_map import MIN_SHARED_LANDMARKS, LandmarkMap
+from mapper.odometry.local_map.observation.image_observation import ImageObservation, observe_image
+from mapper.odometry.local_map.observation.readout_time import ReadoutTime
 from mapper.odometry.local_map.photometric_error import excess_error
-from mapper.odometry.local_map.pose_information import (
+from mapper.odometry.local_map.pose.assessment import UNDOUBTED, Assessment
+from mapper.odometry.local_map.pose.pose_information import (
     covariance_of,
     disparity_ratio,
     frame_information,
@@ -42,13 +43,12 @@ from mapper.odometry.local_map.pose_information import (
     relative_information,
     with_systematic,
 )
-from mapper.odometry.local_map.pose_tracker import PoseTracker, TrackedPose, unmatched
-from mapper.odometry.local_map.readout_time import ReadoutTime
-from mapper.odometry.local_map.relocalizer import Relocalizer
-from mapper.odometry.local_map.rolling_shutter import RollingShutter
-from mapper.odometry.local_map.tracking_recovery import TrackingRecovery
-from mapper.odometry.local_map.triangulation import add_triangulated, inlier_landmarks
-from mapper.odometry.local_map.velocity_filter import VelocityFilter
+from mapper.odometry.local_map.pose.pose_tracker import PoseTracker, TrackedPose, unmatched
+from mapper.odometry.local_map.pose.triangulation import add_triangulated, inlier_landmarks
+from mapper.odometry.local_map.pose.velocity_filter import VelocityFilter
+from mapper.odometry.local_map.recovery.gap_check import GapCheck
+from mapper.odometry.local_map.recovery.relocalizer import Relocalizer
+from mapper.odometry.local_map.recovery.tracking_recovery import TrackingRecovery
 from mapper.places.vocabulary import load_vocabulary
 
 _MIN_START_FEATURES = 100
@@ -313,7 +313,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
             if tracked_pose is not None or expected is not None:
                 tracked_pose = self._depth.supported(observation, last, expected, tracked_pose)
             if tracked_pose is not None and (
-                self._is_steady(tracked_pose, last) or self._is_possible(tracked_pose)
+                not self._gap_check.is_needed(tracked_pose, last) or self._is_possible(tracked_pose)
             ):
                 return tracked_pose
         candidates = self._relocalizer.candidates(observation, inverse(last.T_camera_world)[:3, 3])
@@ -325,12 +325,6 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         found = self._depth.supported(observation, relocalised or last, None, relocalised)
         return found if found is not None and self._is_possible(found) else None
 
-    def _is_steady(self, tracked_pose: TrackedPose, last: TrackedPose) -> bool:
-        """Return whether a pose is soon after the last one, and in its sub-map."""
-        keyframes = self._map.keyframes
-        one_map = keyframes[tracked_pose.reference].origin == keyframes[last.reference].origin
-        return tracked_pose.stamp_ns - last.stamp_ns <= STEADY_NS and one_map
-
     def _is_possible(self, tracked_pose: TrackedPose) -> bool:
         """Return whether a pose after a gap is possible by the motion to it and by what should be in view."""
         last = self._last
@@ -340,8 +334,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
             # Another place, so that a sub-map may begin at once.
             self._unknown_frames = self._config.max_lost_frames
             return False
-        check = self._gap_check
-        return not check.agrees_in_part(tracked_pose, last) and not check.looks_different(tracked_pose, last)
+        return not self._gap_check.is_contradicted(tracked_pose, last)
 
     def _add_keyframe(
         self, tracked_pose: TrackedPose, *, neighbour: int | None, assessed: Assessment = UNDOUBTED

@@ -8,8 +8,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from mapper.core.geometry import Array, Transform, inverse
-from mapper.odometry.local_map.depth_kernels import place_in_cells
-from mapper.odometry.local_map.pose_tracker import TrackedPose
+from mapper.odometry.local_map.depth.depth_kernels import place_in_cells
+from mapper.odometry.local_map.pose.pose_tracker import TrackedPose
 
 _LOCAL_CELLS = 2.0
 """Standard deviation of the window whose mean is taken out: exposures and shading change between images."""

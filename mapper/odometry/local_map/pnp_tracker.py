@@ -3,10 +3,10 @@
 from collections.abc import Iterator
 
 from mapper.core.geometry import Transform, inverse
-from mapper.odometry.local_map.image_observation import ImageObservation
-from mapper.odometry.local_map.landmarks import LandmarkMap
-from mapper.odometry.local_map.pose_tracker import TrackedPose
-from mapper.odometry.local_map.relocalizer import Relocalizer
+from mapper.odometry.local_map.landmarks.landmark_map import LandmarkMap
+from mapper.odometry.local_map.observation.image_observation import ImageObservation
+from mapper.odometry.local_map.pose.pose_tracker import TrackedPose
+from mapper.odometry.local_map.recovery.relocalizer import Relocalizer
 
 
 class PnpPoseTracker:

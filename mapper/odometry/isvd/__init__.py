@@ -1,0 +1,1 @@
+"""Odometry by iterative SVD on matched features."""

@@ -1,0 +1,1 @@
+"""Bundle adjustment, and the residuals that it leaves."""

@@ -1,0 +1,1 @@
+"""The camera against its calibration: intrinsics, depth images, rolling shutter."""

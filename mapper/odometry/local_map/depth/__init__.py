@@ -1,0 +1,1 @@
+"""Alignment of depth images, and their comparison with earlier ones."""

@@ -1,0 +1,1 @@
+"""The local map: keyframes and landmarks, in memory and paged to the disk."""

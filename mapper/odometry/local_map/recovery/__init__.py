@@ -1,0 +1,1 @@
+"""Poses that no prediction leads to: relocalisation, gaps, wrong motions."""
