@@ -136,6 +136,9 @@ class FeatureMatches:
 REPEATED = "repeated"
 """``Diagnostics.method`` of a frame whose image is that of the frame before: nothing shows its pose."""
 
+ANOTHER_PLACE = "another place"
+"""Kind of the doubt about a pose after a gap where what is seen is also at another place."""
+
 SEE_MORE = (
     "a motion that no surface shows takes wheel odometry (wheels.txt), the poses of another odometry "
     "(odometry.kind=given), or a sensor that sees farther; loops do not show it"

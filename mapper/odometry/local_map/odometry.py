@@ -135,6 +135,8 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
                 tracked_pose, last, *inlier_landmarks(self._map, tracked_pose)
             )
             self._calibration.pass_frame(self._before_last, last, tracked_pose)
+        if observation.stamp_ns - last.stamp_ns > STEADY_NS:
+            tracked_pose = self._relocalizer.compared_with_other_places(tracked_pose)
         observation = tracked_pose.observation
         T_camera_world, is_moving = tracked_pose.T_camera_world, tracked_pose.moving_cells()
         displaced = self._earlier_depth.displacement(

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from mapper.core.geometry import exp
+from mapper.odometry.base import ANOTHER_PLACE
 from mapper.odometry.config import LocalMapConfig
 from mapper.odometry.factory import build_frame_odometry
 
@@ -63,6 +64,36 @@ def test_a_place_ten_metres_away_takes_more_than_three_seconds(odometry):
     assert check.is_out_of_reach(later(away, AFTER_NS), last, 0.3)
     assert not check.is_out_of_reach(later(away, AFTER_NS), last, 1.5)  # the log is of a fast sensor
     assert not check.is_out_of_reach(later(away, 3 * AFTER_NS), last, 0.3)
+
+
+def with_a_copy_of_all_places(odometry, shift_m):
+    """Add all keyframes to the map once more, some metres away, as if the rooms there looked alike."""
+    landmark_map, T_shift = odometry._map, exp(np.zeros(3), np.array([shift_m, 0.0, 0.0]))
+    for k in range(len(landmark_map.keyframes)):
+        seen = landmark_map.observation(k)
+        copy = landmark_map.add_keyframe(
+            seen,
+            landmark_map.keyframes[k].T_camera_world @ T_shift,
+            np.full(len(seen), -1, np.int32),
+            new=seen.has_depth,
+            neighbour=k,
+            twist_camera=np.zeros(6),
+        )
+        odometry._relocalizer.add(copy)
+
+
+@pytest.mark.parametrize(
+    ("shift_m", "after_ns", "kinds"),
+    [(3.0, AFTER_NS, [ANOTHER_PLACE]), (3.0, 500_000_000, []), (0.1, AFTER_NS, []), (None, AFTER_NS, [])],
+    ids=["alike, after a gap", "alike, without a gap", "one place, after drift", "one place"],
+)
+def test_after_a_gap_a_view_that_fits_two_places_is_doubtful(odometry, frames, shift_m, after_ns, kinds):
+    if shift_m is not None:
+        with_a_copy_of_all_places(odometry, shift_m)
+    frame = replace(frames[NOW], stamp_ns=frames[NOW - 1].stamp_ns + after_ns)
+    result = odometry.track(odometry.observe(frame))
+    assert [doubt.kind for doubt in result.doubts if doubt.kind == ANOTHER_PLACE] == kinds
+    assert result.node is not None
 
 
 def test_a_frame_after_a_gap_that_a_poster_alone_places_is_lost(odometry, frames, monkeypatch):

@@ -1,12 +1,15 @@
 """Relocaliser: the pose of a frame by descriptors alone, without a prediction, after a jump or a loss."""
 
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
+from mapper.core.doubts import Doubt
 from mapper.core.geometry import Array, Points
 from mapper.features.hamming import Bits, match_mutual_bits
+from mapper.odometry.base import ANOTHER_PLACE
 from mapper.odometry.config import KeyframeOdometryConfig
 from mapper.odometry.local_map.landmarks.landmark_map import Ids, LandmarkMap
 from mapper.odometry.local_map.observation.image_observation import ImageObservation
@@ -22,6 +25,10 @@ _MAX_RATIO = 0.85
 _MATCHING_LEVEL = 2
 """Only descriptors under one node this many steps below the vocabulary's root are compared (Zhao et al. 2020,
 §1.1): the toolkit's own vocabulary has 169 such nodes, so that a frame has a few features under each."""
+_RIVAL_RATIO = 0.5
+"""A place is another that a pose may be at if it gives this share of the pose's inliers."""
+_APART_M = 0.5
+"""Least distance of two places: drift between two visits of one place is less."""
 
 
 class Relocalizer:
@@ -121,6 +128,29 @@ class Relocalizer:
         words = self._vocabulary.vector(observation.words)
         return [k for k, _ in self._index.query(words, min_similarity=0.0, limit=limit)]
 
+    def compared_with_other_places(self, tracked_pose: TrackedPose) -> TrackedPose:
+        """Return a pose, doubtful if the frame shows another place as well, which shares no landmark with it.
+
+        Doors along a corridor, or two rooms with the same furniture: nothing in the image says which it is.
+        """
+        keyframes, ids = self._map.keyframes, tracked_pose.landmark_of_feature
+        origin = keyframes[tracked_pose.reference].origin
+        shared = self._map.shared_counts(ids[ids >= 0])
+        similar = self.similar(tracked_pose.observation, limit=len(keyframes))
+        elsewhere = [k for k in similar if shared[k] == 0 and keyframes[k].origin == origin]
+        rival = self.best_among(
+            elsewhere[: self._config.relocalisation_keyframes],
+            tracked_pose.observation,
+            method="relocalised",
+            is_possible=lambda other: _distance_m(other, tracked_pose) > _APART_M,
+            exhaustive=True,
+        )
+        if rival is None or rival.inliers < _RIVAL_RATIO * tracked_pose.inliers:
+            return tracked_pose
+        distance_m = _distance_m(rival, tracked_pose)
+        text = f"{tracked_pose.inliers} features agree, {rival.inliers} with a place {distance_m:.1f} m away"
+        return replace(tracked_pose, doubts=(*tracked_pose.doubts, Doubt(ANOTHER_PLACE, text)))
+
     def _match_keyframe(
         self, k: int, observation: ImageObservation, *, method: str, exhaustive: bool
     ) -> TrackedPose | None:
@@ -204,3 +234,7 @@ class Relocalizer:
 
     def _nodes(self, words: Ids) -> Ids:
         return self._vocabulary.ancestors_of(words, level=_MATCHING_LEVEL)
+
+
+def _distance_m(a: TrackedPose, b: TrackedPose) -> float:
+    return float(np.linalg.norm(a.body_pose[:3, 3] - b.body_pose[:3, 3]))
