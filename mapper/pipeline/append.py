@@ -18,7 +18,7 @@ from mapper.pipeline.fuse import carry_times, fuse_into
 from mapper.pipeline.joined_components import joined
 from mapper.pipeline.reobserve import reobserve
 from mapper.pipeline.solve import solve
-from mapper.pipeline.track import Start, depth_cautions, session_odometry, track_log
+from mapper.pipeline.track import Start, noted_depth_warnings, session_odometry, track_log
 from mapper.pipeline.tracking_result import TrackingResult, from_tracking, refuse_a_fragment, save_places
 from mapper.run.edits_file import edits_text, parse_edits, write_edits
 from mapper.run.folder import Run, open_run
@@ -70,9 +70,10 @@ def append(
     edits = edits_text(run.path)
     wanted = parse_edits(edits, run.path)
     first = run.open_log()
-    source, warnings = chained(first, second), depth_cautions(second)
-    for note in (*source.notes, *(warning.sentence for warning in warnings)):
+    source = chained(first, second)
+    for note in source.notes:
         progress.note(note)
+    warnings = noted_depth_warnings(second, progress)
     whole = config.model_copy(update={"source": run.config.source})
     with write_run(out, _manifest(run, source, config.source), whole, overwrite=overwrite) as writer:
         carry_times(writer, run.manifest.timing)

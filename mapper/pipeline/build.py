@@ -29,7 +29,7 @@ from mapper.pipeline.components import largest_component
 from mapper.pipeline.floor import above_floor
 from mapper.pipeline.joined_components import joined
 from mapper.pipeline.solve import solve
-from mapper.pipeline.track import depth_cautions, first_session, track_log
+from mapper.pipeline.track import first_session, noted_depth_warnings, track_log
 from mapper.pipeline.tracking_checkpoints import TrackingCheckpoints
 from mapper.pipeline.tracking_result import TrackingResult, from_tracking, refuse_a_fragment, save_places
 from mapper.run import files
@@ -83,9 +83,7 @@ def build(
             by another version was not finished there.
     """
     check_stamps(source.stamps_ns)
-    warnings = depth_cautions(source)
-    for warning in warnings:
-        progress.note(warning.sentence)
+    warnings = noted_depth_warnings(source, progress)
     poses = odometry if isinstance(odometry, Trajectory) else None
     if odometry is not None and poses is None:
         checkpoint_s = None  # the state of a caller's own class cannot be kept

@@ -27,7 +27,7 @@ from mapper.pipeline.components import component_of
 from mapper.pipeline.kidnapping import without_jumps
 from mapper.pipeline.known_map import KnownMap, detector_of, loops_between_days
 from mapper.pipeline.solve import solve
-from mapper.pipeline.track import Start, depth_cautions, session_odometry, track_log
+from mapper.pipeline.track import Start, noted_depth_warnings, session_odometry, track_log
 from mapper.pipeline.tracking_result import TrackingResult, from_tracking
 from mapper.run import files
 from mapper.run.localised import LocalisedManifest, find_stretches
@@ -78,9 +78,7 @@ def localise(
         RunError: OUT is there already.
     """
     _refuse_unfit(source, known, config)
-    warnings = depth_cautions(source)
-    for warning in warnings:
-        progress.note(warning.sentence)
+    warnings = noted_depth_warnings(source, progress)
     start = first_manifest(source)
     manifest = LocalisedManifest(map=str(known.path.resolve()), **dict(start))
     with write_run(out, manifest, config, overwrite=overwrite, kind=files.LOCALISED_LOG) as writer:

@@ -285,6 +285,9 @@ def _wheel_measurements(source: Log, config: BuildConfig) -> WheelMeasurements:
     return WheelMeasurements(wheels, config.graph.wheels)
 
 
-def depth_cautions(source: Log) -> list[RunWarning]:
-    """Return what is implausible about an RGB-D log's depth, before it is tracked."""
-    return [RunWarning(kind="depth", sentence=text, weight="doubt") for text in depth_warnings(source)]
+def noted_depth_warnings(source: Log, progress: Progress) -> list[RunWarning]:
+    """Return what is implausible about an RGB-D log's depth, before it is tracked, and note it."""
+    warnings = [RunWarning(kind="depth", sentence=text, weight="doubt") for text in depth_warnings(source)]
+    for warning in warnings:
+        progress.note(warning.sentence)
+    return warnings
