@@ -11,13 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from mapper.core.deskew import STILL, deskewed, twist_at
+from mapper.core.deskew import deskewed
 from mapper.core.errors import DataError
 from mapper.core.frames import Sensor
 from mapper.core.geometry import Array, Points, apply
 from mapper.core.trajectory import Trajectory
 from mapper.core.voxel_grid import thin
 from mapper.evaluators.metrics.metric import Metric
+from mapper.mapping.placed_frames import placed_frames
 from mapper.runtime.progress import SILENT, Progress
 from mapper.sources.base import Log
 
@@ -67,19 +68,15 @@ def views_of(source: Log, trajectory: Trajectory, *, progress: Progress = SILENT
         DataError: No frame of the log has a pose.
         FrameError: A frame cannot be read.
     """
-    index_of = {int(stamp_ns): index for index, stamp_ns in enumerate(trajectory.stamps_ns)}
-    entries = [entry for entry in source.entries() if entry.stamp_ns in index_of]
-    chosen = entries[:: max(1, -(-len(entries) // _FRAMES))]
+    placed = list(placed_frames(source, trajectory))
+    chosen = placed[:: max(1, -(-len(placed) // _FRAMES))]
     points, towards, frames = [np.empty((0, 3))], [np.empty((0, 3))], [np.empty(0, np.int64)]
     with progress.stage("sharp") as report:
-        for number, entry in enumerate(chosen):
-            index = index_of[entry.stamp_ns]
-            twist = STILL if source.sensor == "rgbd" else twist_at(trajectory, index)
-            scan = deskewed(entry.scan(), twist)
+        for number, frame in enumerate(chosen):
+            scan = deskewed(frame.entry.scan(), frame.twist)
             few = scan.points_body[:: max(1, len(scan.points_body) * len(chosen) // _POINTS)]
-            T_world_body = trajectory.T_world_body[index]
-            points.append(apply(T_world_body, few.astype(np.float64)))
-            towards.append((scan.origin_body - few) @ T_world_body[:3, :3].T)
+            points.append(apply(frame.T_world_body, few.astype(np.float64)))
+            towards.append((scan.origin_body - few) @ frame.T_world_body[:3, :3].T)
             frames.append(np.full(len(few), number, np.int64))
             report(number + 1, len(chosen))
     return Views(np.concatenate(points), np.concatenate(towards), np.concatenate(frames))

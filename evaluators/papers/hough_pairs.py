@@ -276,7 +276,7 @@ def _posed(log: Path) -> list[tuple[FrameRef, Transform]]:
     if source.truth is None or source.sensor != "lidar":
         return []
     poses = dict(source.truth.items())
-    return [(entry, poses[entry.stamp_ns]) for entry in source.entries() if entry.stamp_ns in poses]
+    return [(entry, poses[entry.stamp_ns]) for entry in source.entries_of(poses)]
 
 
 @lru_cache(maxsize=1)

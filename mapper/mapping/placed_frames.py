@@ -38,11 +38,10 @@ class PlacedFrame:
 def placed_frames(source: Log, trajectory: Trajectory) -> Iterator[PlacedFrame]:
     """Yield the frames of a log that have a pose, in the log's order."""
     index_of = {int(stamp_ns): index for index, stamp_ns in enumerate(trajectory.stamps_ns)}
-    for entry in source.entries():
-        index = index_of.get(entry.stamp_ns)
-        if index is not None:
-            twist = STILL if source.sensor == "rgbd" else twist_at(trajectory, index)
-            yield PlacedFrame(entry, index, trajectory.T_world_body[index], twist)
+    for entry in source.entries_of(index_of):
+        index = index_of[entry.stamp_ns]
+        twist = STILL if source.sensor == "rgbd" else twist_at(trajectory, index)
+        yield PlacedFrame(entry, index, trajectory.T_world_body[index], twist)
 
 
 def within_reach(scan: Scan, T_world_body: Transform, config: OctreeConfig) -> tuple[Scan, int]:

@@ -205,10 +205,9 @@ def _spread_scans(source: Log, trajectory: Trajectory, count: int) -> dict[int, 
     spread = np.unique(np.linspace(0, len(trajectory) - 1, count).round().astype(int))
     index_of = {int(trajectory.stamps_ns[index]): int(index) for index in spread}
     scans = {}
-    for entry in source.entries():
-        if entry.stamp_ns in index_of:
-            with suppress(FrameError):  # it was readable in the first pass; fusing reports it
-                scans[index_of[entry.stamp_ns]] = entry.scan()
+    for entry in source.entries_of(index_of):
+        with suppress(FrameError):  # it was readable in the first pass; fusing reports it
+            scans[index_of[entry.stamp_ns]] = entry.scan()
     return scans
 
 

@@ -93,6 +93,5 @@ def _floors(
         up_body = graph.T_world_node[node][:3, :3].T @ up_world
         return node, floor_plane(scan, up_body, tolerance_m=config.level.plane_tolerance_m)
 
-    entries = (entry for entry in source.entries() if entry.stamp_ns in node_at)
-    floors = ordered_map(seen, entries, workers=config.workers)
+    floors = ordered_map(seen, source.entries_of(node_at), workers=config.workers)
     return {node: T_node_floor for node, T_node_floor in floors if T_node_floor is not None}

@@ -110,8 +110,7 @@ class _Search:
         self._trajectory = tracking.trajectory()
         self._tracks = tracking.tracked
         self._views: dict[int, ImageView] = {}
-        index_of = {stamp_ns: index for index, stamp_ns in enumerate(source.stamps_ns.tolist())}
-        self._frame_of = lru_cache(16)(lambda stamp_ns: _rgbd(source.entry_at(index_of[stamp_ns]).load()))
+        self._frame_of = lru_cache(16)(lambda stamp_ns: _rgbd(source.entry_of(stamp_ns).load()))
 
     def loops(self, parts: Sequence[Sequence[int]]) -> list[LoopClosure]:
         """Return the loops between parts, given as nodes, at most one for any two, with their verdicts."""

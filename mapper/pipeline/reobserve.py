@@ -39,7 +39,7 @@ def reobserve(
         twist = twist_at(trajectory, index_of[entry.stamp_ns])
         return entry.stamp_ns, odometry.view(odometry.read(entry), twist)
 
-    entries = [entry for entry in source.entries() if entry.stamp_ns in stamps_ns]
+    entries = list(source.entries_of(stamps_ns))
     views = {}
     with progress.stage("recall") as report:
         for stamp_ns, seen in ordered_map(view, entries, workers=config.workers):

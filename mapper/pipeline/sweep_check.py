@@ -132,10 +132,9 @@ def _measured(
     middle = next(iter(np.flatnonzero(moving.known)[moving.known.sum() // 2 :].tolist()), None)
     if middle is None:
         return None
-    index_of = {stamp_ns: index for index, stamp_ns in enumerate(source.stamps_ns.tolist())}
 
     def scan(track: int) -> Scan:
-        return source.entry_at(index_of[tracks[track].stamp_ns]).scan()
+        return source.entry_of(tracks[track].stamp_ns).scan()
 
     try:
         first = scan(middle)

@@ -1,6 +1,6 @@
 """Recorded logs, whatever their format: frames that are not read yet, and what else a log holds."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Container, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol, overload
@@ -198,6 +198,15 @@ class Log:
     def entries(self) -> Iterator[FrameRef]:
         """Yield every frame's entry in time order; nothing is decoded yet."""
         return map(self.entry_at, range(len(self)))
+
+    def entries_of(self, stamps_ns: Container[int]) -> Iterator[FrameRef]:
+        """Yield the entries of the frames with some stamps, in time order."""
+        stamps = enumerate(self.stamps_ns.tolist())
+        return (self.entry_at(index) for index, stamp_ns in stamps if stamp_ns in stamps_ns)
+
+    def entry_of(self, stamp_ns: int) -> FrameRef:
+        """Return the entry of the frame with a stamp; there is one."""
+        return self.entry_at(int(np.searchsorted(self.stamps_ns, stamp_ns)))
 
     def spread_entries(self, most: int) -> Iterator[FrameRef]:
         """Yield the entries of at most so many frames, evenly spread over the log."""

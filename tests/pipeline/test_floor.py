@@ -11,6 +11,7 @@ from mapper.core.frames import Scan
 from mapper.core.geometry import apply, exp, inverse, rotation_exp, transform
 from mapper.graph.model import PoseSigmas
 from mapper.pipeline.floor import UP_LEVEL, above_floor
+from tests.support.logs import log_in_memory
 from tests.support.noisy_graphs import drifted_chain
 
 COUNT = 30
@@ -36,7 +37,7 @@ def scan_at(k):
 
 def log_of(sensor="rgbd"):
     entries = [SimpleNamespace(stamp_ns=k, scan=lambda k=k: scan_at(k)) for k in range(COUNT)]
-    return SimpleNamespace(sensor=sensor, entries=lambda: iter(entries))
+    return log_in_memory(entries, sensor=sensor)
 
 
 def followed(graph, config=_DEFAULTS, sensor="rgbd", trusted_ns=range(COUNT)):
