@@ -128,6 +128,19 @@ def ray_table(camera: PinholeCamera) -> NDArray[np.float32]:
     return camera.rays(ideal).astype(np.float32).reshape(camera.height_px, camera.width_px, 2)
 
 
+@lru_cache(maxsize=8)
+def undistortion_maps(camera: PinholeCamera) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return (H, W) columns and rows in the raw image of the undistorted one's pixels, for ``cv2.remap``."""
+    import cv2
+
+    size_px = (camera.width_px, camera.height_px)
+    distortion = np.array(camera.distortion)
+    columns, rows = cv2.initUndistortRectifyMap(
+        camera.matrix, distortion, None, camera.matrix, size_px, cv2.CV_32FC1
+    )
+    return columns, rows
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Scan:
     """One cloud of returns; the source has already applied T_body_sensor.

@@ -6,7 +6,6 @@ Depth counts as in the octree: up to the same limit, and not where something mov
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -14,7 +13,14 @@ from numpy.typing import NDArray
 
 from mapper.core.back_projection import back_project
 from mapper.core.errors import FrameError, RunError
-from mapper.core.frames import NO_DISTORTION, DepthImage, PinholeCamera, RgbdFrame, ray_table
+from mapper.core.frames import (
+    NO_DISTORTION,
+    DepthImage,
+    PinholeCamera,
+    RgbdFrame,
+    ray_table,
+    undistortion_maps,
+)
 from mapper.core.geometry import Transform
 from mapper.mapping.config import edits_of
 from mapper.mapping.edits import MapEditor
@@ -61,7 +67,6 @@ def mesh_views(run: Run, octree: OctreeMap, progress: Progress) -> Iterator[Mesh
     editor = MapEditor(edits_of(run.manifest.edits), trajectory.positions_world, room_m=0.0)
     T_world_body = dict(trajectory[::stride].items())
     source = run.open_log()
-    entries = (entry for entry in source.entries() if entry.stamp_ns in T_world_body)
 
     def prepare(entry: FrameRef) -> MeshView | Skipped:
         try:
@@ -73,8 +78,9 @@ def mesh_views(run: Run, octree: OctreeMap, progress: Progress) -> Iterator[Mesh
         T = T_world_body[entry.stamp_ns]
         return rectified(as_mapped(frame, T, octree, editor), T)
 
+    views = ordered_map(prepare, source.entries_of(T_world_body), workers=run.config.workers)
     with progress.stage("mesh") as report:
-        for done, view in enumerate(ordered_map(prepare, entries, workers=run.config.workers), start=1):
+        for done, view in enumerate(views, start=1):
             report(done, len(T_world_body))
             if isinstance(view, Skipped):
                 progress.note(f"not fused: {view.reason}")
@@ -86,7 +92,7 @@ def rectified(frame: RgbdFrame, T_world_body: Transform) -> MeshView:
     """Resample a frame as an ideal pinhole camera would have seen it; depths are not mixed."""
     depth_m, image = frame.depth_m, frame.rgb
     if frame.camera.distortion != NO_DISTORTION:
-        columns, rows = _undistortion(frame.camera)
+        columns, rows = undistortion_maps(frame.camera)
         depth_m = cv2.remap(depth_m, columns, rows, cv2.INTER_NEAREST)
         image = cv2.remap(image, columns, rows, cv2.INTER_LINEAR)
     return MeshView(
@@ -108,17 +114,3 @@ def as_mapped(frame: RgbdFrame, T_world_body: Transform, octree: OctreeMap, edit
         is_mapped &= editor.leave(points_world)
     depth_m[measured] *= is_mapped
     return replace(frame, depth_m=depth_m)
-
-
-@lru_cache(maxsize=8)
-def _undistortion(camera: PinholeCamera) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return where every pixel of the ideal image lies in the real one."""
-    columns, rows = cv2.initUndistortRectifyMap(
-        camera.matrix,
-        np.array(camera.distortion),
-        np.eye(3),
-        camera.matrix,
-        (camera.width_px, camera.height_px),
-        cv2.CV_32FC1,
-    )
-    return columns, rows

@@ -1,13 +1,11 @@
 """Hybrid photometric and geometric registration of two RGB-D images (Park, Zhou & Koltun 2017), by Open3D."""
 
-from functools import lru_cache
 from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from mapper.core.frames import NO_DISTORTION, PinholeCamera, RgbdFrame
+from mapper.core.frames import NO_DISTORTION, RgbdFrame, undistortion_maps
 from mapper.core.geometry import Transform, inverse, nearest_rotation, transform
 from mapper.registration.base import Alignment, failed
 from mapper.runtime.extras import extra
@@ -84,7 +82,7 @@ class HybridRgbdAligner:
 def _image(frame: RgbdFrame) -> Any:
     gray, depth_m = frame.gray, frame.depth_m
     if frame.camera.distortion != NO_DISTORTION:
-        columns, rows = _undistorting_map(frame.camera)
+        columns, rows = undistortion_maps(frame.camera)
         gray = cv2.remap(gray, columns, rows, cv2.INTER_LINEAR)
         depth_m = cv2.remap(depth_m, columns, rows, cv2.INTER_NEAREST)  # which mixes no depths across an edge
     return _O3D.geometry.RGBDImage.create_from_color_and_depth(
@@ -94,17 +92,3 @@ def _image(frame: RgbdFrame) -> Any:
         depth_trunc=np.inf,
         convert_rgb_to_intensity=True,
     )
-
-
-@lru_cache(maxsize=8)
-def _undistorting_map(camera: PinholeCamera) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return the column and the row in the raw image of every pixel of the undistorted one."""
-    columns, rows = cv2.initUndistortRectifyMap(
-        camera.matrix,
-        np.array(camera.distortion),
-        None,
-        camera.matrix,
-        (camera.width_px, camera.height_px),
-        cv2.CV_32FC1,
-    )
-    return columns, rows
