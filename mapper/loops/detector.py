@@ -50,14 +50,14 @@ class LoopDetector(Protocol):
 
     def notes(self) -> Sequence[str]:
         """Return what is suspicious about the loops so far, a sentence each."""
-        ...
+        return ()
 
     def places(self) -> Mapping[int, AnyPlace]:
         """Return the places that were kept, by node."""
-        ...
+        return {}
 
 
-class NoLoopDetector:
+class NoLoopDetector(LoopDetector):
     """Loop detector that finds nothing; its estimate is the odometry's."""
 
     def __init__(self) -> None:
@@ -74,14 +74,6 @@ class NoLoopDetector:
     def current_estimate(self, node: int) -> Transform:
         """Return the odometry's (4, 4) pose of a node."""
         return self._T_world_node[node]
-
-    def notes(self) -> Sequence[str]:
-        """Return nothing."""
-        return ()
-
-    def places(self) -> Mapping[int, AnyPlace]:
-        """Return nothing."""
-        return {}
 
 
 @dataclass(frozen=True, slots=True, eq=False)

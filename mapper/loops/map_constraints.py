@@ -14,11 +14,10 @@ from mapper.loops.base import Place, Proposal, Proposer, Verifier, verify_propos
 from mapper.loops.closure import LoopClosure, has_moved
 from mapper.loops.config import PlaceLoopsConfig, ScanLoopsConfig
 from mapper.loops.consistency_check import ConsistencyCheck
-from mapper.loops.detector import ALONE, ViewOf
+from mapper.loops.detector import ALONE, LoopDetector, ViewOf
 from mapper.loops.factory import build_similarity_proposer, build_verifier
 from mapper.loops.odometry_chain import OdometryChain
 from mapper.loops.online_pose_estimator import IncrementalPoseEstimator, OnlinePoseEstimator
-from mapper.loops.place_file import AnyPlace
 from mapper.loops.proposers import NodePoses, PoseProposer
 from mapper.loops.scan_context_proposer import MAX_SIMILAR
 from mapper.odometry.base import FrameResult
@@ -63,8 +62,8 @@ class _InMap:
         return self._estimator.pose_of(node) if T_map_node is None else T_map_node
 
 
-class MapConstraintDetector(Generic[Place]):
-    """Loop detector that compares the keyframes of a new log with the known places of a map.
+class MapConstraintDetector(LoopDetector, Generic[Place]):
+    """Loop detector that compares the keyframes of a new log with the known places of a map; it keeps none.
 
     What is measured against a place at a fixed pose is a pose in the map. So every constraint leads from one
     node, that of the map's frame, and the consistency check compares constraints found at any two places.
@@ -148,14 +147,6 @@ class MapConstraintDetector(Generic[Place]):
     def current_estimate(self, node: int) -> Transform:
         """Return the (4, 4) current estimate of a node's pose, in the map once its part is localised."""
         return self._estimator.pose_of(node)
-
-    def notes(self) -> Sequence[str]:
-        """Return nothing."""
-        return ()
-
-    def places(self) -> Mapping[int, AnyPlace]:
-        """Return nothing: the map stays as it is."""
-        return {}
 
     def _has_moved(self, track: FrameResult) -> bool:
         return self._last is None or has_moved(self._last, track.T_world_body, self._config)

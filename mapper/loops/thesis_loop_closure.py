@@ -11,7 +11,7 @@ from mapper.features.frame_view import ImageView
 from mapper.loops.base import Verifier, verify_proposal
 from mapper.loops.closure import LoopClosure
 from mapper.loops.config import ThesisLoopsConfig
-from mapper.loops.detector import ViewOf
+from mapper.loops.detector import LoopDetector, ViewOf
 from mapper.loops.online_pose_estimator import OnlinePoseEstimator
 from mapper.loops.proposers import PoseProposer
 from mapper.odometry.base import FrameResult
@@ -19,8 +19,11 @@ from mapper.odometry.sharpest_keyframe import SharpestKeyframes
 from mapper.runtime.archived import Archived, ArchivedMapping, archived
 
 
-class ThesisLoopDetector:
-    """Loop detector of the thesis: sharp frames are compared with the keyframes near their estimate."""
+class ThesisLoopDetector(LoopDetector):
+    """Loop detector of the thesis: sharp frames are compared with the keyframes near their estimate.
+
+    No loop is compared with the odometry, so none is noted.
+    """
 
     def __init__(
         self, config: ThesisLoopsConfig, verifier: Verifier[ImageView], estimator: OnlinePoseEstimator
@@ -64,10 +67,6 @@ class ThesisLoopDetector:
     def current_estimate(self, node: int) -> Transform:
         """Return the (4, 4) current estimate of a node's pose, with the loops so far."""
         return self._estimator.pose_of(node)
-
-    def notes(self) -> Sequence[str]:
-        """Return nothing: no loop is compared with the odometry."""
-        return ()
 
     def places(self) -> Mapping[int, ImageView]:
         """Return the keyframes so far."""
