@@ -5,7 +5,7 @@
 """
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -169,6 +169,16 @@ def nearest_rotation(M: Array) -> Array:
     U[..., 2] *= np.where(np.linalg.det(U) * np.linalg.det(Vt) < 0.0, -1.0, 1.0)[..., np.newaxis]
     R: Array = U @ Vt
     return R
+
+
+def mean_pose(T_near: Transform, poses: Iterable[Transform], informations: Sequence[Array]) -> Transform:
+    """Return the (4, 4) mean of poses by their (6, 6) information, in the tangent of a pose near them."""
+    weighted = [
+        information @ np.concatenate(log(inverse(T_near) @ T))
+        for T, information in zip(poses, informations, strict=True)
+    ]
+    step = np.linalg.solve(np.sum(informations, axis=0), np.sum(weighted, axis=0))
+    return T_near @ exp(step[:3], step[3:])
 
 
 def mean_rotation(rotations: Iterable[Array], weights: Iterable[float]) -> Array:

@@ -9,7 +9,7 @@ import numpy as np
 
 from mapper.config.build import BuildConfig
 from mapper.core.frames import Frame, RgbdFrame
-from mapper.core.geometry import Array, Transform, adjoint, exp, inverse, log
+from mapper.core.geometry import Array, Transform, adjoint, inverse, mean_pose
 from mapper.core.timebase import NS_PER_S
 from mapper.features.config import SiftConfig
 from mapper.features.frame_view import ImageView
@@ -202,12 +202,7 @@ def _agreed(links: Sequence[_Link], graph: PoseGraph, gate: GateConfig) -> LoopC
     ]
     if len(agreeing) < _MIN_LINKS or 2 * len(agreeing) <= len(links):
         return None
-    total = sum((information for _, information in agreeing), np.zeros((6, 6)))
-    pull = sum(
-        (information @ np.concatenate(log(inverse(best.T_i_j) @ T_i_j)) for T_i_j, information in agreeing),
-        np.zeros(6),
-    )
-    step = np.asarray(np.linalg.solve(total, pull), np.float64)
+    poses, informations = zip(*agreeing, strict=True)
     (i, j), found = best.nodes, best.found
     return LoopClosure(
         i=i,
@@ -219,8 +214,8 @@ def _agreed(links: Sequence[_Link], graph: PoseGraph, gate: GateConfig) -> LoopC
         matches=found.matches,
         inliers=found.inliers,
         residual_px=found.residual_px,
-        T_i_j=best.T_i_j @ exp(step[:3], step[3:]),
-        information=total / len(agreeing),
+        T_i_j=mean_pose(best.T_i_j, poses, informations),
+        information=np.sum(informations, axis=0) / len(agreeing),
     )
 
 

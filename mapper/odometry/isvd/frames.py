@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mapper.core.deskew import Twist
-from mapper.core.geometry import Array, Transform, exp, inverse, log, mean_rotation, transform
+from mapper.core.geometry import Array, Transform, mean_pose, mean_rotation, transform
 from mapper.features.matching import Pairs
 from mapper.odometry.config import IsvdOdometryConfig
 from mapper.odometry.isvd.registration import IsvdObservation
@@ -71,26 +71,19 @@ class PoseCandidate:
     T_world_body: Transform
 
 
-def mean_pose(candidates: Sequence[PoseCandidate], config: IsvdOdometryConfig) -> Transform:
-    """Return T_world_body, the mean of the candidates' poses (alg. 7, lines 21–27).
+def average_pose(candidates: Sequence[PoseCandidate], config: IsvdOdometryConfig) -> Transform:
+    """Return T_world_body, the average of the candidates' poses (alg. 7, lines 21–27).
 
     Args:
         candidates: Registrations of a frame, the nearest earlier frame's first.
         config: Settings of the average.
     """
+    poses = np.array([candidate.T_world_body for candidate in candidates])
     if config.average == "information":
-        first = candidates[0].T_world_body
-        total = np.sum([candidate.information for candidate in candidates], axis=0)
-        pull = np.sum(
-            [c.information @ np.concatenate(log(inverse(first) @ c.T_world_body)) for c in candidates],
-            axis=0,
-        )
-        mean = np.linalg.solve(total, pull)
-        return first @ exp(mean[:3], mean[3:])
+        return mean_pose(poses[0], poses, [candidate.information for candidate in candidates])
     weights = np.array([candidate.weight for candidate in candidates])
     if config.average == "mean":
         weights = np.ones(len(candidates))
-    poses = np.array([candidate.T_world_body for candidate in candidates])
     translation: Array = weights @ poses[:, :3, 3] / weights.sum()
     R_world_body = poses[0, :3, :3]
     if config.rotation == "mean":

@@ -27,7 +27,7 @@ from mapper.odometry.base import (
 )
 from mapper.odometry.config import IsvdOdometryConfig, MatchConfig
 from mapper.odometry.isvd.earlier_frames import EarlierFrames
-from mapper.odometry.isvd.frames import PoseCandidate, TrackedFrame, mean_pose
+from mapper.odometry.isvd.frames import PoseCandidate, TrackedFrame, average_pose
 from mapper.odometry.isvd.readout import readout_in_pair
 from mapper.odometry.isvd.registration import IsvdObservation, PairRegistration, RegisterPair
 from mapper.odometry.isvd.registration_errors import RegistrationErrors
@@ -129,7 +129,7 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
             self._shutter.restart()  # the motion before a gap is not that in this image
         candidates, method = self._candidates(self._shutter.predicted(observation))
         if candidates:
-            pose = mean_pose(candidates, self._config)
+            pose = average_pose(candidates, self._config)
             return self._add_node(observation, pose, candidates, method=method)
         return lost_frame(observation.stamp_ns, last.T_world_body, features=len(observation.features))
 
