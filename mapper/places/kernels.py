@@ -109,25 +109,10 @@ def k_majority(bits, seeds, max_iterations):
 
 
 @njit(cache=True, nogil=True)
-def shared_weight(ids_a, weights_a, ids_b, weights_b):
-    """Return Σ min(fA, fB) over the words that two vectors with ascending ids share."""
-    total = 0
-    i, j = 0, 0
-    while i < len(ids_a) and j < len(ids_b):
-        if ids_a[i] < ids_b[j]:
-            i += 1
-        elif ids_a[i] > ids_b[j]:
-            j += 1
-        else:
-            total += min(weights_a[i], weights_b[j])
-            i += 1
-            j += 1
-    return total
-
-
-@njit(cache=True, nogil=True)
 def shared_weights(ids, weights, weights_of_word, count):
-    """Return (count,) uint16, the ``shared_weight`` of a vector and each of the first vectors of an index.
+    """Return (count,) uint16: Σ min(fA, fB) over the words of a vector and each of the first of an index.
+
+    That is ½ Σ (|fA| + |fB| − |fA − fB|) (Zhao et al. 2020, eq. 10) of weights that are not negative.
 
     Args:
         ids: (M,) int32 words of the vector.

@@ -14,7 +14,6 @@ from pydantic import NonNegativeInt, ValidationError
 from mapper.core.config import Config
 from mapper.core.errors import DataError, VocabularyError
 from mapper.features.hamming import Bits
-from mapper.places.kernels import shared_weight
 from mapper.places.word_tree import Ids, WordTree
 from mapper.runtime.checked_file import CheckedFormat
 
@@ -120,14 +119,6 @@ class Vocabulary:
         head = header.model_dump_json().encode()
         columns = self.tree.children, self.tree.centres.astype("<u8"), self.idf.astype("<f8")
         _FORMAT.write(path, head, b"".join(column.tobytes() for column in columns))
-
-
-def similarity(a: WordVector, b: WordVector) -> float:
-    """Return s = ½ Σ (|fA| + |fB| − |fA − fB|), from 0 to 1 (Zhao et al. 2020, eq. 10).
-
-    As weights are not negative, each term is the smaller of the two.
-    """
-    return int(shared_weight(a.ids, a.weights, b.ids, b.weights)) / ONE
 
 
 def load_vocabulary(path: Path | None = None) -> Vocabulary:

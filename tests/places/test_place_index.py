@@ -10,7 +10,7 @@ from mapper.features.hamming import match_mutual_bits, pack
 from mapper.places.config import PlacesConfig, VocabularyConfig
 from mapper.places.index import PlaceIndex
 from mapper.places.training import train
-from mapper.places.vocabulary import ONE, WordVector, load_vocabulary, similarity
+from mapper.places.vocabulary import ONE, WordVector, load_vocabulary
 from mapper.places.word_matching import match_by_word
 from mapper.simulation import CameraSimulator
 from mapper.simulation.config import SynthConfig
@@ -41,11 +41,18 @@ def index(vocabulary, vectors):
     return index
 
 
+def similarity(a, b, words):
+    """Equation 10 of Zhao et al. 2020, in whole units of a weight."""
+    f_a, f_b = np.zeros((2, words), np.int64)
+    f_a[a.ids], f_b[b.ids] = a.weights, b.weights
+    return (abs(f_a) + abs(f_b) - abs(f_a - f_b)).sum() / 2 / ONE
+
+
 @pytest.mark.parametrize("before", [None, 0, 1, 300, 599, 10_000])
 @pytest.mark.parametrize("min_similarity", [0.0, 0.3])
-def test_a_query_equals_comparing_with_everything(index, vectors, before, min_similarity):
+def test_a_query_equals_comparing_with_everything(vocabulary, index, vectors, before, min_similarity):
     for asked in vectors[:5]:
-        scores = [similarity(asked, vector) for vector in vectors[:before]]
+        scores = [similarity(asked, vector, vocabulary.words) for vector in vectors[:before]]
         expected = [(1000 + i, s) for i, s in enumerate(scores) if s >= min_similarity and s > 0]
         expected.sort(key=lambda pair: (-pair[1], pair[0]))
 

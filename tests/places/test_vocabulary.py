@@ -11,7 +11,7 @@ from mapper.core.frames import Scan
 from mapper.places.config import VocabularyConfig
 from mapper.places.training import grow, train
 from mapper.places.training_images import descriptors_of
-from mapper.places.vocabulary import ONE, Vocabulary, WordVector, load_vocabulary, similarity
+from mapper.places.vocabulary import ONE, Vocabulary, load_vocabulary
 from mapper.places.word_tree import WordTree
 from tests.support.descriptors import noisy, random_bits
 from tests.support.logs import MemoryEntry, log_in_memory
@@ -112,32 +112,6 @@ def test_words_that_all_images_have_weigh_nothing(vocabulary):
     mute = Vocabulary(vocabulary.tree, np.zeros(vocabulary.words), "")
     vector = mute.vector(np.array([3, 5, 5], np.int32))
     assert len(vector.ids) == 0
-    assert similarity(vector, vector) == 0.0
-
-
-def test_similarity_is_equation_10(images, vocabulary):
-    vectors = [vocabulary.vector(vocabulary.words_of(bits)) for bits in images]
-
-    def dense(vector):
-        full = np.zeros(vocabulary.words)
-        full[vector.ids] = vector.weights / ONE
-        return full
-
-    for a in vectors:
-        assert similarity(a, a) == 1.0
-        for b in vectors:
-            f_a, f_b = dense(a), dense(b)
-            expected = 0.5 * (abs(f_a) + abs(f_b) - abs(f_a - f_b)).sum()
-            assert similarity(a, b) == pytest.approx(expected, abs=1e-12)
-            assert similarity(a, b) == similarity(b, a)
-
-
-def test_nothing_in_common_is_similarity_zero():
-    def vector(*ids):
-        return WordVector(np.array(ids, np.int32), np.full(len(ids), ONE // len(ids), np.uint16))
-
-    assert similarity(vector(0, 4, 9), vector(1, 5)) == 0.0
-    assert similarity(vector(0, 4), WordVector(np.empty(0, np.int32), np.empty(0, np.uint16))) == 0.0
 
 
 def test_the_same_vocabulary_gives_the_same_bytes(tmp_path, images, vocabulary):
