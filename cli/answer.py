@@ -8,7 +8,6 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, is_dataclass
-from enum import Enum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -137,8 +136,6 @@ def plain(value: Any) -> Any:
     match value:
         case Mapping():
             return {str(key): plain(one) for key, one in value.items()}
-        case Enum():
-            return value.value
         case str() | bool() | int() | None:
             return value
         case float():

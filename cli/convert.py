@@ -1,8 +1,7 @@
 """``mapper convert``: a log in another format."""
 
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal, get_args
 
 import typer
 
@@ -11,18 +10,8 @@ from mapper.cli.options import AS_RECORDED, First, Last, Overrides, RequireTruth
 from mapper.core.errors import ConfigError
 from mapper.runtime.result_paths import LOGS, name_of, place_of
 
-
-class LogFormat(StrEnum):
-    """A format to write."""
-
-    TUM = "tum"
-    MBAG = "mbag"
-    KITTI = "kitti"
-    MCAP = "mcap"
-    BAG = "bag"
-
-
-_FILES = (LogFormat.MCAP, LogFormat.BAG)
+LogFormat = Literal["tum", "mbag", "kitti", "mcap", "bag"]
+_FILES: tuple[LogFormat, ...] = ("mcap", "bag")
 
 
 def convert(
@@ -54,28 +43,25 @@ def convert(
     from mapper.sources.writers import left_out, write_log
 
     if as_ is None:
-        endings = {f".{name}": LogFormat(name) for name in _FILES}
+        endings = {f".{name}": name for name in _FILES}
         as_ = endings.get("" if out is None else out.suffix)
     if as_ is None:
-        raise ConfigError(
-            f"--as: want one of {', '.join(LogFormat)}; an --out that ends in .mcap or .bag says it, too"
-        )
+        formats = ", ".join(get_args(LogFormat))
+        raise ConfigError(f"--as: want one of {formats}; an --out that ends in .mcap or .bag says it, too")
     selected = [*AS_RECORDED, *selection(first, last, stride, require_truth)]
     source = open_source(log, load_source_config(None, merged(selected, set_)))
     ending = f".{as_}" if as_ in _FILES else ""
     out = place_of(out, LOGS / f"{name_of(log)}{ending}")
     progress = output.progress()
-    for note in (*source.notes, *left_out(source, as_.value)):
+    for note in (*source.notes, *left_out(source, as_)):
         progress.note(note)
     checks = ReadingChecks(source)
     with progress.stage("convert") as report:
-        skipped = write_log(
-            checks.log, out, kind=as_.value, on_progress=lambda done: report(done, len(source))
-        )
+        skipped = write_log(checks.log, out, kind=as_, on_progress=lambda done: report(done, len(source)))
     for note in (*(f"skipped: {skip.reason}" for skip in skipped), *checks.notes()):
         progress.note(note)
     frames = len(source) - len(skipped)
     return Answer(
         {"path": out, "format": as_, "frames": frames, "skipped": len(skipped)},
-        f"{out}: {frames} frames as {as_.value}, {len(skipped)} skipped",
+        f"{out}: {frames} frames as {as_}, {len(skipped)} skipped",
     )

@@ -66,7 +66,7 @@ def diff(
         [earlier, later],
         place,
         poses,
-        default=Place.AUTO,
+        default="auto",
         jointly=False,
         workers=IN_PROCESS,
         progress=progress,

@@ -1,8 +1,7 @@
 """``mapper eval``: errors of a trajectory, and the quality of a map."""
 
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -23,30 +22,9 @@ if TYPE_CHECKING:
 
 _TOLERANCE = 1
 
-
-class Align(StrEnum):
-    """Alignment of the estimate with the truth."""
-
-    NONE = "none"
-    YAW = "yaw"
-    SE3 = "se3"
-    SIM3 = "sim3"
-
-
-class World(StrEnum):
-    """World of a map's reference."""
-
-    TRUTH = "truth"
-    MAP = "map"
-
-
-class Format(StrEnum):
-    """Format of the printed metrics."""
-
-    TEXT = "text"
-    MARKDOWN = "markdown"
-    CSV = "csv"
-    JSON = "json"
+Align = Literal["none", "yaw", "se3", "sim3"]
+World = Literal["truth", "map"]
+Format = Literal["text", "markdown", "csv", "json"]
 
 
 def evaluate(
@@ -75,7 +53,7 @@ def evaluate(
     ] = None,
     align: Annotated[
         Align, typer.Option(help="How the estimate is aligned with the truth; yaw is for worlds with z up.")
-    ] = Align.SE3,
+    ] = "se3",
     lengths: Annotated[
         str | None,
         typer.Option(metavar="M,M…", help="Lengths of the relative errors' segments; omit to suit the path."),
@@ -115,7 +93,7 @@ def evaluate(
             help="csv and json have every digit and each length, angles in radians; json is the list of "
             "metrics in what --json prints.",
         ),
-    ] = Format.TEXT,
+    ] = "text",
     *,
     output: Output,
 ) -> Answer:
@@ -191,9 +169,7 @@ def _path_errors(
     if lengths is not None and truth is None:
         raise DataError(f"--lengths {lengths}: relative errors need a truth; give one with --truth")
     lengths_m = None if lengths is None else _numbers(lengths)
-    found = assess(
-        trajectory, truth, alignment=align.value, frames_ns=frames_ns, lengths_m=lengths_m, names=names
-    )
+    found = assess(trajectory, truth, alignment=align, frames_ns=frames_ns, lengths_m=lengths_m, names=names)
     if lengths is not None and not any(map(len, found.lengths)):
         raise DataError(
             f"--lengths {lengths}: the true path, where there are poses, is shorter than that everywhere"
@@ -211,7 +187,7 @@ def _answer(run: "Run | None", metrics: "list[Metric]", found: "Assessment", for
         from mapper.cli.summary import verdict_text
 
         document["verdict"] = run.verdict
-        if format_ in (Format.TEXT, Format.MARKDOWN):
+        if format_ in ("text", "markdown"):
             text += f"\n\n{verdict_text(run)}"
     return Answer(document, text)
 
@@ -231,7 +207,7 @@ def _plot(
     from mapper.evaluators.pictures.path_errors import write_trajectory_errors
 
     if quality is None or found.matched is not None:
-        write_trajectory_errors(folder, found, title=f"{name}, {ALIGNED[align.value]}")
+        write_trajectory_errors(folder, found, title=f"{name}, {ALIGNED[align]}")
     if quality is not None and map_ is not None:
         write_map_errors(folder, quality.check, title=f"{name} against {map_.resolve().name}")
 
@@ -248,12 +224,12 @@ def _of_merged_map(
 
     merged = open_map(folder)
     names = distinct_names([Path(run.path) for run in merged.manifest.runs])
-    metrics, notes = merged_map_metrics(merged, names, alignment=align.value)
+    metrics, notes = merged_map_metrics(merged, names, alignment=align)
     if reference is not None:
         found = read_reference(reference, voxel_m=merged.config.octree.resolution_m)
         metrics += merged_map_quality(merged, found, voxels=voxels)
     text = _text(metrics, Assessment(tuple(metrics)), format_)
-    if notes and format_ in (Format.TEXT, Format.MARKDOWN):
+    if notes and format_ in ("text", "markdown"):
         text = "\n".join([text, "", *notes])
     return Answer({"metrics": records_of(metrics), "notes": notes}, text)
 
@@ -269,7 +245,7 @@ def _map_quality(run: "Run", path: Path, *, world: World | None, register: bool,
     from mapper.evaluators.metrics.map_reference import read_reference
 
     reference = read_reference(path, voxel_m=run.config.octree.resolution_m)
-    return map_quality(run, reference, world=world.value if world else None, voxels=voxels, register=register)
+    return map_quality(run, reference, world=world, voxels=voxels, register=register)
 
 
 def _log_of(run: "Run", log: Path | None) -> "Log":
@@ -319,12 +295,12 @@ def _text(metrics: "list[Metric]", found: "Assessment", format_: Format) -> str:
     from mapper.evaluators.metrics.segments import LENGTH_COLUMNS, length_records
     from mapper.evaluators.tables import table as tables
 
-    if format_ is Format.JSON:
+    if format_ == "json":
         return metric.json_text(_every_metric(metrics, found))
-    if format_ is Format.CSV:
+    if format_ == "csv":
         return tables.csv_text(metric.records_of(_every_metric(metrics, found))).rstrip("\n")
     records = length_records(found.lengths)
-    if format_ is Format.MARKDOWN:
+    if format_ == "markdown":
         shown = [metric.markdown_table(metrics), tables.markdown_table(LENGTH_COLUMNS, records)]
     else:
         lengths = tables.text_table(LENGTH_COLUMNS, records).replace("\n", "\n  ")

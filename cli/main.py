@@ -6,8 +6,7 @@ import os
 import sys
 import warnings
 from collections.abc import Callable
-from enum import StrEnum
-from typing import Annotated, Any, TextIO
+from typing import Annotated, Any, Literal, TextIO
 
 import typer
 
@@ -47,14 +46,6 @@ from mapper.core.errors import MapperError, MapperWarning, Terminated
 
 _INTERRUPTED, _TERMINATED = 130, 143  # 128 + SIGINT, 128 + SIGTERM, as shells count
 _USER_CAN_HELP = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EACCES, errno.EPERM, errno.EROFS}
-
-
-class Shell(StrEnum):
-    """Shell that can complete."""
-
-    BASH = "bash"
-    ZSH = "zsh"
-    FISH = "fish"
 
 
 class Guarded(VerbGroup):
@@ -170,14 +161,15 @@ def start(
     ] = False,
     show: Annotated[bool, typer.Option("--show-completion", help="Print the script that completes.")] = False,
     shell: Annotated[
-        Shell | None, typer.Option(help="Shell for these two; omit for the current one.")
+        Literal["bash", "zsh", "fish"] | None,
+        typer.Option(help="Shell for these two; omit for the current one."),
     ] = None,
 ) -> None:
     """Map recorded RGB-D and LiDAR logs: trajectory, pose graph, octree, 2D slice and MCAP log."""
     if version:
         print(f"mapper {__version__}")
     elif install or show:
-        name = shell.value if shell else completion.detected_shell()
+        name = shell or completion.detected_shell()
         if show:
             print(completion.SCRIPTS[name], end="")
         else:

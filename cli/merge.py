@@ -71,14 +71,14 @@ def merge(
     workers = workers_for(processes, scheduler, default=1)
     progress = output.progress()
     known = open_map(runs[0]) if is_merged_map(runs[0]) else None
-    default = Place.BUILT
+    default: Place = "built"
     if known is None:
         built, out = [open_run(run) for run in runs], out or MAPS / joined_names(runs)
     else:
         built, out = [*runs_of(known), *(open_run(run) for run in runs[1:])], out or known.path
         overwrite |= out.resolve() == known.path.resolve()
         if known.graph is not None:
-            default = Place.AUTO
+            default = "auto"
     placing = placing_of(
         built, place, poses, default=default, jointly=True, known=known, workers=workers, progress=progress
     )

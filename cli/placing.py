@@ -1,9 +1,8 @@
 """Options for where the worlds of several runs lie."""
 
 from collections.abc import Sequence
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, assert_never
+from typing import TYPE_CHECKING, Annotated, Literal, assert_never
 
 import typer
 
@@ -16,14 +15,8 @@ if TYPE_CHECKING:
     from mapper.runtime.executor import Workers
     from mapper.runtime.progress import Progress
 
-
-class Place(StrEnum):
-    """Source of the runs' poses in the map."""
-
-    BUILT = "built"
-    TRUTH = "truth"
-    AUTO = "auto"
-
+Place = Literal["built", "truth", "auto"]
+"""Source of the poses of the runs' worlds in the map."""
 
 PosesFile = Annotated[
     Path | None,
@@ -67,11 +60,11 @@ def placing_of(
     if poses is not None:
         return Placing(by_poses(runs, poses))
     match place or default:
-        case Place.BUILT:
+        case "built":
             return Placing(as_built(runs))
-        case Place.TRUTH:
+        case "truth":
             return Placing(by_truth(runs))
-        case Place.AUTO:
+        case "auto":
             from mapper.pipeline.place_runs import place_by_shared_places, place_jointly
 
             if not jointly:

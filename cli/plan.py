@@ -1,10 +1,9 @@
 """``mapper plan``: a path for a robot through a finished map."""
 
 import json
-from enum import StrEnum
 from math import isfinite
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -19,20 +18,6 @@ if TYPE_CHECKING:
     from mapper.core.geometry import Array
 
 _POINT_OPTIONS = ("--from", "--to")
-
-
-class Unknown(StrEnum):
-    """Treatment of unknown space."""
-
-    BLOCKED = "blocked"
-    FREE = "free"
-
-
-class Layer(StrEnum):
-    """Grid that a path in 2D is planned on."""
-
-    SLICE = "slice"
-    TRAVERSABLE = "traversable"
 
 
 class WithPoints(Verb):
@@ -63,9 +48,12 @@ def plan(
     ] = False,
     radius: Annotated[float | None, typer.Option(help="Radius of the robot, metres.  [default: 0.2]")] = None,
     unknown: Annotated[
-        Unknown | None, typer.Option(help="How to treat unknown space.  [default: blocked]")
+        Literal["blocked", "free"] | None,
+        typer.Option(help="How to treat unknown space.  [default: blocked]"),
     ] = None,
-    layer: Annotated[Layer | None, typer.Option(help="Grid for a path in 2D.  [default: slice]")] = None,
+    layer: Annotated[
+        Literal["slice", "traversable"] | None, typer.Option(help="Grid for a path in 2D.  [default: slice]")
+    ] = None,
     *,
     output: Output,  # noqa: ARG001
 ) -> Answer:
@@ -90,7 +78,7 @@ def plan(
 
     if in_3d:
         refuse_with("--3d", {"--layer": layer})
-    has_storeys = not in_3d and layer == Layer.TRAVERSABLE and (run / f"{files.storey(0)}.yaml").exists()
+    has_storeys = not in_3d and layer == "traversable" and (run / f"{files.storey(0)}.yaml").exists()
     counts = (3,) if in_3d else (2, 3) if has_storeys else (2,)
     start, goal = (_point(text, name, counts) for text, name in zip((from_, to), _POINT_OPTIONS, strict=True))
     config = overridden(PlanConfig(), assignments({"radius_m": radius, "unknown": unknown, "layer": layer}))

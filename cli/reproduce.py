@@ -2,9 +2,8 @@
 
 import os
 from collections.abc import Sequence
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -15,16 +14,10 @@ from mapper.cli.options import First, Last, workers_for
 from mapper.core.errors import ConfigError
 
 
-class Paper(StrEnum):
-    """Papers whose tables can be measured again."""
-
-    THESIS = "thesis"
-    ZHAO = "zhao"
-    HOUGH = "hough"
-
-
 def reproduce(
-    paper: Annotated[Paper, typer.Argument(metavar="PAPER", help="thesis, zhao or hough.")],
+    paper: Annotated[
+        Literal["thesis", "zhao", "hough"], typer.Argument(metavar="PAPER", help="thesis, zhao or hough.")
+    ],
     logs: Annotated[Path, typer.Option(help="Folder with the paper's logs, under their usual names.")],
     out: Annotated[
         Path | None,
@@ -71,9 +64,9 @@ def reproduce(
     from mapper.evaluators.papers.reproduce import reproduce as reproduce_tables
 
     every_core = os.cpu_count() or 1
-    workers = workers_for(processes, scheduler, default=every_core if paper is Paper.THESIS else 1)
+    workers = workers_for(processes, scheduler, default=every_core if paper == "thesis" else 1)
     request = Request(
-        paper=paper.value,
+        paper=paper,
         logs=logs,
         given=_given(log or ()),
         tables=tuple(filter(None, (tables or "").replace(" ", "").split(","))),
@@ -82,7 +75,7 @@ def reproduce(
     )
     progress = output.progress()
     note_compilation(progress)
-    out = out or Path(paper.value)
+    out = out or Path(paper)
     reproduction = reproduce_tables(
         request,
         out,

@@ -1,8 +1,7 @@
 """``mapper config``: every setting with its value and meaning."""
 
 from collections.abc import Mapping, Sequence
-from enum import StrEnum
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -16,18 +15,13 @@ if TYPE_CHECKING:
 _MOST_NEIGHBOURS = 12
 
 
-class SensorName(StrEnum):
-    """Sensor whose defaults are shown."""
-
-    RGBD = "rgbd"
-    LIDAR = "lidar"
-
-
 def show_config(
     key: SettingKey = None,
     config: ConfigFile = None,
     set_: Overrides = None,
-    sensor: Annotated[SensorName, typer.Option(help="Sensor whose defaults are used.")] = SensorName.RGBD,
+    sensor: Annotated[
+        Literal["rgbd", "lidar"], typer.Option(help="Sensor whose defaults are used.")
+    ] = "rgbd",
     docs: Annotated[bool, typer.Option("--docs", help="Explain every setting.")] = False,
     *,
     output: Output,  # noqa: ARG001
@@ -41,7 +35,7 @@ def show_config(
     """
     from mapper.config.loading import load_config
 
-    loaded = load_config(config, set_ or (), sensor=sensor.value)
+    loaded = load_config(config, set_ or (), sensor=sensor)
     values = loaded.model_dump(mode="json")
     if key is None and not docs:
         from mapper.core.toml_text import toml_text
@@ -50,7 +44,7 @@ def show_config(
 
     from mapper.config.describe import settings
 
-    every = list(settings(sensor.value))
+    every = list(settings(sensor))
     found = every if key is None else _asked_for(key, every)
     shown = [setting for setting in found if not setting.is_table] or found
     document = {"settings": [_document(setting, values) for setting in shown]}

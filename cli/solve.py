@@ -1,8 +1,7 @@
 """``mapper solve``: a pose graph from g2o text, solved."""
 
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -16,24 +15,6 @@ if TYPE_CHECKING:
 _MOST_SIZES = 8
 
 
-class RobustKernel(StrEnum):
-    """Treatment of false loops."""
-
-    GNC = "gnc"
-    CAUCHY = "cauchy"
-    HUBER = "huber"
-    DCS = "dcs"
-    NONE = "none"
-
-
-class Initial(StrEnum):
-    """Initial poses of the solver."""
-
-    AUTO = "auto"
-    GIVEN = "given"
-    CHORDAL = "chordal"
-
-
 def solve(
     graph: Annotated[Path, typer.Argument(metavar="GRAPH.g2o", help="Pose graph in 3D or 2D.")],
     out: Annotated[
@@ -43,12 +24,14 @@ def solve(
         ),
     ] = None,
     robust: Annotated[
-        RobustKernel | None,
+        Literal["gnc", "cauchy", "huber", "dcs", "none"] | None,
         typer.Option(
             help="Outlier rejection of loops; in other programs' files, edges between non-consecutive ids."
         ),
     ] = None,
-    initial: Annotated[Initial | None, typer.Option(help="Initial poses.  [default: auto]")] = None,
+    initial: Annotated[
+        Literal["auto", "given", "chordal"] | None, typer.Option(help="Initial poses.  [default: auto]")
+    ] = None,
     set_: Overrides = None,
     *,
     output: Output,

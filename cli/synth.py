@@ -1,9 +1,8 @@
 """``mapper synth``: a synthetic log with exact truth."""
 
 from collections.abc import Mapping
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, TypeVar
+from typing import Annotated, Literal, TypeVar
 
 import typer
 
@@ -15,34 +14,24 @@ from mapper.runtime.result_paths import LOGS, place_of
 
 Settings = TypeVar("Settings")
 
-
-class SensorKind(StrEnum):
-    """Sensor that takes the log."""
-
-    RGBD = "rgbd"
-    LIDAR = "lidar"
-    LINE_LASER = "line-laser"
-
-
-class SceneName(StrEnum):
-    """Surroundings of a camera or of a LiDAR."""
-
-    FLAT = "flat"
-    CORRIDOR = "corridor"
-    HALL = "hall"
-    WHITE_ROOM = "white-room"
-    TWIN_ROOMS = "twin-rooms"
-    STREET = "street"
-    COURTYARD = "courtyard"
-    FIELD = "field"
-    TUNNEL = "tunnel"
-    STAIRCASE = "staircase"
-
+SensorKind = Literal["rgbd", "lidar", "line-laser"]
+SceneName = Literal[
+    "flat",
+    "corridor",
+    "hall",
+    "white-room",
+    "twin-rooms",
+    "street",
+    "courtyard",
+    "field",
+    "tunnel",
+    "staircase",
+]
 
 _NOT_OF: Mapping[SensorKind, tuple[str, ...]] = {
-    SensorKind.RGBD: ("--rings",),
-    SensorKind.LIDAR: ("--path", "--rooms", "--plane-at", "--uncalibrated"),
-    SensorKind.LINE_LASER: (
+    "rgbd": ("--rings",),
+    "lidar": ("--path", "--rooms", "--plane-at", "--uncalibrated"),
+    "line-laser": (
         "--path",
         "--rooms",
         "--plane-at",
@@ -65,7 +54,7 @@ def synth(
     ] = None,
     sensor: Annotated[
         SensorKind, typer.Option(help="A camera in a flat, a LiDAR outdoors, or a line laser on a car.")
-    ] = SensorKind.RGBD,
+    ] = "rgbd",
     seconds: Annotated[float | None, typer.Option(help="Length of the log.")] = None,
     path: Annotated[str | None, typer.Option(help="rgbd: loop, desk, spin or wall.")] = None,
     rooms: Annotated[int | None, typer.Option(help="rgbd: rooms of the flat, an even number from 4.")] = None,
@@ -123,15 +112,15 @@ def synth(
     }
     refuse_with(f"--sensor {sensor}", {name: options[name] for name in _NOT_OF[sensor]})
     given: dict[str, object] = {"duration_s": seconds, "seed": seed}
-    if sensor is SensorKind.LINE_LASER:
+    if sensor == "line-laser":
         return _line_laser(place_of(out, LOGS / sensor), assignments(given), noise, set_, output)
     if plane_at is not None:
         refuse_with("--plane-at", {"--path": path, "--scene": scene})
-    if sensor is SensorKind.RGBD:
-        name, kind, write = scene or SceneName.FLAT, "TUM", _write_camera_log
+    if sensor == "rgbd":
+        name, kind, write = scene or "flat", "TUM", _write_camera_log
         given |= {"path": path, "rooms": rooms} | _at_wall(plane_at) | _camera_noise(noise)
     else:
-        name, kind, write = scene or SceneName.STREET, "KITTI", _write_lidar_log
+        name, kind, write = scene or "street", "KITTI", _write_lidar_log
         given |= {"sensor.rings": rings} | _lidar_noise(noise)
     out = place_of(out, LOGS / name)
     write(out, name, options, merged(assignments(given), set_), output)
@@ -145,7 +134,7 @@ def _write_camera_log(
     from mapper.simulation import write_tum_log
     from mapper.simulation.config import CAMERA_SCENES, MOVING_INDOORS, UNCALIBRATED, SynthWheelsConfig
 
-    start = _scene(CAMERA_SCENES, name, SensorKind.RGBD)
+    start = _scene(CAMERA_SCENES, name, "rgbd")
     if start.scene != "flat":
         refuse_with(f"--scene {name}", {"--rooms": options["--rooms"]})
     changed: dict[str, object] = dict(MOVING_INDOORS) if options["--moving"] else {}
@@ -165,10 +154,10 @@ def _write_lidar_log(
     from mapper.simulation.config import LIDAR_SCENES, MOVING_OUTDOORS, PEDESTRIANS, SynthWheelsConfig
     from mapper.simulation.lidar import write_lidar_log
 
-    start = _scene(LIDAR_SCENES, name, SensorKind.LIDAR)
+    start = _scene(LIDAR_SCENES, name, "lidar")
     changed: dict[str, object] = {}
     if options["--moving"]:
-        changed |= MOVING_OUTDOORS if name is SceneName.STREET else PEDESTRIANS
+        changed |= MOVING_OUTDOORS if name == "street" else PEDESTRIANS
     if options["--wheels"]:
         changed["wheels"] = SynthWheelsConfig()
     config = overridden(start.model_copy(update=changed), overrides)
