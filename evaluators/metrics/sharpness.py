@@ -15,6 +15,7 @@ from mapper.core.deskew import deskewed
 from mapper.core.errors import DataError
 from mapper.core.frames import Sensor
 from mapper.core.geometry import Array, Points, apply
+from mapper.core.subsampling import stride_for
 from mapper.core.trajectory import Trajectory
 from mapper.core.voxel_grid import thin
 from mapper.evaluators.metrics.metric import Metric
@@ -69,7 +70,7 @@ def views_of(source: Log, trajectory: Trajectory, *, progress: Progress = SILENT
         FrameError: A frame cannot be read.
     """
     placed = list(placed_frames(source, trajectory))
-    chosen = placed[:: max(1, -(-len(placed) // _FRAMES))]
+    chosen = placed[:: stride_for(len(placed), _FRAMES)]
     points, towards, frames = [np.empty((0, 3))], [np.empty((0, 3))], [np.empty(0, np.int64)]
     with progress.stage("sharp") as report:
         for number, frame in enumerate(chosen):
@@ -133,7 +134,7 @@ def _patches(views: Views, radius_m: float) -> Iterator[Array]:
     """
     points, towards = views.points_world, views.towards_world
     chosen = thin(points.astype(np.float32), 0.5 * radius_m)
-    chosen = chosen[:: max(1, -(-len(chosen) // _PATCHES))].astype(np.int64)
+    chosen = chosen[:: stride_for(len(chosen), _PATCHES)].astype(np.int64)
     around = cKDTree(points).query_ball_point(points[chosen], 1.001 * radius_m, return_sorted=True)
     for i, near in zip(chosen, around, strict=True):
         offsets = points[near] - points[i]

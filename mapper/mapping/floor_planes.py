@@ -4,6 +4,7 @@ import numpy as np
 
 from mapper.core.frames import Scan
 from mapper.core.geometry import Array, Transform, transform
+from mapper.core.subsampling import stride_for
 from mapper.registration.planes import flat_cells, levels_of
 
 _REACH_M = 5.0
@@ -33,7 +34,7 @@ def floor_plane(scan: Scan, up_body: Array, *, tolerance_m: float) -> Transform 
     """
     points = scan.points_body - scan.origin_body
     points = points[np.einsum("ij,ij->i", points, points) < _REACH_M**2]
-    points = points[:: max(1, -(-len(points) // _POINTS))].astype(np.float64)
+    points = points[:: stride_for(len(points), _POINTS)].astype(np.float64)
     if len(points) < _MIN_PATCHES:
         return None
     centres, normals = flat_cells(points, tolerance_m)

@@ -9,6 +9,7 @@ import numpy as np
 from mapper.core.errors import DataError
 from mapper.core.frames import Scan, Sensor
 from mapper.core.geometry import Array, Points, Transform, apply, exp, transform
+from mapper.core.subsampling import stride_for
 from mapper.core.timebase import nearest
 from mapper.core.trajectory import Trajectory
 from mapper.mapping.config import LevelConfig
@@ -194,7 +195,7 @@ def _matched_readings(accelerations: Accelerations, trajectory: Trajectory) -> t
 
     Readings far from the median length are left out: the body accelerates.
     """
-    stride = max(1, -(-len(accelerations.stamps_ns) // _MAX_READINGS))
+    stride = stride_for(len(accelerations.stamps_ns), _MAX_READINGS)
     stamps_ns = accelerations.stamps_ns[::stride]
     readings = accelerations.acceleration_mps2[::stride]
     lengths = np.linalg.norm(readings, axis=1)

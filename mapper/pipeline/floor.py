@@ -8,6 +8,7 @@ import numpy as np
 from mapper.config.build import BuildConfig
 from mapper.core.errors import FrameError
 from mapper.core.geometry import Array, Transform
+from mapper.core.subsampling import stride_for
 from mapper.graph.floor_factors import floor_factors, on_one_floor, with_height_and_tilt
 from mapper.graph.model import PoseGraph
 from mapper.graph.optimize import optimize
@@ -81,7 +82,7 @@ def _floors(
 ) -> dict[int, Transform]:
     """Return T_node_floor of the nodes that see a floor."""
     nodes = [node for node, stamp_ns in graph.stamps_ns.items() if stamp_ns in trusted_ns]
-    nodes = nodes[:: max(1, -(-len(nodes) // _MAX_KEYFRAMES))]
+    nodes = nodes[:: stride_for(len(nodes), _MAX_KEYFRAMES)]
     node_at = {graph.stamps_ns[node]: node for node in nodes}
 
     def seen(entry: FrameRef) -> tuple[int, Transform | None]:

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from mapper.core.frames import Scan
 from mapper.core.geometry import Array, Points, Transform, apply
+from mapper.core.subsampling import stride_for
 from mapper.registration.surfaces import Prepared
 
 _POINTS_PER_SCAN = 4000
@@ -104,7 +105,7 @@ def patches_of(scans: Sequence[tuple[Scan, Transform]], *, tolerance_m: float) -
 
 def subsampled(scan: Scan) -> Points:
     """Return (M, 3) float64 points of a scan, evenly chosen, body frame; M ≤ 4000."""
-    stride = max(1, -(-len(scan.points_body) // _POINTS_PER_SCAN))
+    stride = stride_for(len(scan.points_body), _POINTS_PER_SCAN)
     return scan.points_body[::stride].astype(np.float64)
 
 
@@ -180,7 +181,7 @@ def levels_of(heights_m: Array, *, tolerance_m: float, least: int) -> list[NDArr
 
 def _best_on_grid(normals: Array, up_guess_world: Array) -> Array:
     candidates = _cone(up_guess_world)
-    few = normals[:: max(1, -(-len(normals) // _GRID_PATCHES))]
+    few = normals[:: stride_for(len(normals), _GRID_PATCHES)]
     score = _consistency(few @ candidates.T).sum(axis=0) * (candidates @ up_guess_world) ** 2
     best: Array = candidates[int(np.argmax(score))]
     return best

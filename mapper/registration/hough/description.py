@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from mapper.core.frames import Scan
 from mapper.core.geometry import Array, Points, Transform, apply
+from mapper.core.subsampling import stride_for
 from mapper.registration.free_space import ScanDescription, range_image
 from mapper.registration.hough.config import HoughConfig
 from mapper.registration.hough.ground_removal import Ground, surroundings
@@ -84,4 +85,4 @@ def describe(scan: Scan, config: HoughConfig) -> HoughDescription:
 
 def _evenly_chosen(values: NDArray[np.float32], limit: int) -> NDArray[np.float32]:
     """Return at most ``limit`` rows."""
-    return np.ascontiguousarray(values[:: max(1, -(-len(values) // limit))])
+    return np.ascontiguousarray(values[:: stride_for(len(values), limit)])
