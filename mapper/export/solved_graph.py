@@ -51,7 +51,7 @@ class SolvedGraph:
     @property
     def loops(self) -> int:
         """Number of factors that are loops."""
-        return sum(factor.origin == "loop" for factor in self.graph.factors)
+        return len(self.graph.loops)
 
     @property
     def rejected(self) -> list[tuple[int, int]]:

@@ -36,7 +36,7 @@ def on_one_floor(graph: PoseGraph, T_node_floor: Mapping[int, Transform]) -> lis
         graph: Nodes with their estimates, and the odometry's factors.
         T_node_floor: (4, 4) frame in the floor plane that a node sees, z along its normal.
     """
-    odometry = [factor for factor in graph.factors if factor.origin != "loop"]
+    odometry = graph.without_loops().factors
     nodes = [node for node in graph.T_world_node if node in T_node_floor]
 
     def chi2(pairs: Sequence[tuple[int, int]]) -> Array:

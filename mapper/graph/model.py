@@ -84,9 +84,8 @@ class PoseGraph:
     fixed: tuple[int, ...] = ()
 
     def __repr__(self) -> str:
-        loops = sum(factor.origin == "loop" for factor in self.factors)
         nodes, factors = len(self.T_world_node), len(self.factors)
-        return f"PoseGraph of {nodes} nodes and {factors} factors, {loops} of them loops"
+        return f"PoseGraph of {nodes} nodes and {factors} factors, {len(self.loops)} of them loops"
 
     @property
     def nodes(self) -> NDArray[np.int64]:
@@ -104,13 +103,14 @@ class PoseGraph:
         return self.poses[:, :3, 3]
 
     @property
+    def loops(self) -> list[BetweenFactor]:
+        """Factors that are loops."""
+        return [factor for factor in self.factors if factor.origin == "loop"]
+
+    @property
     def loops_world(self) -> Array:
         """(L, 2, 3) positions of the two nodes that each loop connects, metres, world frame."""
-        ends = [
-            [self.T_world_node[node][:3, 3] for node in (factor.i, factor.j)]
-            for factor in self.factors
-            if factor.origin == "loop"
-        ]
+        ends = [[self.T_world_node[node][:3, 3] for node in (loop.i, loop.j)] for loop in self.loops]
         return np.array(ends).reshape(-1, 2, 3)
 
     def to_gtsam(self) -> "tuple[gtsam.NonlinearFactorGraph, gtsam.Values]":

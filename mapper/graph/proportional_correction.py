@@ -19,9 +19,8 @@ def distribute(graph: PoseGraph) -> dict[int, Transform]:
         T_world_node of every node, in the graph's order.
     """
     order = {node: place for place, node in enumerate(graph.T_world_node)}
-    loops = [factor for factor in graph.factors if factor.origin == "loop"]
     T_world_node = dict(graph.T_world_node)
-    for loop in sorted(loops, key=lambda loop: max(order[loop.i], order[loop.j])):
+    for loop in sorted(graph.loops, key=lambda loop: max(order[loop.i], order[loop.j])):
         T_world_node = spread(T_world_node, loop)
     return T_world_node
 

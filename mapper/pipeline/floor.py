@@ -66,12 +66,10 @@ def above_floor(
     nodes = on_one_floor(graph, T_node_floor)
     if not nodes:
         return graph, 0
-    before = [factor for factor in graph.factors if factor.origin != "loop"]
-    loops = [factor for factor in graph.factors if factor.origin == "loop"]
-    held = graph
+    before, held = graph.without_loops().factors, graph
     for _ in range(_ROUNDS):
         factors = floor_factors(held.T_world_node, T_node_floor, nodes)
-        held = held.with_factors([*before, *factors, *loops])
+        held = held.with_factors([*before, *factors, *graph.loops])
         held = held.with_poses(optimize(held, config.graph).T_world_node)
     combined = with_height_and_tilt(graph.T_world_node, held.T_world_node, T_node_floor, nodes)
     return graph.with_poses(combined), len(nodes)

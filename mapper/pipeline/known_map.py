@@ -30,6 +30,10 @@ _MAX_MOVED_RATIO = 0.14
 """Least ``max_moved_ratio`` of scans: the map was made on another day."""
 
 
+WITHOUT_PLACES = "no keyframe of it can be recognised; build it with loops.kind=places or scans"
+"""What is said of a run without places."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class KnownMap:
     """A finished map with what its places are recognised by.
@@ -76,9 +80,7 @@ def load_known_map(path: Path, *, progress: Progress = SILENT) -> KnownMap:
             number = len(places)
             places[number], T_map_node[number] = place, T_map_own[node]
     if not places:
-        raise RunError(
-            f"{path}: no keyframe of it can be recognised; build it with loops.kind=places or scans"
-        )
+        raise RunError(f"{path}: {WITHOUT_PLACES}")
     return KnownMap(path, folder.slice, first.config, KnownPlaces(places, T_map_node))
 
 

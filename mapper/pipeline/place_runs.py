@@ -17,7 +17,7 @@ from mapper.merging.joint_graph import JointGraph, solve_jointly
 from mapper.merging.merged_map import MergedMap
 from mapper.merging.placing import Placed, Placing, fit_poses
 from mapper.merging.placing_by_places import SolvedWorlds, solve_worlds
-from mapper.pipeline.known_map import detector_of, loops_between_days, run_places, sensor_of
+from mapper.pipeline.known_map import WITHOUT_PLACES, detector_of, loops_between_days, run_places, sensor_of
 from mapper.run import files
 from mapper.run.folder import Run
 from mapper.run.stored_tracking import load_tracking
@@ -195,9 +195,7 @@ def _recognised(
     """
     first, known = runs[0], [run_places(run, progress=progress) for run in runs]
     if not known[0].places:
-        raise RunError(
-            f"{first.path}: no keyframe of it can be recognised; build it with loops.kind=places or scans"
-        )
+        raise RunError(f"{first.path}: {WITHOUT_PLACES}")
     loops = loops_between_days(first.config.loops, sensor_of(known[0]))
     unfit = {number: reason for number in range(len(runs)) if (reason := _unfit(runs, known, number))}
     fit = [KnownPlaces({}, {}) if number in unfit else places for number, places in enumerate(known)]
@@ -222,7 +220,7 @@ def _refuse_alone(runs: Sequence[Run], placed: int, left_out: Mapping[str, str])
 def _unfit(runs: Sequence[Run], known: Sequence[KnownPlaces[Any]], number: int) -> str:
     """Return why a run's places cannot be compared with those of the first; empty if they can."""
     if not known[number].places:
-        return "no keyframe of it can be recognised; build it with loops.kind=places or scans"
+        return WITHOUT_PLACES
     if sensor_of(known[number]) != sensor_of(known[0]):
         return f"is of sensor {sensor_of(known[number])}, and the first run of {sensor_of(known[0])}"
     if detector_of(runs[number].config) != detector_of(runs[0].config):
