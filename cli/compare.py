@@ -42,8 +42,8 @@ def compare(
     from mapper.sources import open_source
 
     given = CompareConfig(methods=tuple(method or ()))
-    sugar = [*selection(first, last, stride, None), *assignments({"pairs": pairs, "seed": seed})]
-    config = overridden(given, merged(sugar, set_))
+    short_options = [*selection(first, last, stride, None), *assignments({"pairs": pairs, "seed": seed})]
+    config = overridden(given, merged(short_options, set_))
     source = open_source(log, config.source)
     comparison = compare_into(out, source, config, overwrite=overwrite, progress=output.progress())
     return Answer(record_in(out, REPORT), f"{tables_text(comparison)}\n{files_text(out)}")

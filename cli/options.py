@@ -80,9 +80,9 @@ def assignments(given: Mapping[str, object]) -> list[str]:
     return [f"{key}={value}" for key, value in given.items() if value is not None]
 
 
-def merged(sugar: Sequence[str], overrides: Sequence[str] | None) -> list[str]:
-    """Return all overrides in the order in which they win: what is spelled out by --set comes last."""
-    return [*sugar, *(overrides or ())]
+def merged(short_options: Sequence[str], overrides: Sequence[str] | None) -> list[str]:
+    """Return all overrides: those of short options first, as later ones win."""
+    return [*short_options, *(overrides or ())]
 
 
 def workers_for(processes: int | None, scheduler: str | None, *, default: int) -> "Workers":

@@ -268,8 +268,8 @@ def _write_verdict(
 def _warn_of_distortion(writer: RunWriter, source: Log, progress: Progress) -> None:
     """Add what is found about the distortion of depth images to a run's warnings, once."""
     known = writer.manifest.warnings
-    told = {warning.sentence for warning in known}
-    new = [warning for warning in distortion_warnings(source) if warning.sentence not in told]
+    reported = {warning.sentence for warning in known}
+    new = [warning for warning in distortion_warnings(source) if warning.sentence not in reported]
     for warning in new:
         progress.note(warning.sentence)
     writer.update(warnings=(*known, *new))

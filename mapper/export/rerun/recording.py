@@ -165,7 +165,7 @@ class RerunLog:
                 "log/loops",
                 np.array([loop.stamp_j_ns for loop in loops]),
                 rr.TextLog.columns(
-                    text=[_told(loop) for loop in loops],
+                    text=[_loop_text(loop) for loop in loops],
                     level=["INFO" if loop.verdict == "accepted" else "DEBUG" for loop in loops],
                 ),
             )
@@ -277,6 +277,6 @@ def transform_of(T_parent_child: Transform) -> rr.Transform3D:
     return rr.Transform3D(translation=T_parent_child[:3, 3], mat3x3=T_parent_child[:3, :3])
 
 
-def _told(loop: LoopClosure) -> str:
+def _loop_text(loop: LoopClosure) -> str:
     why = f": {loop.reason}" if loop.reason else ""
     return f"{loop.i} → {loop.j} ({loop.proposed_by}, {loop.inliers} inliers) {loop.verdict}{why}"
