@@ -54,6 +54,7 @@ def register(
 
     Example: mapper register scan_10.bin scan_00.bin --method hough-gicp --out registered
     """
+    from mapper.api.guess import parse_guess
     from mapper.api.logs import read_frame
     from mapper.config.loading import load_source_config, overridden
     from mapper.config.register import check_method, register_config
@@ -64,7 +65,6 @@ def register(
         write_registration,
     )
     from mapper.evaluators.register.registration import register as register_frames
-    from mapper.registration.guess import parse_guess
     from mapper.runtime.atomic import atomic_folder
 
     if rerun is not None:

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from mapper.api.guess import parse_guess
 from mapper.api.logs import read_frame
 from mapper.config.loading import Settings, load_source_config, overridden
 from mapper.config.register import check_method, register_config
@@ -16,7 +17,6 @@ from mapper.core.paths import AnyPath
 from mapper.odometry.config import IsvdOdometryConfig
 from mapper.registration.base import Alignment
 from mapper.registration.factory import build_registration
-from mapper.registration.guess import parse_guess
 from mapper.run.cloud import Cloud
 from mapper.sources.config import SourceConfig
 
