@@ -41,9 +41,9 @@ def methods_for(source: Log, config: CompareConfig) -> tuple[list[Method], list[
             require(_LIBRARIES[name], "peers", f"--method {name}")
     absent = {} if config.methods else {n: lib for n, lib in _LIBRARIES.items() if find_spec(lib) is None}
     chosen = config.methods or [name for name in names if name not in absent]
-    blind = [m.name for m in images if m.name in chosen and source.sensor != "rgbd"]
-    methods = [m for m in (*images, *scans) if m.name in chosen and m.name not in blind]
-    notes = [f"{', '.join(blind)}: left out, for the log has no images"] if blind else []
+    unusable = [m.name for m in images if m.name in chosen and source.sensor != "rgbd"]
+    methods = [m for m in (*images, *scans) if m.name in chosen and m.name not in unusable]
+    notes = [f"{', '.join(unusable)}: left out, for the log has no images"] if unusable else []
     if absent:
         libraries = ", ".join(sorted(set(absent.values())))
         notes.append(f"{', '.join(absent)}: left out without {libraries}: {install_line('peers')}")

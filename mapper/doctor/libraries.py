@@ -15,7 +15,7 @@ from mapper.doctor.machine import processors
 from mapper.doctor.system_libraries import apt_line
 from mapper.runtime.extras import DISTRIBUTION, install_line
 
-_PATIENCE_S = 60.0
+_TIMEOUT_S = 60.0
 REQUIREMENT = re.compile(r"(?P<name>[\w.-]+)(\[[\w,]*\])?(>=(?P<least>[\d.]+))?")
 _EXTRA = re.compile(r"""extra == ['"](?P<name>[\w-]+)['"]""")
 _MISSING_OBJECT = re.compile(r"(?P<object>lib[\w.+-]+\.so[\w.]*): cannot open shared object file")
@@ -76,7 +76,7 @@ def check_library(name: str, wanted: Requirement = _ANY) -> Finding:
 
 
 def tried(
-    name: str, version: str, command: Sequence[str], *, again: str, patience_s: float | None = None
+    name: str, version: str, command: Sequence[str], *, again: str, timeout_s: float | None = None
 ) -> Finding:
     """Run a self-test in a process of its own, and return how it ended.
 
@@ -85,18 +85,18 @@ def tried(
         version: Version of the library.
         command: Ends with status 0 if the library works.
         again: Command that reinstalls the library.
-        patience_s: Longer is a failure; None: a minute, and more where processes wait for processors.
+        timeout_s: Longer is a failure; None: a minute, and more where processes wait for processors.
     """
-    if patience_s is None:
-        patience_s = usual_patience_s()
+    if timeout_s is None:
+        timeout_s = usual_timeout_s()
     began = time.monotonic()
     try:
-        ended = subprocess.run(command, capture_output=True, text=True, timeout=patience_s, check=False)
+        ended = subprocess.run(command, capture_output=True, text=True, timeout=timeout_s, check=False)
     except subprocess.TimeoutExpired:
         return Finding(
             name,
             "failed",
-            f"{version}, self-test still busy after {patience_s:.0f} s",
+            f"{version}, self-test still busy after {timeout_s:.0f} s",
             f"try again; then {again}",
         )
     if ended.returncode == 0:
@@ -110,11 +110,11 @@ def tried(
     return Finding(name, "failed", f"{version}, {said}", remedy)
 
 
-def usual_patience_s() -> float:
+def usual_timeout_s() -> float:
     """Return how long a self-test may take: a minute, times the processes that share a processor."""
     if not hasattr(os, "getloadavg"):
-        return _PATIENCE_S
-    return _PATIENCE_S * max(1.0, os.getloadavg()[0] / processors())
+        return _TIMEOUT_S
+    return _TIMEOUT_S * max(1.0, os.getloadavg()[0] / processors())
 
 
 def _after(killer: signal.Signals, again: str) -> str:

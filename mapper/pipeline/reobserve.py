@@ -41,7 +41,7 @@ def reobserve(
 
     entries = list(source.entries_of(stamps_ns))
     views = {}
-    with progress.stage("recall") as report:
+    with progress.stage("observe") as report:
         for stamp_ns, seen in ordered_map(view, entries, workers=config.workers):
             views[stamp_ns] = seen
             report(len(views), len(entries))

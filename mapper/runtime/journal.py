@@ -133,11 +133,11 @@ class StateFile:
         path = self._paths[number % 2]
         with path.open("wb") as file:
             file.write(bytes(_STATE.size))
-            sealed = _Sealed(file, _seal_of(number))
-            with _packed_file(fileobj=sealed, mode="wb", compresslevel=1, mtime=0) as packed:
+            hashed = _HashedFile(file, _hash_of(number))
+            with _packed_file(fileobj=hashed, mode="wb", compresslevel=1, mtime=0) as packed:
                 save(packed)
             file.seek(0)
-            file.write(_STATE.pack(_STATE_MAGIC, number, sealed.seal.digest()))
+            file.write(_STATE.pack(_STATE_MAGIC, number, hashed.digest.digest()))
             file.flush()
             os.fsync(file.fileno())
         if number < 2:
@@ -173,21 +173,21 @@ def opened_state(path: Path) -> Iterator[BinaryIO]:
 
 
 @dataclass(frozen=True, slots=True)
-class _Sealed:
+class _HashedFile:
     """File of a state whose digest is taken as it is written."""
 
     file: BinaryIO
-    seal: "hashlib._Hash"
+    digest: "hashlib._Hash"
 
     def write(self, data: Any, /) -> int:
-        self.seal.update(data)
+        self.digest.update(data)
         return self.file.write(data)
 
     def flush(self) -> None:
         self.file.flush()
 
 
-def _seal_of(number: int) -> "hashlib._Hash":
+def _hash_of(number: int) -> "hashlib._Hash":
     return hashlib.sha256(number.to_bytes(8, "little"))
 
 
@@ -199,9 +199,9 @@ def _whole(path: Path) -> int | None:
             if len(head) < _STATE.size:
                 return None
             magic, number, wanted = _STATE.unpack(head)
-            seal = _seal_of(number)
+            digest = _hash_of(number)
             while piece := file.read(1 << 20):
-                seal.update(piece)
+                digest.update(piece)
     except OSError:
         return None
-    return int(number) if magic == _STATE_MAGIC and seal.digest() == wanted else None
+    return int(number) if magic == _STATE_MAGIC and digest.digest() == wanted else None

@@ -9,7 +9,7 @@ import pytest
 from mapper.core.errors import DataError
 from mapper.doctor import libraries, machine
 from mapper.doctor.finding import Finding
-from mapper.doctor.libraries import Requirement, check_library, tried, usual_patience_s
+from mapper.doctor.libraries import Requirement, check_library, tried, usual_timeout_s
 from mapper.doctor.self_tests import SELF_TESTS, WrongAnswerError, expect_near
 from mapper.doctor.system_libraries import apt_line, check_system_libraries
 from tests.support.command_line import invoke
@@ -83,16 +83,16 @@ def test_a_failure_is_reported_and_not_suffered(code, detail, remedy):
 
 
 def test_a_library_that_hangs_is_given_up():
-    assert "still busy after 1 s" in ended("import time; time.sleep(60)", patience_s=1.0).detail
+    assert "still busy after 1 s" in ended("import time; time.sleep(60)", timeout_s=1.0).detail
 
 
-def test_patience_grows_with_the_processes_that_wait(monkeypatch):
+def test_the_timeout_grows_with_the_processes_that_wait(monkeypatch):
     monkeypatch.setattr("mapper.doctor.libraries.processors", lambda: 2)
-    for load, patience_s in ((0.1, 60.0), (2.0, 60.0), (24.0, 720.0)):
+    for load, timeout_s in ((0.1, 60.0), (2.0, 60.0), (24.0, 720.0)):
         monkeypatch.setattr("os.getloadavg", lambda load=load: (load, load, load))
-        assert usual_patience_s() == patience_s
+        assert usual_timeout_s() == timeout_s
     monkeypatch.delattr("os.getloadavg")
-    assert usual_patience_s() == 60.0
+    assert usual_timeout_s() == 60.0
 
 
 def test_a_library_that_is_missing_or_old_is_told_with_the_line_that_mends_it():

@@ -23,7 +23,7 @@ _HOST, _PORT = "127.0.0.1", 9876
 DEFAULT_URL = f"rerun+http://{_HOST}:{_PORT}/proxy"
 ENDING = ".rrd"
 _SPAWN, _CONNECT = "spawn", "connect"
-_PATIENCE_S = 3.0
+_TIMEOUT_S = 3.0
 _START_S = 30.0
 _PIPE_BYTES = 1 << 20
 _FLUSH_S = 60.0
@@ -175,7 +175,7 @@ def _free_port() -> int:
 
 def _listens(host: str, port: int) -> bool:
     try:
-        socket.create_connection((host, port), timeout=_PATIENCE_S).close()
+        socket.create_connection((host, port), timeout=_TIMEOUT_S).close()
     except OSError:
         return False
     return True
@@ -194,7 +194,7 @@ def _refuse_without_listener(url: str) -> None:
     parts = urlsplit(url)
     try:
         port = parts.port or _PORT
-        socket.create_connection((str(parts.hostname), port), timeout=_PATIENCE_S).close()
+        socket.create_connection((str(parts.hostname), port), timeout=_TIMEOUT_S).close()
     except (OSError, ValueError) as error:
         raise ViewerError(
             f"rerun: no viewer answers at {url} ({error}); start one there with: rerun"
