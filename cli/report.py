@@ -67,49 +67,61 @@ def distinct_names(runs: Sequence[Path]) -> list[str]:
 
 
 def _figures(run: "Run") -> "list[Figure]":
-    import numpy as np
-
     from mapper.evaluators.metrics.evaluate import assess
     from mapper.evaluators.metrics.loops import loop_metrics_of_run
     from mapper.evaluators.metrics.metric import shown
-    from mapper.export.path_band import SIGMAS
     from mapper.export.report.data import Figure
 
-    counts, timing, truth, poses = run.manifest.counts, run.manifest.timing, run.truth, run.poses
-    frames_ns = run.frames_ns
-    metrics = list(assess(run.trajectory, truth, frames_ns=frames_ns).metrics)
-    if truth is not None:
-        metrics += loop_metrics_of_run(run, truth)
-    right: list[tuple[str, str]] = [("verdict", run.verdict.state)]
+    metrics = list(assess(run.trajectory, run.truth, frames_ns=run.frames_ns).metrics)
+    if run.truth is not None:
+        metrics += loop_metrics_of_run(run, run.truth)
+    figures = [Figure(name, value, "Is it right?") for name, value in _correctness(run)]
+    figures += [Figure(name, value, "Is it complete?") for name, value in _completeness(run)]
+    for metric in metrics:
+        name, value, unit = shown(metric, digits=_DIGITS)
+        figures.append(Figure(name, f"{value} {unit}", _question(metric.quantity)))
+    return figures + [Figure(name, value, "How fast was it?") for name, value in _speed(run)]
+
+
+def _correctness(run: "Run") -> list[tuple[str, str]]:
+    """Return names and values of what a run itself says about its errors."""
+    import numpy as np
+
+    from mapper.export.path_band import SIGMAS
+
+    counts, poses = run.manifest.counts, run.poses
+    rows: list[tuple[str, str]] = [("verdict", run.verdict.state)]
     if poses is not None and np.isfinite(poses.position_sigmas_m).any():
         widest_m = SIGMAS * float(np.nanmax(poses.position_sigmas_m))
-        right.append((f"uncertainty of the path, {SIGMAS:g} σ", f"at most {widest_m:.{_DIGITS}g} m"))
+        rows.append((f"uncertainty of the path, {SIGMAS:g} σ", f"at most {widest_m:.{_DIGITS}g} m"))
     if counts.loop_candidates:
-        right.append(("loops that hold", f"{counts.loops} of {counts.loop_candidates} candidates"))
-    complete = [
+        rows.append(("loops that hold", f"{counts.loops} of {counts.loop_candidates} candidates"))
+    return rows
+
+
+def _completeness(run: "Run") -> list[tuple[str, str]]:
+    """Return names and values of how many frames a run has, and how large its results are."""
+    counts = run.manifest.counts
+    incomplete = (("doubtful", counts.doubtful), ("lost", counts.lost), ("skipped", counts.skipped))
+    return [
         ("frames tracked", f"{counts.tracked} of {counts.listed}"),
-        *(
-            (f"frames {what}", str(n))
-            for what, n in (("doubtful", counts.doubtful), ("lost", counts.lost), ("skipped", counts.skipped))
-            if n
-        ),
+        *((f"frames {what}", str(n)) for what, n in incomplete if n),
         ("graph", f"{counts.nodes} nodes, {counts.factors} factors"),
         ("octree", f"{counts.voxels_text} of {run.config.octree.resolution_m:g} m"),
         ("cloud", f"{counts.cloud_points:,} points"),
     ]
-    fast = [
+
+
+def _speed(run: "Run") -> list[tuple[str, str]]:
+    """Return names and values of a run's time and memory."""
+    timing = run.manifest.timing
+    return [
         ("build", f"{timing.total_s:.{_DIGITS}g} s for {timing.log_s:.{_DIGITS}g} s of log"),
         ("× real time", f"{timing.real_time_factor:.{_DIGITS}g}"),
         ("frames per second", f"{timing.frames_per_s:.{_DIGITS}g}"),
         *((f"to {stage}", f"{seconds:.{_DIGITS}g} s") for stage, seconds in timing.stage_s.items()),
         ("peak memory", f"{timing.peak_memory_mb:.{_DIGITS}g} MB"),
     ]
-    figures = [Figure(name, value, "Is it right?") for name, value in right]
-    figures += [Figure(name, value, "Is it complete?") for name, value in complete]
-    for metric in metrics:
-        name, value, unit = shown(metric, digits=_DIGITS)
-        figures.append(Figure(name, f"{value} {unit}", _question(metric.quantity)))
-    return figures + [Figure(name, value, "How fast was it?") for name, value in fast]
 
 
 def _question(quantity: str) -> "Question":
