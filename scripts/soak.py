@@ -106,15 +106,15 @@ class Soak:
             [*MAPPER, *map(str, work)], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
         )
         try:
-            _, told = process.communicate(timeout=after_s)
+            _, stderr = process.communicate(timeout=after_s)
             self.seconds[str(work[0])] = time.monotonic() - began
         except subprocess.TimeoutExpired:
             process.send_signal(how)
-            _, told = process.communicate(timeout=60.0)
+            _, stderr = process.communicate(timeout=60.0)
         what = f"{' '.join(map(str, work[:1]))} {how.name} after {after_s:.1f} s"
         self._count(f"{work[0]} {ENDINGS.get(process.returncode, process.returncode)}")
-        if process.returncode not in ENDINGS or "Traceback" in told:
-            self.faults.append(f"{what}: status {process.returncode}: {told}")
+        if process.returncode not in ENDINGS or "Traceback" in stderr:
+            self.faults.append(f"{what}: status {process.returncode}: {stderr}")
         self._compare(what)
 
     def _resumed(self) -> None:
@@ -129,14 +129,14 @@ class Soak:
             after_s = self.random.uniform(0.0, 0.7 + 0.1 * len(kills)) * self.duration_s
             process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
             try:
-                _, told = process.communicate(timeout=after_s)
+                _, stderr = process.communicate(timeout=after_s)
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.communicate()
                 kills.append(round(after_s, 2))
                 continue
             if process.returncode:
-                self.faults.append(f"resume after kills at {kills} s: status {process.returncode}: {told}")
+                self.faults.append(f"resume after kills at {kills} s: status {process.returncode}: {stderr}")
                 return
         self.duration_s = 0.5 * (self.duration_s + time.monotonic() - began)  # the machine may be busy
         self.kills += len(kills)
@@ -148,11 +148,13 @@ class Soak:
     def _full_disk(self) -> None:
         work = self._work()
         blocks = int(2 ** self.random.uniform(0.0, 12.0))  # of 1 kB
-        told = self._told(["sh", "-c", f'ulimit -f {blocks} && exec "$@"', "sh", *MAPPER, *map(str, work)])
+        done = self._completed(
+            ["sh", "-c", f'ulimit -f {blocks} && exec "$@"', "sh", *MAPPER, *map(str, work)]
+        )
         what = f"{work[0]} with files of {blocks} kB at most"
-        self._count(f"{work[0]}, full disk: status {told.returncode}")
-        if told.returncode not in (0, 1) or told.stderr.count("mapper: ") > 1 or "Traceback" in told.stderr:
-            self.faults.append(f"{what}: status {told.returncode}: {told.stderr}")
+        self._count(f"{work[0]}, full disk: status {done.returncode}")
+        if done.returncode not in (0, 1) or done.stderr.count("mapper: ") > 1 or "Traceback" in done.stderr:
+            self.faults.append(f"{what}: status {done.returncode}: {done.stderr}")
         self._compare(what)
 
     def _damaged_log(self) -> None:
@@ -161,12 +163,12 @@ class Soak:
             shutil.rmtree(path, ignore_errors=True)
         shutil.copytree(self.log, log)
         damage = [self._damage(log) for _ in range(self.random.randint(1, 4))]
-        told = self._told([*MAPPER, "build", str(log), "--out", str(out), "--quiet"])
+        done = self._completed([*MAPPER, "build", str(log), "--out", str(out), "--quiet"])
         what = f"build of a log with {', '.join(damage)}"
-        self._count(f"damaged log: status {told.returncode}")
-        if told.returncode not in (0, 1) or "Traceback" in told.stderr:
-            self.faults.append(f"{what}: status {told.returncode}: {told.stderr}")
-        if told.returncode == 0:
+        self._count(f"damaged log: status {done.returncode}")
+        if done.returncode not in (0, 1) or "Traceback" in done.stderr:
+            self.faults.append(f"{what}: status {done.returncode}: {done.stderr}")
+        if done.returncode == 0:
             self._check(out, what)
         elif out.exists():
             self.faults.append(f"{what}: failed, but {out} is there")
@@ -203,23 +205,23 @@ class Soak:
         except (MapperError, OSError) as error:
             self.faults.append(f"{what}: {error}")
             return
-        # A process that was killed may leave a temporary file, which the doctor tells; nothing else.
+        # A process that was killed may leave a temporary file, which the doctor reports; nothing else.
         wrong = [finding for finding in findings if finding.verdict == "failed"]
         self.faults += [f"{what}: {finding.name}: {finding.detail}" for finding in wrong]
 
     def _count(self, ending: str) -> None:
         self.counts[ending] += 1
 
-    def _told(self, command: list[str]) -> "subprocess.CompletedProcess[str]":
+    def _completed(self, command: list[str]) -> "subprocess.CompletedProcess[str]":
         try:
             return subprocess.run(command, capture_output=True, text=True, check=False, timeout=LONGEST_S)
         except subprocess.TimeoutExpired:
             return subprocess.CompletedProcess(command, -1, "", f"hangs: no end after {LONGEST_S:g} s")
 
     def _must(self, *arguments: object) -> None:
-        told = self._told([*MAPPER, *map(str, arguments)])
-        if told.returncode:
-            raise SystemExit(f"soak: {arguments[0]} failed: {told.stderr}")
+        done = self._completed([*MAPPER, *map(str, arguments)])
+        if done.returncode:
+            raise SystemExit(f"soak: {arguments[0]} failed: {done.stderr}")
 
 
 def main() -> None:

@@ -354,7 +354,7 @@ class OctreeMap:
         coarse.restore(TreeLeaves(codes, depths, nodes.log_odds))
         return coarse
 
-    def forget(self, voxels: int) -> None:
+    def lower_known(self, voxels: int) -> None:
         """Reduce the number of known voxels, after the log-odds of some were set to NaN."""
         self._known -= voxels
 
@@ -378,7 +378,7 @@ class OctreeMap:
         values[known] = np.nan
         self.blocks.table.values[slots] = values
         count = int(np.count_nonzero(known))
-        self.forget(count)
+        self.lower_known(count)
         return count
 
     def drop_unknown(self) -> None:

@@ -161,7 +161,7 @@ def remove_moving_objects(octree: OctreeMap, scans: Callable[[], Iterable[ScanUp
         if not (attached & ~moved).any():
             break
         moved |= attached
-    octree.forget(
+    octree.lower_known(
         _decide(
             blocks.table.values, ever, moved, hits, voids, passes, octree.sensor, octree.occupied_log_odds
         )

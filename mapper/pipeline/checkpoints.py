@@ -206,7 +206,7 @@ class Checkpoints:
         Raises:
             DataError: The state or the journal is damaged.
         """
-        self.archive.forget()
+        self.archive.clear()
         with opened_state(path) as file:
             state: dict[str, Any] = load(file)
         end = int(state["journal_end"])

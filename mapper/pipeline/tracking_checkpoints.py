@@ -110,7 +110,7 @@ class TrackingCheckpoints:
             )
         self._states.remove()
         checkpoints.journal.remove()
-        checkpoints.archive.forget()
+        checkpoints.archive.clear()
         return TrackingState(odometry, ())
 
     def add(self, frame: FrameCheckpoint, odometry: Odometry[Any]) -> None:

@@ -66,7 +66,7 @@ class Archive:
             self._journal.open()
         for reference in written:
             assert reference.place is not None
-            self._remember(reference.place, reference.data)
+            self._cache(reference.place, reference.data)
             reference.release(self)
 
     def read(self, reference: Archived[Any], /) -> Any:
@@ -82,16 +82,16 @@ class Archive:
         data = loads(unpack(self._journal.read(reference.place)), archived=self.at)
         if isinstance(data, Archivable):
             refer(data, reference)
-        self._remember(reference.place, data)
+        self._cache(reference.place, data)
         return data
 
-    def forget(self) -> None:
+    def clear(self) -> None:
         """Drop all data, as the journal does when it is deleted."""
         self._recent.clear()
         self._references.clear()
         self._new, self._size = [], 0
 
-    def _remember(self, place: int, data: Any) -> None:
+    def _cache(self, place: int, data: Any) -> None:
         size = size_of(data)
         self._recent[place] = data, size
         self._size += size

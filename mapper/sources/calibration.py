@@ -101,7 +101,7 @@ _FREIBURG_NAME = re.compile(r"(?:^|[^a-z])(?:freiburg|fr)([123])(?!\d)", re.IGNO
 
 
 def freiburg_camera(*names: str) -> Calibration | None:
-    """Return the camera of the first name that speaks of freiburg1, 2 or 3, or of fr1_, fr2_ or fr3_."""
+    """Return the camera of the first name that contains freiburg1, 2 or 3, or fr1_, fr2_ or fr3_."""
     for name in names:
         if found := _FREIBURG_NAME.search(name):
             return FREIBURG[found[1]]

@@ -2,7 +2,7 @@
 
 Decoding takes a third of the time a log takes. ISA-L inflates twice as fast as the zlib in OpenCV's
 reader, and the row filters (PNG specification, third edition, §9) are a short compiled loop: 1.5 to 2.3
-times as fast together. The stream's checksum vouches for every pixel, so a damaged file never half-decodes.
+times as fast together. The stream's checksum covers every pixel, so a damaged file never half-decodes.
 """
 
 import struct
