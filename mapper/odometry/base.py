@@ -145,12 +145,16 @@ SEE_MORE = (
 )
 """What to try where ``Diagnostics.unobservable`` names a motion in most frames."""
 
-STEADY_NS = NS_PER_S
-"""After a longer gap the frame before does not predict the pose of this one."""
+_MAX_STEADY_NS = NS_PER_S
 
 _FAST_M_S, _FAST_RATIO = 2.0, 3.0
 """Least speed, and least ratio to a log's usual one, that a sensor does not keep up between two places: a
 brisk walk is 2 m/s."""
+
+
+def is_gap(begin_ns: int, end_ns: int) -> bool:
+    """Return whether an earlier frame is so old that it does not predict the pose of a later one."""
+    return end_ns - begin_ns > _MAX_STEADY_NS
 
 
 def fastest_m_s(usual_m_s: float) -> float:
@@ -165,7 +169,7 @@ def fastest_m_s(usual_m_s: float) -> float:
 class MotionCheck(Protocol):
     """Other measurement of the body's motion, which holds whatever the images show.
 
-    Poses found after a gap of more than ``STEADY_NS``, or in another sub-map, have to pass it.
+    Poses found after a gap (``is_gap``), or in another sub-map, have to pass it.
     """
 
     def contradiction(self, T_begin_end: Transform, begin_ns: int, end_ns: int) -> str:

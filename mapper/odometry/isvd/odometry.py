@@ -17,12 +17,12 @@ from mapper.features.frame_view import ImageView
 from mapper.graph.model import BetweenFactor
 from mapper.graph.noise import with_model_error
 from mapper.odometry.base import (
-    STEADY_NS,
     Diagnostics,
     FeatureMatches,
     FrameOdometry,
     FrameResult,
     MotionCheck,
+    is_gap,
     lost_frame,
 )
 from mapper.odometry.config import IsvdOdometryConfig, MatchConfig
@@ -170,7 +170,7 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
     def _follows(self, observation: IsvdObservation) -> bool:
         """Return whether a frame is soon after the last tracked one."""
         last = self._earlier.last
-        return last is not None and observation.stamp_ns - last.observation.stamp_ns <= STEADY_NS
+        return last is not None and not is_gap(last.observation.stamp_ns, observation.stamp_ns)
 
     def _corrected(self, frame: TrackedFrame) -> IsvdObservation:
         """Return what a frame observed, by the readout time as it is known now."""
@@ -217,7 +217,7 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
     def _is_possible(self, found: Alignment, earlier: IsvdObservation, now: IsvdObservation) -> bool:
         """Return whether a motion across a gap is possible by another measurement of it, if any."""
         check, begin_ns, end_ns = self._motion_check, earlier.stamp_ns, now.stamp_ns
-        if check is None or end_ns - begin_ns <= STEADY_NS:
+        if check is None or not is_gap(begin_ns, end_ns):
             return True
         return not check.contradiction(found.T_target_source, begin_ns, end_ns)
 

@@ -9,7 +9,7 @@ import numpy as np
 from mapper.core.doubts import Doubt
 from mapper.core.geometry import Array, Transform, inverse, log
 from mapper.core.timebase import NS_PER_S
-from mapper.odometry.base import STEADY_NS
+from mapper.odometry.base import is_gap
 from mapper.odometry.local_map.depth.earlier_depth import Displacement
 from mapper.odometry.local_map.displaced_surfaces import DisplacedSurfaces
 from mapper.odometry.local_map.pose.assessment import UNDOUBTED, Assessment
@@ -220,6 +220,7 @@ class _FrameMotion:
 
     Attributes:
         elapsed_s: Time since the last tracked frame.
+        follows_gap: Whether that is so old that it does not predict this one.
         shift: Angle and distance to the last pose.
         jump: Angle and distance to the predicted pose; −∞ if nothing predicts it.
         sigma_rad: Largest standard deviation of the rotation.
@@ -227,6 +228,7 @@ class _FrameMotion:
     """
 
     elapsed_s: float
+    follows_gap: bool
     shift: tuple[float, float]
     jump: tuple[float, float]
     sigma_rad: float
@@ -246,15 +248,11 @@ class _FrameMotion:
             jump = _angle_and_distance(T_camera_world, T_camera_world_predicted)
         return cls(
             (tracked_pose.stamp_ns - last.stamp_ns) / NS_PER_S,
+            is_gap(last.stamp_ns, tracked_pose.stamp_ns),
             _angle_and_distance(T_camera_world, last.T_camera_world),
             jump,
             *(largest_sigma(covariance[k : k + 3, k : k + 3]) for k in (0, 3)),
         )
-
-    @property
-    def follows_gap(self) -> bool:
-        """Whether the last tracked frame is so old that nothing predicts this one."""
-        return self.elapsed_s > STEADY_NS / NS_PER_S
 
     @property
     def off_rad(self) -> float:

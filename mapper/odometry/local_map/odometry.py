@@ -15,11 +15,11 @@ from mapper.graph.model import BetweenFactor
 from mapper.graph.noise import inflated
 from mapper.odometry.base import (
     REPEATED,
-    STEADY_NS,
     FeatureMatches,
     FrameOdometry,
     FrameResult,
     MotionCheck,
+    is_gap,
     lost_frame,
 )
 from mapper.odometry.config import KeyframeOdometryConfig
@@ -120,9 +120,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         """Track the next frame, in time order."""
         self._map.step()
         last = self._last
-        follows = (
-            last is not None and not self._lost_frames and observation.stamp_ns - last.stamp_ns <= STEADY_NS
-        )
+        follows = last is not None and not (self._lost_frames or is_gap(last.stamp_ns, observation.stamp_ns))
         if not follows:
             self._shutter.restart()  # the motion before a gap is not that in this image
         observation = self._shutter.predicted(observation)
@@ -135,7 +133,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
                 tracked_pose, last, *inlier_landmarks(self._map, tracked_pose)
             )
             self._calibration.pass_frame(self._before_last, last, tracked_pose)
-        if observation.stamp_ns - last.stamp_ns > STEADY_NS:
+        if is_gap(last.stamp_ns, observation.stamp_ns):
             tracked_pose = self._relocalizer.compared_with_other_places(tracked_pose)
         observation = tracked_pose.observation
         T_camera_world, is_moving = tracked_pose.T_camera_world, tracked_pose.moving_cells()
@@ -290,7 +288,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         """Return whether a sub-map without texture ended too long ago: nothing in it is recognised."""
         origin = self._map.observation(self._map.keyframes[last.reference].origin)
         is_bare = all(there.has_depth.sum() < _MIN_START_FEATURES for there in (last.observation, origin))
-        return is_bare and observation.stamp_ns - last.stamp_ns > STEADY_NS
+        return is_bare and is_gap(last.stamp_ns, observation.stamp_ns)
 
     def _begin_sub_map(self, observation: ImageObservation) -> FrameResult:
         """Make the frame a sub-map's first keyframe, at the world's origin or the last tracked pose."""
@@ -322,7 +320,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         relocalised = self._relocalizer.best_among(
             candidates, observation, method="relocalised", is_possible=self._is_possible, exhaustive=True
         )
-        if relocalised is None and observation.stamp_ns - last.stamp_ns > STEADY_NS:
+        if relocalised is None and is_gap(last.stamp_ns, observation.stamp_ns):
             return None  # depth alone needs a guess, and by now the camera may be in another room
         found = self._depth.supported(observation, relocalised or last, None, relocalised)
         return found if found is not None and self._is_possible(found) else None

@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from mapper.core.frames import RgbdFrame
 from mapper.core.geometry import Array, inverse
 from mapper.core.timebase import NS_PER_S
-from mapper.odometry.base import STEADY_NS, MotionCheck, fastest_m_s
+from mapper.odometry.base import MotionCheck, fastest_m_s, is_gap
 from mapper.odometry.config import KeyframeOdometryConfig
 from mapper.odometry.local_map.landmarks.landmark_map import LandmarkMap
 from mapper.odometry.local_map.pose.local_search import LocalSearch
@@ -43,7 +43,7 @@ class GapCheck:
         """Return whether a pose is found after a gap, or in another sub-map than the last one."""
         keyframes = self._map.keyframes
         one_map = keyframes[tracked_pose.reference].origin == keyframes[last.reference].origin
-        return not one_map or _after_gap(tracked_pose, last)
+        return not one_map or is_gap(last.stamp_ns, tracked_pose.stamp_ns)
 
     def is_out_of_reach(self, tracked_pose: TrackedPose, last: TrackedPose, usual_speed_m_s: float) -> bool:
         """Return whether the motion to a pose is impossible.
@@ -62,15 +62,15 @@ class GapCheck:
         check = self._motion_check
         if check is not None and check.contradiction(T_begin_end, since.stamp_ns, tracked_pose.stamp_ns):
             return True
-        elapsed_ns = tracked_pose.stamp_ns - since.stamp_ns
-        if elapsed_ns <= STEADY_NS:
+        if not is_gap(since.stamp_ns, tracked_pose.stamp_ns):
             return False
+        elapsed_ns = tracked_pose.stamp_ns - since.stamp_ns
         distance_m = float(np.linalg.norm(T_begin_end[:3, 3]))
         return distance_m > fastest_m_s(usual_speed_m_s) * elapsed_ns / NS_PER_S
 
     def is_contradicted(self, tracked_pose: TrackedPose, last: TrackedPose) -> bool:
         """Return whether a pose after a gap is contradicted by what should be in view."""
-        return _after_gap(tracked_pose, last) and (
+        return is_gap(last.stamp_ns, tracked_pose.stamp_ns) and (
             self._agrees_in_part(tracked_pose) or self._looks_different(tracked_pose)
         )
 
@@ -116,10 +116,6 @@ class GapCheck:
             return NOTHING_COMPARED
         T_keyframe_camera = self._map.keyframes[k].T_camera_world @ inverse(tracked_pose.T_camera_world)
         return image_agreement(frame, shown, T_keyframe_camera)
-
-
-def _after_gap(tracked_pose: TrackedPose, last: TrackedPose) -> bool:
-    return tracked_pose.stamp_ns - last.stamp_ns > STEADY_NS
 
 
 def _by_parts(pixels: Array, size_px: tuple[int, int]) -> NDArray[np.intp]:
