@@ -68,11 +68,7 @@ class WheelsOdometry:
         factors: tuple[BetweenFactor, ...] = ()
         if last is None:
             keyframe = WheelNode(0, stamp_ns, T_odom_body)
-        elif is_far(
-            inverse(last.T_odom_body) @ T_odom_body,
-            distance_m=self._config.keyframe_distance_m,
-            angle_rad=self._config.keyframe_angle_rad,
-        ):
+        elif is_far(inverse(last.T_odom_body) @ T_odom_body, self._config):
             keyframe = WheelNode(last.node + 1, stamp_ns, T_odom_body)
             factors = (wheel_factor(last, keyframe, self._odometer, self._config, origin="odometry"),)
         assert keyframe is not None

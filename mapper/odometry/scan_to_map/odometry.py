@@ -259,11 +259,7 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
         T_middle_body = self._state.motion.twist.over(-observation.middle_s)
         T_world_body = found.T_world_middle @ T_middle_body
         T_key_body = inverse(keyframe.T_world_body) @ T_world_body
-        is_keyframe = is_far(
-            T_key_body,
-            distance_m=self._config.keyframe_distance_m,
-            angle_rad=self._config.keyframe_angle_rad,
-        )
+        is_keyframe = is_far(T_key_body, self._config)
         node, covariance = keyframe.node, noise.covariance
         factors: tuple[BetweenFactor, ...] = ()
         scan = ScanKeyframe(self._state.next_node, deskewed, found.T_world_middle, T_world_body, at_stamp)

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from mapper.core.frames import Points32
 from mapper.core.geometry import Array, Transform, apply
+from mapper.core.subsampling import stride_for
 from mapper.odometry.scan_to_map.scan_matcher import DeskewedScan
 from mapper.odometry.scan_to_map.surface_covariance import surface_covariance
 from mapper.registration.acceptance import weakest_direction
@@ -157,7 +158,7 @@ def _checked(deskewed: DeskewedScan) -> Points32:
     Seen at a grazing angle, ground and walls are passed by the neighbouring rays.
     """
     prepared, origin = deskewed.prepared, deskewed.scan.origin_body
-    step = max(1, -(-len(prepared.points) // _CHECKED_POINTS))
+    step = stride_for(len(prepared.points), _CHECKED_POINTS)
     rays = prepared.points[::step] - origin
     ranges_m = np.linalg.norm(rays, axis=1)
     apart_m = np.maximum(_SPACED_VOXELS * prepared.voxel_m, _SPACED_PIXELS * _DIRECTION_RAD * ranges_m)

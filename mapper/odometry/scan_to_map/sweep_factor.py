@@ -7,6 +7,7 @@ import numpy as np
 
 from mapper.core.deskew import Twist, deskewed
 from mapper.core.geometry import Array, Transform, apply, exp, inverse
+from mapper.core.subsampling import stride_for
 from mapper.odometry.scan_to_map.scan_observation import ScanObservation
 from mapper.registration.refining import plane_rows
 
@@ -102,7 +103,7 @@ def _cost(first: Sweep, second: Sweep, factor: float) -> float:
     observation = second.observation
     swept = observation.sweep(observation.middle_s)
     all_points = deskewed(swept, _scaled(second.twist, factor)).points_body
-    points = all_points[:: max(1, -(-len(all_points) // _POINTS))].astype(np.float64)
+    points = all_points[:: stride_for(len(all_points), _POINTS)].astype(np.float64)
     T_first_second = inverse(_middle(first, factor)) @ _middle(second, factor)
     distances_m = np.full(len(points), np.inf)
     for _ in range(_POSE_STEPS):

@@ -8,6 +8,7 @@ import numpy as np
 from mapper.core.deskew import Twist, deskewed
 from mapper.core.frames import Scan
 from mapper.core.geometry import Array, Transform, apply, exp, inverse
+from mapper.core.subsampling import stride_for
 from mapper.odometry.scan_to_map.scan_fit import ScanKeyframe
 
 _POINTS = 3000
@@ -61,7 +62,7 @@ def sweep_motion(
         max_pair_distance_m: Largest distance between the points of a pair.
     """
     assert sweep.times_s is not None
-    step_of = max(1, -(-len(sweep.points_body) // _POINTS))
+    step_of = stride_for(len(sweep.points_body), _POINTS)
     part = Scan(sweep.stamp_ns, sweep.points_body[::step_of], times_s=sweep.times_s[::step_of])
     times_s = sweep.times_s[::step_of].astype(np.float64)
     half_s = float(np.abs(times_s).max())
