@@ -29,7 +29,7 @@ from mapper.runtime.archived import Archived, ArchivedMapping, archived
 
 ViewOf = Callable[[], FrameView]
 
-ALONE = ("alone", "no loop from a keyframe nearby agrees")
+UNCONFIRMED = ("unconfirmed", "no loop from a keyframe nearby agrees")
 """Step and reason of a measured loop that no other has confirmed yet."""
 
 
@@ -240,7 +240,7 @@ class KeyframeLoopDetector(Generic[Place]):
 
     def _add_hypothesis(self, closure: LoopClosure) -> None:
         """Keep a measured loop as a hypothesis, and accept all that are confirmed now."""
-        self._closures[closure.i, closure.j] = closure.rejected(*ALONE)
+        self._closures[closure.i, closure.j] = closure.rejected(*UNCONFIRMED)
         for confirmed in self._consistency.add(closure):
             self._closures[confirmed.i, confirmed.j] = confirmed
             self._estimator.close(confirmed)

@@ -14,7 +14,7 @@ from mapper.loops.base import Place, Proposal, Proposer, Verifier, verify_propos
 from mapper.loops.closure import LoopClosure, has_moved
 from mapper.loops.config import PlaceLoopsConfig, ScanLoopsConfig
 from mapper.loops.consistency_check import ConsistencyCheck
-from mapper.loops.detector import ALONE, LoopDetector, ViewOf
+from mapper.loops.detector import UNCONFIRMED, LoopDetector, ViewOf
 from mapper.loops.factory import build_similarity_proposer, build_verifier
 from mapper.loops.odometry_chain import OdometryChain
 from mapper.loops.online_pose_estimator import IncrementalPoseEstimator, OnlinePoseEstimator
@@ -164,7 +164,7 @@ class MapConstraintDetector(LoopDetector, Generic[Place]):
 
     def _add_hypothesis(self, place: int, closure: LoopClosure) -> None:
         """Keep a measured constraint as a hypothesis, and accept all that are confirmed now."""
-        self._closures[place, closure.j] = closure.rejected(*ALONE)
+        self._closures[place, closure.j] = closure.rejected(*UNCONFIRMED)
         self._place_of[closure.j] = place
         for confirmed in self._consistency.add(closure):
             self._failed = 0

@@ -106,7 +106,8 @@ class ScanVerifier:
         rivals = [score for score, other in guesses if exceeds(discrepancy(other, np.eye(4), T_i_j), _SAME)]
         lead = _score(self._worse(i, j, T_i_j, self._coarse)) - max(rivals, default=-1.0)
         if lead < config.min_lead:
-            return replace(found, reason=f"rival: leads another motion by {lead:.2f}, want {config.min_lead}")
+            reason = f"ambiguous: another motion is {lead:.2f} worse, want {config.min_lead}"
+            return replace(found, reason=reason)
         return self._measured(found, alignment, self._cloud(j))
 
     def _guesses(self, i: ScanPlace, j: ScanPlace) -> list[tuple[float, Transform]]:
@@ -137,8 +138,8 @@ class ScanVerifier:
             )
         elif worse.visible_contradicting_ratio > limit:
             reason = (
-                f"sight: {worse.visible_contradicting_ratio:.0%} of what stands in one was looked through in "
-                f"the other, at most {limit:.0%}"
+                f"free space: {worse.visible_contradicting_ratio:.0%} of what stands in one was looked "
+                f"through in the other, at most {limit:.0%}"
             )
         return Verification(worse.visible, reason, worse.agreeing)
 

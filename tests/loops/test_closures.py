@@ -64,7 +64,7 @@ def test_a_verdict_fits_its_reason():
     with pytest.raises(DataError, match="a rejected loop says why"):
         loop(1, 2, verdict="rejected")
     with pytest.raises(DataError, match="a rejected loop says why"):
-        loop(1, 2, reason="alone: …")
+        loop(1, 2, reason="unconfirmed: …")
     with pytest.raises(DataError, match="without a measurement"):
         loop(1, 2, information=None)
 
@@ -73,19 +73,19 @@ def test_loops_that_the_solver_lets_go_are_rejected():
     before = {0: at(0.0), 1: at(1.0), 2: at(2.0)}
     loops = [
         loop(0, 1, at(1.1)),
-        loop(0, 2, verdict="rejected", reason="alone: no", information=None),
+        loop(0, 2, verdict="rejected", reason="unconfirmed: no", information=None),
         loop(0, 2, at(5.0)),
     ]
     solved = Solution({0: at(0.0), 1: at(1.1), 2: at(2.0)}, 1, (0.0,) * 3, (0.0,) * 3, (1.0, 0.9, 0.02))
-    kept, alone, refused = apply_solution(loops, before, solved)
+    kept, unconfirmed, refused = apply_solution(loops, before, solved)
     assert kept.verdict == "accepted"
     assert kept.before.translation_m == pytest.approx(0.1)
     assert kept.after.translation_m == pytest.approx(0.0, abs=1e-9)
     assert kept.weight == 0.9
-    assert alone is loops[1]
+    assert unconfirmed is loops[1]
     assert (refused.verdict, refused.weight) == ("rejected", 0.02)
-    assert [loop.rejected_by for loop in (kept, alone, refused)] == ["", "alone", SOLVER]
-    assert rejections([kept, alone, refused, refused]) == {SOLVER: 2, "alone": 1}
+    assert [loop.rejected_by for loop in (kept, unconfirmed, refused)] == ["", "unconfirmed", SOLVER]
+    assert rejections([kept, unconfirmed, refused, refused]) == {SOLVER: 2, "unconfirmed": 1}
 
 
 def test_the_constraint_is_a_loop():

@@ -110,14 +110,14 @@ def test_a_loop_that_no_other_confirms_is_rejected():
     detector = build_loop_detector(PlaceLoopsConfig(places=PLACES, min_agreeing=NODES), "batch")
     walk(detector, Room(1))
     assert not accepted(detector)
-    assert any(loop.reason.startswith("alone: ") for loop in detector.closures())
+    assert any(loop.reason.startswith("unconfirmed: ") for loop in detector.closures())
 
 
 def test_loops_confirm_each_other_only_nearby_along_the_path():
     detector = build_loop_detector(PlaceLoopsConfig(places=PLACES, agreement_path_m=0.01), "batch")
     walk(detector, Room(1))
     assert not accepted(detector)
-    assert any(loop.reason.startswith("alone: ") for loop in detector.closures())
+    assert any(loop.reason.startswith("unconfirmed: ") for loop in detector.closures())
 
 
 def test_a_look_needs_motion():

@@ -107,7 +107,8 @@ def test_another_street_is_another_street(connected):
     feed(detector, poses, views_other, first=len(one))
     assert detector.closures(), "streets are similar"
     assert not accepted(detector)
-    assert {loop.reason.split(":")[0] for loop in detector.closures()} <= {"vote", "overlap", "sight", "gate"}
+    steps = {loop.reason.split(":")[0] for loop in detector.closures()}
+    assert steps <= {"vote", "overlap", "free space", "gate"}
 
 
 def test_an_empty_field_closes_nothing_and_says_why():
@@ -192,7 +193,7 @@ def test_obstacles_in_free_space_contradict():
         on_street(street(1), 10.0), on_street(street(2), 10.0), seeds=(1, 2), min_agreeing_ratio=0.0
     )
     assert found.T_i_j is None
-    assert found.reason.startswith("sight: ")
+    assert found.reason.startswith("free space: ")
 
 
 def test_scans_that_share_too_little_are_not_one_place():
@@ -217,7 +218,7 @@ def test_a_square_yard_looks_the_same_four_ways():
     verifier = ScanVerifier(ScanVerificationConfig())
     found = verifier.verify(verifier.describe(yard), verifier.describe(yard))
     assert found.T_i_j is None
-    assert found.reason.startswith("rival: ")
+    assert found.reason.startswith("ambiguous: ")
 
 
 def test_a_corridor_is_degenerate_along_itself():
