@@ -115,7 +115,7 @@ def choose(
         notes.append(_choice_note(f"wheel odometry {wheels.topic.name}", config.wheels, "wheels"))
     elif odometry := [one.topic.name for one in pick.all({ODOMETRY}) if one is not truth]:
         notes.append(
-            f"odometry {odometry[0]} is not used; if wheels tell it, source.topics.wheels={odometry[0]}"
+            f"odometry {odometry[0]} is not used; if it is wheel odometry, source.topics.wheels={odometry[0]}"
         )
     return Choice(frames, imu, truth, wheels, notes)
 
