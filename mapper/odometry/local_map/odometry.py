@@ -1,6 +1,5 @@
 """Odometry against a local map of keyframes and landmarks (Mur-Artal & Tardós 2017; Zhao et al. 2020)."""
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -23,28 +22,22 @@ from mapper.odometry.base import (
     lost_frame,
 )
 from mapper.odometry.config import KeyframeOdometryConfig
-from mapper.odometry.local_map.bundle.log_residuals import LogResiduals
 from mapper.odometry.local_map.calibration.calibration_checks import CalibrationChecks
 from mapper.odometry.local_map.calibration.rolling_shutter import RollingShutter
 from mapper.odometry.local_map.depth.earlier_depth import EarlierDepth
 from mapper.odometry.local_map.depth_tracker import DepthTracker
 from mapper.odometry.local_map.frame_doubts import FrameDoubts
 from mapper.odometry.local_map.keyframe_decision import KeyframeDecision
-from mapper.odometry.local_map.landmarks.landmark_map import MIN_SHARED_LANDMARKS, LandmarkMap
+from mapper.odometry.local_map.landmarks.landmark_map import LandmarkMap
+from mapper.odometry.local_map.local_mapping import LocalMapping
 from mapper.odometry.local_map.observation.image_observation import ImageObservation, observe_image
 from mapper.odometry.local_map.observation.readout_time import ReadoutTime
 from mapper.odometry.local_map.photometric_error import excess_error
 from mapper.odometry.local_map.pose.assessment import UNDOUBTED, Assessment
-from mapper.odometry.local_map.pose.pose_information import (
-    covariance_of,
-    disparity_ratio,
-    frame_information,
-    keyframe_residuals,
-    relative_information,
-    with_systematic,
-)
+from mapper.odometry.local_map.pose.pose_information import covariance_of, frame_information, with_systematic
 from mapper.odometry.local_map.pose.pose_tracker import PoseTracker, TrackedPose, unmatched
-from mapper.odometry.local_map.pose.triangulation import add_triangulated, inlier_landmarks
+from mapper.odometry.local_map.pose.previous_pixels import previous_pixels
+from mapper.odometry.local_map.pose.triangulation import inlier_landmarks
 from mapper.odometry.local_map.pose.velocity_filter import VelocityFilter
 from mapper.odometry.local_map.recovery.gap_check import GapCheck
 from mapper.odometry.local_map.recovery.relocalizer import Relocalizer
@@ -57,8 +50,6 @@ _MIN_FIRST_FEATURES = 70
 """Those that the log's first sub-map needs: later ones may begin on a hand before the lens."""
 _OWN_SHARE = 0.5
 """Share of a pose's information that is left as its landmarks were measured no better than its features."""
-_FACTORS_PER_KEYFRAME = 4
-"""Factors of each keyframe, to the earlier ones that share most landmarks with it."""
 
 MakePoseTracker = Callable[[LandmarkMap, Relocalizer], PoseTracker]
 
@@ -86,7 +77,6 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         self._config = config
         self._detector = build_detector(config.detector)
         readout = ReadoutTime(config.readout_s, windows_sharing=config.bundle_keyframes)
-        self._readout = readout
         self._shutter = RollingShutter(readout)
         self._map = LandmarkMap(scale_factor=self._detector.scale_factor, readout=readout)
         self._vocabulary = load_vocabulary(config.vocabulary)
@@ -101,10 +91,9 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         self._recovery = TrackingRecovery(config, self._map, self._relocalizer, self._earlier_depth)
         self._decision = KeyframeDecision(config, self._map)
         self._doubts = FrameDoubts()
-        self._residuals = LogResiduals(disparity_sigma=config.disparity_sigma_px)
         self._calibration = CalibrationChecks(self._map)
+        self._mapping = LocalMapping(config, self._map, self._relocalizer, self._calibration)
         self._agreeing = np.zeros(0, np.bool_)  # features by which the last frame was tracked
-        self._still_keyframes = config.bundle_keyframes  # the newest ones, in which few features move
         self._lost_frames = 0  # since the last tracked one
         self._unknown_frames = 0  # those of them with enough features to begin a sub-map
 
@@ -167,18 +156,14 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         self, tracked_pose: TrackedPose, information: Array, assessed: Assessment, *, is_keyframe: bool
     ) -> FrameResult:
         """Return the result of a tracked frame with its covariance, and extend the map by a keyframe."""
-        reference, inliers = tracked_pose.reference, tracked_pose.inliers
         self._agreeing = tracked_pose.landmark_of_feature >= 0
-        links = []
         if is_keyframe:
-            tracked_pose = self._add_keyframe(tracked_pose, neighbour=reference, assessed=assessed)
-            links = [self._factor(reference, tracked_pose.reference)]
-        self._last = tracked_pose
-        result = self._result(tracked_pose, inliers=inliers, is_keyframe=is_keyframe, links=links)
-        if is_keyframe:
-            information = links[0].information
+            result = self._keyframe(tracked_pose, neighbour=tracked_pose.reference, assessed=assessed)
+            information = result.links[0].information
         else:
-            information = self._residuals.rescaled(_OWN_SHARE * information, result.T_node_body)
+            self._last = tracked_pose
+            result = self._result(tracked_pose, is_keyframe=False)
+            information = self._mapping.residuals.rescaled(_OWN_SHARE * information, result.T_node_body)
             information = with_systematic(information, tracked_pose)
             if assessed.doubts:
                 information = inflated(information, sigma_rad=assessed.sigma_rad, sigma_m=assessed.sigma_m)
@@ -186,6 +171,34 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
             result = replace(result, diagnostics=replace(result.diagnostics, method=REPEATED))
         shutter = self._shutter.pose_covariance(tracked_pose.observation.T_body_camera)
         return replace(result, doubts=assessed.doubts, covariance=covariance_of(information) + shutter)
+
+    def _keyframe(
+        self, tracked_pose: TrackedPose, *, neighbour: int | None, assessed: Assessment = UNDOUBTED
+    ) -> FrameResult:
+        """Make a frame a keyframe of a neighbour's sub-map, or of a new one, and return its result."""
+        self._last = self._mapping.add_keyframe(
+            tracked_pose, neighbour=neighbour, twist_camera=self._shutter.twist_camera, assessed=assessed
+        )
+        self._decision.restart()
+        links = [] if neighbour is None else [self._mapping.factor(neighbour, self._last.reference)]
+        return self._result(self._last, is_keyframe=True, links=links)
+
+    def _result(
+        self, tracked_pose: TrackedPose, *, is_keyframe: bool, links: Sequence[BetweenFactor] = ()
+    ) -> FrameResult:
+        """Return the result of a frame, with the inliers by which it was tracked: a keyframe has more."""
+        T_world_body = tracked_pose.body_pose
+        node = self._map.keyframes[tracked_pose.reference]
+        return FrameResult(
+            stamp_ns=tracked_pose.stamp_ns,
+            node=tracked_pose.reference,
+            T_node_body=inverse(node.body_pose) @ T_world_body,
+            T_world_body=T_world_body,
+            is_keyframe=is_keyframe,
+            diagnostics=tracked_pose.diagnostics(int(self._agreeing.sum())),
+            links=links,
+            twist=self._shutter.twist_body(tracked_pose.observation),
+        )
 
     def view(self, observation: ImageObservation, twist: Twist | None = None, /) -> ImageView:
         """Return the view for place recognition, by the readout time as it is known now.
@@ -204,25 +217,12 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         last = self._last
         if last is None or self._lost_frames:
             return None
-        landmarks = last.landmark_of_feature
-        previous_px = np.full((len(landmarks), 2), np.nan)
-        before = self._before_last
-        earlier = [(self._map.landmark_of_feature(last.reference), self._map.observation(last.reference))]
-        if before is not None:
-            ids = before.landmark_of_feature
-            if self._map.keyframes[before.reference].stamp_ns == before.stamp_ns:
-                ids = self._map.landmark_of_feature(before.reference)  # refining may have dropped some
-            earlier.append((ids, before.observation))
-        for ids, observation in earlier:
-            if observation.stamp_ns != last.observation.stamp_ns:
-                common, now, then = np.intersect1d(landmarks, ids, return_indices=True)
-                now, then = now[common >= 0], then[common >= 0]
-                previous_px[now] = observation.pixels[then]
-        return FeatureMatches(self._agreeing, previous_px)
+        return FeatureMatches(self._agreeing, previous_pixels(self._map, last, self._before_last))
 
     def sensor_notes(self) -> Sequence[str]:
         """Return the estimated readout time of the camera's shutter, if it has any."""
-        return [self._readout.sentence] if self._readout.sentence else []
+        sentence = self._map.readout.sentence
+        return [sentence] if sentence else []
 
     def calibration_warnings(self) -> Sequence[str]:
         """Return what in the images contradicts their focal length, and the stamps of their depth."""
@@ -240,37 +240,10 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         return replace(result, doubts=(*result.doubts, *later.doubts), covariance=covariance)
 
     def finish(self) -> Sequence[BetweenFactor]:
-        """Return a factor from every keyframe to those earlier ones that share most landmarks with it.
-
-        The first keyframe of a sub-map has none, as its pose in other sub-maps is unknown.
-        """
-        factors = []
-        for j, keyframe in enumerate(self._map.keyframes):
-            self._map.step()
+        """Return the factors between the keyframes, with the doubts that later frames add."""
+        for keyframe in self._map.keyframes:
             keyframe.doubt_m = max(keyframe.doubt_m, self._doubts.in_hindsight(keyframe.stamp_ns).sigma_m)
-            if j == keyframe.origin:
-                continue
-            earlier = [(k, shared) for k, shared in self._map.covisible(j, min_shared=1) if k < j]
-            strong = [k for k, shared in earlier if shared >= MIN_SHARED_LANDMARKS]
-            weak = [k for k, _ in earlier[:1]] or [self._map.previous(j)]
-            linked = [keyframe.depth_link.reference] if keyframe.depth_link is not None else []
-            targets = dict.fromkeys([*(strong[:_FACTORS_PER_KEYFRAME] or linked or weak), *linked])
-            factors += [self._factor(i, j, shared_by=len(targets)) for i in targets]
-        return factors
-
-    def _factor(self, i: int, j: int, *, shared_by: int = 1) -> BetweenFactor:
-        """Return the relative pose of two keyframes in the current map.
-
-        ``shared_by`` factors of j rest largely on the same features. Were these the same, each factor would
-        have that share of their information, were they others, all: it has the geometric mean.
-        """
-        keyframes = self._map.keyframes
-        T_i_j = inverse(keyframes[i].body_pose) @ keyframes[j].body_pose
-        information = relative_information(self._map, i, j)
-        information = self._residuals.rescaled(information, T_i_j) / math.sqrt(shared_by)
-        if (doubt_m := keyframes[j].doubt_m) > 0.0:
-            information = inflated(information, sigma_rad=keyframes[j].doubt_rad, sigma_m=doubt_m)
-        return BetweenFactor(i, j, T_i_j, information)
+        return self._mapping.factors()
 
     def _not_found(self, observation: ImageObservation) -> FrameResult:
         """Return a lost frame, or begin a new sub-map with it once enough frames matched no landmarks."""
@@ -299,9 +272,9 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         self._shutter.restart()
         self._agreeing = np.zeros(len(observation), np.bool_)
         self._velocity.restart()
-        self._before_last, self._last = None, self._add_keyframe(start, neighbour=None)
+        self._before_last = None
         self._depth.began(observation)
-        return self._result(self._last, inliers=0, is_keyframe=True)
+        return self._keyframe(start, neighbour=None)
 
     def _find_pose(
         self, observation: ImageObservation, last: TrackedPose, expected: Transform | None
@@ -335,76 +308,6 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
             self._unknown_frames = self._config.max_lost_frames
             return False
         return not self._gap_check.is_contradicted(tracked_pose, last)
-
-    def _add_keyframe(
-        self, tracked_pose: TrackedPose, *, neighbour: int | None, assessed: Assessment = UNDOUBTED
-    ) -> TrackedPose:
-        """Turn a tracked frame into a keyframe, refine the map around it, and return its refined pose.
-
-        ``neighbour`` is a keyframe of the sub-map in which it was tracked; None begins a new one.
-        """
-        config, observation = self._config, tracked_pose.observation
-        # A measured noise is taken as it is; where much moves, more weight would prefer passers-by's motion.
-        if config.depth_noise is None and tracked_pose.few_move:
-            observation = observation.with_disparity_sigma(self._residuals.disparity_sigma)
-        self._still_keyframes = self._still_keyframes + 1 if tracked_pose.few_move else 0
-        is_still = self._still_keyframes >= config.bundle_keyframes  # all of the window
-        variance_factor = self._residuals.variance_factor if is_still else 1.0
-        is_new = observation.has_depth & (tracked_pose.landmark_of_feature < 0)
-        is_new[tracked_pose.moving] = False
-        index = self._map.add_keyframe(
-            observation,
-            tracked_pose.T_camera_world,
-            tracked_pose.landmark_of_feature,
-            new=is_new,
-            neighbour=neighbour,
-            twist_camera=self._shutter.twist_camera,
-            depth_information=None if tracked_pose.depth is None else tracked_pose.depth.lasting_information,
-        )
-        if config.triangulate and tracked_pose.few_move:  # without depth nothing shows what moves
-            add_triangulated(self._map, index, except_for=tracked_pose.moving)
-        self._relocalizer.add(index)
-        self._map.refine(index, window=config.bundle_keyframes, variance_factor=variance_factor)
-        self._map.follow_readout()
-        self._map.cull()
-        self._calibration.pass_keyframe()
-        if (statistics := keyframe_residuals(self._map, index)) is not None:
-            self._residuals.add(statistics)
-            self._map.residual_variance = self._residuals.variance
-        if (ratio := disparity_ratio(self._map, index)) is not None:
-            self._residuals.add_disparity_ratio(ratio)
-        self._decision.restart()
-        keyframe = self._map.keyframes[index]
-        keyframe.doubt_rad, keyframe.doubt_m = assessed.sigma_rad, assessed.sigma_m
-        return replace(
-            tracked_pose,
-            observation=self._map.observation(index),
-            T_camera_world=keyframe.T_camera_world,
-            landmark_of_feature=self._map.landmark_of_feature(index),
-            reference=index,
-        )
-
-    def _result(
-        self,
-        tracked_pose: TrackedPose,
-        *,
-        inliers: int,
-        is_keyframe: bool,
-        links: Sequence[BetweenFactor] = (),
-    ) -> FrameResult:
-        """Return the result of a frame; a keyframe's landmarks are more than the ``inliers`` that it had."""
-        T_world_body = tracked_pose.body_pose
-        node = self._map.keyframes[tracked_pose.reference]
-        return FrameResult(
-            stamp_ns=tracked_pose.observation.stamp_ns,
-            node=tracked_pose.reference,
-            T_node_body=inverse(node.body_pose) @ T_world_body,
-            T_world_body=T_world_body,
-            is_keyframe=is_keyframe,
-            diagnostics=tracked_pose.diagnostics(inliers),
-            links=links,
-            twist=self._shutter.twist_body(tracked_pose.observation),
-        )
 
     def _lost(self, observation: ImageObservation) -> FrameResult:
         self._lost_frames += 1

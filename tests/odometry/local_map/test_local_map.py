@@ -79,7 +79,7 @@ def test_disparities_weigh_what_the_residuals_of_a_log_show(frames):
         assert len(odometry._map.keyframes) > 10
         observation = odometry._last.observation
         weights = observation.weights[observation.has_depth & ~observation.on_outline]
-        return weights[:, 2] / weights[:, 0], odometry._residuals.disparity_sigma**-2
+        return weights[:, 2] / weights[:, 0], odometry._mapping.residuals.disparity_sigma**-2
 
     weight, expected = relative_weight()
     assert expected > 1.5
@@ -93,11 +93,13 @@ def test_keyframes_in_which_much_moves_keep_the_usual_weight(frames):
     odometry = build_frame_odometry(LocalMapConfig())
     for frame in frames[:10]:
         odometry.track(odometry.observe(frame))
-    odometry._residuals.disparity_sigma = 0.5
+    odometry._mapping.residuals.disparity_sigma = 0.5
 
     def relative_weights(moving):
         last = replace(odometry._last, moving=np.arange(moving, dtype=np.int32))
-        observation = odometry._add_keyframe(last, neighbour=last.reference).observation
+        observation = odometry._mapping.add_keyframe(
+            last, neighbour=last.reference, twist_camera=np.zeros(6)
+        ).observation
         weights = observation.weights[observation.has_depth & ~observation.on_outline]
         return np.unique(np.round(weights[:, 2] / weights[:, 0], 6))
 
@@ -113,7 +115,7 @@ def test_bundles_have_the_usual_variances_until_a_window_of_keyframes_is_still(f
     monkeypatch.setattr(odometry._map, "refine", lambda _, **given: factors.append(given["variance_factor"]))
     for moving in (0, len(odometry._last.observation) // 2, 0, 0, 0):
         last = replace(odometry._last, moving=np.arange(moving, dtype=np.int32))
-        odometry._add_keyframe(last, neighbour=last.reference)
+        odometry._mapping.add_keyframe(last, neighbour=last.reference, twist_camera=np.zeros(6))
     assert factors[1:4] == [1.0, 1.0, 1.0]
     assert factors[0] < 1.0
     assert factors[4] < 1.0
