@@ -13,7 +13,6 @@ from mapper.odometry.local_map.depth.depth_alignment import (
     DepthAlignment,
     ReferenceSurfaces,
     align_depth,
-    observes_all,
 )
 from mapper.odometry.local_map.depth.depth_kernels import Landmarks, PosePrior
 from mapper.odometry.local_map.depth.earlier_depth import EarlierDepth
@@ -81,11 +80,6 @@ class DepthTracker:
         self._keyframes: list[int] = []  # those among them
         self._observed_ns = 0  # when every motion was last observed
         self._is_confirmed = False  # the sub-map, by a frame of many landmarks
-
-    def can_start(self, observation: ImageObservation) -> bool:
-        """Return whether a map can begin with a frame although it has few features."""
-        cells = observation.depth_cells
-        return cells is not None and observes_all(surface_of(cells))
 
     def began(self, observation: ImageObservation) -> None:
         """Reset the tracker at a sub-map's first frame."""

@@ -24,8 +24,7 @@ from mapper.odometry.base import (
 from mapper.odometry.config import KeyframeOdometryConfig
 from mapper.odometry.local_map.calibration.calibration_checks import CalibrationChecks
 from mapper.odometry.local_map.calibration.rolling_shutter import RollingShutter
-from mapper.odometry.local_map.depth.earlier_depth import EarlierDepth
-from mapper.odometry.local_map.depth_tracker import DepthTracker
+from mapper.odometry.local_map.depth.earlier_depth import Displacement, EarlierDepth
 from mapper.odometry.local_map.frame_doubts import FrameDoubts
 from mapper.odometry.local_map.keyframe_decision import KeyframeDecision
 from mapper.odometry.local_map.landmarks.landmark_map import LandmarkMap
@@ -35,19 +34,16 @@ from mapper.odometry.local_map.observation.readout_time import ReadoutTime
 from mapper.odometry.local_map.photometric_error import excess_error
 from mapper.odometry.local_map.pose.assessment import UNDOUBTED, Assessment
 from mapper.odometry.local_map.pose.pose_information import covariance_of, frame_information, with_systematic
-from mapper.odometry.local_map.pose.pose_tracker import PoseTracker, TrackedPose, unmatched
+from mapper.odometry.local_map.pose.pose_tracker import PoseTracker, TrackedPose
 from mapper.odometry.local_map.pose.previous_pixels import previous_pixels
 from mapper.odometry.local_map.pose.triangulation import inlier_landmarks
 from mapper.odometry.local_map.pose.velocity_filter import VelocityFilter
-from mapper.odometry.local_map.recovery.gap_check import GapCheck
+from mapper.odometry.local_map.pose_estimator import PoseEstimator
+from mapper.odometry.local_map.recovery.lost_frames import LostFrames
 from mapper.odometry.local_map.recovery.relocalizer import Relocalizer
 from mapper.odometry.local_map.recovery.tracking_recovery import TrackingRecovery
 from mapper.places.vocabulary import load_vocabulary
 
-_MIN_START_FEATURES = 100
-"""Features with depth that a sub-map's first frame must have: a few times ``min_inliers``."""
-_MIN_FIRST_FEATURES = 70
-"""Those that the log's first sub-map needs: later ones may begin on a hand before the lens."""
 _OWN_SHARE = 0.5
 """Share of a pose's information that is left as its landmarks were measured no better than its features."""
 
@@ -76,26 +72,24 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         """
         self._config = config
         self._detector = build_detector(config.detector)
+        self._vocabulary = load_vocabulary(config.vocabulary)
         readout = ReadoutTime(config.readout_s, windows_sharing=config.bundle_keyframes)
         self._shutter = RollingShutter(readout)
         self._map = LandmarkMap(scale_factor=self._detector.scale_factor, readout=readout)
-        self._vocabulary = load_vocabulary(config.vocabulary)
-        self._relocalizer = Relocalizer(config, self._map, self._vocabulary)
-        self._tracker = make_tracker(self._map, self._relocalizer)
+        relocalizer = Relocalizer(config, self._map, self._vocabulary)
+        tracker = make_tracker(self._map, relocalizer)
+        self._lost = LostFrames(config, self._map)
+        self._estimator = PoseEstimator(config, self._map, relocalizer, tracker, motion_check, self._lost)
+        self._earlier_depth = EarlierDepth(self._map, config.depth_noise)
+        self._recovery = TrackingRecovery(config, self._map, relocalizer, self._earlier_depth)
+        self._velocity = VelocityFilter()
+        self._doubts = FrameDoubts()
+        self._decision = KeyframeDecision(config, self._map)
+        self._calibration = CalibrationChecks(self._map)
+        self._mapping = LocalMapping(config, self._map, relocalizer, self._calibration)
         self._last: TrackedPose | None = None
         self._before_last: TrackedPose | None = None
-        self._velocity = VelocityFilter()
-        self._depth = DepthTracker(config, self._map)
-        self._earlier_depth = EarlierDepth(self._map, config.depth_noise)
-        self._gap_check = GapCheck(config, self._map, motion_check)
-        self._recovery = TrackingRecovery(config, self._map, self._relocalizer, self._earlier_depth)
-        self._decision = KeyframeDecision(config, self._map)
-        self._doubts = FrameDoubts()
-        self._calibration = CalibrationChecks(self._map)
-        self._mapping = LocalMapping(config, self._map, self._relocalizer, self._calibration)
         self._agreeing = np.zeros(0, np.bool_)  # features by which the last frame was tracked
-        self._lost_frames = 0  # since the last tracked one
-        self._unknown_frames = 0  # those of them with enough features to begin a sub-map
 
     def observe(self, frame: Frame) -> ImageObservation:
         """Detect features and look up their depth. Pure; safe in any thread.
@@ -109,46 +103,61 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         """Track the next frame, in time order."""
         self._map.step()
         last = self._last
-        follows = last is not None and not (self._lost_frames or is_gap(last.stamp_ns, observation.stamp_ns))
+        follows = last is not None and not (self._lost.count or is_gap(last.stamp_ns, observation.stamp_ns))
         if not follows:
             self._shutter.restart()  # the motion before a gap is not that in this image
         observation = self._shutter.predicted(observation)
-        expected = None if last is None else self._velocity.predicted(observation.stamp_ns, last)
-        tracked_pose = None if last is None else self._find_pose(observation, last, expected)
-        if last is None or tracked_pose is None:
+        if last is None:
+            return self._not_found(observation)
+        expected = self._velocity.predicted(observation.stamp_ns, last)
+        tracked_pose = self._estimator.estimate(observation, last, expected, self._doubts.usual_speed_m_s)
+        if tracked_pose is None:
             return self._not_found(observation)
         if follows:
             tracked_pose = self._shutter.refined(
                 tracked_pose, last, *inlier_landmarks(self._map, tracked_pose)
             )
             self._calibration.pass_frame(self._before_last, last, tracked_pose)
-        if is_gap(last.stamp_ns, observation.stamp_ns):
-            tracked_pose = self._relocalizer.compared_with_other_places(tracked_pose)
-        observation = tracked_pose.observation
-        T_camera_world, is_moving = tracked_pose.T_camera_world, tracked_pose.moving_cells()
         displaced = self._earlier_depth.displacement(
-            observation, T_camera_world, tracked_pose.reference, self._shutter.known_twist, is_moving
+            tracked_pose.observation,
+            tracked_pose.T_camera_world,
+            tracked_pose.reference,
+            self._shutter.known_twist,
+            tracked_pose.moving_cells(),
         )
         recognised = self._recovery.relocalised(tracked_pose, displaced, self._shutter.known_twist)
         if recognised is not None:
-            (tracked_pose, displaced), expected = recognised, None
             self._velocity.restart()
-        elif not follows and self._recovery.is_contradicted(tracked_pose, displaced):
-            return self._not_found(observation)
+            return self._follow(*recognised, last, None, is_recognised=True)
+        if not follows and self._recovery.is_contradicted(tracked_pose, displaced):
+            return self._not_found(tracked_pose.observation)
+        return self._follow(tracked_pose, displaced, last, expected)
+
+    def _follow(
+        self,
+        tracked_pose: TrackedPose,
+        displaced: Displacement,
+        last: TrackedPose,
+        expected: Transform | None,
+        *,
+        is_recognised: bool = False,
+    ) -> FrameResult:
+        """Assess a pose, and follow it unless it is implausible."""
         information = frame_information(self._map, tracked_pose)
         covariance = covariance_of(information)
         assessed = self._doubts.assess(
             tracked_pose, covariance, last, expected, displaced, excess_error(tracked_pose, last, expected)
         )
-        if assessed.is_implausible and tracked_pose.inliers < self._config.weak_inliers:
-            return self._lost(observation)
+        is_weak = tracked_pose.inliers < self._config.weak_inliers
+        if assessed.is_implausible and is_weak:
+            return self._lost_frame(tracked_pose.observation)
         # The motion before a gap does not predict the motion after it.
-        self._before_last = None if self._lost_frames else last
-        if self._before_last is not None and recognised is None:
+        self._before_last = None if self._lost.count else last
+        if self._before_last is not None and not is_recognised:
             self._velocity.add(tracked_pose, covariance, last, is_doubtful=bool(assessed.doubts))
-        self._lost_frames = self._unknown_frames = 0
-        is_keyframe = self._decision.is_due(tracked_pose) and recognised is None
-        if assessed.repeats or (assessed.doubts and tracked_pose.inliers >= self._config.weak_inliers):
+        self._lost.restart()
+        is_keyframe = self._decision.is_due(tracked_pose) and not is_recognised
+        if assessed.repeats or (assessed.doubts and not is_weak):
             is_keyframe = False  # tracking goes on without it
         return self._tracked(tracked_pose, information, assessed, is_keyframe=is_keyframe)
 
@@ -200,6 +209,22 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
             twist=self._shutter.twist_body(tracked_pose.observation),
         )
 
+    def _not_found(self, observation: ImageObservation) -> FrameResult:
+        """Return a lost frame, or begin a new sub-map with it once enough frames matched no landmarks."""
+        if not self._lost.begins_sub_map(observation, self._last):
+            return self._lost_frame(observation)
+        start = self._estimator.first_of_sub_map(observation, self._last)
+        self._shutter.restart()
+        self._velocity.restart()
+        self._before_last, self._agreeing = None, np.zeros(len(observation), np.bool_)
+        return self._keyframe(start, neighbour=None)
+
+    def _lost_frame(self, observation: ImageObservation) -> FrameResult:
+        self._lost.count += 1
+        self._velocity.restart()
+        T_world_body = np.eye(4) if self._last is None else self._last.body_pose
+        return lost_frame(observation.stamp_ns, T_world_body, features=len(observation), residual_unit="px")
+
     def view(self, observation: ImageObservation, twist: Twist | None = None, /) -> ImageView:
         """Return the view for place recognition, by the readout time as it is known now.
 
@@ -215,7 +240,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
     def matches(self) -> FeatureMatches | None:
         """Return the features matched to landmarks, and these landmarks' pixels in an earlier frame."""
         last = self._last
-        if last is None or self._lost_frames:
+        if last is None or self._lost.count:
             return None
         return FeatureMatches(self._agreeing, previous_pixels(self._map, last, self._before_last))
 
@@ -244,73 +269,3 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         for keyframe in self._map.keyframes:
             keyframe.doubt_m = max(keyframe.doubt_m, self._doubts.in_hindsight(keyframe.stamp_ns).sigma_m)
         return self._mapping.factors()
-
-    def _not_found(self, observation: ImageObservation) -> FrameResult:
-        """Return a lost frame, or begin a new sub-map with it once enough frames matched no landmarks."""
-        last, most = self._last, self._config.max_lost_frames
-        enough = _MIN_FIRST_FEATURES if last is None else _MIN_START_FEATURES
-        if observation.has_depth.sum() >= enough:
-            self._unknown_frames += 1
-            begins = last is None or 0 < most < self._unknown_frames
-        else:
-            is_open = last is None or (most > 0 and self._is_out_of_reach(last, observation))
-            begins = is_open and self._depth.can_start(observation)
-        return self._begin_sub_map(observation) if begins else self._lost(observation)
-
-    def _is_out_of_reach(self, last: TrackedPose, observation: ImageObservation) -> bool:
-        """Return whether a sub-map without texture ended too long ago: nothing in it is recognised."""
-        origin = self._map.observation(self._map.keyframes[last.reference].origin)
-        is_bare = all(there.has_depth.sum() < _MIN_START_FEATURES for there in (last.observation, origin))
-        return is_bare and is_gap(last.stamp_ns, observation.stamp_ns)
-
-    def _begin_sub_map(self, observation: ImageObservation) -> FrameResult:
-        """Make the frame a sub-map's first keyframe, at the world's origin or the last tracked pose."""
-        last = self._last
-        T_camera_world = inverse(observation.T_body_camera) if last is None else last.T_camera_world
-        start = TrackedPose(observation, T_camera_world, unmatched(observation), 0, 0, 1.0, 0, 0.0, "start")
-        self._lost_frames = self._unknown_frames = 0
-        self._shutter.restart()
-        self._agreeing = np.zeros(len(observation), np.bool_)
-        self._velocity.restart()
-        self._before_last = None
-        self._depth.began(observation)
-        return self._keyframe(start, neighbour=None)
-
-    def _find_pose(
-        self, observation: ImageObservation, last: TrackedPose, expected: Transform | None
-    ) -> TrackedPose | None:
-        """Track from the last frame; if that fails, or it was lost, relocalise among similar keyframes."""
-        if self._lost_frames == 0:
-            tracked_pose = self._tracker.track(observation, last, expected)
-            # Without a prediction depth may lead into a wrong minimum, so keyframes are recognised first.
-            if tracked_pose is not None or expected is not None:
-                tracked_pose = self._depth.supported(observation, last, expected, tracked_pose)
-            if tracked_pose is not None and (
-                not self._gap_check.is_needed(tracked_pose, last) or self._is_possible(tracked_pose)
-            ):
-                return tracked_pose
-        candidates = self._relocalizer.candidates(observation, inverse(last.T_camera_world)[:3, 3])
-        relocalised = self._relocalizer.best_among(
-            candidates, observation, method="relocalised", is_possible=self._is_possible, exhaustive=True
-        )
-        if relocalised is None and is_gap(last.stamp_ns, observation.stamp_ns):
-            return None  # depth alone needs a guess, and by now the camera may be in another room
-        found = self._depth.supported(observation, relocalised or last, None, relocalised)
-        return found if found is not None and self._is_possible(found) else None
-
-    def _is_possible(self, tracked_pose: TrackedPose) -> bool:
-        """Return whether a pose after a gap is possible by the motion to it and by what should be in view."""
-        last = self._last
-        if last is None:
-            return True
-        if self._gap_check.is_out_of_reach(tracked_pose, last, self._doubts.usual_speed_m_s):
-            # Another place, so that a sub-map may begin at once.
-            self._unknown_frames = self._config.max_lost_frames
-            return False
-        return not self._gap_check.is_contradicted(tracked_pose, last)
-
-    def _lost(self, observation: ImageObservation) -> FrameResult:
-        self._lost_frames += 1
-        self._velocity.restart()
-        T_world_body = np.eye(4) if self._last is None else self._last.body_pose
-        return lost_frame(observation.stamp_ns, T_world_body, features=len(observation), residual_unit="px")

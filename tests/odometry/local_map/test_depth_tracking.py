@@ -252,14 +252,14 @@ def test_depth_takes_part_where_landmarks_tell_too_little(
         odometry.track(observation)
     last = odometry._last
     T_predicted = odometry._velocity.predicted(observations[3].stamp_ns, last)
-    found = odometry._tracker.track(observations[3], last, T_predicted)
+    found = odometry._estimator._tracker.track(observations[3], last, T_predicted)
     kept = np.flatnonzero(found.landmark_of_feature >= 0)
     ids = np.full_like(found.landmark_of_feature, -1)
     spread = kept[np.linspace(0, len(kept) - 1, landmarks).astype(int)]
     ids[spread] = found.landmark_of_feature[spread]
 
     found = replace(found, landmark_of_feature=ids, moving=np.arange(moving, dtype=np.int32))
-    supported = odometry._depth.supported(observations[3], last, T_predicted, found)
+    supported = odometry._estimator._depth.supported(observations[3], last, T_predicted, found)
 
     assert supported.method == method
     assert (supported.depth is None) == (method == "map")
@@ -272,7 +272,7 @@ def test_a_relocalised_frame_is_not_aligned_to_itself(frames):
     for observation in observations[:3]:
         odometry.track(observation)
     last = odometry._last
-    right = odometry._tracker.track(observations[3], last, None)
+    right = odometry._estimator._tracker.track(observations[3], last, None)
     found = replace(
         right,
         T_camera_world=exp(np.zeros(3), np.array([0.1, 0.0, 0.0])) @ right.T_camera_world,
@@ -280,7 +280,7 @@ def test_a_relocalised_frame_is_not_aligned_to_itself(frames):
         method="relocalised",
     )
 
-    supported = odometry._depth.supported(observations[3], found, None, found)
+    supported = odometry._estimator._depth.supported(observations[3], found, None, found)
 
     assert supported.method == "relocalised+depth"
     error = inverse(right.T_camera_world) @ supported.T_camera_world

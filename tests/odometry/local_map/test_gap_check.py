@@ -38,19 +38,19 @@ def with_a_corner_alone(pose):
 
 
 def test_after_a_gap_landmarks_have_to_agree_all_over_the_view(odometry):
-    check, last = odometry._gap_check, odometry._last
+    check, last = odometry._estimator._gap_check, odometry._last
     right = later(last, AFTER_NS)
     assert not check.is_contradicted(right, last)
     assert check.is_contradicted(with_a_corner_alone(right), last)
 
 
 def test_a_pose_soon_after_the_last_one_may_rest_on_a_part_of_the_view(odometry):
-    check, last = odometry._gap_check, odometry._last
+    check, last = odometry._estimator._gap_check, odometry._last
     assert not check.is_contradicted(with_a_corner_alone(later(last, 500_000_000)), last)
 
 
 def test_few_landmarks_spread_over_the_view_are_enough(odometry):
-    check, last = odometry._gap_check, odometry._last
+    check, last = odometry._estimator._gap_check, odometry._last
     ids = last.landmark_of_feature.copy()
     found = np.flatnonzero(ids >= 0)
     ids[np.setdiff1d(found, np.random.default_rng(1).choice(found, 40, replace=False))] = -1
@@ -58,7 +58,7 @@ def test_few_landmarks_spread_over_the_view_are_enough(odometry):
 
 
 def test_a_place_ten_metres_away_takes_more_than_three_seconds(odometry):
-    check, last = odometry._gap_check, odometry._last
+    check, last = odometry._estimator._gap_check, odometry._last
     T_away = exp(np.zeros(3), np.array([10.0, 0.0, 0.0]))
     away = replace(last, T_camera_world=T_away @ last.T_camera_world)
     assert check.is_out_of_reach(later(away, AFTER_NS), last, 0.3)
@@ -79,7 +79,7 @@ def with_a_copy_of_all_places(odometry, shift_m):
             neighbour=k,
             twist_camera=np.zeros(6),
         )
-        odometry._relocalizer.add(copy)
+        odometry._estimator._relocalizer.add(copy)
 
 
 @pytest.mark.parametrize(
@@ -99,9 +99,10 @@ def test_after_a_gap_a_view_that_fits_two_places_is_doubtful(odometry, frames, s
 def test_a_frame_after_a_gap_that_a_poster_alone_places_is_lost(odometry, frames, monkeypatch):
     observation = odometry.observe(replace(frames[NOW], stamp_ns=frames[NOW].stamp_ns + AFTER_NS))
     alone = with_a_corner_alone(odometry._last)
-    monkeypatch.setattr(odometry._tracker, "track", lambda *_: replace(alone, observation=observation))
-    monkeypatch.setattr(odometry._depth, "supported", lambda *arguments: arguments[-1])
-    monkeypatch.setattr(odometry._relocalizer, "candidates", lambda *_: [])
+    estimator = odometry._estimator
+    monkeypatch.setattr(estimator._tracker, "track", lambda *_: replace(alone, observation=observation))
+    monkeypatch.setattr(estimator._depth, "supported", lambda *arguments: arguments[-1])
+    monkeypatch.setattr(estimator._relocalizer, "candidates", lambda *_: [])
     assert odometry.track(observation).node is None
 
 
@@ -125,7 +126,7 @@ def seen_otherwise(pose, by_ns, change):
     ids=["the same view", "in other light", "another picture", "nearer surfaces"],
 )
 def test_after_a_gap_the_images_between_the_features_have_to_agree(odometry, change, is_different):
-    check, last = odometry._gap_check, odometry._last
+    check, last = odometry._estimator._gap_check, odometry._last
     assert check.is_contradicted(seen_otherwise(last, AFTER_NS, change), last) == is_different
     assert not check.is_contradicted(seen_otherwise(last, 500_000_000, change), last)
 
@@ -133,7 +134,8 @@ def test_after_a_gap_the_images_between_the_features_have_to_agree(odometry, cha
 def test_a_frame_after_a_gap_whose_image_is_of_another_place_is_lost(odometry, frames, monkeypatch):
     observation = odometry.observe(replace(frames[NOW], stamp_ns=frames[NOW].stamp_ns + AFTER_NS))
     changed = replace(observation, grey_cells=np.flip(observation.grey_cells).copy())
-    monkeypatch.setattr(odometry._tracker, "track", lambda *_: replace(odometry._last, observation=changed))
-    monkeypatch.setattr(odometry._depth, "supported", lambda *arguments: arguments[-1])
-    monkeypatch.setattr(odometry._relocalizer, "candidates", lambda *_: [])
+    estimator = odometry._estimator
+    monkeypatch.setattr(estimator._tracker, "track", lambda *_: replace(odometry._last, observation=changed))
+    monkeypatch.setattr(estimator._depth, "supported", lambda *arguments: arguments[-1])
+    monkeypatch.setattr(estimator._relocalizer, "candidates", lambda *_: [])
     assert odometry.track(changed).node is None

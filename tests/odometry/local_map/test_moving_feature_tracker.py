@@ -40,7 +40,8 @@ def moving_now(odometry, body, *, walked_m, known):
     )
     nothing = np.zeros(len(body), np.bool_)
     is_still = (last.landmark_of_feature >= 0) & ~body
-    return odometry._tracker._moving.moving(last.T_camera_world, last.observation, before, nothing, is_still)
+    tracker = odometry._estimator._tracker
+    return tracker._moving.moving(last.T_camera_world, last.observation, before, nothing, is_still)
 
 
 def test_who_walked_is_followed_with_the_features_that_did_not_match(odometry, body):

@@ -142,7 +142,7 @@ def test_of_two_weak_poses_that_of_more_inliers_counts(frames, order):
     config = LocalMapConfig(weak_inliers=10_000)
     odometry = build_frame_odometry(config)
     tracked(frames[:12], odometry)
-    relocalizer, observation = odometry._relocalizer, odometry.observe(frames[12])
+    relocalizer, observation = odometry._estimator._relocalizer, odometry.observe(frames[12])
     keyframes = range(len(odometry._map.keyframes))[::order]
     alone = [relocalizer.best_among([k], observation, method="alone") for k in keyframes]
 
@@ -235,7 +235,7 @@ def test_isvd_stays_lost_rather_than_in_another_room(frames):
 def test_where_nothing_predicts_the_motion_a_place_is_recognised_before_depth_is_aligned(frames, monkeypatch):
     odometry = build_frame_odometry(LocalMapConfig())
     known = tracked(frames[seconds(0.0, 1.0)], odometry)
-    monkeypatch.setattr(odometry._tracker, "track", lambda *_: None)
+    monkeypatch.setattr(odometry._estimator._tracker, "track", lambda *_: None)
     gap_ns = 800_000_000  # longer than ten frames
     again = replace(frames[len(known) - 2], stamp_ns=known[-1].stamp_ns + gap_ns)
     found = odometry.track(odometry.observe(again))

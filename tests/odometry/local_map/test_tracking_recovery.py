@@ -72,10 +72,10 @@ def test_nothing_is_recognised_farther_off_than_doubtful_keyframes_can_have_led(
 
 def test_a_recognised_frame_is_doubtful_no_keyframe_and_where_it_is(odometry, frames, monkeypatch):
     observation = odometry.observe(frames[NOW])
-    track = odometry._tracker.track
+    track = odometry._estimator._tracker.track
     wrong = Mock(side_effect=lambda *arguments: astray(track(*arguments)))
-    monkeypatch.setattr(odometry._tracker, "track", wrong)
-    monkeypatch.setattr(odometry._depth, "supported", lambda *arguments: arguments[-1])
+    monkeypatch.setattr(odometry._estimator._tracker, "track", wrong)
+    monkeypatch.setattr(odometry._estimator._depth, "supported", lambda *arguments: arguments[-1])
     result = odometry.track(observation)
     monkeypatch.undo()
     assert not result.is_keyframe
@@ -87,7 +87,7 @@ def test_a_recognised_frame_is_doubtful_no_keyframe_and_where_it_is(odometry, fr
 
 @pytest.mark.parametrize(("inliers", "outcome"), [(40, "lost"), (400, "doubtful")])
 def test_an_implausible_pose_of_few_features_is_lost(odometry, frames, monkeypatch, inliers, outcome):
-    track = odometry._tracker.track
+    track = odometry._estimator._tracker.track
 
     def with_inliers(*arguments):
         pose = track(*arguments)
@@ -95,8 +95,8 @@ def test_an_implausible_pose_of_few_features_is_lost(odometry, frames, monkeypat
         ids[np.flatnonzero(ids >= 0)[inliers:]] = -1
         return replace(pose, landmark_of_feature=ids)
 
-    monkeypatch.setattr(odometry._tracker, "track", with_inliers)
-    monkeypatch.setattr(odometry._depth, "supported", lambda *arguments: arguments[-1])
+    monkeypatch.setattr(odometry._estimator._tracker, "track", with_inliers)
+    monkeypatch.setattr(odometry._estimator._depth, "supported", lambda *arguments: arguments[-1])
     implausible = Assessment((Doubt("jump", "jump"),), 0.1, 0.5, is_implausible=True)
     monkeypatch.setattr(odometry._doubts, "assess", lambda *_: implausible)
     before = odometry._last
@@ -114,7 +114,7 @@ def test_among_what_moves_the_predicted_pose_needs_no_more_features(odometry, mo
     moving = np.arange(len(ids) // 5, dtype=np.int32) if moves else np.empty(0, np.int32)
     predicted = replace(pose, landmark_of_feature=ids, moving=moving, method="map")
     other = replace(pose, T_camera_world=T_ASIDE @ pose.T_camera_world, method="fallback")
-    best = odometry._tracker._better(predicted, other)
+    best = odometry._estimator._tracker._better(predicted, other)
     assert best.method == ("map" if first else "fallback")
 
 
@@ -124,7 +124,7 @@ def test_among_what_moves_the_predicted_pose_needs_no_more_features(odometry, mo
 def test_after_a_loss_a_pose_of_few_features_that_displaces_surfaces_is_not_taken(
     odometry, frames, monkeypatch, inliers, aside, outcome
 ):
-    track, last = odometry._tracker.track, odometry._last
+    track, last = odometry._estimator._tracker.track, odometry._last
 
     def recognised(observation, *_):
         pose = track(observation, last, None)
@@ -133,8 +133,8 @@ def test_after_a_loss_a_pose_of_few_features_that_displaces_surfaces_is_not_take
         T_camera_world = T_ASIDE @ pose.T_camera_world if aside else pose.T_camera_world
         return replace(pose, T_camera_world=T_camera_world, landmark_of_feature=ids)
 
-    monkeypatch.setattr(odometry, "_find_pose", recognised)
+    monkeypatch.setattr(odometry._estimator, "estimate", recognised)
     monkeypatch.setattr(odometry._recovery, "relocalised", lambda *_: None)
-    odometry._lost_frames = 1
+    odometry._lost.count = 1
     result = odometry.track(odometry.observe(frames[NOW]))
     assert (result.node is None) == (outcome == "lost")
