@@ -11,7 +11,7 @@ from mapper.odometry.config import LocalMapConfig
 from mapper.odometry.local_map.depth.earlier_depth import EarlierDepth
 from mapper.odometry.local_map.landmarks.landmark_map import Ids, LandmarkMap
 from mapper.odometry.local_map.observation.image_observation import ImageObservation
-from mapper.odometry.local_map.pose.camera_motion import agreeing, camera_motion
+from mapper.odometry.local_map.pose.camera_motion import CameraMotion, agreeing, camera_motion
 from mapper.odometry.local_map.pose.local_search import LocalSearch, PredictedFeatures
 from mapper.odometry.local_map.pose.moving_feature_tracker import MovingFeatureTracker
 from mapper.odometry.local_map.pose.pose_tracker import TrackedPose, project, unmatched
@@ -125,9 +125,21 @@ class MotionPoseTracker:
             ),
             self._map.residual_variance,
         )
-        agree = motion.agree
-        if agree.sum() < self._config.min_matches // 2:
+        if motion.agree.sum() < self._config.min_matches // 2:
             return None
+        return self._refined(motion, observation, last, features, ids, moved)
+
+    def _refined(
+        self,
+        motion: CameraMotion,
+        observation: ImageObservation,
+        last: TrackedPose,
+        features: Ids,
+        ids: Ids,
+        moved: NDArray[np.bool_],
+    ) -> TrackedPose | None:
+        """Refine the pose of a motion by the landmarks around it, and return it with what moves by itself."""
+        agree = motion.agree
         contradicting = features[motion.moving] if not motion.doubts else features[:0]
         is_moving = self._moving.moving(
             motion.T_camera_world,
