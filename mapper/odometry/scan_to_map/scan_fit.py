@@ -33,17 +33,14 @@ _PIXELS = 1.5  # a ray that is compared with a point is off by up to so many
 _SMALL_SHARE = 0.03
 """Share of a motion's displacements that goes along normals, below which the pairs that show it are counted.
 Streets and rooms have more."""
-_FACING = 0.3
-"""Share of one point's displacement along its normals, from which on its pair shows the motion: more than
-the errors of normals make."""
 _OFF_VOXELS = 1.0  # nearer to the keyframe rings lie on the same places, and so errors of normals are alike
 _SAME_VOXELS = 0.25  # nearer to it a sensor seems to stand; 0.2 and 0.3 serve as well, 0.15 and 0.4 do not
 _LEAST_BREADTH = 7.0
 """Breadth of the surface of a point that shows whether it stands: where rings pass from a road to a rail,
 normals lean along the road, wherever the sensor is. 6 and 10 serve as well."""
-_FEW_PAIRS, _ENOUGH_PAIRS = 8, 24
-"""Pairs that face a motion and agree: a bare tunnel has up to 11 by chance, a field with two trees 13 to 60.
-They measure it to σ/√pairs, with the 0.1 m that a point agrees within to 0.02 m."""
+_LITTLE_WEIGHT, _ENOUGH_WEIGHT, _STANDARD_ERRORS = 1.0, 3.0, 2.0
+"""Weight of the pairs that show a motion, less so many standard errors: a bare tunnel has up to 0.4, one with
+walls rough by 10 cm 10 to 20, a motorway 3 to 23, a field with a few trees 1.4 to 10."""
 _PAIR_VOXELS = 0.6
 """Error of such a pair: a point agrees within 0.33 voxels, a standard deviation of 0.19, and the normals of
 ten neighbours err alike. 0.45 and 0.8 serve as well."""
@@ -261,21 +258,24 @@ def _shown(rows: Array, own_rows: Array) -> Array:
 def _observability(
     degeneracy: Degeneracy, points: Array, rows: Array, own_rows: Array, agree: NDArray[np.bool_]
 ) -> tuple[Array, Array]:
-    """Return (6,) whether enough pairs show a motion (as Tuna et al. 2024, §III, count contributions).
+    """Return (6,) whether the pairs that agree show a motion (as Tuna et al. 2024, §III, sum contributions).
 
     With it comes (6,) how much these pairs weigh; infinite where many pairs show the motion. Shares do not
-    tell: normals off by a few degrees, a thousand times, make as large a share as one tree. A pair weighs as
-    much as the square of its displacement by the motion, whose mean over all points is 1, and at most 1:
-    however many pairs lie on one tree, they hardly measure a rotation about it.
+    tell, as noise makes one of every pair. A pair weighs as much as the product of its displacements along
+    both normals, of a motion that displaces all points by 1 m root mean square, and at most 1: however many
+    pairs lie on one tree, they hardly measure a rotation about it. Rough walls, of which no pair faces the
+    motion, show it, too. Noise adds to such a sum no more than a few of its standard errors.
     """
     observability, weights = np.ones(6), np.full(6, np.inf)
     for k in range(degeneracy.unobservable_count):
         motion = degeneracy.motions[k]
-        displacements = np.cross(motion[:3], points) + motion[3:]
+        displacements = np.cross(motion[:3], points[agree]) + motion[3:]
         squared = np.einsum("ni,ni->n", displacements, displacements)
-        facing = ((rows @ motion) * (own_rows @ motion) > _FACING * squared) & agree
-        observability[k] = np.clip((facing.sum() - _FEW_PAIRS) / (_ENOUGH_PAIRS - _FEW_PAIRS), 0.0, 1.0)
-        weights[k] = max(float(np.minimum(squared[facing], 1.0).sum()), _LEAST_WEIGHT)
+        products = (rows[agree] @ motion) * (own_rows[agree] @ motion) / np.maximum(squared, 1.0)
+        weight = float(products.sum())
+        least = weight - _STANDARD_ERRORS * float(np.sqrt((products**2).sum()))
+        observability[k] = np.clip((least - _LITTLE_WEIGHT) / (_ENOUGH_WEIGHT - _LITTLE_WEIGHT), 0.0, 1.0)
+        weights[k] = max(weight, _LEAST_WEIGHT)
     return observability, weights
 
 

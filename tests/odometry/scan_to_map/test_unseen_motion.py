@@ -1,4 +1,4 @@
-"""A tunnel with bare walls: nothing shows the motion along it."""
+"""A tunnel: bare walls show nothing of the motion along it, rough ones all of it."""
 
 import numpy as np
 import pytest
@@ -15,11 +15,13 @@ from mapper.pipeline.tracking_result import TrackingResult, refuse_a_fragment
 INTERVAL_NS = 100_000_000
 
 
-def tunnel_scan(stamp_ns, *, seed):
-    """Return what is seen of a tunnel whose walls are bare."""
+def tunnel_scan(stamp_ns, *, seed, x_m=0.0, rough_m=0.0):
+    """Return what is seen from a place in a tunnel whose walls are bare, or rough by so much."""
     rng = np.random.default_rng(seed)
     along, angle = rng.uniform(-25.0, 25.0, 12000), rng.uniform(0.0, 2.0 * np.pi, 12000)
     corners = np.clip(np.stack([np.cos(angle), np.sin(angle)]) * 6.0, -4.0, 4.0)
+    phases = 1.9 * (along + x_m), 3.1 * (along + x_m) + 4.0 * angle
+    corners *= 1.0 + rough_m / 4.0 * (np.sin(phases[0]) + np.sin(phases[1]))
     points = np.column_stack([along, *corners]) + rng.normal(0.0, 0.01, (12000, 3))
     return Scan(stamp_ns, points.astype(np.float32))
 
@@ -42,6 +44,21 @@ def test_a_velocity_that_no_scan_showed_is_unknown_and_so_is_the_way_it_goes():
     assert sigmas_m[-1] > 30.0  # in three seconds
     assert np.all(np.diff(sigmas_m) > 0.0)
     assert np.sqrt(tracks[-1].covariance[5, 5]) < 0.6  # the tunnel shows its height
+
+
+def test_rough_walls_show_the_motion_though_none_faces_it():
+    config = GicpOdometryConfig()
+    odometry = ScanOdometry(config, GicpMatcher(config))
+    places_m = np.arange(20) * 0.1
+    scans = [
+        tunnel_scan(k * INTERVAL_NS, seed=k, x_m=x_m, rough_m=0.1) for k, x_m in enumerate(places_m.tolist())
+    ]
+    tracks = [odometry.track(odometry.observe(scan)) for scan in scans]
+
+    doubtful = [track for track in tracks if track.doubts]
+    assert len(doubtful) < 6  # nearer than a voxel to the first scan
+    assert not any(track.doubts for track in tracks[6:])
+    assert tracks[-1].T_world_body[0, 3] == pytest.approx(places_m[-1], abs=0.05)
 
 
 def test_a_log_that_nothing_shows_the_motion_of_is_refused_with_the_remedy():
