@@ -43,6 +43,12 @@ _MAX_POINTS = 2500  # of the scan; fewer than twice as many are used
 _GOOD = 0.75  # a score of this part of the usual one ends the search
 _FAIR, _GUESSES = 0.5, 3  # and so does one of this part to which so many guesses lead
 _FASTEST_RADPS = 4.0 * np.pi  # two turns a second; heads and drones that turn faster are not scanned with
+_FASTEST_MPS = 45.0  # of a sensor whose velocity is not known yet
+_STANDING_OVERLAP = 0.8
+"""Overlap of a sensor that is slow or stands, as along tunnels with 0.86 and more. Motorways at 22 to 31 m/s
+have up to 0.7 where it seems to stand. 0.95 serves as well, but for tunnels whose walls repeat themselves."""
+_FASTER_STEP, _MOST_STEPS = 4.0, 5  # of poses from which faster ones are searched, in pair distances
+_MOSTLY = 0.7  # part of an axis of the body that lies along motions which surfaces do not show
 _LEAST_AGREEMENT = 0.1  # of a pose that is searched for: where scans hardly overlap, nothing contradicts
 
 _Attempt = tuple[int, Transform | None, str]
@@ -130,6 +136,8 @@ class PoseSearch:
             if near is not None and (accepts_all or (not self.is_suspect(near) and near.is_measured)):
                 return near
             best = self._preferred(best, near)
+        if best is not None and not accepts_all and (faster := self._faster(scan, best)) is not None:
+            return faster
         if best is not None and not self.is_suspect(best):
             return best
         candidates = [] if best is None else [_compared(scan, best)]
@@ -139,6 +147,31 @@ class PoseSearch:
             on_doubtful = self._assessed(scan, T_world_near, scan.doubtful, "map")
             candidates += [] if on_doubtful is None else [_compared(scan, on_doubtful)]
         return self._searched(scan, keys, candidates)
+
+    def _faster(self, scan: UnplacedScan, slow: PoseCandidate) -> PoseCandidate | None:
+        """Return the best pose farther along motions that surfaces do not show at a slow one; None without.
+
+        While no velocity is known, the sensor may move faster than the matcher reaches: on a road its rings
+        lie on those of the keyframe as if it stood, but trees and posts beside it do not.
+        """
+        if scan.spread is not None or slow.fit.overlap >= _STANDING_OVERLAP:
+            return None
+        step_m = _FASTER_STEP * self._config.max_pair_distance_m
+        count = int(_FASTEST_MPS * scan.motion.elapsed_s(scan.time_ns) / step_m + 0.5)
+        found = []
+        open_part = slow.fit.degeneracy.directions.T @ slow.fit.degeneracy.directions
+        for axis in open_part[np.linalg.norm(open_part, axis=1) >= _MOSTLY]:
+            for steps in range(1, min(count, _MOST_STEPS) + 1):
+                for way_m in (steps * step_m, -steps * step_m):
+                    T_world_guess = slow.T_world_middle @ transform(np.eye(3), way_m * axis)
+                    T_world_found = self._matcher.match(scan.deskewed, T_world_guess, reach="near")
+                    found.append(self._assessed(scan, T_world_found, slow.keyframe, "map"))
+        measured = [_compared(scan, pose) for pose in found if pose is not None and pose.is_measured]
+        fitting = [pose for pose in measured if not self.usual.contradicts(pose.shares)]
+        fastest = max(fitting, key=lambda pose: pose.score, default=None)
+        if fastest is None or (slow.is_measured and slow.score >= fastest.score):
+            return None
+        return fastest
 
     def _searched(
         self, scan: UnplacedScan, keys: Sequence[ScanKeyframe], candidates: list[PoseCandidate]

@@ -1,4 +1,4 @@
-"""A tunnel: bare walls show nothing of the motion along it, rough ones all of it."""
+"""Motions that hardly any surface shows: along tunnels and fields, and while no velocity is known."""
 
 import numpy as np
 import pytest
@@ -6,11 +6,15 @@ import pytest
 from mapper.config.loading import load_config
 from mapper.core.errors import TrackingError
 from mapper.core.frames import Scan
+from mapper.core.geometry import inverse
 from mapper.graph.model import PoseGraph
 from mapper.odometry.scan_to_map.config import GicpOdometryConfig
 from mapper.odometry.scan_to_map.gicp import GicpMatcher
 from mapper.odometry.scan_to_map.odometry import ScanOdometry
 from mapper.pipeline.tracking_result import TrackingResult, refuse_a_fragment
+from mapper.simulation.config import LIDAR_SCENES, LidarSensorConfig
+from mapper.simulation.lidar import make_outdoor_scene
+from tests.support.street_scans import on_street, still_scan
 
 INTERVAL_NS = 100_000_000
 
@@ -59,6 +63,20 @@ def test_rough_walls_show_the_motion_though_none_faces_it():
     assert len(doubtful) < 6  # nearer than a voxel to the first scan
     assert not any(track.doubts for track in tracks[6:])
     assert tracks[-1].T_world_body[0, 3] == pytest.approx(places_m[-1], abs=0.05)
+
+
+def test_a_log_may_begin_at_83_kilometres_an_hour_among_few_trees():
+    scene = make_outdoor_scene(LIDAR_SCENES["field"].model_copy(update={"seed": 3}))
+    sensor = LidarSensorConfig(rings=32, azimuth_steps=720)
+    places = [on_street(scene, 20.0 + 2.3 * k) for k in range(4)]
+    config = GicpOdometryConfig()
+    odometry = ScanOdometry(config, GicpMatcher(config))
+    for k, T_world_body in enumerate(places):
+        scan = Scan(k * INTERVAL_NS, still_scan(scene, sensor, T_world_body, seed=k))
+        track = odometry.track(odometry.observe(scan))
+        error = inverse(track.T_world_body) @ inverse(places[0]) @ T_world_body
+        assert np.linalg.norm(error[:3, 3]) < 0.15
+        assert not track.doubts
 
 
 def test_a_log_that_nothing_shows_the_motion_of_is_refused_with_the_remedy():
