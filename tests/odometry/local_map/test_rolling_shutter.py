@@ -109,7 +109,7 @@ def test_readout_time_is_zero_until_it_is_certain():
     for _ in range(60):
         readout.learn(information=1e7, gradient=1e7 * (readout.seconds - 0.02))
     assert readout.seconds == pytest.approx(0.02, abs=0.0006)
-    assert "rows are read within 20 ms from the top, as estimated" in readout.sentence
+    assert "rows are read within at least 20 ms from the top, as estimated" in readout.sentence
 
 
 def test_given_readout_time_is_kept():
@@ -126,9 +126,8 @@ def test_what_the_odometry_knows_of_the_shutter_it_tells():
     assert odometry.sensor_notes() == []
     for _ in range(60):
         odometry._map.readout.learn(information=1e7, gradient=1e7 * (odometry._map.readout.seconds + 0.01))
-    assert [note[:64] for note in odometry.sensor_notes()] == [
-        "rolling shutter: rows are read within 10 ms from the bottom, as "
-    ]
+    (note,) = odometry.sensor_notes()
+    assert note.startswith("rolling shutter: rows are read within at least 10 ms from the bottom, ")
 
 
 @pytest.mark.parametrize("gap_s", [0, 2])

@@ -16,7 +16,8 @@ class ReadoutTime:
 
     It is one more unknown of every local bundle adjustment, after the poses and points are eliminated
     (Hedborg et al. 2012 adjust the motion within each image; here it is known from tracking, and the readout
-    time is what is sought). The windows overlap, which ``windows_sharing`` allows for.
+    time is what is sought). The windows overlap, which ``windows_sharing`` allows for. The estimate
+    tends to be too short: the motion within an image, which is refined by it, makes up for the rest.
     """
 
     def __init__(self, given_s: float | None, *, windows_sharing: int, windows_counted: int = 20) -> None:
@@ -40,9 +41,9 @@ class ReadoutTime:
         """The estimate in words; empty if there is none, or all rows are read at once."""
         if not self.is_estimated or self.seconds == 0.0:
             return ""
-        begin = "top" if self.seconds > 0.0 else "bottom"
+        begin, readout_ms = "top" if self.seconds > 0.0 else "bottom", 1e3 * abs(self.seconds)
         return (
-            f"rolling shutter: rows are read within {1e3 * abs(self.seconds):.0f} ms from the {begin}, as "
+            f"rolling shutter: rows are read within at least {readout_ms:.0f} ms from the {begin}, as "
             "estimated from the log; odometry.readout_s sets it"
         )
 
