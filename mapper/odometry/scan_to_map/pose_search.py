@@ -28,8 +28,9 @@ from mapper.odometry.scan_to_map.scan_fit import (
     directions_of,
     fit_of,
 )
-from mapper.odometry.scan_to_map.scan_matcher import DeskewedScan, ScanMatcher
-from mapper.odometry.scan_to_map.usual_fit import Shares, UsualFit, jump_between
+from mapper.odometry.scan_to_map.scan_matcher import DeskewedScan
+from mapper.odometry.scan_to_map.scan_state import ScanState
+from mapper.odometry.scan_to_map.usual_fit import Shares, jump_between
 from mapper.registration.base import Aligner
 from mapper.registration.factory import build_registration
 from mapper.registration.free_space import ScanDescription
@@ -109,16 +110,11 @@ class UnplacedScan:
 class PoseSearch:
     """Search by a matcher and by registration to the last keyframes."""
 
-    def __init__(self, config: ScanOdometryConfig, matcher: ScanMatcher) -> None:
-        self.usual = UsualFit()
+    def __init__(self, config: ScanOdometryConfig, state: ScanState) -> None:
         self._config = config
-        self._matcher = matcher
+        self._state = state
         self._rescue = build_registration(config.rescue) if config.rescue is not None else None
         self._rescuer: tuple[DeskewedScan, Aligner] | None = None
-
-    def go_on(self, matcher: ScanMatcher, usual: UsualFit) -> None:
-        """Go on with another map and other usual shares."""
-        self._matcher, self.usual = matcher, usual
 
     def find(self, scan: UnplacedScan, T_world_guess: Transform | None = None) -> PoseCandidate | None:
         """Return the pose that fits best; None if no method finds one.
@@ -129,7 +125,7 @@ class PoseSearch:
         """
         accepts_all = self._config.usual_ratio == 0.0
         T_world_begin = scan.prediction if T_world_guess is None else T_world_guess
-        T_world_near = self._matcher.match(scan.deskewed, T_world_begin, reach="near")
+        T_world_near = self._state.matcher.match(scan.deskewed, T_world_begin, reach="near")
         best: PoseCandidate | None = None
         for key in scan.keyframes:
             near = self._assessed(scan, T_world_near, key, "map")
@@ -164,10 +160,10 @@ class PoseSearch:
             for steps in range(1, min(count, _MOST_STEPS) + 1):
                 for way_m in (steps * step_m, -steps * step_m):
                     T_world_guess = slow.T_world_middle @ transform(np.eye(3), way_m * axis)
-                    T_world_found = self._matcher.match(scan.deskewed, T_world_guess, reach="near")
+                    T_world_found = self._state.matcher.match(scan.deskewed, T_world_guess, reach="near")
                     found.append(self._assessed(scan, T_world_found, slow.keyframe, "map"))
         measured = [_compared(scan, pose) for pose in found if pose is not None and pose.is_measured]
-        fitting = [pose for pose in measured if not self.usual.contradicts(pose.shares)]
+        fitting = [pose for pose in measured if not self._state.usual.contradicts(pose.shares)]
         fastest = max(fitting, key=lambda pose: pose.score, default=None)
         if fastest is None or (slow.is_measured and slow.score >= fastest.score):
             return None
@@ -255,20 +251,20 @@ class PoseSearch:
         """Return whether a pose fits less than usual, or is a surprise, so that others are tried."""
         return (
             candidate.jump.is_unusual
-            or self.usual.agrees_little(candidate.shares)
+            or self._state.usual.agrees_little(candidate.shares)
             or not self.fits(candidate)
         )
 
     def _is_enough(self, best: PoseCandidate, answers: Answers) -> bool:
         """Return whether no other pose has to be tried: it fits well, or several guesses lead to it."""
-        usual = self.usual.usual.score
+        usual = self._state.usual.usual.score
         if best.score >= _GOOD * usual and not self.is_suspect(best):
             return True
         return best.score >= _FAIR * usual and answers.guesses_of(best.T_world_middle) >= _GUESSES
 
     def fits(self, candidate: PoseCandidate) -> bool:
         """Return whether a pose fits as usual."""
-        usual, shares = self.usual, candidate.shares
+        usual, shares = self._state.usual, candidate.shares
         return not (
             usual.has_little_overlap(shares, usual_ratio=self._config.usual_ratio)
             or usual.contradicts(shares)
@@ -283,7 +279,7 @@ class PoseSearch:
         """
         if self._config.lost_ratio == 0.0:
             return False
-        usual, shares = self.usual, candidate.shares
+        usual, shares = self._state.usual, candidate.shares
         if not usual.is_known:  # in a field half of the points have partners
             return shares.overlap < 0.5 * self._config.lost_ratio
         share = shares.overlap / usual.usual.overlap
@@ -313,7 +309,7 @@ class PoseSearch:
         """
         if self._config.usual_ratio == 0.0:
             return ()
-        usual, shares = self.usual, candidate.shares
+        usual, shares = self._state.usual, candidate.shares
         little = usual.has_little_overlap(shares, usual_ratio=self._config.usual_ratio)
         contradicts = usual.contradicts(shares, is_rescued=candidate.method == "rescued")
         disagrees, jumps = usual.disagrees(shares), candidate.jump.is_unusual
@@ -350,12 +346,12 @@ class PoseSearch:
     def _nearby(self, scan: UnplacedScan, keyframe: ScanKeyframe) -> Iterator[_Attempt]:
         """Yield poses that are found from the predicted one, from no motion, and from turns of both."""
         T_world_predicted = scan.prediction
-        yield 0, self._matcher.match(scan.deskewed, T_world_predicted, reach="far"), "far"
+        yield 0, self._state.matcher.match(scan.deskewed, T_world_predicted, reach="far"), "far"
         up = T_world_predicted[2, :3]
         turned = [T_world_predicted @ exp(turn * up, np.zeros(3)) for turn in _TURNS_RAD]
         for guess, T_world_guess in enumerate((T_world_predicted, *turned, scan.motion.T_world_last)):
-            if self._matcher.uses_guess and guess > 0:  # from the predicted pose it was the first try
-                yield guess, self._matcher.match(scan.deskewed, T_world_guess, reach="near"), "turned"
+            if self._state.matcher.uses_guess and guess > 0:  # from the predicted pose it was the first try
+                yield guess, self._state.matcher.match(scan.deskewed, T_world_guess, reach="near"), "turned"
             for key in dict.fromkeys((keyframe, keyframe if scan.last is None else scan.last)):
                 method = "keyframe" if key is keyframe else "scan"
                 for T_world_found in self._registered(scan, key, T_world_guess):
@@ -385,7 +381,7 @@ class PoseSearch:
         found = self._rescuer[1].align(scan.deskewed.scan, np.eye(4))
         if found.converged:
             T_world_found = keyframe.T_world_middle @ found.T_target_source
-            yield -1, self._matcher.match(scan.deskewed, T_world_found, reach="near"), "rescued"
+            yield -1, self._state.matcher.match(scan.deskewed, T_world_found, reach="near"), "rescued"
             yield -1, T_world_found, "rescued"
 
     def _registered(
@@ -402,7 +398,7 @@ class PoseSearch:
         )
         if not isinstance(T_key_scan, str):
             T_world_found = key.T_world_middle @ T_key_scan
-            yield self._matcher.match(scan.deskewed, T_world_found, reach="near")
+            yield self._state.matcher.match(scan.deskewed, T_world_found, reach="near")
             yield T_world_found
 
 

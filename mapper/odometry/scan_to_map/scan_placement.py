@@ -6,13 +6,14 @@ from mapper.core.deskew import STILL, Twist
 from mapper.core.geometry import Transform
 from mapper.odometry.scan_to_map.config import ScanOdometryConfig
 from mapper.odometry.scan_to_map.motion_model import covariance_unmeasured
+from mapper.odometry.scan_to_map.placed_scan import PlacedScan
 from mapper.odometry.scan_to_map.pose_candidate import PoseCandidate
 from mapper.odometry.scan_to_map.pose_search import PoseSearch, UnplacedScan
 from mapper.odometry.scan_to_map.scan_matcher import DeskewedScan
 from mapper.odometry.scan_to_map.scan_noise import independent_covariance
 from mapper.odometry.scan_to_map.scan_observation import ScanObservation
+from mapper.odometry.scan_to_map.scan_state import ScanState
 from mapper.odometry.scan_to_map.sweep_motion import SweepMotion, sweep_motion
-from mapper.odometry.scan_to_map.tracked_scan import PlacedScan, ScanState
 
 _SETTLED = 0.05
 """Displacement of a sweep's outer points, in voxels, by a change of the velocity: less ends the search for
@@ -24,31 +25,30 @@ _WIDENED = 2.0  # expected changes of the velocity, for turns begin and end sudd
 class ScanPlacement:
     """Search of a scan's pose together with the velocity during its sweep."""
 
-    def __init__(self, config: ScanOdometryConfig, search: PoseSearch) -> None:
+    def __init__(self, config: ScanOdometryConfig, state: ScanState, search: PoseSearch) -> None:
         self._config = config
+        self._state = state
         self._search = search
 
-    def place(
-        self, state: ScanState, observation: ScanObservation, guess: PlacedScan | None = None
-    ) -> PlacedScan | None:
+    def place(self, observation: ScanObservation, guess: PlacedScan | None = None) -> PlacedScan | None:
         """Return where a scan fits best; None if next to nothing agrees with any pose.
 
         A sensor that turned may have stopped meanwhile: where the sweep fits badly when it is deskewed by the
         predicted velocity, it is placed without one, too.
         """
-        twist = state.motion.twist
-        placed = self._placed_by(state, observation, guess, twist)
+        twist = self._state.motion.twist
+        placed = self._placed_by(observation, guess, twist)
         if placed is not None and not self._search.doubts(placed.found):
             return placed
         if not observation.is_bent_by(float(np.linalg.norm(twist.rotation_radps))):
             return placed
-        at_rest = self._placed_by(state, observation, guess, STILL)
+        at_rest = self._placed_by(observation, guess, STILL)
         if placed is None or (at_rest is not None and not self._search.doubts(at_rest.found)):
             return at_rest
         return placed
 
     def _placed_by(
-        self, state: ScanState, observation: ScanObservation, guess: PlacedScan | None, twist: Twist
+        self, observation: ScanObservation, guess: PlacedScan | None, twist: Twist
     ) -> PlacedScan | None:
         """Return where a scan fits best if its velocity is about the one given.
 
@@ -56,17 +56,17 @@ class ScanPlacement:
         together with the pose; not before the errors of a few predictions are known, as two scans, each with
         a velocity of its own, fit under wrong ones, too.
         """
-        motion, time_ns = state.motion, observation.middle_ns
+        motion, time_ns = self._state.motion, observation.middle_ns
         deskewed, sigmas = observation.deskew(twist), motion.velocity_sigmas(time_ns)
-        if motion.turning_change(time_ns) is None or not self.may_be_bent(state, observation):
-            found = self.pose_of(state, deskewed, time_ns)
+        if motion.turning_change(time_ns) is None or not self.may_be_bent(observation):
+            found = self.pose_of(deskewed, time_ns)
             if found is None:
                 return None
             changes = np.maximum(sigmas, motion.change(time_ns, found.T_world_middle))
             return PlacedScan(deskewed, found, None, covariance_unmeasured(changes))
         if guess is None:
             T_world_predicted, start = motion.predicted(time_ns), twist
-            matched = state.matcher.match(deskewed, T_world_predicted, reach="near")
+            matched = self._state.matcher.match(deskewed, T_world_predicted, reach="near")
             T_world_middle = T_world_predicted if matched is None else matched
         else:
             T_world_middle, start = guess.found.T_world_middle, guess.twist or twist
@@ -80,7 +80,7 @@ class ScanPlacement:
             expected, covariance = motion.velocity(time_ns, T_world_middle, of_pose)
             before = start if sweep is None else sweep.twist
             measured = sweep_motion(
-                state.keyframes,
+                self._state.keyframes,
                 sweep_of_middle,
                 T_world_middle,
                 expected,
@@ -93,9 +93,7 @@ class ScanPlacement:
             if measured is not None:
                 sweep, deskewed = measured, observation.deskew(measured.twist)
                 settled = measured.twist.rotation_radps - before.rotation_radps
-            found = self.pose_of(
-                state, deskewed, time_ns, None if measured is None else measured.T_world_middle
-            )
+            found = self.pose_of(deskewed, time_ns, None if measured is None else measured.T_world_middle)
             if found is None:
                 break
             T_world_middle = found.T_world_middle
@@ -103,7 +101,7 @@ class ScanPlacement:
                 break
         if found is None:
             deskewed, sweep = observation.deskew(twist), None
-            found = self.pose_of(state, deskewed, time_ns)
+            found = self.pose_of(deskewed, time_ns)
         if found is None:
             return None
         if sweep is None:
@@ -116,16 +114,17 @@ class ScanPlacement:
         return PlacedScan(deskewed, found, sweep.twist, covariance)
 
     def pose_of(
-        self, state: ScanState, deskewed: DeskewedScan, time_ns: int, T_world_guess: Transform | None = None
+        self, deskewed: DeskewedScan, time_ns: int, T_world_guess: Transform | None = None
     ) -> PoseCandidate | None:
         """Return the pose that fits best; None if next to nothing agrees with any."""
+        state = self._state
         scan = UnplacedScan(deskewed, state.keyframes, state.doubtful, state.last, state.motion, time_ns)
         found = self._search.find(scan, T_world_guess)
         return None if found is None or self._search.is_lost(found) else found
 
-    def may_be_bent(self, state: ScanState, observation: ScanObservation) -> bool:
+    def may_be_bent(self, observation: ScanObservation) -> bool:
         """Return whether the velocity may have changed so much that it displaces the points of the sweep."""
         if observation.scan.times_s is None:
             return False
-        change_radps = state.motion.turning_change(observation.middle_ns)
+        change_radps = self._state.motion.turning_change(observation.middle_ns)
         return change_radps is None or observation.is_bent_by(change_radps)

@@ -13,10 +13,11 @@ from mapper.core.geometry import angle_between, exp, inverse
 from mapper.odometry.factory import build_frame_odometry
 from mapper.odometry.node_offset import NodeOffset
 from mapper.odometry.scan_to_map.config import GicpOdometryConfig
+from mapper.odometry.scan_to_map.first_sweep import FirstSweep
 from mapper.odometry.scan_to_map.motion_model import velocities_at
 from mapper.odometry.scan_to_map.odometry import ScanOdometry
+from mapper.odometry.scan_to_map.placed_scan import PlacedScan
 from mapper.odometry.scan_to_map.scan_placement import ScanPlacement
-from mapper.odometry.scan_to_map.tracked_scan import PlacedScan
 from mapper.simulation.config import LIDAR_SCENES, LidarSynthConfig
 from mapper.simulation.lidar import LidarSimulator
 
@@ -144,9 +145,8 @@ def begun(odometry, monkeypatch, scores):
         found = SimpleNamespace(score=score, T_world_middle=np.eye(4))
         return None if score is None else SimpleNamespace(found=found)
 
-    monkeypatch.setattr(ScanOdometry, "_begun", placed)
+    monkeypatch.setattr(FirstSweep, "_begun", placed)
     monkeypatch.setattr(ScanPlacement, "place", lambda *_: None)
-    monkeypatch.setattr(ScanOdometry, "_placed", lambda *arguments: arguments[-1])
     first, second, third = (source().entry_at(index).load() for index in range(3))
     odometry.track(odometry.observe(first))
     odometry.track(odometry.observe(second))

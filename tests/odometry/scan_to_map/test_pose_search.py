@@ -11,6 +11,7 @@ from mapper.odometry.scan_to_map.odometry import ScanOdometry
 from mapper.odometry.scan_to_map.pose_candidate import Answers, PoseCandidate, best_of
 from mapper.odometry.scan_to_map.pose_search import PoseSearch
 from mapper.odometry.scan_to_map.scan_fit import fit_of
+from mapper.odometry.scan_to_map.scan_state import ScanState
 from mapper.odometry.scan_to_map.usual_fit import Shares, UsualFit, jump_between
 from tests.support.room_scans import CRATES, INDOOR, OFF, keyframe, room_scan
 
@@ -113,7 +114,7 @@ def test_answers_count_the_guesses_that_led_to_them():
 def test_a_pose_that_was_searched_is_a_doubt_if_another_fits_as_well(method, agreement, is_doubted):
     key = keyframe(room_scan(0, seed=1))
     fit = fit_of(key, key.deskewed, np.eye(4), max_pair_distance_m=0.5)
-    search = PoseSearch(GicpOdometryConfig(), GicpMatcher(GicpOdometryConfig()))
+    search = PoseSearch(GicpOdometryConfig(), ScanState(GicpMatcher(GicpOdometryConfig())))
 
     def candidate(T_world_middle, share):
         jump = jump_between(np.eye(4), T_world_middle, None)

@@ -16,6 +16,7 @@ from mapper.odometry.scan_to_map.odometry import ScanOdometry
 from mapper.odometry.scan_to_map.pose_candidate import PoseCandidate
 from mapper.odometry.scan_to_map.pose_search import PoseSearch
 from mapper.odometry.scan_to_map.scan_fit import contradiction, described, fit_of
+from mapper.odometry.scan_to_map.scan_state import ScanState
 from mapper.odometry.scan_to_map.usual_fit import Shares, UsualFit, jump_between
 from tests.support.room_scans import CRATES, INDOOR, OFF, keyframe, room_scan
 
@@ -282,9 +283,10 @@ def test_a_direction_that_disagrees_is_a_doubt_where_the_motion_was_predicted(is
     key, scan = keyframe(room_scan(0, seed=1)), keyframe(room_scan(1, OFF, seed=2)).deskewed
     fit = fit_of(key, scan, OFF, max_pair_distance_m=0.5)
     fit = replace(fit, observability=np.array([float(is_shown), 1.0, 1.0, 1.0, 1.0, 1.0]))
-    search = PoseSearch(GicpOdometryConfig(), GicpMatcher(GicpOdometryConfig()))
+    state = ScanState(GicpMatcher(GicpOdometryConfig()))
+    search = PoseSearch(GicpOdometryConfig(), state)
     for _ in range(6):
-        search.usual.add(Shares(1.0, 0.9, 0.0))
+        state.usual.add(Shares(1.0, 0.9, 0.0))
 
     doubts = search.doubts(
         PoseCandidate(key, OFF, fit, Shares(1.0, 0.3, 0.0), jump_between(OFF, OFF, None), MEASURED, "map")
@@ -306,9 +308,10 @@ def test_a_direction_that_disagrees_is_a_doubt_where_the_motion_was_predicted(is
 def test_a_pose_that_only_a_wide_search_found_has_to_agree_more(method, shares, is_doubted):
     key, scan = keyframe(room_scan(0, seed=1)), keyframe(room_scan(1, OFF, seed=2)).deskewed
     fit = fit_of(key, scan, OFF, max_pair_distance_m=0.5)
-    search = PoseSearch(GicpOdometryConfig(), GicpMatcher(GicpOdometryConfig()))
+    state = ScanState(GicpMatcher(GicpOdometryConfig()))
+    search = PoseSearch(GicpOdometryConfig(), state)
     for _ in range(6):
-        search.usual.add(Shares(0.5, 0.9, 0.001))
+        state.usual.add(Shares(0.5, 0.9, 0.001))
 
     candidate = PoseCandidate(key, OFF, fit, shares, jump_between(OFF, OFF, None), MEASURED, method)
 
@@ -383,9 +386,10 @@ def test_little_overlap_where_the_pose_was_predicted_is_a_doubt(shares, off_m, s
     key = keyframe(room_scan(0, seed=1))
     found = exp(np.zeros(3), np.array([off_m, 0.0, 0.0]))
     fit = fit_of(key, key.deskewed, np.eye(4), max_pair_distance_m=0.5)
-    search = PoseSearch(GicpOdometryConfig(), GicpMatcher(GicpOdometryConfig()))
+    state = ScanState(GicpMatcher(GicpOdometryConfig()))
+    search = PoseSearch(GicpOdometryConfig(), state)
     for _ in range(6):
-        search.usual.add(Shares(0.9, 0.9, 0.001))
+        state.usual.add(Shares(0.9, 0.9, 0.001))
     candidate = PoseCandidate(
         key, found, fit, shares, jump_between(np.eye(4), found, spread), MEASURED, "map"
     )
