@@ -58,7 +58,7 @@ class MotionModel:
         """Return the spread of a predicted pose; None before enough predictions could be compared.
 
         Errors are accelerations: they grow with the time since the last scan and since the one before it. A
-        steady log is given two hundredths of the motion, so that its first acceleration is no surprise.
+        steady log is given two hundredths of the motion, so that its first acceleration is not unusual.
         """
         if len(self._errors) < _FEWEST_ERRORS:
             return None

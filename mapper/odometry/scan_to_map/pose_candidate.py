@@ -12,7 +12,7 @@ from mapper.odometry.scan_to_map.usual_fit import Jump, Shares
 
 ALIKE = 0.1
 """Scores nearer than this do not decide."""
-_SAME_VOXELS, _SAME_RAD = 0.25, 0.01  # two answers of a registration that differ less are one
+_SAME_VOXELS, _SAME_RAD = 0.25, 0.01  # two poses found by a registration that differ less are one
 _OTHER_RAD = 0.1  # poses this far apart, or by the largest pair distance, are not the same
 
 
@@ -28,7 +28,7 @@ class PoseCandidate:
         jump: From the predicted pose.
         blend: Of what was found and what was predicted.
         method: Step that found it.
-        rival_score: Highest score of another pose; -inf if no other was found.
+        second_score: Highest score of another pose; -inf if no other was found.
     """
 
     keyframe: ScanKeyframe
@@ -38,7 +38,7 @@ class PoseCandidate:
     jump: Jump
     blend: Blend
     method: str
-    rival_score: float = -np.inf
+    second_score: float = -np.inf
 
     @property
     def was_searched(self) -> bool:
@@ -48,7 +48,7 @@ class PoseCandidate:
     @property
     def is_one_of_two(self) -> bool:
         """Whether another pose fits as well."""
-        return self.was_searched and self.score < self.rival_score + ALIKE
+        return self.was_searched and self.score < self.second_score + ALIKE
 
     @property
     def is_measured(self) -> bool:
@@ -61,7 +61,7 @@ class PoseCandidate:
         return self.shares.score
 
 
-class Answers:
+class FoundPoses:
     """Poses that registrations found, each with the guesses that led to it."""
 
     def __init__(self, voxel_m: float, first: Sequence[Transform]) -> None:
@@ -99,18 +99,18 @@ def best_of(candidates: Sequence[PoseCandidate], *, other_m: float) -> PoseCandi
         return None
     highest = max(candidate.score for candidate in candidates)
     alike = [candidate for candidate in candidates if candidate.score >= highest - ALIKE]
-    surprises = [_surprise(candidate) for candidate in alike]
-    least = min(surprises)
+    jumps = [_relative_jump(candidate) for candidate in alike]
+    least = min(jumps)
     best = max(
-        (c for c, surprise in zip(alike, surprises, strict=True) if surprise <= least + 1.0),
+        (c for c, jump in zip(alike, jumps, strict=True) if jump <= least + 1.0),
         key=lambda candidate: candidate.score,
     )
-    rivals = (
+    others = (
         candidate.score
         for candidate in candidates
         if not _are_near(candidate.T_world_middle, best.T_world_middle, other_m, _OTHER_RAD)
     )
-    return replace(best, rival_score=max(rivals, default=-np.inf))
+    return replace(best, second_score=max(others, default=-np.inf))
 
 
 def _are_near(T_world_one: Transform, T_world_other: Transform, near_m: float, near_rad: float) -> bool:
@@ -120,8 +120,8 @@ def _are_near(T_world_one: Transform, T_world_other: Transform, near_m: float, n
     )
 
 
-def _surprise(candidate: PoseCandidate) -> float:
-    """Return the jump in units of what would be much, or of 1 m and 1 rad where that is unknown."""
+def _relative_jump(candidate: PoseCandidate) -> float:
+    """Return the jump in units of its limit, or of 1 m and 1 rad where that is unknown."""
     jump = candidate.jump
     if not np.isfinite(jump.limit_m):
         return jump.translation_m + jump.rotation_rad

@@ -20,7 +20,7 @@ from mapper.core.geometry import (
 from mapper.odometry.scan_to_map.config import ScanOdometryConfig
 from mapper.odometry.scan_to_map.motion_model import MotionModel, Spread
 from mapper.odometry.scan_to_map.observed_part import MEASURED, observed_part
-from mapper.odometry.scan_to_map.pose_candidate import Answers, PoseCandidate, best_of
+from mapper.odometry.scan_to_map.pose_candidate import FoundPoses, PoseCandidate, best_of
 from mapper.odometry.scan_to_map.scan_fit import (
     ScanKeyframe,
     contradiction,
@@ -113,8 +113,8 @@ class PoseSearch:
     def __init__(self, config: ScanOdometryConfig, state: ScanState) -> None:
         self._config = config
         self._state = state
-        self._rescue = build_registration(config.rescue) if config.rescue is not None else None
-        self._rescuer: tuple[DeskewedScan, Aligner] | None = None
+        self._global_registration = build_registration(config.rescue) if config.rescue is not None else None
+        self._global_aligner: tuple[DeskewedScan, Aligner] | None = None
 
     def find(self, scan: UnplacedScan, T_world_guess: Transform | None = None) -> PoseCandidate | None:
         """Return the pose that fits best; None if no method finds one.
@@ -179,9 +179,9 @@ class PoseSearch:
             keys: Keyframes that it is registered to.
             candidates: Poses by prediction, with the contradictions of both scans.
         """
-        # A pose that does not fit the keyframes may fit the doubtful one, so each has answers of its own.
-        answers = {
-            is_doubtful: Answers(
+        # A pose that does not fit the keyframes may fit the doubtful one, so the poses of each count apart.
+        found_poses = {
+            is_doubtful: FoundPoses(
                 scan.deskewed.prepared.voxel_m,
                 [c.T_world_middle for c in candidates if (c.keyframe is scan.doubtful) == is_doubtful],
             )
@@ -191,7 +191,9 @@ class PoseSearch:
         def enough() -> PoseCandidate | None:
             """Return the best pose so far if no other has to be tried."""
             best = best_of(candidates, other_m=self._config.max_pair_distance_m)
-            is_enough = best is not None and self._is_enough(best, answers[best.keyframe is scan.doubtful])
+            is_enough = best is not None and self._is_enough(
+                best, found_poses[best.keyframe is scan.doubtful]
+            )
             return best if is_enough else None
 
         if (found := enough()) is not None:
@@ -203,7 +205,7 @@ class PoseSearch:
                 for guess, T_world_middle, method in way(scan, key):
                     if T_world_middle is None or not scan.can_have_turned_to(T_world_middle):
                         continue
-                    if answers[key is scan.doubtful].add(T_world_middle, guess):
+                    if found_poses[key is scan.doubtful].add(T_world_middle, guess):
                         candidate = self._assessed(scan, T_world_middle, key, method)
                         if candidate is not None and candidate.shares.agreement >= _LEAST_AGREEMENT:
                             candidates.append(_compared(scan, candidate))
@@ -248,19 +250,19 @@ class PoseSearch:
         return other if rank(other) > rank(one) else one
 
     def is_suspect(self, candidate: PoseCandidate) -> bool:
-        """Return whether a pose fits less than usual, or is a surprise, so that others are tried."""
+        """Return whether a pose fits less than usual, or jumps unusually, so that others are tried."""
         return (
             candidate.jump.is_unusual
             or self._state.usual.agrees_little(candidate.shares)
             or not self.fits(candidate)
         )
 
-    def _is_enough(self, best: PoseCandidate, answers: Answers) -> bool:
+    def _is_enough(self, best: PoseCandidate, found_poses: FoundPoses) -> bool:
         """Return whether no other pose has to be tried: it fits well, or several guesses lead to it."""
         usual = self._state.usual.usual.score
         if best.score >= _GOOD * usual and not self.is_suspect(best):
             return True
-        return best.score >= _FAIR * usual and answers.guesses_of(best.T_world_middle) >= _GUESSES
+        return best.score >= _FAIR * usual and found_poses.guesses_of(best.T_world_middle) >= _GUESSES
 
     def fits(self, candidate: PoseCandidate) -> bool:
         """Return whether a pose fits as usual."""
@@ -293,7 +295,7 @@ class PoseSearch:
         return share < (self._config.lost_ratio if is_contradicted else 0.5 * self._config.lost_ratio)
 
     def _is_where_predicted(self, candidate: PoseCandidate) -> bool:
-        """Return whether a pose is no surprise, and nearer to the predicted one than keyframes are."""
+        """Return whether a pose is nearer to the predicted one than keyframes are, and its jump usual."""
         jump, config = candidate.jump, self._config
         is_near = (
             jump.translation_m < config.keyframe_distance_m and jump.rotation_rad < config.keyframe_angle_rad
@@ -311,7 +313,7 @@ class PoseSearch:
             return ()
         usual, shares = self._state.usual, candidate.shares
         little = usual.has_little_overlap(shares, usual_ratio=self._config.usual_ratio)
-        contradicts = usual.contradicts(shares, is_rescued=candidate.method == "rescued")
+        contradicts = usual.contradicts(shares, of_wide_search=candidate.method == "rescued")
         disagrees, jumps = usual.disagrees(shares), candidate.jump.is_unusual
         if not usual.is_known:
             little = disagrees = False
@@ -374,11 +376,12 @@ class PoseSearch:
 
     def _globally(self, scan: UnplacedScan, keyframe: ScanKeyframe) -> Iterator[_Attempt]:
         """Yield the pose that is found without a guess."""
-        if self._rescue is None:
+        if self._global_registration is None:
             return
-        if self._rescuer is None or self._rescuer[0] is not keyframe.deskewed:
-            self._rescuer = keyframe.deskewed, self._rescue.prepare(keyframe.deskewed.scan)
-        found = self._rescuer[1].align(scan.deskewed.scan, np.eye(4))
+        if self._global_aligner is None or self._global_aligner[0] is not keyframe.deskewed:
+            aligner = self._global_registration.prepare(keyframe.deskewed.scan)
+            self._global_aligner = keyframe.deskewed, aligner
+        found = self._global_aligner[1].align(scan.deskewed.scan, np.eye(4))
         if found.converged:
             T_world_found = keyframe.T_world_middle @ found.T_target_source
             yield -1, self._state.matcher.match(scan.deskewed, T_world_found, reach="near"), "rescued"

@@ -19,7 +19,7 @@ from mapper.registration.planes import up_of
 _MIN_PAIRS = 20
 _SURFACE_VOXELS = 0.33  # a point this near to a surface agrees with it
 _ALONG = 3.0
-"""Pair distances within which a partner tells whether a point lies on a surface: a ring on the ground is as
+"""Pair distances within which a partner shows whether a point lies on a surface: a ring on the ground is as
 far from the keyframe's as the sensor moved, up to two pair distances before the next keyframe."""
 _DIRECTION_RAD = 0.0175  # of the range images: one degree
 _MARGIN_M = 0.2
@@ -207,7 +207,7 @@ def fit_of(
     own = own * np.sign(np.einsum("ni,ni->n", own, normals))[:, None]
     rows = np.hstack([np.cross(points, normals), normals])
     own_rows = np.hstack([np.cross(points, own), own])
-    shown, telling = _shown(rows, own_rows), np.ones(len(near), np.bool_)
+    shown, is_counted = _shown(rows, own_rows), np.ones(len(near), np.bool_)
     if np.trace(shown[3:, 3:]) <= 0.0:
         return None
     degeneracy = degeneracy_of(shown, points=source.points, min_share=_SMALL_SHARE)
@@ -219,12 +219,12 @@ def fit_of(
             alone = degeneracy_of(of_broad, points=source.points, min_share=_SMALL_SHARE)
             along_m = np.linalg.norm(alone.directions @ T_key_scan[:3, 3])
             if len(alone.directions) and along_m < _SAME_VOXELS * source.voxel_m:
-                shown, telling, degeneracy = of_broad, is_broad, alone
+                shown, is_counted, degeneracy = of_broad, is_broad, alone
     agree = (distances_m <= _ALONG * max_pair_distance_m) & normals_key.any(axis=1)
     agree &= np.abs(off_m) <= _SURFACE_VOXELS * source.voxel_m
     agreement, weakest = weakest_direction(source.normals, agree)
     counts = FreeSpaceCheck(_MARGIN_M).count(keyframe.description, _checked(deskewed), T_key_scan)
-    observability, weights = _observability(degeneracy, points, rows, own_rows, agree[near] & telling)
+    observability, weights = _observability(degeneracy, points, rows, own_rows, agree[near] & is_counted)
     shown_m = _PAIR_VOXELS * source.voxel_m / np.sqrt(weights)
     if moved_voxels < _OFF_VOXELS:
         observability[: degeneracy.unobservable_count] = 0.0
@@ -261,7 +261,7 @@ def _observability(
     """Return (6,) whether the pairs that agree show a motion (as Tuna et al. 2024, §III, sum contributions).
 
     With it comes (6,) how much these pairs weigh; infinite where many pairs show the motion. Shares do not
-    tell, as noise makes one of every pair. A pair weighs as much as the product of its displacements along
+    show it, as noise makes one of every pair. A pair weighs as much as the product of its displacements along
     both normals, of a motion that displaces all points by 1 m root mean square, and at most 1: however many
     pairs lie on one tree, they hardly measure a rotation about it. Rough walls, of which no pair faces the
     motion, show it, too. Noise adds to such a sum no more than a few of its standard errors.

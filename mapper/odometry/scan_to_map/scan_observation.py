@@ -20,7 +20,7 @@ _MIN_POINTS = 100
 """Fewer points left after thinning do not constrain a pose."""
 _FINER = 0.5  # voxel size of the first thinning, of whose points each prepared point is the mean
 _NEGLIGIBLE = 0.2
-"""Displacement of a sweep's outer points, in voxels: velocities that make less are not told apart."""
+"""Displacement of a sweep's outer points, in voxels: velocities that make less are not distinguished."""
 _DISPLACED = 0.5  # displacement of a sweep's outer points, in voxels: more makes a pose doubtful
 
 

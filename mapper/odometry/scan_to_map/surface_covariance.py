@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from mapper.core.geometry import Array
 
 _SECTORS = 12  # of azimuth, each of two elevations
-_FEWEST = 10  # points of a sector that tells how much its distances agree
+_FEWEST = 10  # points of a sector that shows how much its distances agree
 _MEDIAN_CHI2, _FREEDOM = 0.455, 6.0  # of one degree of freedom; of a pose
 _LEAST_SHARE, _LEAST_SCATTER = 1e-9, 1e-2  # relative to the best known motion; to independent distances
 _SCATTER = 0.75

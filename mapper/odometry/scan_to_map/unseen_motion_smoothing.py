@@ -21,7 +21,7 @@ from mapper.odometry.scan_to_map.scan_noise import (
 )
 
 _AROUND_S = 1.0
-"""Frames so long before and after a stretch tell its velocities at both ends, and stretches nearer to each
+"""Frames so long before and after a stretch show its velocities at both ends, and stretches nearer to each
 other are one. Over as long, the log's accelerations are measured: over less they are the poses' noise."""
 _WINDOWS, _FEWEST_WINDOWS = 200, 10
 _LEAST_DENSITY = 1e-6  # rad²/s³ and m²/s³: keeps a synthetic log of one velocity finite

@@ -26,7 +26,7 @@ wrong ones 0.013 to 0.03 and more. It may be so many times the usual one where p
 _LEAST_SCORE = 0.1
 """Part of the usual score below which fewer contradictions are too many: scans 1.5 s apart had 0.6 and more
 under right poses, and less than 0 under wrong ones. 0 serves as well; with 0.25 right scans are doubtful."""
-_LEAST_RESCUED_SCORE = 0.25
+_LEAST_WIDE_SCORE = 0.25
 """That part for poses of a wide search: all 3 below it that contradict were wrong by 3.5 to 7 degrees. 0.2
 and 0.4 serve as well."""
 _FIRST_SCANS, _FIRST_OVERLAP, _FIRST_AGREEMENT, _FIRST_SPREAD = 3, 0.7, 0.4, 1.5
@@ -54,13 +54,13 @@ class Shares:
 
     @property
     def score(self) -> float:
-        """Agreement less what contradicts, weighted; overlap does not tell, as ground lies on any ground."""
+        """Agreement less what contradicts, weighted; overlap shows little, as ground lies on any ground."""
         return self.agreement - _CONTRADICTION_WEIGHT * self.contradicting
 
 
 @dataclass(frozen=True, slots=True)
 class Jump:
-    """Deviation from the predicted pose, and how much would be a surprise."""
+    """Deviation from the predicted pose, and how much would be unusual."""
 
     translation_m: float
     rotation_rad: float
@@ -69,7 +69,7 @@ class Jump:
 
     @property
     def is_unusual(self) -> bool:
-        """Whether it is a surprise."""
+        """Whether it is more than the limits."""
         return self.translation_m > self.limit_m or self.rotation_rad > self.limit_rad
 
     @property
@@ -82,7 +82,7 @@ class Jump:
 
 
 def jump_between(T_world_predicted: Transform, T_world_found: Transform, spread: Spread | None) -> Jump:
-    """Return how far a pose lies from the predicted one; without a known spread nothing is a surprise."""
+    """Return how far a pose lies from the predicted one; without a known spread nothing is unusual."""
     error = inverse(T_world_predicted) @ T_world_found
     limits = (np.inf, np.inf)
     if spread is not None:
@@ -137,7 +137,7 @@ class UsualFit:
 
     @property
     def is_known(self) -> bool:
-        """Whether any scan told what is usual; until then poses are searched for, but none is doubted."""
+        """Whether any scan showed what is usual; until then poses are searched for, but none is doubted."""
         return bool(self._recent)
 
     def has_little_overlap(self, shares: Shares, *, usual_ratio: float) -> bool:
@@ -160,20 +160,20 @@ class UsualFit:
     def is_weak(self, shares: Shares) -> bool:
         """Return whether a pose agrees so little that it may be off by part of a voxel in a direction.
 
-        What contradicts more than usual counts, too. Before some scans have told what is usual, a perfect fit
-        is.
+        What contradicts more than usual counts, too. Until some scans have shown what is usual, a perfect
+        fit is.
         """
         usual = self.usual.agreement if len(self._recent) >= _FEWEST else 1.0
         excess = max(shares.contradicting - self.usual.contradicting, 0.0)
         return shares.agreement - _CONTRADICTION_WEIGHT * excess < _LITTLE * usual
 
-    def contradicts(self, shares: Shares, *, is_rescued: bool = False) -> bool:
+    def contradicts(self, shares: Shares, *, of_wide_search: bool = False) -> bool:
         """Return whether too much stands where rays passed: at all, or for the little that agrees.
 
         A pose that only a wide search found has to agree more.
         """
         usual = self.usual
-        least_score = (_LEAST_RESCUED_SCORE if is_rescued else _LEAST_SCORE) * usual.score
+        least_score = (_LEAST_WIDE_SCORE if of_wide_search else _LEAST_SCORE) * usual.score
         if shares.contradicting <= _TIMES_CONTRADICTING * usual.contradicting:
             return False
         return shares.contradicting > _MAX_CONTRADICTING or (usual.score > 0.0 and shares.score < least_score)

@@ -8,7 +8,7 @@ from mapper.odometry.scan_to_map.config import GicpOdometryConfig
 from mapper.odometry.scan_to_map.gicp import GicpMatcher
 from mapper.odometry.scan_to_map.observed_part import MEASURED
 from mapper.odometry.scan_to_map.odometry import ScanOdometry
-from mapper.odometry.scan_to_map.pose_candidate import Answers, PoseCandidate, best_of
+from mapper.odometry.scan_to_map.pose_candidate import FoundPoses, PoseCandidate, best_of
 from mapper.odometry.scan_to_map.pose_search import PoseSearch
 from mapper.odometry.scan_to_map.scan_fit import fit_of
 from mapper.odometry.scan_to_map.scan_state import ScanState
@@ -91,16 +91,16 @@ def test_a_search_ends_when_several_guesses_lead_to_one_pose(monkeypatch):
     assert np.linalg.norm(track.T_world_body[:3, 3]) < 0.02
 
 
-def test_answers_count_the_guesses_that_led_to_them():
-    answers = Answers(0.2, [np.eye(4)])
+def test_found_poses_count_the_guesses_that_led_to_them():
+    found = FoundPoses(0.2, [np.eye(4)])
     close, far = (exp(np.zeros(3), np.array([x_m, 0.0, 0.0])) for x_m in (0.02, 0.2))
     turned = exp(np.array([0.0, 0.0, 0.05]), np.zeros(3))
 
-    assert not answers.add(close, 1)
-    assert answers.add(far, 1)
-    assert answers.add(turned, 2)
-    assert not answers.add(close, 1)
-    assert [answers.guesses_of(pose) for pose in (np.eye(4), far, turned)] == [2, 1, 1]
+    assert not found.add(close, 1)
+    assert found.add(far, 1)
+    assert found.add(turned, 2)
+    assert not found.add(close, 1)
+    assert [found.guesses_of(pose) for pose in (np.eye(4), far, turned)] == [2, 1, 1]
 
 
 @pytest.mark.parametrize(
@@ -126,5 +126,5 @@ def test_a_pose_that_was_searched_is_a_doubt_if_another_fits_as_well(method, agr
         [candidate(np.eye(4), 0.5), candidate(nearly, 0.49), candidate(there, agreement)], other_m=0.5
     )
 
-    assert best.rival_score == agreement
+    assert best.second_score == agreement
     assert [doubt.text for doubt in search.doubts(best)] == ["another pose fits as well"] * is_doubted
