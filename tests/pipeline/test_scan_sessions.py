@@ -73,7 +73,7 @@ def test_a_loop_between_scans_can_be_added_by_hand(first, tmp_path):
 def test_scans_of_two_places_are_no_loop_whoever_says_so(first, tmp_path):
     shutil.copytree(first.path, tmp_path / "run")
     copy = open_run(tmp_path / "run")
-    with pytest.raises(LoopError, match=r"loop 0 → 20: not added; (vote|overlap|sight): "):
+    with pytest.raises(LoopError, match=r"loop 0 → 20: not added; (vote|overlap|free space): "):
         edit_loops(copy.open_log(), copy, add=[(0, 20)])
     assert open_run(copy.path).loops == []
 
