@@ -6,7 +6,7 @@ from typing import Annotated, Literal, get_args
 import typer
 
 from mapper.cli.answer import Answer, Output
-from mapper.cli.options import AS_RECORDED, First, Last, Overrides, RequireTruth, Stride, merged, selection
+from mapper.cli.options import First, Last, Overrides, RequireTruth, Stride, merged, selection
 from mapper.core.errors import ConfigError
 from mapper.runtime.result_paths import LOGS, name_of, place_of
 
@@ -48,7 +48,7 @@ def convert(
     if as_ is None:
         formats = ", ".join(get_args(LogFormat))
         raise ConfigError(f"--as: want one of {formats}; an --out that ends in .mcap or .bag says it, too")
-    selected = [*AS_RECORDED, *selection(first, last, stride, require_truth)]
+    selected = selection(first, last, stride, require_truth)
     source = open_source(log, load_source_config(None, merged(selected, set_)))
     ending = f".{as_}" if as_ in _FILES else ""
     out = place_of(out, LOGS / f"{name_of(log)}{ending}")

@@ -58,10 +58,6 @@ RequireTruth = Annotated[
 ]
 
 
-AS_RECORDED = ("source.undistort_depth=false",)
-"""Overrides of commands that copy, or measure, depth images as they were recorded."""
-
-
 def selection(
     first: int | None, last: int | None, stride: int | None, require_truth: bool | None
 ) -> list[str]:

@@ -108,10 +108,6 @@ def summary_text(run: Run, metrics: Sequence[Metric]) -> str:
     ]
     if run.manifest.input.appended:
         rows.insert(0, ("logs", run.manifest.input.title))
-    if run.manifest.solve is not None and run.manifest.solve.floor_nodes:
-        rows.append(
-            ("height and tilt", f"from the floor that {run.manifest.solve.floor_nodes} keyframes see")
-        )
     if run.manifest.levelling is not None:
         rows.append(("levelled by", f"{run.manifest.levelling.method}: {run.manifest.levelling.detail}"))
     if run.manifest.edits:

@@ -10,7 +10,7 @@ import typer
 
 from mapper.cli.answer import Answer, Output
 from mapper.cli.option_rules import refuse_with
-from mapper.cli.options import AS_RECORDED, First, Last, Overrides, Overwrite, Stride, merged, selection
+from mapper.cli.options import First, Last, Overrides, Overwrite, Stride, merged, selection
 from mapper.core.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -71,7 +71,7 @@ def depth(
 
     distances_m = _distances(logs, plane_at, fit_plane=fit_plane, keep_tilt=keep_tilt)
     where = None if patch is None else _patch(patch)
-    config = load_config(None, merged([*AS_RECORDED, *selection(first, last, stride, None)], set_)).source
+    config = load_config(None, merged(selection(first, last, stride, None), set_)).source
     sources = [open_source(log, config) for log in logs]
     with nullcontext() if out is None else atomic_folder(out, FOLDER, overwrite=overwrite) as folder:
         study = study_depth(

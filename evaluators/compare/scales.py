@@ -4,7 +4,7 @@ from typing import Any, get_args
 
 from mapper.core.config import AnyConfig, with_changes
 from mapper.core.frames import Sensor
-from mapper.odometry.scan_to_map.config import KissOdometryConfig
+from mapper.odometry.scans.config import KissOdometryConfig
 from mapper.registration.config import VOXEL_M, RegistrationConfig
 from mapper.registration.hough.config import HoughConfig
 

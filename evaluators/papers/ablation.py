@@ -20,13 +20,13 @@ from mapper.odometry.config import IsvdOdometryConfig, MatchConfig
 from mapper.odometry.isvd.odometry import IsvdOdometry
 from mapper.odometry.isvd.registration import (
     IsvdObservation,
-    PairAlignment,
     PairRegistration,
     RegisterPair,
     matched_pairs,
 )
 from mapper.pipeline.solve import solve
 from mapper.pipeline.tracking_result import TrackingResult, refuse_a_fragment
+from mapper.registration.base import Alignment
 from mapper.sources.base import Log
 
 
@@ -86,7 +86,7 @@ class _SharedDetector:
         self._detector = build_detector(config)
         self._gray: Image | None = None
         self._pairs: dict[tuple[int, MatchConfig], Pairs] = {}
-        self._compared: dict[tuple[int, MatchConfig, Hashable], PairAlignment] = {}
+        self._compared: dict[tuple[int, MatchConfig, Hashable], tuple[Alignment, float, int]] = {}
 
     @property
     def scale_factor(self) -> float:
@@ -103,7 +103,7 @@ class _SharedDetector:
 
     def comparing(self, config: IsvdOdometryConfig) -> RegisterPair:
         """Return the comparison of an earlier frame with the newest by an odometry's settings."""
-        register = PairRegistration(config)
+        register = PairRegistration(config.registration, by_pixels=config.residual == "pixels")
         how = (
             config.registration,
             config.residual,
@@ -114,10 +114,13 @@ class _SharedDetector:
             config.max_depth_m,
         )
 
-        def compare(target: IsvdObservation, source: IsvdObservation, match: MatchConfig) -> PairAlignment:
+        def compare(
+            target: IsvdObservation, source: IsvdObservation, match: MatchConfig
+        ) -> tuple[Alignment, float, int]:
             key = (target.stamp_ns, match, how)
             if key not in self._compared:
-                self._compared[key] = register.fit(target, source, self._match(target, source, match))
+                pairs = self._match(target, source, match)
+                self._compared[key] = (*register.fit(target, source, pairs), len(pairs))
             return self._compared[key]
 
         return compare

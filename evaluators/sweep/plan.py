@@ -19,7 +19,7 @@ from mapper.evaluators.sweep.build_job import BuildJob
 from mapper.evaluators.sweep.config import ConfigurationConfig, MethodConfig, SweepConfig
 from mapper.loops.config import PlaceLoopsConfig, ScanLoopsConfig, ThesisLoopsConfig
 from mapper.odometry.config import IsvdOdometryConfig, KeyframeOdometryConfig
-from mapper.odometry.scan_to_map.config import ScanOdometryConfig
+from mapper.odometry.scans.config import ScanOdometryConfig
 from mapper.run.fingerprint import fingerprint
 from mapper.runtime.atomic import resumable_folder, write_json
 from mapper.runtime.executor import IN_PROCESS, Workers

@@ -212,7 +212,6 @@ class RgbdFrame:
         camera: Intrinsics that hold for both images.
         T_body_camera: (4, 4) pose of the camera in the body frame.
         depth_delay_s: Time from the image's stamp to the depth image's.
-        removed_distortion_per_m: Root mean square of the distortion that was removed from 1 / depth, 1/m.
     """
 
     stamp_ns: int
@@ -221,7 +220,6 @@ class RgbdFrame:
     camera: PinholeCamera
     T_body_camera: Transform = field(default_factory=lambda: np.eye(4))
     depth_delay_s: float = 0.0
-    removed_distortion_per_m: float = 0.0
 
     def __post_init__(self) -> None:
         want = (self.camera.height_px, self.camera.width_px)

@@ -158,40 +158,6 @@ def _mark_peaks(peaks: Image, above: Image, row: Image, below: Image) -> None:
 
 
 @njit(cache=True, nogil=True)
-def peaks_of(scores: Image, pixels: Pixels) -> NDArray[np.float64]:
-    """Return the (N, 2) column and row of local maxima of the scores, to a part of a pixel.
-
-    Each is the maximum of the quadratic that fits the 3 × 3 scores best (Leutenegger, Chli & Siegwart 2011,
-    §3.1), at most a pixel away.
-
-    Args:
-        scores: (H, W) uint8 of ``fast_scores``.
-        pixels: (N, 2) column and row, not at the border.
-    """
-    found = np.empty((len(pixels), 2))
-    for i in range(len(pixels)):
-        x, y = pixels[i]
-        found[i] = x, y
-        total = along_x = along_y = across = squares_x = squares_y = 0.0
-        for dy in range(-1, 2):
-            for dx in range(-1, 2):
-                score = float(scores[y + dy, x + dx])
-                total += score
-                along_x += dx * score
-                along_y += dy * score
-                across += dx * dy * score
-                squares_x += dx * dx * score
-                squares_y += dy * dy * score
-        gx, gy = along_x / 6.0, along_y / 6.0
-        hxx, hyy, hxy = squares_x - total / 1.5, squares_y - total / 1.5, across / 4.0
-        determinant = hxx * hyy - hxy * hxy
-        if hxx < 0.0 and determinant > 0.0:
-            found[i, 0] += min(max((hxy * gy - hyy * gx) / determinant, -1.0), 1.0)
-            found[i, 1] += min(max((hxy * gx - hxx * gy) / determinant, -1.0), 1.0)
-    return found
-
-
-@njit(cache=True, nogil=True)
 def orientations(image: Image, pixels: Pixels) -> NDArray[np.float32]:
     """Return (N,) radians from each pixel to the intensity centroid (Rublee et al. 2011, eq. 1–3).
 

@@ -4,7 +4,6 @@ from bisect import bisect_right
 from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import dataclass
 from functools import partial
-from itertools import compress
 from typing import Generic, Protocol
 
 import numpy as np
@@ -23,7 +22,6 @@ from mapper.loops.odometry_chain import OdometryChain
 from mapper.loops.online_pose_estimator import OnlinePoseEstimator
 from mapper.loops.place_file import AnyPlace
 from mapper.loops.proposers import PoseProposer
-from mapper.loops.reach_gate import checked_reach
 from mapper.odometry.base import FrameResult
 from mapper.runtime.archived import Archived, ArchivedMapping, archived
 
@@ -173,7 +171,6 @@ class KeyframeLoopDetector(Generic[Place]):
                 continue
             known = self._places[proposal.node].data
             closure = self._gate.checked(verify_proposal(proposal, node, known, place, self._verifier))
-            closure = self._reached(closure)
             self._closures[closure.i, closure.j] = closure
             if closure.verdict == "accepted":
                 self._add_hypothesis(closure)
@@ -195,16 +192,6 @@ class KeyframeLoopDetector(Generic[Place]):
     def places(self) -> Mapping[int, Place]:
         """Return the places that were kept, those of an earlier session too, by node."""
         return ArchivedMapping(self._places)
-
-    def _reached(self, closure: LoopClosure) -> LoopClosure:
-        """Return a loop as it is, or rejected if it joins parts of the path that are too far apart."""
-        if closure.verdict != "accepted" or self._chain.connected(closure.i, [closure.j])[0]:
-            return closure  # the drift gate has judged it
-        nodes = list(self._stamps_ns)
-        with_i, with_j = (self._chain.connected(end, nodes) for end in (closure.i, closure.j))
-        parts = list(compress(nodes, with_i)), list(compress(nodes, with_j))
-        poses = {node: self._estimator.pose_of(node) for node in (*parts[0], *parts[1], closure.i)}
-        return checked_reach(closure, parts, poses, self._stamps_ns)
 
     def _search_from(self, track: FrameResult) -> _Search | None:
         """Return the search to make from here; None where too little has changed since the last."""

@@ -18,9 +18,6 @@ class LevelConfig(Config):
     """Number of frames, spread over the log, in which planes are searched."""
     plane_tolerance_m: PositiveFloat = 0.03
     """Largest standard deviation of a plane's points from it: the noise of the sensor."""
-    follow_floor: bool = True
-    """Give a depth camera's path the height and tilt that the floor shows, unless the odometry says that it
-    is not one plane: a ramp, stairs, several storeys. Needs ``graph.solve`` "batch"."""
     heading: Literal["walls", "start"] = "walls"
     """Direction of x and y: along most walls if these agree, so that they are straight in a slice; or the
     first pose's heading."""

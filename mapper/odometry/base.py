@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mapper.core.doubts import Doubt
 from mapper.core.frames import Frame
-from mapper.core.geometry import Array, Transform, adjoint, inverse
+from mapper.core.geometry import Array, Transform
 from mapper.core.timebase import NS_PER_S
 from mapper.graph.model import BetweenFactor
 from mapper.sources.base import FrameRef
@@ -45,31 +45,6 @@ class Diagnostics:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class UnseenMotions:
-    """Motions of a frame that surfaces show in part or not at all, and whose prediction is poor.
-
-    Attributes:
-        motions: (K, 6) tangents of the body (rotation, translation) as rows; each displaces the points by 1 m
-            root mean square.
-        parts: (K, 6) rows whose product with a tangent is its part along each motion, metres.
-        sigmas_m: (K,) standard deviation with which surfaces show each.
-        covariance: (6, 6) of the pose, as ``FrameResult.covariance``, by what surfaces show.
-        doubts: Those of the frame that are due to these motions.
-    """
-
-    motions: Array
-    parts: Array
-    sigmas_m: Array
-    covariance: Array
-    doubts: tuple[Doubt, ...] = ()
-
-    def at(self, T_body_other: Transform) -> UnseenMotions:
-        """Return the motions as tangents of another pose (4, 4) of the body."""
-        Ad = adjoint(inverse(T_body_other))
-        return replace(self, motions=self.motions @ Ad.T, parts=self.parts @ adjoint(T_body_other))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class FrameResult:
     """One tracked frame.
 
@@ -88,7 +63,6 @@ class FrameResult:
         doubts: Why the pose may be wrong; empty if there is no reason.
         covariance: (6, 6) of the pose in the body's tangent (rotation, translation), rad² and m²: relative to
             ``node``, or for a keyframe to the keyframe before it. None if nothing measured it.
-        unseen: Motions that were predicted, if this is doubtful, or if no velocity was measured before.
     """
 
     stamp_ns: int
@@ -103,7 +77,6 @@ class FrameResult:
     is_sharp: bool = True
     doubts: tuple[Doubt, ...] = ()
     covariance: Array | None = None
-    unseen: UnseenMotions | None = None
 
 
 def lost_frame(
@@ -133,12 +106,6 @@ class FeatureMatches:
     previous_px: Array
 
 
-REPEATED = "repeated"
-"""``Diagnostics.method`` of a frame whose image is that of the frame before: nothing shows its pose."""
-
-ANOTHER_PLACE = "another place"
-"""Kind of the doubt about a pose after a gap where what is seen is also at another place."""
-
 SEE_MORE = (
     "a motion that no surface shows takes wheel odometry (wheels.txt), the poses of another odometry "
     "(odometry.kind=given), or a sensor that sees farther; loops do not show it"
@@ -147,23 +114,10 @@ SEE_MORE = (
 
 _MAX_STEADY_NS = NS_PER_S
 
-_FAST_M_S, _FAST_RATIO = 2.0, 3.0
-"""Least speed, and least ratio to a log's usual one, that a sensor does not keep up between two places: a
-brisk walk is 2 m/s."""
-
 
 def is_gap(begin_ns: int, end_ns: int) -> bool:
     """Return whether an earlier frame is so old that it does not predict the pose of a later one."""
     return end_ns - begin_ns > _MAX_STEADY_NS
-
-
-def fastest_m_s(usual_m_s: float) -> float:
-    """Return the speed beyond which a sensor cannot have come from one place to another.
-
-    Args:
-        usual_m_s: Median speed of the log; 0 if it is not known.
-    """
-    return max(_FAST_M_S, _FAST_RATIO * usual_m_s)
 
 
 class MotionCheck(Protocol):
@@ -230,18 +184,6 @@ class SensorCheck(Protocol):
 
     def calibration_warnings(self) -> Sequence[str]:
         """Return what in the log contradicts the sensor's calibration, a sentence each."""
-        ...
-
-
-@runtime_checkable
-class HindsightOdometry(Protocol):
-    """Odometry in which later frames change the results of earlier ones."""
-
-    def in_hindsight(self, results: Sequence[FrameResult], /) -> list[FrameResult]:
-        """Return the results of all frames once the log has ended, with all factors, as later ones show them.
-
-        Nodes, keyframes, and the nodes that factors connect stay as they are.
-        """
         ...
 
 

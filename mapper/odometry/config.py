@@ -8,7 +8,7 @@ from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, Pos
 from mapper.core.config import Config, Ratio
 from mapper.features.config import DetectorConfig, OrbConfig, UniformOrbConfig
 from mapper.graph.config import WheelNoiseConfig
-from mapper.odometry.scan_to_map.config import (
+from mapper.odometry.scans.config import (
     GicpOdometryConfig,
     HoughOdometryConfig,
     IcpOdometryConfig,
@@ -73,9 +73,6 @@ class IsvdOdometryConfig(Config):
     thesis, §4.1.1); false puts the depth of that pixel on the feature's own ray."""
     max_depth_m: PositiveFloat = 5.0
     """Depth beyond it is not used: a Kinect's error grows with the square of the depth."""
-    readout_s: float | None = None
-    """Rolling shutter: time from the first row's exposure to the last row's; 0 is a global shutter. None
-    estimates it from the log."""
     keyframe_interval: PositiveInt = 20
     """With ``earlier = "frames"``: one keyframe, the sharpest, in this many frames (Somlyai, PhD thesis,
     §4.1.2), for frames that were lost."""
@@ -97,8 +94,7 @@ class KeyframeOdometryConfig(Config):
     """bf: depth z is used as the disparity bf / z (Mur-Artal & Tardós 2017); 40 to 43 for a Kinect. For
     another sensor, set it to the focal length times the baseline."""
     disparity_sigma_px: PositiveFloat = 1.0
-    """Standard deviation of the virtual disparity relative to that of a pixel; in bundle adjustments less
-    where a log's residuals show it."""
+    """Standard deviation of the virtual disparity relative to that of a pixel."""
     depth_noise: DepthNoiseConfig | None = None
     """Depth noise of the sensor, as measured by ``mapper sensor depth``, which replaces the disparity's."""
     depth_residual: bool = True
@@ -140,8 +136,6 @@ class KeyframeOdometryConfig(Config):
     """Seed of P3P's samples."""
     align_depth: bool = False
     """Where an image has few landmarks, its depth image is aligned to those of the keyframes."""
-    triangulate: bool = False
-    """Features without depth become landmarks if two keyframes show them from different positions."""
     min_agreement_ratio: Ratio = 0.3
     """A pose with a smaller share of agreeing matches is rejected: repeated structure gave 0.28."""
     relocalisation_keyframes: PositiveInt = 5
@@ -155,9 +149,6 @@ class LocalMapConfig(KeyframeOdometryConfig):
     align_depth: bool = True
     """Where an image has few landmarks, its depth image is aligned to those of the keyframes; false where
     depth is unreliable."""
-    triangulate: bool = True
-    """Features without depth, such as beyond the sensor's range, become landmarks if two keyframes show them
-    from different positions; false uses only features with depth."""
     search_px: PositiveFloat = 15.0
     """Search radius around the predicted pixel in the finest octave, doubled once if too little matches;
     raise it for fast motion."""

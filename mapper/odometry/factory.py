@@ -16,7 +16,7 @@ from mapper.odometry.config import (
     PnpConfig,
     WheelsOdometryConfig,
 )
-from mapper.odometry.scan_to_map.config import (
+from mapper.odometry.scans.config import (
     AnyScanOdometryConfig,
     GicpOdometryConfig,
     HoughOdometryConfig,
@@ -25,7 +25,7 @@ from mapper.odometry.scan_to_map.config import (
 )
 
 if TYPE_CHECKING:
-    from mapper.odometry.scan_to_map.scan_matcher import ScanMatcher
+    from mapper.odometry.scans.scan_matcher import ScanMatcher
     from mapper.sources.base import Log
 
 
@@ -39,7 +39,7 @@ def odometry_for(
         DataError: The file of known poses is malformed.
     """
     from mapper.odometry.given_poses import poses_for
-    from mapper.odometry.scan_to_map.surroundings import adapted_to
+    from mapper.odometry.scans.surroundings import adapted_to
 
     return build_odometry(adapted_to(config, log), poses_for(config, log), motion_check)
 
@@ -95,17 +95,17 @@ def build_frame_odometry(
 
             return IsvdOdometry(config, motion_check=motion_check)
         case LocalMapConfig():
-            from mapper.odometry.local_map.motion_tracker import MotionPoseTracker
-            from mapper.odometry.local_map.odometry import KeyframeOdometry
+            from mapper.odometry.keyframes.motion_tracker import MotionPoseTracker
+            from mapper.odometry.keyframes.odometry import KeyframeOdometry
 
             return KeyframeOdometry(config, partial(MotionPoseTracker, config), motion_check)
         case PnpConfig():
-            from mapper.odometry.local_map.odometry import KeyframeOdometry
-            from mapper.odometry.local_map.pnp_tracker import PnpPoseTracker
+            from mapper.odometry.keyframes.odometry import KeyframeOdometry
+            from mapper.odometry.keyframes.pnp_tracker import PnpPoseTracker
 
             return KeyframeOdometry(config, PnpPoseTracker, motion_check)
         case GicpOdometryConfig() | IcpOdometryConfig() | KissOdometryConfig() | HoughOdometryConfig():
-            from mapper.odometry.scan_to_map.odometry import ScanOdometry
+            from mapper.odometry.scans.odometry import ScanOdometry
 
             return ScanOdometry(config, _build_matcher(config))
         case _:
@@ -116,19 +116,19 @@ def _build_matcher(config: AnyScanOdometryConfig) -> "ScanMatcher":
     """Return the scan matcher that the settings choose, before its first scan."""
     match config:
         case GicpOdometryConfig():
-            from mapper.odometry.scan_to_map.gicp import GicpMatcher
+            from mapper.odometry.scans.gicp import GicpMatcher
 
             return GicpMatcher(config)
         case IcpOdometryConfig():
-            from mapper.odometry.scan_to_map.icp import IcpMatcher
+            from mapper.odometry.scans.icp import IcpMatcher
 
             return IcpMatcher(config)
         case KissOdometryConfig():
-            from mapper.odometry.scan_to_map.kiss_icp import KissMatcher
+            from mapper.odometry.scans.kiss_icp import KissMatcher
 
             return KissMatcher(config)
         case HoughOdometryConfig():
-            from mapper.odometry.scan_to_map.scan_to_scan import ScanToScanMatcher
+            from mapper.odometry.scans.scan_to_scan import ScanToScanMatcher
 
             return ScanToScanMatcher(config)
         case _:

@@ -4,7 +4,7 @@ import numpy as np
 
 from mapper.core.geometry import Transform, angle_between
 from mapper.odometry.config import GivenOdometryConfig, WheelsOdometryConfig
-from mapper.odometry.scan_to_map.config import ScanOdometryConfig
+from mapper.odometry.scans.config import ScanOdometryConfig
 
 
 def is_far(

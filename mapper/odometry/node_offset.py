@@ -7,7 +7,7 @@ from typing import Generic
 from mapper.core.deskew import Twist
 from mapper.features.frame_view import FrameView
 from mapper.graph.model import BetweenFactor
-from mapper.odometry.base import FeatureMatches, FrameResult, HindsightOdometry, Observation, Odometry
+from mapper.odometry.base import FeatureMatches, FrameResult, Observation, Odometry
 from mapper.sources.base import FrameRef
 
 
@@ -33,13 +33,6 @@ class NodeOffset(Generic[Observation]):
     def matches(self) -> FeatureMatches | None:
         """Return the matches of the frame tracked last."""
         return self._odometry.matches()
-
-    def in_hindsight(self, results: Sequence[FrameResult], /) -> list[FrameResult]:
-        """Return the results of all frames as later ones show them."""
-        if not isinstance(self._odometry, HindsightOdometry):
-            return list(results)
-        own = [_numbered(result, -self._first_node) for result in results]
-        return [_numbered(result, self._first_node) for result in self._odometry.in_hindsight(own)]
 
     def finish(self) -> Sequence[BetweenFactor]:
         """Return the measurements that were still being refined when the log ended."""

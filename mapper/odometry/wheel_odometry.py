@@ -15,11 +15,11 @@ from mapper.features.frame_view import FrameView
 from mapper.graph.model import BetweenFactor
 from mapper.graph.wheel_factors import WheelNode, wheel_factor
 from mapper.odometry.base import Diagnostics, FrameResult, lost_frame
+from mapper.odometry.camera.image_observation import observe_image
 from mapper.odometry.config import GivenOdometryConfig, LocalMapConfig, WheelsOdometryConfig
 from mapper.odometry.keyframe_distance import is_far
-from mapper.odometry.local_map.observation.image_observation import observe_image
-from mapper.odometry.scan_to_map.config import GicpOdometryConfig
-from mapper.odometry.scan_to_map.scan_observation import observe_scan
+from mapper.odometry.scans.config import GicpOdometryConfig
+from mapper.odometry.scans.scan_observation import observe_scan
 from mapper.places.vocabulary import Vocabulary, load_vocabulary
 from mapper.sensing.wheel_kinematics import Odometer, pose_at
 from mapper.sources.base import FrameRef

@@ -13,7 +13,6 @@ from mapper.loops.factory import build_keyframe_loop_detector
 from mapper.odometry.base import FrameResult
 from mapper.odometry.node_offset import NodeOffset
 from mapper.pipeline.components import component_of
-from mapper.pipeline.floor import above_level_floor, tracked_stamps
 from mapper.pipeline.fuse import carry_times, fuse_into
 from mapper.pipeline.joined_components import joined
 from mapper.pipeline.reobserve import reobserve
@@ -91,9 +90,6 @@ def append(
             tracking = component_of(tracking, next(iter(known)), progress=progress)
             solved = solve(tracking.graph, tracking.loops, config.graph)
         _refuse_unconnected(second, run, solved.loops, known)
-        trusted_ns = tracked_stamps(before.records) | {track.stamp_ns for track in tracking.tracked}
-        with writer.clock.stage("level"):
-            solved = above_level_floor(source, solved, config, trusted_ns=trusted_ns)
         later = from_tracking(replace(tracking, graph=solved.graph, loops=solved.loops), None)
         save_places(writer, tracking)
         save_solved(writer, before.solved(solved.graph, solved.loops).then(later, truth=source.truth))

@@ -1,6 +1,5 @@
 """From a recorded log to a run folder: track, solve, level, fuse."""
 
-from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -26,7 +25,6 @@ from mapper.pipeline.checkpoints import (
     remove_checkpoints,
 )
 from mapper.pipeline.components import largest_component
-from mapper.pipeline.floor import above_floor
 from mapper.pipeline.joined_components import joined
 from mapper.pipeline.solve import solve
 from mapper.pipeline.track import first_session, noted_depth_warnings, track_log
@@ -155,9 +153,9 @@ class _Steps:
         tracking = replace(tracking, graph=solved.graph, loops=solved.loops)
         tracking = largest_component(tracking, progress=self.progress)
         with self.writer.clock.stage("level"):
-            tracking, level, floor_nodes = levelled(self.source, tracking, self.config)
+            level = level_of(self.source, tracking, self.config)
         tracking = replace(tracking, graph=tracking.graph.moved(level.T_level_world))
-        return _Solved(tracking, solved.report.model_copy(update={"floor_nodes": floor_nodes}), level)
+        return _Solved(tracking, solved.report, level)
 
     def save(self, solved: _Solved) -> None:
         """Write the solved poses, the graph and the places."""
@@ -182,37 +180,10 @@ def _height_warning(source: Log, trajectory: Trajectory) -> str:
     return f"the camera is {height_m:.1f} m above the floor; is source.camera.depth_factor right?"
 
 
-def levelled(source: Log, tracking: TrackingResult, config: BuildConfig) -> tuple[TrackingResult, Level, int]:
-    """Return a solved log above its floor, its level frame, and how many nodes see that floor."""
+def level_of(source: Log, tracking: TrackingResult, config: BuildConfig) -> Level:
+    """Return the level frame of a solved log, found in scans of some of its tracked frames."""
     trajectory = tracking.tracked_trajectory()
     scans = _spread_scans(source, trajectory, config.level.frames)
-    level = _level(source, trajectory, scans, config)
-    graph, floor_nodes = above_floor(
-        source,
-        tracking.graph,
-        config,
-        up_world=level.T_level_world[2, :3],
-        trusted_ns={track.stamp_ns for track in tracking.tracked},
-    )
-    if floor_nodes:
-        tracking = replace(tracking, graph=graph)
-        level = _level(source, tracking.tracked_trajectory(), scans, config)
-    return tracking, level, floor_nodes
-
-
-def _spread_scans(source: Log, trajectory: Trajectory, count: int) -> dict[int, Scan]:
-    """Return the scans of a few poses, spread over the trajectory, by the poses' indices."""
-    spread = np.unique(np.linspace(0, len(trajectory) - 1, count).round().astype(int))
-    index_of = {int(trajectory.stamps_ns[index]): int(index) for index in spread}
-    scans = {}
-    for entry in source.entries_of(index_of):
-        with suppress(FrameError):  # it was readable in the first pass; fusing reports it
-            scans[index_of[entry.stamp_ns]] = entry.scan()
-    return scans
-
-
-def _level(source: Log, trajectory: Trajectory, scans: Mapping[int, Scan], config: BuildConfig) -> Level:
-    """Find the level frame from scans of some of the poses."""
     placed = [
         (deskewed(scan, twist_at(trajectory, index)), trajectory.T_world_body[index])
         for index, scan in scans.items()
@@ -224,3 +195,14 @@ def _level(source: Log, trajectory: Trajectory, scans: Mapping[int, Scan], confi
         config=config.level,
         axes=AXES[source.sensor],
     )
+
+
+def _spread_scans(source: Log, trajectory: Trajectory, count: int) -> dict[int, Scan]:
+    """Return the scans of a few poses, spread over the trajectory, by the poses' indices."""
+    spread = np.unique(np.linspace(0, len(trajectory) - 1, count).round().astype(int))
+    index_of = {int(trajectory.stamps_ns[index]): int(index) for index in spread}
+    scans = {}
+    for entry in source.entries_of(index_of):
+        with suppress(FrameError):  # it was readable in the first pass; fusing reports it
+            scans[index_of[entry.stamp_ns]] = entry.scan()
+    return scans

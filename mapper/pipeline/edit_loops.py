@@ -12,7 +12,6 @@ from mapper.graph.odometry_poses import by_odometry
 from mapper.loops.base import Proposal, Verifier, verify_proposal
 from mapper.loops.closure import LoopClosure, accepted_loops
 from mapper.loops.factory import build_verifier, keyframe_loops
-from mapper.pipeline.floor import above_level_floor, tracked_stamps
 from mapper.pipeline.fuse import fuse_changed
 from mapper.pipeline.reobserve import reobserve
 from mapper.pipeline.solve import solve
@@ -74,8 +73,6 @@ def edit_loops(
         _refuse_rejected(loop)
     if len(components(solved.graph)) > len(components(graph)):
         raise LoopError(f"{run.path}: without these loops the graph falls apart; nothing removed")
-    trusted_ns = tracked_stamps(tracked.records)
-    solved = above_level_floor(source, solved, run.config, trusted_ns=trusted_ns)
     changed = tracked.solved(solved.graph, solved.loops)
     return fuse_changed(source, run, changed, solve=solved.report, progress=progress)
 

@@ -26,7 +26,6 @@ from mapper.octree.map_file import write_map
 from mapper.octree.octomap_file import write_bt, write_ot
 from mapper.octree.scan_update_file import ScanUpdateWriter, open_scan_updates
 from mapper.pipeline.checkpoints import Checkpoints
-from mapper.pipeline.distortion_warnings import distortion_warnings
 from mapper.pipeline.fuse_checkpoints import MarkedUpdates, known_updates
 from mapper.pipeline.settings_trial import try_settings
 from mapper.run import files
@@ -201,7 +200,6 @@ def fuse_into(
         results = replace(results, frame_ms={})
     make_writer = ScanUpdateWriter if checkpoints is None else partial(MarkedUpdates, checkpoints=checkpoints)
     with writer.clock.stage("fuse"):
-        _warn_of_distortion(writer, source, progress)
         settings = _with_depth_noise(writer, source, config, progress)
         if checkpoints is not None:
             cached = known_updates(checkpoints, settings.octree)
@@ -263,16 +261,6 @@ def _write_verdict(
         with writer.clock.stage("track"):
             trial = try_settings(source, config, results, progress=progress)
     writer.update(warnings=tuple(warnings), trial=trial, verdict=verdict_of(warnings, trial))
-
-
-def _warn_of_distortion(writer: RunWriter, source: Log, progress: Progress) -> None:
-    """Add what is found about the distortion of depth images to a run's warnings, once."""
-    known = writer.manifest.warnings
-    reported = {warning.sentence for warning in known}
-    new = [warning for warning in distortion_warnings(source) if warning.sentence not in reported]
-    for warning in new:
-        progress.note(warning.sentence)
-    writer.update(warnings=(*known, *new))
 
 
 def _with_depth_noise(writer: RunWriter, source: Log, config: BuildConfig, progress: Progress) -> BuildConfig:

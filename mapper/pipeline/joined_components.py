@@ -18,7 +18,6 @@ from mapper.graph.model import PoseGraph
 from mapper.loops.base import Verification
 from mapper.loops.closure import Discrepancy, LoopClosure, accepted_loops, discrepancy, exceeds
 from mapper.loops.config import GateConfig, PlaceLoopsConfig
-from mapper.loops.reach_gate import checked_reach
 from mapper.loops.wide_baseline import verify_wide
 from mapper.odometry.base import FrameResult
 from mapper.odometry.config import IsvdOdometryConfig
@@ -117,7 +116,7 @@ class _Search:
         keyframes = self._keyframes(parts)
         self._observe(frame for part in keyframes for frame in part)
         loops = []
-        for (first, nodes_i), (second, nodes_j) in combinations(zip(keyframes, parts, strict=True), 2):
+        for first, second in combinations(keyframes, 2):
             hits = self._links(product(first, second))
             around = {
                 (i.stamp_ns, j.stamp_ns): (i, j)
@@ -126,19 +125,8 @@ class _Search:
             }
             links = self._links(around.values())
             if (loop := _agreed(links, self._graph, self._gate)) is not None:
-                ends = (nodes_i, nodes_j) if loop.i in nodes_i else (nodes_j, nodes_i)
-                loops.append(self._reached(loop, *ends))
+                loops.append(loop)
         return loops
-
-    def _reached(self, loop: LoopClosure, with_i: Sequence[int], with_j: Sequence[int]) -> LoopClosure:
-        """Return a loop, rejected if the sensor cannot have moved so far between its parts.
-
-        Only nodes of the log's last session count: the time between two sessions may be made up.
-        """
-        sessions, stamps_ns = self._source.sessions, self._graph.stamps_ns
-        begin_ns = int(sessions[-1].log.stamps_ns[0]) if sessions else 0
-        ends = [[node for node in nodes if stamps_ns[node] >= begin_ns] for nodes in (with_i, with_j)]
-        return checked_reach(loop, (ends[0], ends[1]), self._graph.T_world_node, stamps_ns)
 
     def _keyframes(self, parts: Sequence[Sequence[int]]) -> list[list[FrameResult]]:
         """Return keyframes of every part, evenly spread over it."""

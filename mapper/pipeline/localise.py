@@ -198,7 +198,7 @@ def _doubtful_unless_confirmed(
         for loop in tracking.loops
         if loop.rejected_by == SOLVER and loop.after is not None and exceeds(loop.after, slack)
     } - held
-    contradicted = Doubt("contradicted place", "the place that was recognised here contradicts the others")
+    contradicted = Doubt("disagreement", "the place that was recognised here contradicts the others")
     doubts |= dict.fromkeys(contradicting, contradicted)
     tracks = tuple(
         replace(track, doubts=(*track.doubts, doubts[track.node])) if track.node in doubts else track
@@ -231,10 +231,10 @@ def _unconfirmed(
         limit_m = path_m * (_FAR if is_between else _FAR_BEYOND)
         if not begin < node < end:
             text = "the map was searched in vain here, at the end of what was recognised"
-            doubts[node] = Doubt("searched in vain", text)
+            doubts[node] = Doubt("unconfirmed", text)
         elif np.abs(known_m - at_m).min() > limit_m:
             text = f"more than {limit_m:g} m of path from the nearest place that was recognised"
-            doubts[node] = Doubt("far from recognised places", text)
+            doubts[node] = Doubt("unconfirmed", text)
     return doubts
 
 

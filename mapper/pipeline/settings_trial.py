@@ -13,7 +13,7 @@ from mapper.core.frames import Sensor
 from mapper.core.timebase import NS_PER_S
 from mapper.loops.config import NoLoopsConfig
 from mapper.odometry.config import PnpConfig
-from mapper.odometry.scan_to_map.config import HoughOdometryConfig
+from mapper.odometry.scans.config import HoughOdometryConfig
 from mapper.pipeline.track import track_log
 from mapper.run.manifest import Trial
 from mapper.run.results import RunResults

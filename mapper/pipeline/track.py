@@ -16,10 +16,9 @@ from mapper.loops.closure import LoopClosure, accepted_loops
 from mapper.loops.detector import LoopDetector
 from mapper.loops.factory import build_loop_detector, build_verifier
 from mapper.loops.verification_log import VerificationLog
-from mapper.odometry.base import FrameResult, HindsightOdometry, Odometry, SensorCheck
+from mapper.odometry.base import FrameResult, Odometry, SensorCheck
 from mapper.odometry.factory import build_odometry, odometry_for
 from mapper.pipeline.doubtful_keyframes import without_doubtful_ends
-from mapper.pipeline.sweep_check import sweep_warnings
 from mapper.pipeline.tracking_checkpoints import FrameCheckpoint, TrackingCheckpoints
 from mapper.pipeline.tracking_result import BY_POSES, TrackingResult
 from mapper.run.manifest import RunWarning
@@ -133,7 +132,7 @@ def track_log(
             search = searches.take()
             if checkpoints is not None:
                 checkpoints.add(FrameCheckpoint(result, search, ms, checks.reading(done - 1)), odometry)
-    return first_pass.result(odometry, checks, progress, sweep_warnings(source, first_pass.tracks, config))
+    return first_pass.result(odometry, checks, progress)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -208,9 +207,8 @@ class _FirstPass:
         odometry: Odometry[Any],
         checks: ReadingChecks,
         progress: Progress,
-        more: Iterable[RunWarning],
     ) -> TrackingResult:
-        """Return the result of all frames, with more warnings; nothing is added afterwards."""
+        """Return the result of all frames; nothing is added afterwards."""
         tracks = _in_hindsight(self.tracks, odometry, checks)
         before = self._start.graph
         graph = PoseGraph(dict(before.T_world_node), dict(before.stamps_ns), list(before.factors))
@@ -218,7 +216,7 @@ class _FirstPass:
             if track.is_keyframe and track.node is not None:
                 graph.add_node(track.node, track.stamp_ns, track.T_world_body)
             graph.add_factors(track.factors)
-        warnings = [*self._warnings(graph, odometry, checks), *more]
+        warnings = self._warnings(graph, odometry, checks)
         for warning in warnings:
             progress.note(warning.sentence)
         graph.add_factors(self._wheel_factors)
@@ -259,8 +257,6 @@ def _in_hindsight(
     """Return the frames' results with all factors, and with what later frames and the readings add."""
     if tracks:
         tracks = [*tracks[:-1], replace(tracks[-1], factors=(*tracks[-1].factors, *odometry.finish()))]
-    if isinstance(odometry, HindsightOdometry):
-        tracks = odometry.in_hindsight(tracks)
     doubts = checks.doubts()
     return [
         replace(track, doubts=track.doubts or tuple(doubts.get(track.stamp_ns, ())))

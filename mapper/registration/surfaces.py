@@ -11,12 +11,9 @@ from mapper.core.frames import Points32
 from mapper.core.geometry import Array, Points
 from mapper.core.voxel_grid import voxel_means
 from mapper.registration.kd_tree import KdTree, kd_tree, neighbours_of
-from mapper.registration.scan_lines import fit_across_lines
 
 _NEIGHBOURS = 10
 _FEWEST_NEIGHBOURS = 5
-_SPACING_NEIGHBOUR = 3
-"""Number of other points within a point's spacing."""
 _VOXELS_ACROSS = 2**20  # within, positions in voxels are exact to a millionth of one
 _LINE = 1e-12
 """Least squared length of a normal before it is normalised, relative to the spread's; points on a line have
@@ -29,18 +26,12 @@ class Prepared:
 
     Attributes:
         normals: (N, 3) unit normals towards the origin; zero where there are too few neighbours.
-        spacing_m: (N,) distance of the third nearest other point; infinity where there are too few.
-        breadth: (N,) ratio, at least 1, of two variances of the points that give a normal: of the smaller one
-            along their plane to that across it. On a line and in a bush it is near 1, the normal arbitrary.
-            Of a normal from scan lines it is the square of their distance, relative to what they are off it.
         voxel_m: Edge of the voxels, metres.
         neighbours: Number of points that each normal is fitted to.
         tree: Search tree of the points; None without points.
     """
 
     normals: Array
-    spacing_m: Array
-    breadth: Array
     voxel_m: float
     neighbours: int
     tree: KdTree | None
@@ -57,27 +48,19 @@ class Prepared:
         return self.tree.nearest(points)
 
 
-def prepared(
-    points: Points32 | Points,
-    *,
-    voxel_m: float,
-    neighbours: int = _NEIGHBOURS,
-    origin: Array | None = None,
-) -> Prepared:
+def prepared(points: Points32 | Points, *, voxel_m: float, neighbours: int = _NEIGHBOURS) -> Prepared:
     """Return a cloud with one point per voxel, its normals and search tree.
 
     Args:
         points: (N, 3) finite positions, metres.
         voxel_m: Edge of the voxels, metres.
         neighbours: Nearest points, itself included, that give each normal.
-        origin: (3,) where the beams of a single scan begin; where the nearest points lie on one scan line,
-            the scan lines beside it then give the normal. None for other clouds.
 
     Raises:
         DataError: A point lies more than 2²⁰ voxels from the origin.
     """
     if len(points) == 0:
-        return Prepared(np.empty((0, 3)), np.empty(0), np.empty(0), voxel_m, neighbours, None)
+        return Prepared(np.empty((0, 3)), voxel_m, neighbours, None)
     farthest_m, limit_m = float(np.abs(points).max()), _VOXELS_ACROSS * voxel_m
     if farthest_m >= limit_m:
         raise DataError(
@@ -85,30 +68,20 @@ def prepared(
             f"{voxel_m} m voxels; move the cloud to the origin or enlarge voxel_m"
         )
     tree = kd_tree(voxel_means(points, voxel_m))
-    normals, spacing_m, breadth = _surroundings(tree, min(neighbours, len(tree.points)), origin)
-    return Prepared(normals, spacing_m, breadth, voxel_m, neighbours, tree)
+    return Prepared(_normals(tree, min(neighbours, len(tree.points))), voxel_m, neighbours, tree)
 
 
-def _surroundings(tree: KdTree, neighbours: int, origin: Array | None) -> tuple[Array, Array, Array]:
-    """Return the normals, the spacing and the breadth of a tree's points."""
-    normals, spacing_m = np.zeros_like(tree.points), np.full(len(tree.points), np.inf)
-    breadth = np.ones(len(tree.points))
+def _normals(tree: KdTree, neighbours: int) -> Array:
+    normals = np.zeros_like(tree.points)
     if neighbours >= _FEWEST_NEIGHBOURS:
-        about, squared = neighbours_of(tree.points, tree.axes, tree.cuts, tree.points, neighbours)
-        elongation = np.ones(len(tree.points))
-        _fit_normals(tree.points, about, normals, breadth, elongation)
-        if origin is not None:
-            fit_across_lines(tree.points, about, elongation, origin, normals, breadth)
-        spacing_m = np.sqrt(squared[:, _SPACING_NEIGHBOUR])
-    return normals, spacing_m, breadth
+        about, _ = neighbours_of(tree.points, tree.axes, tree.cuts, tree.points, neighbours)
+        _fit_normals(tree.points, about, normals)
+    return normals
 
 
 @njit(cache=True, nogil=True)
-def _fit_normals(points, about, normals, breadth, elongation):  # type: ignore[no-untyped-def]
-    """Fill in the normals, towards the origin, of the planes that fit the points about each point best.
-
-    With them come the breadth and the elongation of these planes.
-    """
+def _fit_normals(points, about, normals):  # type: ignore[no-untyped-def]
+    """Fill in the normals, towards the origin, of the planes that fit the points about each point best."""
     count = about.shape[1]
     for i in range(len(points)):
         mx = my = mz = 0.0
@@ -120,7 +93,7 @@ def _fit_normals(points, about, normals, breadth, elongation):  # type: ignore[n
             x, y, z = points[j, 0] - mx, points[j, 1] - my, points[j, 2] - mz
             xx, xy, xz = xx + x * x, xy + x * y, xz + x * z
             yy, yz, zz = yy + y * y, yz + y * z, zz + z * z
-        nx, ny, nz, breadth[i], elongation[i] = _least_axis(xx, xy, xz, yy, yz, zz)
+        nx, ny, nz = _least_axis(xx, xy, xz, yy, yz, zz)
         sign = -1.0 if nx * points[i, 0] + ny * points[i, 1] + nz * points[i, 2] > 0.0 else 1.0
         normals[i, 0], normals[i, 1], normals[i, 2] = sign * nx, sign * ny, sign * nz
 
@@ -129,8 +102,6 @@ def _fit_normals(points, about, normals, breadth, elongation):  # type: ignore[n
 def _least_axis(xx, xy, xz, yy, yz, zz):  # type: ignore[no-untyped-def]
     """Return the unit eigenvector of a symmetric matrix's least eigenvalue (Smith 1961); 0 if it has none.
 
-    With it come the ratios of the middle eigenvalue to the least, and of the largest to the middle.
-
     The rows of the matrix less that eigenvalue span a plane: the eigenvector is normal to it, and the longest
     of their three cross products is the most accurate.
     """
@@ -138,14 +109,10 @@ def _least_axis(xx, xy, xz, yy, yz, zz):  # type: ignore[no-untyped-def]
     a, b, c = xx - mean, yy - mean, zz - mean
     spread = np.sqrt((a * a + b * b + c * c + 2.0 * (xy * xy + xz * xz + yz * yz)) / 6.0)
     if spread == 0.0:
-        return 0.0, 0.0, 0.0, 1.0, 1.0
+        return 0.0, 0.0, 0.0
     determinant = a * (b * c - yz * yz) - xy * (xy * c - yz * xz) + xz * (xy * yz - b * xz)
     cosine = min(max(determinant / (2.0 * spread**3), -1.0), 1.0)
-    angle = np.arccos(cosine)
-    least = mean + 2.0 * spread * np.cos((angle + 2.0 * np.pi) / 3.0)
-    middle = mean + 2.0 * spread * np.cos((angle + 4.0 * np.pi) / 3.0)
-    ratio = middle / max(least, _LINE * mean)
-    longer = (3.0 * mean - least - middle) / max(middle, _LINE * mean)
+    least = mean + 2.0 * spread * np.cos((np.arccos(cosine) + 2.0 * np.pi) / 3.0)
     a, b, c = xx - least, yy - least, zz - least
     x, y, z = xy * yz - xz * b, xz * xy - a * yz, a * b - xy * xy
     square = x * x + y * y + z * z
@@ -156,6 +123,6 @@ def _least_axis(xx, xy, xz, yy, yz, zz):  # type: ignore[no-untyped-def]
         if u * u + v * v + w * w > square:
             x, y, z, square = u, v, w, u * u + v * v + w * w
     if square <= _LINE * spread**4:
-        return 0.0, 0.0, 0.0, 1.0, 1.0
+        return 0.0, 0.0, 0.0
     length = np.sqrt(square)
-    return x / length, y / length, z / length, ratio, longer
+    return x / length, y / length, z / length

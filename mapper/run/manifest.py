@@ -191,8 +191,6 @@ class Solve(Config):
     all covariances are right, many times that where those of the odometry are too small."""
     loops_rejected: float | None = None
     """Share of the loops that reached the solver and were rejected by it."""
-    floor_nodes: int = 0
-    """Nodes that see the floor from which the path took its heights and tilts afterwards; 0 without one."""
 
 
 class Levelling(Config):

@@ -8,7 +8,7 @@ import numpy as np
 from mapper.core.geometry import path_length
 from mapper.core.timebase import NS_PER_S, stretches
 from mapper.navigation.config import TraversableConfig
-from mapper.odometry.base import ANOTHER_PLACE, SEE_MORE
+from mapper.odometry.base import SEE_MORE
 from mapper.run.frame_outcomes import DISCONNECTED, FrameRecord
 from mapper.run.graph_warnings import (
     COME_BACK,
@@ -62,7 +62,6 @@ def find_warnings(results: RunResults, manifest: Manifest) -> list[RunWarning]:
         *_skipped(results.records, manifest),
         *_gaps(timeline),
         *_lost(results.records, timeline),
-        *_ambiguous(results.records, timeline),
         *doubtful,
         *loop_warnings(results),
         *_levelling(manifest),
@@ -219,27 +218,6 @@ def _lost(records: Sequence[FrameRecord], timeline: TimeLine) -> Iterator[RunWar
         f"longest (at most {_MAX_LOST_SHARE:.0%} and {_BROKEN_LOST_S:g} s are harmless)",
         where=timeline.place(first, last),
         weight=weight,
-    )
-
-
-def _ambiguous(records: Sequence[FrameRecord], timeline: TimeLine) -> Iterator[RunWarning]:
-    """Yield a warning if frames after a gap may be at another place: so may all that follow them."""
-    found = [
-        (k, doubt)
-        for k, record in enumerate(records)
-        for doubt in record.doubts
-        if record.outcome == "doubtful" and doubt.kind == ANOTHER_PLACE
-    ]
-    if not found:
-        return
-    first, doubt = found[0]
-    yield RunWarning(
-        kind="ambiguous",
-        sentence=f"after {counted(len(found), 'gap')} the view fits two places; all that follows may be "
-        f"displaced: {doubt.text}",
-        suggestion="record without gaps, or with wheel odometry (wheels.txt)",
-        where=timeline.place(first, first),
-        weight="doubt",
     )
 
 

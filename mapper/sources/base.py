@@ -13,7 +13,6 @@ from mapper.core.frames import Frame, RgbdFrame, Scan, Sensor
 from mapper.core.geometry import Array
 from mapper.core.timebase import Stamps
 from mapper.core.trajectory import Trajectory
-from mapper.sensing.depth_distortion import DepthDistortion
 
 
 class ImageFile(Protocol):
@@ -145,8 +144,6 @@ class Log:
         wheels: T_odom_body by wheel odometry, in a frame of its own that drifts, if the log has it.
         are_units_assumed: Nothing says how many units of its depth images a metre has.
         notes: Sentences on what opening it left out or assumed.
-        removed_distortion: Returns the depth distortion that frames are loaded without, or None if none was
-            found. None itself where frames are loaded as they were recorded.
         sessions: The logs that a chained log is made of, oldest first; empty for any other.
     """
 
@@ -161,7 +158,6 @@ class Log:
     wheels: Trajectory | None = None
     are_units_assumed: bool = False
     notes: Sequence[str] = ()
-    removed_distortion: Callable[[], DepthDistortion | None] | None = None
     sessions: "Sequence[Session]" = ()
 
     def __len__(self) -> int:

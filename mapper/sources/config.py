@@ -117,9 +117,6 @@ class SourceConfig(Config):
     depth_offset_s: float = 0.0
     """Added to the stamps of depth images before they are paired with colour images: how much later they show
     the scene than their stamps say. The warning ``camera`` reports it if it was measured."""
-    undistort_depth: bool = True
-    """Remove a smooth error of the depth that is the same in all images, as far as the log's planes show it.
-    The warning ``camera`` reports what was removed. Turn it off to compare with methods that do not."""
     rate_hz: PositiveFloat | None = None
     """Frames per second of numbered files without stamps; None is the format's own (30, Poznań, scans 10)."""
     camera: CameraConfig | None = None

@@ -167,7 +167,7 @@ def _inspected(path: Path, topics: Sequence[TopicFacts], source: Log) -> Inspect
         wheels=None if source.wheels is None else timing_of(source.wheels.stamps_ns),
         wheels_path_m=0.0 if source.wheels is None else source.wheels.path_length_m,
         readings=0 if source.accelerations is None else len(source.accelerations.stamps_ns),
-        notes=[*source.notes, *damage, *checks.notes(), *_distortion(source)],
+        notes=[*source.notes, *damage, *checks.notes()],
         warnings=depth_warnings(source),
         vehicle=vehicle_box(source),
     )
@@ -226,16 +226,6 @@ def _damage(checks: ReadingChecks) -> Iterator[str]:
     for run in (*checks.repeated("image", fewest=2), *checks.repeated("depth", fewest=2)):
         _unreadable(checks.log, range(max(run.start - step, 0), run.start))
         _unreadable(checks.log, range(run.stop, min(run.stop + step, len(checks.log))))
-
-
-def _distortion(log: Log) -> Iterator[str]:
-    """Yield a note if depth images have a distortion, which loading a frame has measured already."""
-    distortion = None if log.removed_distortion is None else log.removed_distortion()
-    if distortion is not None:
-        yield (
-            f"depth images are bent, all in the same way, by {distortion.text}; mapper build removes that "
-            "(source.undistort_depth)"
-        )
 
 
 def _unreadable(log: Log, indices: Iterable[int]) -> list[str]:

@@ -103,7 +103,7 @@ class ReadingChecks:
         for what, _, named, fewest in _FROZEN:
             for run in self.repeated(what, fewest=fewest):
                 for index in run[1:]:
-                    doubt = Doubt(named, f"{named} as {index - run[0]} frames before")
+                    doubt = Doubt("repeated image", f"{named} as {index - run[0]} frames before")
                     doubts.setdefault(int(self._stamps_ns[index]), []).append(doubt)
         return doubts
 

@@ -9,7 +9,6 @@ from mapper.core.errors import SourceError
 from mapper.core.timebase import NS_PER_S, nearest
 from mapper.sources.base import Log
 from mapper.sources.config import SourceConfig
-from mapper.sources.depth_distortion import undistorted
 from mapper.sources.timed_scans import with_point_times
 from mapper.sources.vehicle import without_vehicle
 
@@ -17,13 +16,11 @@ from mapper.sources.vehicle import without_vehicle
 def selected(log: Log, config: SourceConfig) -> Log:
     """Return the frames ``first_frame`` … ``last_frame`` by ``stride``, with truth where it is required.
 
-    Returns of the sensor's own vehicle are left out of them, and depth distortion if it is to be.
+    Returns of the sensor's own vehicle are left out of them.
 
     Raises:
         SourceError: Nothing is left, or truth is required of a log that has none.
     """
-    if config.undistort_depth:
-        log = undistorted(log)
     if log.sensor == "lidar" and (config.point_time_scale != 1.0 or config.sweep_s is not None):
         log = with_point_times(log, time_scale=config.point_time_scale, sweep_s=config.sweep_s)
     if config.body.clears:

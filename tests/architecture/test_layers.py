@@ -38,18 +38,7 @@ LAYERS = (
 )
 """The folders of mapper/. Each may import those before it, so there is no circle."""
 
-SUBFOLDERS = {
-    "odometry": ("local_map", "isvd", "scan_to_map"),
-    "odometry/local_map": (
-        "observation",
-        "bundle",
-        "landmarks",
-        "depth",
-        "pose",
-        "recovery",
-        "calibration",
-    ),
-}
+SUBFOLDERS = {"odometry": ("camera", "keyframes", "isvd", "scans")}
 """Folders in folders of mapper/ that are layers as well; the modules beside them combine them."""
 
 NO_RUN = {"config", "run", "export", "pipeline"}
@@ -90,7 +79,7 @@ HOMES = {
     "rich": ("cli/",),
     "open3d": ("mapper/export/mesh.py", "mapper/registration/ndt.py", "mapper/registration/rgbd.py"),
     "small_gicp": (),
-    "kiss_icp": ("mapper/odometry/scan_to_map/kiss_icp.py",),
+    "kiss_icp": ("mapper/odometry/scans/kiss_icp.py",),
     "kiss_matcher": ("mapper/registration/kiss_matcher.py",),
     "pyoctomap": (),
     "evo": (),

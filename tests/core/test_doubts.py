@@ -3,7 +3,7 @@ import pytest
 from mapper.core.doubts import Doubt, doubts_of, doubts_text, kinds_text
 from mapper.core.errors import DataError
 
-DOUBTS = (Doubt("jump", "jump of 0.3 m, 0.1 m is usual"), Doubt("another pose", "another pose fits as well"))
+DOUBTS = (Doubt("jump", "jump of 0.3 m, 0.1 m is usual"), Doubt("disagreement", "another pose fits as well"))
 
 
 @pytest.mark.parametrize("doubts", [(), DOUBTS[:1], DOUBTS])
@@ -11,8 +11,11 @@ def test_doubts_are_read_from_their_texts_and_kinds(doubts):
     assert doubts_of(doubts_text(doubts), kinds_text(doubts)) == doubts
 
 
-def test_texts_without_kinds_are_of_their_own_kinds():
-    assert doubts_of(doubts_text(DOUBTS), "") == tuple(Doubt(doubt.text, doubt.text) for doubt in DOUBTS)
+@pytest.mark.parametrize("kinds", ["", "one side; another pose"])
+def test_kinds_of_older_runs_are_disagreement(kinds):
+    assert doubts_of(doubts_text(DOUBTS), kinds) == tuple(
+        Doubt("disagreement", doubt.text) for doubt in DOUBTS
+    )
 
 
 def test_a_kind_that_is_missing_is_an_error():

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from mapper.cli.summary import summary_text
 from mapper.config.loading import load_config, overridden
 from mapper.core.errors import ConfigError, RunError, TrackingError
 from mapper.evaluators.metrics.trajectory import align, associate, ate
@@ -76,16 +75,6 @@ def test_the_world_is_levelled_with_the_floor_at_zero(run):
 
     truth = run.truth  # the synthetic world's z is up and its floor at 0, so heights agree without alignment
     np.testing.assert_allclose(T_world_body[:, 2, 3], truth.T_world_body[:, 2, 3], atol=0.05)
-
-
-def test_a_run_says_that_its_path_follows_the_floor(run, desk_log, tmp_path, monkeypatch):
-    assert run.manifest.solve.floor_nodes == 0
-    assert "from the floor" not in summary_text(run, [])
-
-    monkeypatch.setattr("mapper.pipeline.build.above_floor", lambda _source, graph, *_, **__: (graph, 7))
-    above = build_run(desk_log, tmp_path / "run", "source.last_frame=10")
-    assert above.manifest.solve.floor_nodes == 7
-    assert "from the floor that 7 keyframes see" in summary_text(above, [])
 
 
 def test_the_graph_is_the_trajectory_s(run):

@@ -116,7 +116,7 @@ def test_what_lies_on_the_disk_alone_is_read_again_to_the_same_bytes(
             return super().read(reference)
 
     monkeypatch.setattr("mapper.pipeline.checkpoints.Archive", Forgetful)
-    monkeypatch.setattr("mapper.odometry.local_map.landmarks.keyframe._READY", 1)
+    monkeypatch.setattr("mapper.odometry.keyframes.keyframe._READY", 1)
     for log, wanted, frame in ((desk_log, desk_run, 20), (street, street_run, 12)):
         read.clear()
         stopped(log, tmp_path / log.name, observer=StopAt(frame))

@@ -13,7 +13,7 @@ from mapper.pipeline.doubtful_keyframes import without_doubtful_ends
 
 STEP = exp(np.array([0.0, 0.0, 0.2]), np.array([0.5, 0.1, 0.0]))
 SIGMAS = PoseSigmas(0.2, 1.0)
-DOUBTS = (Doubt("another pose", "another pose fits as well"),)
+DOUBTS = (Doubt("disagreement", "another pose fits as well"),)
 
 
 def frame(index, node, T_world, T_node_body, *, doubts=(), sigma=0.1):

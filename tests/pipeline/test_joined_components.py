@@ -68,13 +68,6 @@ def test_walls_that_are_painted_otherwise_stay_apart():
     assert len(components(result.graph)) == 2
 
 
-def test_a_place_that_is_too_far_away_for_the_time_between_joins_nothing():
-    log, tracking = broken(1, 1, pause_ns=1_200_000_000)
-    result = joined(log, tracking, CONFIG, progress=SILENT)
-    assert [loop.rejected_by for loop in result.loops] == ["reach"]
-    assert len(components(result.graph)) == 2
-
-
 def test_without_loops_between_images_nothing_is_searched(one_wall):
     log, tracking = one_wall
     unread = replace(log, entry_at=lambda _: pytest.fail("a frame is read"))

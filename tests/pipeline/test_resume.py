@@ -13,8 +13,7 @@ import pytest
 
 from mapper.cli.summary import summary_text
 from mapper.core.errors import RunError, TrackingError
-from mapper.odometry.local_map.landmarks import paged_table
-from mapper.odometry.local_map.odometry import KeyframeOdometry
+from mapper.odometry.keyframes.odometry import KeyframeOdometry
 from mapper.pipeline.checkpoint_identity import write_identity
 from mapper.places.vocabulary import SHIPPED
 from mapper.run.folder import open_run
@@ -53,18 +52,6 @@ def test_tracking_goes_on_at_the_frame_where_it_was_stopped(desk_log, desk_run, 
     assert resumed(run) == [("track", 8), ("track", 15)]
     (line,) = [line for line in summary_text(run, []).splitlines() if line.startswith("resumed ")]
     assert line.endswith(" track at frame 8; track at frame 15")
-
-
-def test_landmarks_that_had_left_the_memory_are_there_when_it_goes_on(
-    desk_log, desk_run, tmp_path, monkeypatch
-):
-    monkeypatch.setattr(paged_table, "WORKING_SET_STEPS", -1)
-    monkeypatch.setattr(paged_table, "_EVERY_STEPS", 1)
-    for frames in (9, 20):
-        stopped(desk_log, tmp_path / "run", observer=StopAt(frames))
-    run = start(desk_log, tmp_path / "run")
-    assert_same(run, desk_run)
-    assert resumed(run) == [("track", 8), ("track", 27)]
 
 
 @pytest.mark.parametrize("kind", ["gicp", "kiss-icp", "icp"])

@@ -22,7 +22,7 @@ from mapper.runtime.atomic import atomic_folder, partial_of
 
 MANIFEST = Manifest(status="building", input=Input(path="/log", kind="tum", fingerprint="sha256:0"))
 
-DOUBTS = (Doubt("jump", "jump of 0.3 m"), Doubt("another pose", "another pose fits as well"))
+DOUBTS = (Doubt("jump", "jump of 0.3 m"), Doubt("disagreement", "another pose fits as well"))
 
 
 def draft_of(out, *, overwrite=False):
@@ -186,14 +186,14 @@ def test_doubts_of_older_runs_have_no_kinds(tmp_path):
     how = Diagnostics(9, 8, 7, 0.5, "m", "map")
     write_records(tmp_path / "frames.csv", [FrameRecord(10, "doubtful", 0, False, how, DOUBTS)])
     header, row = (tmp_path / "frames.csv").read_text().splitlines()
-    assert (header.rpartition(",")[2], row.rpartition(",")[2]) == ("doubt_kinds", "jump; another pose")
+    assert (header.rpartition(",")[2], row.rpartition(",")[2]) == ("doubt_kinds", "jump; disagreement")
     older = "\n".join(line.rpartition(",")[0] for line in (header, row))
     (tmp_path / "frames.csv").write_text(older + "\n")
 
     (record,) = read_records(tmp_path / "frames.csv")
 
     assert [doubt.text for doubt in record.doubts] == [doubt.text for doubt in DOUBTS]
-    assert [doubt.kind for doubt in record.doubts] == [doubt.text for doubt in DOUBTS]
+    assert [doubt.kind for doubt in record.doubts] == ["disagreement"] * 2
 
 
 @pytest.mark.parametrize(

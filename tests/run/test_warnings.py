@@ -10,7 +10,6 @@ from mapper.core.geometry import exp, inverse
 from mapper.core.trajectory import Trajectory
 from mapper.graph.model import BetweenFactor, PoseSigmas
 from mapper.loops.closure import Discrepancy, LoopClosure
-from mapper.odometry.base import ANOTHER_PLACE
 from mapper.run.frame_outcomes import DISCONNECTED
 from mapper.run.manifest import AppendedLog, Levelling, RunWarning, SkippedFrame, Trial
 from mapper.run.pose_covariances import uncertain_poses
@@ -91,7 +90,7 @@ def test_a_part_that_is_left_out_breaks_a_run():
 
 def test_doubtful_frames_and_their_main_reasons():
     jumps = {k: doubted(Doubt("jump", f"jump of 0.{k} m where 0.09 m was predicted")) for k in range(11, 19)}
-    some = {k: doubted(Doubt("one side", "12 inliers on one side of the image")) for k in range(51, 54)}
+    some = {k: doubted(Doubt("disagreement", "12 inliers on one side of the image")) for k in range(51, 54)}
     warning = only(results_of(changed=jumps | some))
     assert (warning.kind, warning.weight) == ("doubtful", "doubt")
     assert "11 of 200 placed frames are doubtful, 5.5% (at most 2% are usual)" in warning.sentence
@@ -100,15 +99,6 @@ def test_doubtful_frames_and_their_main_reasons():
     )
     assert warning.where == "1.1 … 1.8 s"
     assert only(results_of(changed={12: doubted(), 51: doubted(), 99: doubted()})).weight == "note"
-
-
-def test_a_view_that_fits_two_places():
-    twice = doubted(Doubt(ANOTHER_PLACE, "90 features agree, 80 with a place 3.0 m away"))
-    (ambiguous,) = found(results_of(changed={60: twice, 120: twice}), kind="ambiguous")
-    assert ambiguous.weight == "doubt"
-    assert "after 2 gaps the view fits two places" in ambiguous.sentence
-    assert "80 with a place 3.0 m away" in ambiguous.sentence
-    assert ambiguous.where.startswith("6.0")
 
 
 def test_motions_that_nothing_shows_have_another_remedy_than_settings():

@@ -7,7 +7,7 @@ import pytest
 
 from mapper import __version__
 from mapper.core.errors import DependencyError
-from mapper.odometry.scan_to_map.config import KissOdometryConfig
+from mapper.odometry.scans.config import KissOdometryConfig
 from mapper.registration.config import KissMatcherConfig, NdtConfig
 from mapper.runtime.extras import DISTRIBUTION, extra, require
 from tests.support.paths import ROOT
@@ -50,7 +50,7 @@ def view():
 
 
 def kiss_icp():
-    from mapper.odometry.scan_to_map.kiss_icp import KissMatcher
+    from mapper.odometry.scans.kiss_icp import KissMatcher
 
     KissMatcher(KissOdometryConfig())
 

@@ -59,8 +59,8 @@ def test_frames_that_repeat_earlier_ones_are_doubted():
         entry.load()
     doubts = checks.doubts()
     assert sorted(doubts) == log.stamps_ns[[*range(8, 17), *range(31, 35)]].tolist()
-    assert doubts[log.stamps_ns[9]] == [Doubt("same image", "same image as 2 frames before")]
-    assert doubts[log.stamps_ns[31]] == [Doubt("same depth image", "same depth image as 1 frames before")]
+    assert doubts[log.stamps_ns[9]] == [Doubt("repeated image", "same image as 2 frames before")]
+    assert doubts[log.stamps_ns[31]] == [Doubt("repeated image", "same depth image as 1 frames before")]
 
 
 def scans_of(seeds):
@@ -82,7 +82,7 @@ def test_scans_that_repeat_are_noted_and_doubted():
     for entry in checks.log.entries():
         entry.load()
     assert sorted(checks.doubts()) == log.stamps_ns[13:15].tolist()
-    assert checks.doubts()[log.stamps_ns[14]] == [Doubt("same points", "same points as 2 frames before")]
+    assert checks.doubts()[log.stamps_ns[14]] == [Doubt("repeated image", "same points as 2 frames before")]
     assert notes_on(scans_of(frozen(20, 12, FROZEN_SCANS - 1))) == []
 
 

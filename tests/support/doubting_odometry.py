@@ -14,7 +14,7 @@ from mapper.pipeline import track
 
 DOUBTS = (
     Doubt("jump", "jump of 0.50 m where 0.02 m was predicted"),
-    Doubt("one side", "12 inliers on one side of the image"),
+    Doubt("disagreement", "12 inliers on one side of the image"),
 )
 SIGMAS = np.array([0.1, 0.1, 0.1, 0.5, 0.5, 0.5])
 

@@ -4,9 +4,9 @@ import numpy as np
 
 from mapper.core.frames import Scan
 from mapper.core.geometry import exp
-from mapper.odometry.scan_to_map.config import GicpOdometryConfig
-from mapper.odometry.scan_to_map.scan_fit import ScanKeyframe
-from mapper.odometry.scan_to_map.scan_matcher import DeskewedScan
+from mapper.odometry.scans.config import GicpOdometryConfig
+from mapper.odometry.scans.scan_fit import ScanKeyframe
+from mapper.odometry.scans.scan_matcher import DeskewedScan
 from mapper.registration.surfaces import prepared
 
 INDOOR = GicpOdometryConfig(voxel_m=0.2, cell_m=0.25, coarse_cell_m=1.0, min_range_m=0.3, rescue=None)

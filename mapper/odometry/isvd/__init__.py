@@ -1,1 +1,1 @@
-"""Odometry by iterative SVD on matched features."""
+"""Visual odometry against a local map of keyframes, refined by local bundle adjustment."""

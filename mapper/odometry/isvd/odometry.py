@@ -1,7 +1,9 @@
 """ISVD odometry: each frame registered against several earlier ones (Somlyai, PhD thesis, alg. 7)."""
 
 import math
+from collections import deque
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,9 +11,8 @@ from numpy.typing import NDArray
 from mapper.core.deskew import Twist
 from mapper.core.errors import FrameError
 from mapper.core.frames import Frame, PinholeCamera, RgbdFrame
-from mapper.core.geometry import Array, Transform, apply, inverse
-from mapper.core.timebase import NS_PER_S
-from mapper.features.base import Detector, Features
+from mapper.core.geometry import Array, Transform, apply, exp, inverse, log, mean_rotation, transform
+from mapper.features.base import Detector
 from mapper.features.factory import build_detector
 from mapper.features.frame_view import ImageView
 from mapper.graph.model import BetweenFactor
@@ -26,24 +27,68 @@ from mapper.odometry.base import (
     lost_frame,
 )
 from mapper.odometry.config import IsvdOdometryConfig, MatchConfig
-from mapper.odometry.isvd.earlier_frames import EarlierFrames
-from mapper.odometry.isvd.frames import PoseCandidate, TrackedFrame, average_pose
-from mapper.odometry.isvd.readout import readout_in_pair
-from mapper.odometry.isvd.registration import IsvdObservation, PairRegistration, RegisterPair
-from mapper.odometry.isvd.registration_errors import RegistrationErrors
-from mapper.odometry.local_map.calibration.rolling_shutter import RollingShutter
-from mapper.odometry.local_map.observation.readout_time import ReadoutTime
+from mapper.odometry.isvd.registration import IsvdObservation, PairRegistration, RegisterPair, matched_pairs
+from mapper.odometry.sharpest_keyframe import SharpestKeyframes
 from mapper.registration.base import Alignment
-from mapper.registration.reprojection import disparity_sigmas_px, image_measurements
+from mapper.runtime.archived import Archived, archived
 from mapper.sensing.config import KINECT_NOISE
 from mapper.sensing.depth_filter import dif
 from mapper.sensing.depth_noise import depth_sigma_m, feature_depth_m
 
+_VIRTUAL_BASELINE_PX_M = 40.0
+"""bf: depth z counts as the disparity bf / z (Mur-Artal & Tardós 2017)."""
 _DEPTH_SHARE = 0.01
 """Error of depths beside the sensor's noise, as a share: its scale, and the slope where a feature lies."""
-_PAIRS_SHARING, _PAIRS_COUNTED = 4, 200
-"""Pairs of images that show the readout time: a new image is in one, a keyframe in some 20, their geometric
-mean; and how many of them the estimate is from."""
+_NEW_VIEW, _NEAR_VIEW = 0.15, 0.6
+"""Differences of views: from this on a frame is a keyframe, up to this it is registered against one."""
+_HALF_VIEW_RAD = 0.5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrackedFrame:
+    """A tracked frame: its node, its observation, and T_world_body as estimated when it was tracked."""
+
+    node: int
+    observation: IsvdObservation
+    T_world_body: Transform
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Keyframe:
+    """A tracked frame that is kept, with what it observed in the archive."""
+
+    node: int
+    observation: Archived[IsvdObservation]
+    T_world_body: Transform
+
+    def loaded(self) -> TrackedFrame:
+        """Return the frame."""
+        return TrackedFrame(self.node, self.observation.data, self.T_world_body)
+
+
+def _kept(frame: TrackedFrame) -> _Keyframe:
+    return _Keyframe(frame.node, archived(frame.observation), frame.T_world_body)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseCandidate:
+    """Registration of a new frame against an earlier one.
+
+    Attributes:
+        earlier: The earlier frame, the target.
+        alignment: The motion, earlier ← new.
+        information: (6, 6) of the motion, with the error that its features share.
+        weight: Its quality W, 1/m (eq. 4.1).
+        matches: Number of matched features, with or without depth.
+        T_world_body: (4, 4) pose of the new frame by this registration.
+    """
+
+    earlier: TrackedFrame
+    alignment: Alignment
+    information: Array
+    weight: float
+    matches: int
+    T_world_body: Transform
 
 
 class IsvdOdometry(FrameOdometry[IsvdObservation]):
@@ -69,21 +114,21 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
             detector: Replaces the configured one, so that several odometries on the same frames can share
                 the detection.
             register: Replaces the registration, so that they can share registrations as well.
-            motion_check: Rules out poses after a gap; None if only the images measure the motion.
+            motion_check: Rules out poses after a gap; None if nothing but the images tells of the motion.
         """
         self._config = config
         self._motion_check = motion_check
         self._detector = detector or build_detector(config.detector)
-        self._registration = PairRegistration(config)
+        self._registration = PairRegistration(config.registration, by_pixels=config.residual == "pixels")
         self._register_pair = register or self._registration
-        self._earlier = EarlierFrames(config)
-        self._next_node = 0
-        self._nearest_match: tuple[IsvdObservation, PoseCandidate] | None = None
-        self._readout = ReadoutTime(
-            config.readout_s, windows_sharing=_PAIRS_SHARING, windows_counted=_PAIRS_COUNTED
+        self._recent: deque[TrackedFrame] = deque(
+            maxlen=max(config.previous_frames, config.keyframe_interval)
         )
-        self._shutter = RollingShutter(self._readout)
-        self._errors = RegistrationErrors()
+        self._keyframes: list[_Keyframe] = []
+        self._sharpest = SharpestKeyframes(config.keyframe_interval)
+        self._next_node = 0
+        self._turn = 0
+        self._nearest_match: tuple[IsvdObservation, PoseCandidate, MatchConfig] | None = None
 
     def observe(self, frame: Frame) -> IsvdObservation:
         """Return a frame's features with their 3D points. Pure.
@@ -100,21 +145,20 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
         z[z > config.max_depth_m] = np.nan
         pixels = self._undistorted(features.pixels, camera)
         at = self._undistorted(np.rint(features.pixels), camera) if config.whole_pixels else pixels
+        rays = (at - [camera.cx_px, camera.cy_px]) / [camera.fx_px, camera.fy_px]
+        sigma_px = self._detector.scale_factor ** features.octave.astype(np.float64)
         sigma_m = np.hypot(depth_sigma_m(config.depth_noise or KINECT_NOISE, z), _DEPTH_SHARE * z)
-        measured, weights, intrinsics = image_measurements(
-            pixels,
-            z,
-            camera.intrinsics,
-            sigma_px=self._sigma_px(features),
-            disparity_sigma_px=disparity_sigmas_px(z, sigma_m),
-        )
+        # Without depth the weight is not used, but it is a factor in sums.
+        disparity_sigma_px = np.where(np.isnan(z), 1.0, _VIRTUAL_BASELINE_PX_M / z**2 * sigma_m)
         return IsvdObservation(
             stamp_ns=frame.stamp_ns,
             features=features,
-            points_body=apply(frame.T_body_camera, np.column_stack([camera.rays(at) * z[:, None], z])),
-            measured=measured,
-            weights=weights,
-            intrinsics=intrinsics,
+            points_body=apply(frame.T_body_camera, np.column_stack([rays * z[:, None], z])),
+            measured=np.column_stack([pixels, _VIRTUAL_BASELINE_PX_M / z]),
+            weights=np.column_stack([sigma_px, sigma_px, disparity_sigma_px]) ** -2.0,
+            intrinsics=np.array(
+                [camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px, _VIRTUAL_BASELINE_PX_M]
+            ),
             camera=camera,
             T_body_camera=frame.T_body_camera,
         )
@@ -122,78 +166,73 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
     def track(self, observation: IsvdObservation) -> FrameResult:
         """Track the next frame, in time order."""
         self._nearest_match = None
-        last = self._earlier.last
-        if last is None:
+        if not self._recent:
             return self._add_node(observation, np.eye(4), [], method="start")
-        if not self._follows(observation):
-            self._shutter.restart()  # the motion before a gap is not that in this image
-        candidates, method = self._candidates(self._shutter.predicted(observation))
+        earlier = self._earlier()
+        for match, method in ((self._config.match, "isvd"), (self._config.fallback, "fallback")):
+            candidates = self._register(observation, earlier, match)
+            if candidates:
+                self._nearest_match = observation, candidates[0], match
+                return self._add_node(observation, self._combine(candidates), candidates, method=method)
+        candidates = self._relocalise(observation)
         if candidates:
-            pose = average_pose(candidates, self._config)
-            return self._add_node(observation, pose, candidates, method=method)
-        return lost_frame(observation.stamp_ns, last.T_world_body, features=len(observation.features))
+            self._nearest_match = observation, candidates[0], self._config.match
+            return self._add_node(observation, self._combine(candidates), candidates, method="relocalised")
+        last_world = self._recent[-1].T_world_body
+        return lost_frame(observation.stamp_ns, last_world, features=len(observation.features))
 
-    def view(self, observation: IsvdObservation, twist: Twist | None = None, /) -> ImageView:
-        """Return the view for place recognition, by the readout time as it is known now."""
-        if twist is not None:
-            observation = self._shutter.corrected(observation, twist)
+    def view(self, observation: IsvdObservation, _twist: Twist | None = None, /) -> ImageView:
+        """Return the view for place recognition. Pure."""
+        features, camera = observation.features, observation.camera
         return ImageView(
             stamp_ns=observation.stamp_ns,
             pixels=observation.measured[:, :2],
-            sigma_px=self._sigma_px(observation.features),
-            descriptors=observation.features.descriptors,
+            sigma_px=self._detector.scale_factor ** features.octave.astype(np.float64),
+            descriptors=features.descriptors,
             points_camera=apply(inverse(observation.T_body_camera), observation.points_body),
-            intrinsics=observation.camera.intrinsics,
+            intrinsics=np.array([camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px]),
             T_body_camera=observation.T_body_camera,
         )
 
     def matches(self) -> FeatureMatches | None:
-        """Return the matches of the last frame with the nearest earlier one."""
+        """Return the matches of the last frame with the nearest earlier one, matched again."""
         if self._nearest_match is None:
             return None
-        observation, candidate = self._nearest_match
-        earlier, pairs = self._corrected(candidate.earlier), candidate.pairs
+        observation, candidate, match = self._nearest_match
+        earlier = candidate.earlier.observation
+        pairs = matched_pairs(earlier, observation, match)
         motion = candidate.alignment.T_target_source
         then, now = pairs[self._registration.agreeing(earlier, observation, pairs, motion)].T
         before_px = np.full((len(observation.features), 2), np.nan)
         before_px[now] = earlier.measured[:, :2][then]
         return FeatureMatches(np.isfinite(before_px[:, 0]), before_px)
 
-    def sensor_notes(self) -> Sequence[str]:
-        """Return the estimated readout time of the camera's shutter, if it has any."""
-        return [self._readout.sentence] if self._readout.sentence else []
-
-    def calibration_warnings(self) -> Sequence[str]:
-        """Return nothing: pairs of images show no focal length."""
-        return ()
-
-    def _follows(self, observation: IsvdObservation) -> bool:
-        """Return whether a frame is soon after the last tracked one."""
-        last = self._earlier.last
-        return last is not None and not is_gap(last.observation.stamp_ns, observation.stamp_ns)
-
-    def _corrected(self, frame: TrackedFrame) -> IsvdObservation:
-        """Return what a frame observed, by the readout time as it is known now."""
-        return self._shutter.corrected(frame.observation, frame.twist)
-
-    def _sigma_px(self, features: Features) -> Array:
-        """Return the (N,) standard deviations of features' pixels: one pixel of their pyramid level."""
-        return self._detector.scale_factor ** features.octave.astype(np.float64)
-
     def _undistorted(self, pixels: NDArray[np.float32], camera: PinholeCamera) -> Array:
         exact: Array = pixels.astype(np.float64)
         return camera.undistort(exact) if self._config.undistort else exact
 
-    def _candidates(self, observation: IsvdObservation) -> tuple[list[PoseCandidate], str]:
-        """Return the registrations of a frame, and how they were found; none if all failed."""
-        earlier = self._earlier.to_register()
-        for match, method in ((self._config.match, "isvd"), (self._config.fallback, "fallback")):
-            if candidates := self._register(observation, earlier, match):
-                return candidates, method
-        keyframes = (keyframe.loaded() for keyframe in self._earlier.to_relocalise())
-        candidates = self._register(observation, keyframes, self._config.match)
-        # Of keyframes from anywhere, only that counts with which most pairs agree.
-        return sorted(candidates, key=lambda candidate: -candidate.alignment.pairs)[:1], "relocalised"
+    def _earlier(self) -> list[TrackedFrame]:
+        """Return the MP earlier frames to register the next frame against, the one before it first."""
+        count = self._config.previous_frames
+        if self._config.earlier == "frames":
+            return list(self._recent)[-count:][::-1]
+        last = self._recent[-1]
+        keyframes = [keyframe for keyframe in self._keyframes if keyframe.node != last.node]
+        differences = self._view_differences(last, keyframes)
+        nearest = np.argsort(differences, kind="stable")[: count - 1]
+        return [last, *(keyframes[i].loaded() for i in nearest if differences[i] <= _NEAR_VIEW)]
+
+    def _view_differences(self, frame: TrackedFrame, others: Sequence[_Keyframe]) -> Array:
+        """Return (N,) how far views are apart: by shift relative to the depth of the scene, and by turn."""
+        if not others:
+            return np.empty(0)
+        poses = np.array([other.T_world_body for other in others])
+        depth_m = np.nanmedian(_VIRTUAL_BASELINE_PX_M / frame.observation.measured[:, 2])
+        shift = np.linalg.norm(poses[:, :3, 3] - frame.T_world_body[:3, 3], axis=1) / depth_m
+        traces = np.einsum("nij,ij->n", poses[:, :3, :3], frame.T_world_body[:3, :3])
+        turn = np.arccos(np.clip(0.5 * (traces - 1.0), -1.0, 1.0)) / _HALF_VIEW_RAD
+        difference: Array = shift + turn
+        return difference
 
     def _register(
         self, observation: IsvdObservation, earlier: Iterable[TrackedFrame], match: MatchConfig
@@ -201,25 +240,61 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
         """Return the registrations that succeeded, in the order of the earlier frames."""
         candidates = []
         for frame in earlier:
-            found = self._register_pair(self._corrected(frame), observation, match)
-            alignment = found.alignment
+            alignment, weight, matches = self._register_pair(frame.observation, observation, match)
             if alignment.converged and self._is_possible(alignment, frame.observation, observation):
                 T = alignment.T_target_source
                 assert alignment.information is not None  # it converged
                 information = with_model_error(alignment.information, T)
                 candidates.append(
-                    PoseCandidate(
-                        frame, alignment, information, found.weight, found.pairs, frame.T_world_body @ T
-                    )
+                    PoseCandidate(frame, alignment, information, weight, matches, frame.T_world_body @ T)
                 )
         return candidates
 
     def _is_possible(self, found: Alignment, earlier: IsvdObservation, now: IsvdObservation) -> bool:
-        """Return whether a motion across a gap is possible by another measurement of it, if any."""
+        """Return whether a motion across a gap is possible, where something else tells it."""
         check, begin_ns, end_ns = self._motion_check, earlier.stamp_ns, now.stamp_ns
         if check is None or not is_gap(begin_ns, end_ns):
             return True
         return not check.contradiction(found.T_target_source, begin_ns, end_ns)
+
+    def _combine(self, candidates: Sequence[PoseCandidate]) -> Transform:
+        """Return T_world_body; the nearest earlier frame comes first (alg. 7, lines 21–27)."""
+        if self._config.average == "information":
+            first = candidates[0].T_world_body
+            total = np.sum([candidate.information for candidate in candidates], axis=0)
+            pull = np.sum(
+                [c.information @ np.concatenate(log(inverse(first) @ c.T_world_body)) for c in candidates],
+                axis=0,
+            )
+            mean = np.linalg.solve(total, pull)
+            return first @ exp(mean[:3], mean[3:])
+        weights = np.array([candidate.weight for candidate in candidates])
+        if self._config.average == "mean":
+            weights = np.ones(len(candidates))
+        poses = np.array([candidate.T_world_body for candidate in candidates])
+        translation: Array = weights @ poses[:, :3, 3] / weights.sum()
+        R_world_body = poses[0, :3, :3]
+        if self._config.rotation == "mean":
+            R_world_body = mean_rotation(poses[:, :3, :3], weights)
+        return transform(R_world_body, translation)
+
+    def _relocalise(self, observation: IsvdObservation) -> list[PoseCandidate]:
+        """Return the registration against a keyframe that most pairs agree with; none if all failed."""
+        keyframes = (keyframe.loaded() for keyframe in self._keyframes_to_try())
+        candidates = self._register(observation, keyframes, self._config.match)
+        return sorted(candidates, key=lambda candidate: -candidate.alignment.pairs)[:1]
+
+    def _keyframes_to_try(self) -> list[_Keyframe]:
+        """Return the keyframes nearest to the last tracked pose, and some of the others in turn."""
+        count = self._config.relocalisation_keyframes
+        last_world = self._recent[-1].T_world_body[:3, 3]
+        by_distance = sorted(
+            self._keyframes, key=lambda k: float(np.linalg.norm(k.T_world_body[:3, 3] - last_world))
+        )
+        far = by_distance[count:]
+        in_turn = [far[(self._turn + i) % len(far)] for i in range(min(count, len(far)))]
+        self._turn += len(in_turn)
+        return by_distance[:count] + in_turn
 
     def _add_node(
         self,
@@ -229,88 +304,43 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
         *,
         method: str,
     ) -> FrameResult:
-        """Make the frame a node, with a factor from each candidate.
-
-        Args:
-            observation: Observation as its rows were read.
-            T_world_body: (4, 4) pose of the frame.
-            candidates: Its registrations, the nearest earlier frame's first.
-            method: Word for what found them.
-        """
+        """Make the frame a node, with a factor from each candidate."""
         node = self._next_node
         self._next_node += 1
-        twist = self._follow(observation, T_world_body)
-        tracked = TrackedFrame(node, observation, T_world_body, twist)
-        self._learn(tracked, candidates)
-        if candidates:
-            self._nearest_match = self._corrected(tracked), candidates[0]
-        self._earlier.add(tracked)
-        self._errors.add(observation.stamp_ns, candidates)
-        factors = self._factors(node, candidates)
+        tracked = TrackedFrame(node, observation, T_world_body)
+        self._recent.append(tracked)
+        if self._config.earlier == "frames":
+            keyframe = self._sharpest.add(node, len(observation.features))
+            self._keyframes.extend(_kept(frame) for frame in self._recent if frame.node == keyframe)
+        elif not (self._view_differences(tracked, self._keyframes) < _NEW_VIEW).any():
+            self._keyframes.append(_kept(tracked))
+        nearest = candidates[0].alignment if candidates else None
+        # All rest on this frame's features. Were the earlier ones' the same, too, each factor would have its
+        # share of the information, were they others, all: it has the geometric mean.
+        shared_by = math.sqrt(max(len(candidates), 1))
+        factors = tuple(
+            BetweenFactor(
+                candidate.earlier.node,
+                node,
+                candidate.alignment.T_target_source,
+                candidate.information / shared_by,
+            )
+            for candidate in candidates
+        )
         return FrameResult(
             stamp_ns=observation.stamp_ns,
             node=node,
             T_node_body=np.eye(4),
             T_world_body=T_world_body,
             is_keyframe=True,
-            diagnostics=_diagnostics(observation, candidates, method),
+            diagnostics=Diagnostics(
+                features=len(observation.features),
+                matches=candidates[0].matches if candidates else 0,
+                inliers=nearest.pairs if nearest else 0,
+                residual=nearest.inlier_rmse_m if nearest else 0.0,
+                residual_unit="m",
+                method=method,
+            ),
             factors=factors,
             links=factors,
-            twist=twist,
         )
-
-    def _factors(self, node: int, candidates: Sequence[PoseCandidate]) -> tuple[BetweenFactor, ...]:
-        """Return a factor from each candidate's earlier frame.
-
-        All rest on this frame's features. Were the earlier ones' the same, too, each factor would have its
-        share of the information, were they others, all: it has the geometric mean.
-        """
-        shared_by = math.sqrt(max(len(candidates), 1))
-        return tuple(
-            BetweenFactor(
-                candidate.earlier.node,
-                node,
-                candidate.alignment.T_target_source,
-                self._errors.rescaled(candidate) / shared_by,
-            )
-            for candidate in candidates
-        )
-
-    def _follow(self, observation: IsvdObservation, T_world_body: Transform) -> Twist:
-        """Return the velocity of the body in a frame's image, by its pose and that of the frame before."""
-        before = self._earlier.last
-        if before is not None and self._follows(observation):
-            T_body_camera = observation.T_body_camera
-            T_before_camera = inverse(before.T_world_body @ T_body_camera) @ T_world_body @ T_body_camera
-            elapsed_ns = observation.stamp_ns - before.observation.stamp_ns
-            self._shutter.follow(T_before_camera, elapsed_ns / NS_PER_S)
-        return self._shutter.twist_body(observation)
-
-    def _learn(self, tracked: TrackedFrame, candidates: Sequence[PoseCandidate]) -> None:
-        """Take the readout time from the frame and the nearest keyframe, where the motion was another."""
-        if not self._readout.is_estimated or len(candidates) < 2:
-            return
-        candidate = candidates[1]
-        self._readout.learn(
-            *readout_in_pair(
-                self._corrected(candidate.earlier),
-                self._corrected(tracked),
-                candidate.pairs,
-                candidate.alignment.T_target_source,
-                twists_body=(candidate.earlier.twist, tracked.twist),
-            )
-        )
-
-
-def _diagnostics(
-    observation: IsvdObservation, candidates: Sequence[PoseCandidate], method: str
-) -> Diagnostics:
-    nearest = candidates[0].alignment if candidates else None
-    return Diagnostics(
-        features=len(observation.features),
-        matches=len(candidates[0].pairs) if candidates else 0,
-        inliers=nearest.pairs if nearest else 0,
-        residual=nearest.inlier_rmse_m if nearest else 0.0,
-        residual_unit="m",
-        method=method,
-    )

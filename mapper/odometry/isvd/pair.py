@@ -30,9 +30,9 @@ def align_images(
     seen_target = odometry.observe(target)
     detected = time.perf_counter()
     seen_source = odometry.observe(source)
-    register = PairRegistration(config)
+    register = PairRegistration(config.registration, by_pixels=config.residual == "pixels")
     for match in (config.match, config.fallback):
-        alignment = register(seen_target, seen_source, match).alignment
+        alignment, _, _ = register(seen_target, seen_source, match)
         if alignment.converged:
             break
     return alignment, {"prepare": detected - began, "align": time.perf_counter() - detected}

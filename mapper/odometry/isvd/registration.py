@@ -10,9 +10,9 @@ from mapper.core.frames import PinholeCamera
 from mapper.core.geometry import Array, Points, Transform, adjoint, apply, inverse
 from mapper.features.base import Features
 from mapper.features.matching import Pairs, homography_inliers, match_mutual
-from mapper.odometry.config import IsvdOdometryConfig, MatchConfig
-from mapper.odometry.local_map.observation.pixel_motion import of_middle_row
+from mapper.odometry.config import MatchConfig
 from mapper.registration.base import Alignment, failed
+from mapper.registration.config import IsvdConfig
 from mapper.registration.isvd import Isvd
 from mapper.registration.reprojection import classify, normal_matrix, refine_pose
 from mapper.registration.variance_factor import residual_statistics
@@ -47,77 +47,38 @@ class IsvdObservation(Archivable):
     camera: PinholeCamera
     T_body_camera: Transform
 
-    @property
-    def depths_m(self) -> Array:
-        """(N,) depths in the camera, metres; NaN without one."""
-        depths_m: Array = self.intrinsics[4] / self.measured[:, 2]
-        return depths_m
 
-    def swept(self, sweep_camera: Array, /) -> "IsvdObservation":
-        """Return the observation as a global shutter would have read it, when the middle row was read.
-
-        Args:
-            sweep_camera: (6,) motion of the camera while the rows were read, in its own axes (rotation,
-                translation); for features as they were read.
-        """
-        if not sweep_camera.any():
-            return self
-        pixels, depth_m = of_middle_row(
-            self.measured[:, :2],
-            self.depths_m,
-            self.intrinsics,
-            self.camera.height_px,
-            sweep_camera,
-        )
-        points_camera = apply(inverse(self.T_body_camera), self.points_body)
-        rays = points_camera[:, :2] / points_camera[:, 2:]  # through whole pixels, if it is so set
-        rays += (pixels - self.measured[:, :2]) / self.intrinsics[:2]
-        points_camera = np.column_stack([rays * depth_m[:, np.newaxis], depth_m])
-        return replace(
-            self,
-            measured=np.column_stack([pixels, self.intrinsics[4] / depth_m]),
-            points_body=apply(self.T_body_camera, points_camera),
-        )
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PairAlignment:
-    """Alignment of two observations by their features.
-
-    Attributes:
-        alignment: Motion from the source to the target.
-        weight: Its quality W in 1/m (Somlyai, PhD thesis, eq. 4.1), 0 if it did not converge.
-        pairs: (M, 2) matched features of the target and the source, whether they agree or not.
-    """
-
-    alignment: Alignment
-    weight: float
-    pairs: Pairs
-
-
-RegisterPair = Callable[[IsvdObservation, IsvdObservation, MatchConfig], PairAlignment]
+RegisterPair = Callable[[IsvdObservation, IsvdObservation, MatchConfig], tuple[Alignment, float, int]]
 """Registration of two observations (target, source), as ``PairRegistration``."""
 
 
 class PairRegistration:
     """Registration of one frame's features to those of an earlier one."""
 
-    def __init__(self, config: IsvdOdometryConfig) -> None:
-        """Set the method: ISVD, refined by the pixels if these are the residual, a second test of it."""
-        self._config = config.registration
-        self._isvd = Isvd(config.registration)
-        self._by_pixels = config.residual == "pixels"
+    def __init__(self, config: IsvdConfig, *, by_pixels: bool) -> None:
+        """Set the method.
 
-    def __call__(self, target: IsvdObservation, source: IsvdObservation, match: MatchConfig) -> PairAlignment:
-        """Match the features of two observations and align the source to the target."""
-        return self.fit(target, source, matched_pairs(target, source, match))
+        Args:
+            config: Of ISVD.
+            by_pixels: Refine ISVD's motion by the pixels, which is also a second test of it.
+        """
+        self._config = config
+        self._isvd = Isvd(config)
+        self._by_pixels = by_pixels
 
-    def fit(self, target: IsvdObservation, source: IsvdObservation, pairs: Pairs) -> PairAlignment:
-        """Align the source to the target by matched features."""
+    def __call__(
+        self, target: IsvdObservation, source: IsvdObservation, match: MatchConfig
+    ) -> tuple[Alignment, float, int]:
+        """Return the source's alignment to the target, its quality W (eq. 4.1), and the number of matches."""
+        pairs = matched_pairs(target, source, match)
+        return *self.fit(target, source, pairs), len(pairs)
+
+    def fit(self, target: IsvdObservation, source: IsvdObservation, pairs: Pairs) -> tuple[Alignment, float]:
+        """Return the alignment by matched features, and its quality W."""
         alignment, weight = self._isvd.fit_weighted(*shared_points(target, source, pairs))
         if self._by_pixels and alignment.converged:
             alignment = self._refined(target, source, pairs, alignment)
-        return PairAlignment(alignment, weight, pairs)
+        return alignment, weight
 
     def agreeing(
         self, target: IsvdObservation, source: IsvdObservation, pairs: Pairs, T_target_source: Transform
@@ -164,8 +125,7 @@ class PairRegistration:
             return failed(f"{count} of {among} pairs agree in the image")
         seen = T_camera_target, points[agree], measured[agree], weights[agree], source.intrinsics
         # The target's points were measured no better than the source's pixels, so the information is halved.
-        residuals = residual_statistics(*seen)
-        information = 0.5 * normal_matrix(*seen) / residuals.variance_factor
+        information = 0.5 * normal_matrix(*seen) / residual_statistics(*seen).variance_factor
         to_camera = adjoint(inverse(source.T_body_camera))
         T_target_source = inverse(source.T_body_camera @ T_camera_target)
         points_target, points_source = shared_points(target, source, pairs)
@@ -177,7 +137,6 @@ class PairRegistration:
             inlier_rmse_m=float(np.sqrt((miss_m**2).mean())) if len(miss_m) else 0.0,
             pairs=count,
             information=to_camera.T @ information @ to_camera,
-            residuals=residuals,
         )
 
 

@@ -17,7 +17,7 @@ from mapper.features.frame_view import ScanView
 from mapper.odometry.base import Diagnostics, FrameResult
 from mapper.odometry.config import IsvdOdometryConfig
 from mapper.odometry.factory import build_frame_odometry
-from mapper.odometry.scan_to_map.config import KissOdometryConfig
+from mapper.odometry.scans.config import KissOdometryConfig
 from mapper.registration.base import Alignment, failed
 from mapper.registration.config import VOXEL_M
 from mapper.registration.hough.config import HoughGicpConfig

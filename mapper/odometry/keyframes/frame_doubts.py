@@ -1,0 +1,183 @@
+"""Doubts of RGB-D frames: what speaks against a tracked pose, measured against what is usual in this log."""
+
+import math
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from mapper.core.doubts import Doubt
+from mapper.core.geometry import Array, Transform, inverse, log
+from mapper.odometry.camera.image_observation import FEW_MOVING
+from mapper.odometry.keyframes.earlier_depth import Displacement
+from mapper.odometry.keyframes.pose_tracker import TrackedPose
+
+_MEMORY = 100
+"""Undoubted frames whose medians are the usual."""
+_FEWEST = 10
+"""With fewer of them nothing is known to be usual."""
+_LOOSE_M = 0.025
+"""A translation this uncertain is doubtful where the usual is far better: 1 % of a view 2 to 3 m deep."""
+_LOOSE_RATIO = 4.0
+_LOW_AGREEMENT = 0.5
+"""Share of the usual agreement below which a pose is doubtful, however many features agree."""
+_JUMP_RATIO = 8.0
+"""Deviation from constant velocity, relative to the usual per second, that is a jump. The 99th percentile of
+right poses is 3 to 6."""
+_SUPPORT_AGREEMENT, _SUPPORT_RATIO = 0.85, 2.0
+"""A jump is believed if the agreement is at least this share of the usual, and the uncertainty at most this
+multiple, and nothing in view moves by itself: fast motions are real."""
+
+_MOST_DISPLACED, _MOST_DISPLACED_STILL = 0.4, 0.5
+"""When a larger share of the surfaces that two images have in common lies elsewhere, the pose is doubtful;
+where few features move, the majority has to. A real desk's edges give up to 0.48 under right poses, a
+passer-by's pose more than 0.4 in every second frame."""
+
+
+@dataclass(frozen=True, slots=True)
+class Assessment:
+    """Doubts about a pose, with the error that they suggest.
+
+    Attributes:
+        doubts: Reasons why it may be wrong; empty if there is none.
+        sigma_rad: Standard deviation of the rotation about each axis.
+        sigma_m: Standard deviation of the translation along each axis.
+    """
+
+    doubts: tuple[Doubt, ...] = ()
+    sigma_rad: float = 0.0
+    sigma_m: float = 0.0
+
+
+UNDOUBTED = Assessment()
+
+
+class FrameDoubts:
+    """Running medians of a log's figures of tracking, and the tests of new frames against them."""
+
+    def __init__(self) -> None:
+        names = ("sigma_m", "agreement", "jump_rad_s", "jump_m_s", "speed_rad_s", "speed_m_s")
+        self._figures: dict[str, deque[float]] = {name: deque(maxlen=_MEMORY) for name in names}
+        self._shown_since_ns = 0
+
+    def assess(
+        self,
+        tracked_pose: TrackedPose,
+        covariance: Array,
+        last: TrackedPose,
+        T_camera_world_predicted: Transform | None,
+        displaced: Displacement,
+    ) -> Assessment:
+        """Return the doubts of a frame; the figures of undoubted ones become part of the usual.
+
+        Args:
+            tracked_pose: Of the frame.
+            covariance: (6, 6) of its pose from the features that agree, (rotation, translation).
+            last: The tracked frame before it.
+            T_camera_world_predicted: (4, 4) by constant velocity; None if nothing predicts it.
+            displaced: Surfaces that lie elsewhere by this pose than in an earlier frame.
+        """
+        stamp_ns = tracked_pose.observation.stamp_ns
+        elapsed_s = 1e-9 * (stamp_ns - last.observation.stamp_ns)
+        sigma_rad, sigma_m = (_largest_sigma(covariance[k : k + 3, k : k + 3]) for k in (0, 3))
+        speed = _motion(tracked_pose.T_camera_world, last.T_camera_world)
+        jump = (math.nan, math.nan)
+        if T_camera_world_predicted is not None:
+            jump = _motion(tracked_pose.T_camera_world, T_camera_world_predicted)
+        if not _is_repeated(tracked_pose, last):
+            self._shown_since_ns = stamp_ns
+        shown_s = 1e-9 * (stamp_ns - self._shown_since_ns)
+
+        doubts = list(tracked_pose.doubts)
+        if tracked_pose.depth is not None:  # landmarks were few, so what is usual of them says nothing
+            return Assessment(tuple(doubts), sigma_rad, sigma_m) if doubts else UNDOUBTED
+        usual_m, usual_agreement = self._usual("sigma_m"), self._usual("agreement")
+        agreement = tracked_pose.agreement
+        if sigma_m > max(_LOOSE_M, _LOOSE_RATIO * usual_m):
+            doubts.append(
+                Doubt(
+                    "unobservable",
+                    f"{tracked_pose.inliers} features agree, which tell the translation to {sigma_m:.3f} m"
+                    + (f", {usual_m:.3f} m is usual" if usual_m else ""),
+                )
+            )
+        if agreement < _LOW_AGREEMENT * usual_agreement:
+            doubts.append(
+                Doubt("disagreement", f"{agreement:.0%} of the matches agree, {usual_agreement:.0%} is usual")
+            )
+        few_move = len(tracked_pose.moving) <= FEW_MOVING * len(tracked_pose.observation)
+        is_supported = (
+            agreement >= _SUPPORT_AGREEMENT * usual_agreement
+            and sigma_m <= _SUPPORT_RATIO * usual_m
+            and few_move
+        )
+        if not is_supported:
+            doubts += self._jumps(jump, elapsed_s)
+        if shown_s > 0.0:
+            doubts.append(Doubt("repeated image", f"the image has been the same for {shown_s:.2f} s"))
+        if displaced.ratio > (_MOST_DISPLACED_STILL if few_move else _MOST_DISPLACED):
+            doubts.append(
+                Doubt(
+                    "elsewhere",
+                    f"{displaced.ratio:.0%} of the surfaces lie elsewhere than "
+                    f"{displaced.since_s:.1f} s before",
+                )
+            )
+            sigma_m = max(sigma_m, displaced.distance_m)
+        if doubts:
+            # How far off it may be: as far as the prediction says, or as the camera moves in the time.
+            off = [
+                max(abs(miss) if math.isfinite(miss) else 0.0, self._usual(name) * shown_s)
+                for miss, name in zip(jump, ("speed_rad_s", "speed_m_s"), strict=True)
+            ]
+            return Assessment(tuple(doubts), max(off[0], sigma_rad), max(off[1], sigma_m))
+        self._learn(sigma_m=sigma_m, agreement=agreement)
+        if elapsed_s > 0.0:
+            self._learn(speed_rad_s=speed[0] / elapsed_s, speed_m_s=speed[1] / elapsed_s)
+            if T_camera_world_predicted is not None:
+                self._learn(jump_rad_s=jump[0] / elapsed_s, jump_m_s=jump[1] / elapsed_s)
+        return UNDOUBTED
+
+    def _jumps(self, jump: tuple[float, float], elapsed_s: float) -> list[Doubt]:
+        usual_rad, usual_m = (self._usual(name) * elapsed_s for name in ("jump_rad_s", "jump_m_s"))
+        doubts = []
+        if usual_rad and jump[0] > _JUMP_RATIO * usual_rad:
+            doubts.append(
+                Doubt(
+                    "jump",
+                    f"turn {math.degrees(jump[0]):.1f}° off the predicted one, "
+                    f"{math.degrees(usual_rad):.1f}° is usual",
+                )
+            )
+        if usual_m and jump[1] > _JUMP_RATIO * usual_m:
+            doubts.append(
+                Doubt("jump", f"jump of {jump[1]:.2f} m off the predicted place, {usual_m:.2f} m is usual")
+            )
+        return doubts
+
+    def _usual(self, name: str) -> float:
+        """Return the median of a figure; 0 while too little is known."""
+        figures = self._figures[name]
+        return float(np.median(figures)) if len(figures) >= _FEWEST else 0.0
+
+    def _learn(self, **figures: float) -> None:
+        for name, figure in figures.items():
+            self._figures[name].append(figure)
+
+
+def _motion(T_camera_world: Transform, T_before_world: Transform) -> tuple[float, float]:
+    """Return the angle and the distance between two poses of the camera."""
+    rotation_rad, translation_m = log(T_camera_world @ inverse(T_before_world))
+    return float(np.linalg.norm(rotation_rad)), float(np.linalg.norm(translation_m))
+
+
+def _largest_sigma(covariance: Array) -> float:
+    return math.sqrt(float(np.linalg.eigvalsh(covariance)[-1]))
+
+
+def _is_repeated(tracked_pose: TrackedPose, last: TrackedPose) -> bool:
+    """Return whether two images are the same to the last feature: the camera was frozen."""
+    now, before = tracked_pose.observation, last.observation
+    return (
+        len(now) > 0 and np.array_equal(now.bits, before.bits) and np.array_equal(now.pixels, before.pixels)
+    )

@@ -1,1 +1,0 @@
-"""Bundle adjustment, and the residuals that it leaves."""

@@ -1,1 +1,0 @@
-"""The camera against its calibration: intrinsics, depth images, rolling shutter."""

@@ -1,1 +1,0 @@
-"""Alignment of depth images, and their comparison with earlier ones."""

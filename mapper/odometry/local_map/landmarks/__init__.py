@@ -1,1 +1,0 @@
-"""The local map: keyframes and landmarks, in memory and paged to the disk."""

@@ -1,1 +1,0 @@
-"""Pose of a frame from its features: prediction, search, motion of the camera among others, covariance."""

@@ -1,1 +1,0 @@
-"""Poses that no prediction leads to: relocalisation, gaps, wrong motions."""

@@ -1,0 +1,144 @@
+"""Constant-velocity model of the sensor's motion, with the errors that its predictions had in this log."""
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from mapper.core.deskew import STILL, Twist, twist_between
+from mapper.core.geometry import Array, Transform, angle_between, inverse
+from mapper.core.timebase import NS_PER_S
+
+_MIN_ELAPSED_S = 0.005  # over less, an error of millimetres becomes a large velocity
+_ERRORS, _FEWEST_ERRORS = 50, 5  # of recent predictions: of so many the median is taken, of fewer none
+_MEDIAN_LENGTH = 1.538  # of a vector of three independent normal errors, in standard deviations
+_LEAST_M, _LEAST_RAD, _LEAST_SHARE = 2e-3, 1e-3, 0.02
+
+
+@dataclass(frozen=True, slots=True)
+class Spread:
+    """Standard deviations of a predicted pose, of each axis: rad and m."""
+
+    rotation_rad: float
+    translation_m: float
+
+
+class MotionModel:
+    """Motion of the body in the middle of each sweep.
+
+    Attributes:
+        T_world_last: (4, 4) pose in the middle of the last scan that was placed.
+        twist: Velocity until then.
+    """
+
+    def __init__(self, time_ns: int, T_world_last: Transform) -> None:
+        self.T_world_last = T_world_last
+        self.twist: Twist = STILL
+        self._time_ns = time_ns
+        self._elapsed_s = 0.0
+        self._placed = 0
+        self._covariance = np.zeros((6, 6))
+        self._median = np.zeros(2)
+        self._errors: deque[tuple[float, float]] = deque(maxlen=_ERRORS)
+
+    def elapsed_s(self, time_ns: int) -> float:
+        """Return the seconds since the last scan that was placed."""
+        return (time_ns - self._time_ns) / NS_PER_S
+
+    def predicted(self, time_ns: int) -> Transform:
+        """Return T_world_body (4, 4) at a time, if the velocity stays."""
+        return self.T_world_last @ self.twist.over(self.elapsed_s(time_ns))
+
+    def spread(self, time_ns: int) -> Spread | None:
+        """Return the spread of a predicted pose; None before enough predictions could be compared.
+
+        Errors are accelerations: they grow with the time since the last scan and since the one before it. A
+        steady log is given two hundredths of the motion, so that its first acceleration is no surprise.
+        """
+        if len(self._errors) < _FEWEST_ERRORS:
+            return None
+        elapsed_s = self.elapsed_s(time_ns)
+        rotation, translation = self._median
+        moved = float(np.linalg.norm(self.twist.translation_mps)) * elapsed_s
+        turned = float(np.linalg.norm(self.twist.rotation_radps)) * elapsed_s
+        time_s2 = _time_s2(elapsed_s, self._elapsed_s)
+        return Spread(
+            float(np.hypot(rotation * time_s2, _LEAST_RAD + _LEAST_SHARE * turned)),
+            float(np.hypot(translation * time_s2, _LEAST_M + _LEAST_SHARE * moved)),
+        )
+
+    def acceleration(self, time_ns: int, T_world_body: Transform, twist: Twist) -> float:
+        """Return the angular acceleration to a velocity at a pose, at least the usual one, rad/s²."""
+        usual, elapsed_s = float(self._median[0]), self.elapsed_s(time_ns)
+        if elapsed_s < _MIN_ELAPSED_S:
+            return usual
+        change = twist.rotation_radps - self.mean_twist(time_ns, T_world_body).rotation_radps
+        return max(usual, 2.0 * float(np.linalg.norm(change)) / elapsed_s)
+
+    def velocity(self, time_ns: int, T_world_body: Transform) -> tuple[Twist, Array]:
+        """Return the expected velocity at a pose, and its (6, 6) covariance, rotation before translation.
+
+        Under white noise of the acceleration (Anderson & Barfoot 2015) the velocity w₁ after an interval t,
+        given that before it, w₀, and the mean m, is 3/2 m − 1/2 w₀, with the variance qt/4; that of the pose
+        predicted with w₀ is qt³/3.
+        """
+        mean = self.mean_twist(time_ns, T_world_body)
+        expected = Twist(
+            1.5 * mean.rotation_radps - 0.5 * self.twist.rotation_radps,
+            1.5 * mean.translation_mps - 0.5 * self.twist.translation_mps,
+        )
+        return expected, np.diag(0.75 * self.velocity_sigmas(time_ns) ** 2) + 0.25 * self._covariance
+
+    def velocity_sigmas(self, time_ns: int) -> Array:
+        """Return (6,) standard deviations of what the velocity changes until a time, rad/s and m/s."""
+        spread, elapsed_s = self.spread(time_ns), self.elapsed_s(time_ns)
+        if spread is None or elapsed_s < _MIN_ELAPSED_S:
+            sigmas = float(np.linalg.norm(self.twist.rotation_radps)), 0.0  # it may just have begun to turn
+        else:
+            sigmas = spread.rotation_rad / elapsed_s, spread.translation_m / elapsed_s
+        return np.repeat(sigmas, 3)
+
+    def mean_twist(self, time_ns: int, T_world_body: Transform) -> Twist:
+        """Return the mean velocity from the last scan to a pose."""
+        elapsed_s = self.elapsed_s(time_ns)
+        if elapsed_s < _MIN_ELAPSED_S:
+            return self.twist
+        return twist_between(self.T_world_last, T_world_body, duration_s=elapsed_s)
+
+    def follow(
+        self,
+        time_ns: int,
+        T_world_body: Transform,
+        *,
+        is_certain: bool = True,
+        measured: tuple[Twist, Array] | None = None,
+    ) -> None:
+        """Take over the pose of a scan; an uncertain one says nothing on the errors of predictions.
+
+        Args:
+            time_ns: Of the pose.
+            T_world_body: (4, 4) the pose.
+            is_certain: Whether it is.
+            measured: Velocity then and its (6, 6) covariance; None is the mean one since the last scan.
+        """
+        elapsed_s = self.elapsed_s(time_ns)
+        self._placed += 1
+        if elapsed_s >= _MIN_ELAPSED_S:
+            if is_certain and self._placed > 1:  # the first is predicted without a velocity
+                error = inverse(self.predicted(time_ns)) @ T_world_body
+                lengths = angle_between(np.eye(3), error[:3, :3]), float(np.linalg.norm(error[:3, 3]))
+                time_s2 = _time_s2(elapsed_s, self._elapsed_s)
+                self._errors.append((lengths[0] / time_s2, lengths[1] / time_s2))
+                self._median = np.median(np.array(self._errors), axis=0) / _MEDIAN_LENGTH
+            if measured is None:
+                covariance = np.diag(self.velocity_sigmas(time_ns) ** 2)
+                self.twist, self._covariance = self.mean_twist(time_ns, T_world_body), covariance
+            else:
+                self.twist, self._covariance = measured
+            self._elapsed_s = elapsed_s if measured is None else 0.0
+        self.T_world_last, self._time_ns = T_world_body, time_ns
+
+
+def _time_s2(elapsed_s: float, before_s: float) -> float:
+    """Return what an acceleration is multiplied by: from the middle of one interval over the next."""
+    return 0.5 * elapsed_s * (elapsed_s + before_s)

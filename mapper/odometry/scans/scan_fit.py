@@ -1,0 +1,194 @@
+"""Fit of a scan to a keyframe under a motion: overlap, agreement by direction, free space, observability."""
+
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapper.core.frames import Points32
+from mapper.core.geometry import Array, Transform, apply
+from mapper.odometry.scans.scan_matcher import DeskewedScan
+from mapper.registration.acceptance import weakest_direction
+from mapper.registration.degeneracy import Degeneracy, degeneracy_of
+from mapper.registration.free_space import FreeSpaceCheck, ScanDescription, range_image
+
+_MIN_PAIRS = 20
+_SURFACE_VOXELS = 0.33  # a point this near to a surface agrees with it
+_DIRECTION_RAD = 0.0175  # of the range images: one degree
+_MARGIN_M = 0.2
+_CHECKED_POINTS = 2000
+_GRAZING = 0.01  # least sine of the angle between a ray and a surface
+_PIXELS = 1.5  # a ray that is compared with a point is off by up to so many
+_SMALL_SHARE = 0.03
+"""Share of a motion's displacements that goes along normals, below which the pairs that show it are counted.
+Streets and rooms have more."""
+_FACING = 0.3
+"""Share of one point's displacement along its normals, from which on its pair shows the motion: more than
+the errors of normals make."""
+_OFF_VOXELS = 1.0  # nearer to the keyframe rings lie on the same places, and so errors of normals are alike
+_FEW_PAIRS, _ENOUGH_PAIRS = 8, 24
+"""Pairs that face a motion and agree: a bare tunnel has up to 11 by chance, a field with two trees 13 to 60.
+They measure it to σ/√pairs, with the 0.1 m that a point agrees within to 0.02 m."""
+
+
+@dataclass(frozen=True, eq=False)
+class ScanKeyframe:
+    """A scan that became a node.
+
+    Attributes:
+        node: Its number.
+        deskewed: The scan as taken all at once in the middle of its sweep.
+        T_world_middle: (4, 4) pose of the body then.
+        T_world_body: (4, 4) pose of the body at the scan's stamp.
+        covariance_at_stamp: (6, 6) of that pose relative to the other, in the body's tangent.
+    """
+
+    node: int
+    deskewed: DeskewedScan
+    T_world_middle: Transform
+    T_world_body: Transform
+    covariance_at_stamp: Array = field(default_factory=lambda: np.zeros((6, 6)))
+
+    @cached_property
+    def description(self) -> ScanDescription:
+        """Its points and rays for the free-space check."""
+        return described(self.deskewed)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScanFit:
+    """A scan on a keyframe's surfaces. A pair is a point and the keyframe's point nearest to it.
+
+    Attributes:
+        overlap: Share of the points with a partner in range.
+        rmse_m: Root mean square distance of these pairs.
+        agreement: Share that lies on the surfaces, of those that face the direction where the least does.
+        contradicting: Share of the points in space that the keyframe's rays passed.
+        rows: (M, 6) Jacobian of the pairs' distances from the keyframe's surfaces by the scan's tangent.
+        residuals_m: (M,) these distances.
+        points: (M, 3) the paired points, scan's frame.
+        degeneracy: Of what the normals of both scans show.
+        observability: (6,) of the degeneracy's motions: 1 if measured, 0 if not, and between.
+        unobservable: Names of the motions that are rather not measured, as in "translation along x".
+    """
+
+    overlap: float
+    rmse_m: float
+    agreement: float
+    contradicting: float
+    rows: Array
+    residuals_m: Array
+    points: Array
+    degeneracy: Degeneracy
+    observability: Array
+    unobservable: str
+
+
+def described(deskewed: DeskewedScan) -> ScanDescription:
+    """Return the points and rays of a scan for the free-space check."""
+    scan = deskewed.scan
+    ranges_m = range_image(scan.points_body, scan.origin_body, _DIRECTION_RAD)
+    return ScanDescription(np.eye(4), _checked(deskewed), ranges_m, _DIRECTION_RAD, scan.origin_body)
+
+
+def _checked(deskewed: DeskewedScan) -> Points32:
+    """Return the points for the free-space check, each where a ray off by some pixels hits its surface.
+
+    Seen at a grazing angle, ground and walls are passed by the neighbouring rays.
+    """
+    prepared, origin = deskewed.prepared, deskewed.scan.origin_body
+    step = max(1, -(-len(prepared.points) // _CHECKED_POINTS))
+    rays = prepared.points[::step] - origin
+    facing = np.abs(np.einsum("ni,ni->n", prepared.normals[::step], rays))
+    sine = np.clip(facing / np.maximum(np.linalg.norm(rays, axis=1), _MARGIN_M), _GRAZING, 1.0)
+    beyond = _PIXELS * _DIRECTION_RAD * np.sqrt(1.0 - sine**2) / sine
+    return np.ascontiguousarray((origin + rays * (1.0 + beyond[:, None])).astype(np.float32))
+
+
+def fit_of(
+    keyframe: ScanKeyframe,
+    deskewed: DeskewedScan,
+    T_key_scan: Transform,
+    *,
+    max_pair_distance_m: float,
+) -> ScanFit | None:
+    """Return the fit of a scan; None with too few pairs, or without normals.
+
+    The squared cosine of a motion and a fitted normal has the normal's error squared in it, so that even a
+    bare tunnel seems to show the motion along it. Errors of the normals of two scans are independent, so the
+    product of both scans' cosines (instrumental variables; Fuller 1987, §1.4) has none.
+
+    Args:
+        keyframe: With the surfaces.
+        deskewed: The scan.
+        T_key_scan: (4, 4) motion between both in the middle of their sweeps.
+        max_pair_distance_m: Largest distance between the points of a pair.
+    """
+    target, source = keyframe.deskewed.prepared, deskewed.prepared
+    points_key = apply(T_key_scan, source.points)
+    indices, distances_m = target.nearest(points_key)
+    near = np.flatnonzero(distances_m <= max_pair_distance_m)
+    if len(near) < _MIN_PAIRS:
+        return None
+    partners, points = indices[near], source.points[near]
+    normals_key = target.normals[partners]
+    residuals_m = np.einsum("ni,ni->n", normals_key, points_key[near] - target.points[partners])
+    normals = normals_key @ T_key_scan[:3, :3]
+    own = source.normals[near]
+    own = own * np.sign(np.einsum("ni,ni->n", own, normals))[:, None]
+    rows = np.hstack([np.cross(points, normals), normals])
+    own_rows = np.hstack([np.cross(points, own), own])
+    shown = np.einsum("ni,nj->ij", rows, own_rows)
+    if np.trace(shown[3:, 3:]) <= 0.0:
+        return None
+    agree = np.zeros(len(source.points), dtype=bool)
+    agree[near] = (np.abs(residuals_m) <= _SURFACE_VOXELS * source.voxel_m) & normals.any(axis=1)
+    agreement, _ = weakest_direction(source.normals, agree)
+    counts = FreeSpaceCheck(_MARGIN_M).count(keyframe.description, _checked(deskewed), T_key_scan)
+    degeneracy = degeneracy_of(0.5 * (shown + shown.T), points=source.points, min_share=_SMALL_SHARE)
+    observability = _observability(degeneracy, points, rows, own_rows, agree[near])
+    if np.linalg.norm(T_key_scan[:3, 3]) < _OFF_VOXELS * source.voxel_m:
+        observability[: degeneracy.unobservable_count] = 0.0
+    unobservable = ""
+    if observability.min() < 0.5:
+        least = 1.001 * float(degeneracy.shares[observability < 0.5].max())
+        unobservable = degeneracy_of(
+            0.5 * (shown + shown.T), points=source.points, min_share=max(least, 1e-9)
+        ).text
+    return ScanFit(
+        overlap=len(near) / len(source.points),
+        rmse_m=float(np.sqrt(np.mean(distances_m[near] ** 2))),
+        agreement=agreement,
+        contradicting=counts.contradicting_ratio,
+        rows=rows,
+        residuals_m=residuals_m,
+        points=points,
+        degeneracy=degeneracy,
+        observability=observability,
+        unobservable=unobservable,
+    )
+
+
+def _observability(
+    degeneracy: Degeneracy, points: Array, rows: Array, own_rows: Array, agree: NDArray[np.bool_]
+) -> Array:
+    """Return (6,) whether enough pairs show a motion (as Tuna et al. 2024, §III, count contributions).
+
+    Shares do not tell: normals off by a few degrees, a thousand times, make as large a share as one tree.
+    """
+    observability = np.ones(6)
+    for k in range(degeneracy.unobservable_count):
+        motion = degeneracy.motions[k]
+        displacements = np.cross(motion[:3], points) + motion[3:]
+        along = (rows @ motion) * (own_rows @ motion)
+        facing = along > _FACING * np.einsum("ni,ni->n", displacements, displacements)
+        pairs = int((facing & agree).sum())
+        observability[k] = np.clip((pairs - _FEW_PAIRS) / (_ENOUGH_PAIRS - _FEW_PAIRS), 0.0, 1.0)
+    return observability
+
+
+def contradiction(keyframe: ScanKeyframe, description: ScanDescription, T_key_scan: Transform) -> float:
+    """Return the share of both scans' points in space that the other's rays passed, the mean of the two."""
+    both = FreeSpaceCheck(_MARGIN_M).compare(keyframe.description, description, T_key_scan)
+    return 0.5 * (both.source.contradicting_ratio + both.target.contradicting_ratio)

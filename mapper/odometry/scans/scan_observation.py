@@ -1,0 +1,95 @@
+"""Observation of one scan: the points in range, thinned."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mapper.core.deskew import STILL, Twist, deskewed
+from mapper.core.errors import FrameError
+from mapper.core.frames import Frame, Scan
+from mapper.core.voxel_grid import thin
+from mapper.features.frame_view import ScanView
+from mapper.odometry.scans.config import ScanOdometryConfig
+from mapper.odometry.scans.scan_matcher import DeskewedScan
+from mapper.registration.surfaces import prepared
+
+_MIN_POINTS = 100
+"""Fewer points left after thinning do not constrain a pose."""
+_FINER = 0.5  # voxel size of the first thinning, of whose points each prepared point is the mean
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScanObservation:
+    """A thinned scan.
+
+    Attributes:
+        scan: Points in range, body frame, with their times if the log has them.
+        middle_s: Middle of the sweep, seconds after the scan's stamp; 0 without times.
+        half_s: Half of the sweep's duration, seconds; 0 without times.
+        range_m: Median distance of the points from the sensor.
+        deskewed: The scan as taken all at once; None if that depends on the motion during the sweep.
+        voxel_m: Voxel size of the prepared points.
+    """
+
+    scan: Scan
+    middle_s: float
+    half_s: float
+    range_m: float
+    deskewed: DeskewedScan | None
+    voxel_m: float
+
+    def deskew(self, twist: Twist) -> DeskewedScan:
+        """Return the scan as taken all at once in the middle of the sweep, under a constant velocity.
+
+        In the middle an error of the velocity cancels: half of the points move one way and half the other. At
+        the start of the sweep it would move the pose, and so increase the next velocity's error.
+        """
+        return self.deskewed or _prepared(deskewed(self.sweep(self.middle_s), twist), self.voxel_m)
+
+    def displacement(self, turning_radps: float) -> float:
+        """Return how far a change of the rotation, rad/s, displaces the sweep's outer points, in voxels."""
+        return turning_radps * self.half_s * self.range_m / self.voxel_m
+
+    def view(self, twist: Twist | None) -> ScanView:
+        """Return the points as taken all at once at the stamp, one per voxel; no twist is no motion."""
+        points = deskewed(self.scan, twist or STILL).points_body
+        return ScanView(self.scan.stamp_ns, points[thin(points, self.voxel_m)])
+
+    def sweep(self, moment_s: float) -> Scan:
+        """Return the points with times from a moment after the stamp, seconds."""
+        if self.scan.times_s is None:
+            return self.scan
+        return replace(self.scan, times_s=self.scan.times_s - np.float32(moment_s))
+
+
+def observe_scan(frame: Frame, config: ScanOdometryConfig) -> ScanObservation:
+    """Return a frame's points in range, thinned; prepared for registration unless they are to be deskewed.
+
+    Raises:
+        FrameError: Too few points are in range.
+    """
+    scan = frame.scan()
+    range_m = np.linalg.norm(scan.points_body - scan.origin_body.astype(np.float32), axis=1)
+    in_range = np.flatnonzero((range_m >= config.min_range_m) & (range_m <= config.max_range_m))
+    points_body = scan.points_body[in_range]
+    kept = thin(points_body, _FINER * config.voxel_m)
+    if len(kept) < _MIN_POINTS:
+        raise FrameError(
+            f"scan {scan.stamp_ns}: {len(scan.points_body)} points, of which {len(kept)} are left between "
+            f"{config.min_range_m:g} m and {config.max_range_m:g} m and {_FINER * config.voxel_m:g} m apart; "
+            f"want {_MIN_POINTS} (odometry.min_range_m, max_range_m, voxel_m)"
+        )
+    thinned = replace(scan, points_body=points_body[kept], colors=None, times_s=None)
+    median_m = float(np.median(range_m[in_range][kept]))
+    if scan.times_s is None:
+        whole = _prepared(thinned, config.voxel_m)
+        return ScanObservation(thinned, 0.0, 0.0, median_m, whole, config.voxel_m)
+    times_s = scan.times_s[in_range][kept]
+    first_s, last_s = float(times_s.min()), float(times_s.max())
+    middle_s, half_s = 0.5 * (first_s + last_s), 0.5 * (last_s - first_s)
+    swept = replace(thinned, times_s=times_s)
+    return ScanObservation(swept, middle_s, half_s, median_m, None, config.voxel_m)
+
+
+def _prepared(scan: Scan, voxel_m: float) -> DeskewedScan:
+    return DeskewedScan(scan, prepared(scan.points_body, voxel_m=voxel_m))

@@ -1,0 +1,95 @@
+"""Doubts of RGB-D frames: what is right is not doubted, and what may be wrong says why and by how much."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mapper.core.frames import RgbdFrame
+from mapper.core.geometry import exp
+from mapper.odometry.config import LocalMapConfig
+from mapper.odometry.factory import build_frame_odometry
+from mapper.odometry.keyframes.earlier_depth import Displacement
+from mapper.odometry.keyframes.frame_doubts import FrameDoubts
+
+NOT_DISPLACED = Displacement()
+
+
+@pytest.fixture
+def odometry():
+    return build_frame_odometry(LocalMapConfig())
+
+
+def track(frames, odometry):
+    return [odometry.track(odometry.observe(frame)) for frame in frames]
+
+
+def later(frame, of):
+    """Return a frame with the stamp of another one."""
+    return RgbdFrame(of.stamp_ns, frame.image, frame.depth_m, frame.camera, frame.T_body_camera)
+
+
+def test_right_frames_are_not_doubted(frames, odometry):
+    assert not any(step.doubts for step in track(frames, odometry))
+
+
+def test_a_frozen_camera_is_doubted_until_it_moves_again(frames, odometry):
+    frozen = [later(frames[29], of) for of in frames[30:36]]
+    tracks = track([*frames[:30], *frozen, *frames[36:45]], odometry)
+
+    doubtful = [i for i, step in enumerate(tracks) if "repeated image" in {d.kind for d in step.doubts}]
+    assert doubtful == list(range(30, 36))
+    assert not any(tracks[i].is_keyframe for i in doubtful)
+    assert all(step.covariance is not None for step in tracks[30:36])
+    sigmas_m = [np.sqrt(tracks[i].covariance[3, 3]) for i in doubtful]
+    assert sigmas_m == sorted(sigmas_m)
+    assert not tracks[-1].doubts
+
+
+def kinds(assessment):
+    return [doubt.kind for doubt in assessment.doubts]
+
+
+def test_doubts_are_measured_against_what_is_usual(frames, odometry):
+    """A jump that is supported as well as the frames before it is a fast motion, and not doubted."""
+    doubts = FrameDoubts()
+    track(frames[:2], odometry)
+    pose = odometry._last
+    step_ns = 33_000_000
+
+    def assess(k, *, moved_m=0.001, agreement=0.95, sigma_m=0.001, displaced=NOT_DISPLACED, moving=0):
+        now = replace(
+            pose,
+            observation=replace(pose.observation, stamp_ns=k * step_ns, pixels=pose.observation.pixels + k),
+            T_camera_world=exp(np.zeros(3), np.array([moved_m, 0.0, 0.0])) @ pose.T_camera_world,
+            agreement=agreement,
+            moving=np.arange(moving),
+        )
+        last = replace(pose, observation=replace(pose.observation, stamp_ns=(k - 1) * step_ns))
+        covariance = np.diag([1e-6] * 3 + [sigma_m**2] * 3)
+        return doubts.assess(now, covariance, last, pose.T_camera_world, displaced)
+
+    assert not any(assess(k).doubts for k in range(1, 30))
+    assert not assess(30, moved_m=0.3).doubts
+    jump = assess(31, moved_m=0.3, agreement=0.7)
+    assert kinds(jump) == ["jump"]
+    assert jump.sigma_m == pytest.approx(0.3, rel=0.01)
+    assert "unobservable" in kinds(assess(32, sigma_m=0.05))
+    assert "disagreement" in kinds(assess(33, agreement=0.4))
+    displaced = assess(34, displaced=Displacement(0.6, 0.15, 0.4))
+    assert kinds(displaced) == ["elsewhere"]
+    assert displaced.sigma_m == pytest.approx(0.15)
+    assert not assess(35, displaced=Displacement(0.45, 0.15, 0.4)).doubts
+    assert kinds(assess(36, displaced=Displacement(0.45, 0.15, 0.4), moving=100)) == ["elsewhere"]
+
+
+def test_factors_of_a_doubtful_keyframe_tell_less(frames, odometry):
+    track(frames, odometry)
+    before = [factor for factor in odometry.finish() if factor.j == 1]
+    odometry._map.keyframes[1].doubt_rad, odometry._map.keyframes[1].doubt_m = 0.1, 0.2
+    after = [factor for factor in odometry.finish() if factor.j == 1]
+
+    sigma_m = [np.sqrt(np.linalg.inv(factor.information)[3, 3]) for factor in (*before, *after)]
+    assert len(sigma_m) == 2
+    assert sigma_m[0] < 0.02
+    assert sigma_m[1] == pytest.approx(np.hypot(0.2, sigma_m[0]), rel=1e-3)

@@ -1,0 +1,144 @@
+"""The default odometry on a short synthetic log: accurate, repeatable, and lost where it should be."""
+
+import numpy as np
+import pytest
+
+from mapper.core.errors import FrameError
+from mapper.core.frames import PinholeCamera, RgbdFrame, Scan
+from mapper.core.geometry import exp, inverse
+from mapper.core.trajectory import Trajectory, trajectory_from
+from mapper.features.config import OrbConfig
+from mapper.graph.config import GraphConfig
+from mapper.graph.model import PoseGraph
+from mapper.graph.optimize import optimize
+from mapper.odometry.config import LocalMapConfig
+from mapper.odometry.factory import build_frame_odometry
+from tests.support.desk_frames import ate_rmse_m, blank
+
+
+def track(frames, config=None):
+    """Track, solve as the pipeline does, and return tracks and trajectory."""
+    odometry = build_frame_odometry(config or LocalMapConfig())
+    graph = PoseGraph()
+    tracks = []
+    for frame in frames:
+        step = odometry.track(odometry.observe(frame))
+        if step.is_keyframe:
+            graph.add_node(step.node, step.stamp_ns, step.T_world_body)
+        tracks.append(step)
+    graph.add_factors(odometry.finish())
+    T_world_node = optimize(graph, GraphConfig()).T_world_node
+    placed = [step for step in tracks if step.node is not None]
+    return tracks, trajectory_from((s.stamp_ns, T_world_node[s.node] @ s.T_node_body) for s in placed)
+
+
+def test_it_follows_the_truth(source, frames):
+    tracks, trajectory = track(frames)
+    assert all(step.node is not None for step in tracks)
+    assert ate_rmse_m(trajectory, source.truth) < 0.01
+    assert 1 < sum(step.is_keyframe for step in tracks) < len(frames) // 2
+
+
+def test_plain_orb_works_as_well(source, frames):
+    _, trajectory = track(frames, LocalMapConfig(detector=OrbConfig()))
+    assert len(trajectory) == len(frames)
+    assert ate_rmse_m(trajectory, source.truth) < 0.01
+
+
+def test_the_same_walk_four_times_as_large_has_the_same_drift_per_metre(source, frames):
+    """Then most walls are 4 to 12 m away. Drift may not depend on a limit of the depth."""
+    large = [RgbdFrame(f.stamp_ns, f.image, 4.0 * f.depth_m, f.camera, f.T_body_camera) for f in frames]
+    T_world_body = source.truth.T_world_body.copy()
+    T_world_body[:, :3, 3] *= 4.0
+    _, trajectory = track(large)
+    assert len(trajectory) == len(frames)
+    assert ate_rmse_m(trajectory, Trajectory(source.truth.stamps_ns, T_world_body)) < 4.0 * 0.01
+
+
+def test_depth_beyond_the_limit_is_not_used(frames):
+    def depth_m(**settings):
+        config = LocalMapConfig(**settings)
+        return build_frame_odometry(config).observe(frames[0]).points_camera[:, 2]
+
+    every, near = depth_m(), depth_m(max_depth_m=1.4)
+    assert np.nanmax(every) > 1.4
+    assert np.array_equal(near, np.where(every <= 1.4, every, np.nan), equal_nan=True)
+
+
+def test_the_same_frames_give_the_same_bytes(frames):
+    first, second = (track(frames[:20])[1] for _ in range(2))
+    assert first.T_world_body.tobytes() == second.T_world_body.tobytes()
+
+
+def test_a_camera_off_the_body_moves_the_same_world(frames):
+    """T_body_camera only renames what the trajectory is the pose of."""
+    T_body_camera = exp(np.array([0.3, -0.2, 0.5]), np.array([0.1, 0.2, -0.3]))
+    mounted = [RgbdFrame(f.stamp_ns, f.image, f.depth_m, f.camera, T_body_camera) for f in frames[:20]]
+    _, camera = track(frames[:20])
+    _, body = track(mounted)
+    expected = T_body_camera @ camera.T_world_body @ inverse(T_body_camera)
+    assert np.allclose(body.T_world_body, expected, atol=1e-6)
+
+
+def test_covered_frames_are_lost_and_the_next_ones_are_found_again(source, frames):
+    covered = [*frames[:15], *(blank(f) for f in frames[15:22]), *frames[22:]]
+
+    tracks, trajectory = track(covered)
+
+    lost = [i for i, step in enumerate(tracks) if step.node is None]
+    assert lost == list(range(15, 22))
+    assert all(tracks[i].diagnostics.method == "lost" for i in lost)
+    assert tracks[22].diagnostics.method.startswith("relocalised")
+    assert all((tracks[i].T_world_body == tracks[14].T_world_body).all() for i in lost)
+    assert ate_rmse_m(trajectory, source.truth) < 0.01
+
+
+def test_a_sudden_jump_is_bridged_by_matching(source, frames):
+    jumped = [*frames[:12], *frames[24:]]
+    tracks, trajectory = track(jumped)
+    assert all(step.node is not None for step in tracks)
+    assert ate_rmse_m(trajectory, source.truth) < 0.01
+
+
+def test_a_jump_to_another_place_is_no_motion(frames):
+    """Noise matches nothing: the honest answer is "lost"."""
+    rng = np.random.default_rng(0)
+    noise = rng.integers(0, 256, frames[0].image.shape, dtype=np.uint8)
+    stranger = RgbdFrame(frames[10].stamp_ns, noise, np.full_like(frames[0].depth_m, 2.0), frames[0].camera)
+    tracks, _ = track([*frames[:10], stranger])
+    assert tracks[-1].node is None
+
+
+def test_nothing_starts_before_there_is_texture(frames):
+    tracks, _ = track([blank(frames[0]), *frames[1:4]])
+    assert [step.node for step in tracks[:2]] == [None, 0]
+    assert tracks[1].is_keyframe
+
+
+def test_a_view_that_is_mostly_new_becomes_a_keyframe(frames):
+    """The more of a view must be known, the more keyframes it takes."""
+    few, many = (track(frames[:20], LocalMapConfig(mapped_ratio=ratio))[0] for ratio in (0.0, 0.9))
+    assert sum(step.is_keyframe for step in few) < sum(step.is_keyframe for step in many)
+
+
+def test_factors_connect_every_keyframe_to_an_earlier_one(frames):
+    odometry = build_frame_odometry(LocalMapConfig())
+    keyframes = sum(odometry.track(odometry.observe(frame)).is_keyframe for frame in frames)
+    factors = odometry.finish()
+    assert {factor.j for factor in factors} == set(range(1, keyframes))
+    assert all(factor.i < factor.j for factor in factors)
+    # A hundred landmarks at a metre or two pin a pose to millimetres, not to microns or metres.
+    sigma_m = [float(np.sqrt(np.linalg.inv(factor.information)[3:, 3:].trace() / 3)) for factor in factors]
+    assert 1e-4 < np.median(sigma_m) < 2e-2
+
+
+def test_a_bare_scan_is_refused():
+    scan = Scan(7, np.zeros((3, 3), np.float32))
+    with pytest.raises(FrameError, match="needs colour and depth"):
+        build_frame_odometry(LocalMapConfig()).observe(scan)
+
+
+def test_an_image_without_features_is_observed_as_empty():
+    camera = PinholeCamera(64, 48, 60.0, 60.0, 31.5, 23.5)
+    frame = RgbdFrame(0, np.zeros((48, 64), np.uint8), np.zeros((48, 64), np.float32), camera)
+    assert len(build_frame_odometry(LocalMapConfig()).observe(frame)) == 0
