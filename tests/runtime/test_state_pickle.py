@@ -9,7 +9,7 @@ import pytest
 from mapper.core.errors import DataError
 from mapper.core.frames import PinholeCamera, Scan
 from mapper.loops.scan_context_proposer import ScanPlace
-from mapper.odometry.keyframes.log_residuals import LogResiduals
+from mapper.odometry.keyframes.local_mapping import LogResiduals
 from mapper.runtime.archived import Archivable, archived
 from mapper.runtime.state_pickle import dumps, fixed_parts, loads
 

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.core.geometry import Array, Transform, adjoint, apply, inverse
+from mapper.core.geometry import Array, Points, Transform, adjoint, apply, inverse
 from mapper.odometry.camera.image_observation import ImageObservation
 from mapper.odometry.camera.readout_time import ReadoutTime
 from mapper.odometry.keyframes.bundle_adjustment import adjust, common_parameter
@@ -183,6 +183,11 @@ class LandmarkMap:
         """Return the landmarks that a keyframe observes, in feature order."""
         ids = self.keyframes[index].landmark_of_feature
         return ids[ids >= 0]
+
+    def positions_of(self, landmark_of_feature: Ids) -> Points:
+        """Return the (M, 3) positions of the landmarks that features have, in the order of the features."""
+        positions_world: Points = self.landmarks["position"][landmark_of_feature[landmark_of_feature >= 0]]
+        return positions_world
 
     def landmarks_of_any(self, keyframes: Iterable[int], *, except_for: Ids) -> Ids:
         """Return, in increasing order, the landmarks that any of the keyframes observes."""

@@ -45,7 +45,7 @@ class Relocalizer:
         observation: ImageObservation,
         *,
         method: str,
-        is_possible: Callable[[TrackedPose], bool] = lambda _: True,
+        is_possible: Callable[[TrackedPose], bool] | None = None,
         exhaustive: bool = False,
     ) -> TrackedPose | None:
         """Return the first pose that many landmarks agree with, else that of most inliers; None if not found.
@@ -55,7 +55,7 @@ class Relocalizer:
         best: TrackedPose | None = None
         for k in keyframes:
             tracked_pose = self._match_keyframe(k, observation, method=method, exhaustive=exhaustive)
-            if tracked_pose is None or not is_possible(tracked_pose):
+            if tracked_pose is None or not (is_possible is None or is_possible(tracked_pose)):
                 continue
             if best is None or tracked_pose.inliers > best.inliers:
                 best = tracked_pose

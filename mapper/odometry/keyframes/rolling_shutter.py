@@ -43,11 +43,11 @@ class RollingShutter:
         self._velocity = None
         self.twist_camera = np.zeros(6)
 
-    def predicted(self, observation: ImageObservation) -> ImageObservation:
+    def predict(self, observation: ImageObservation) -> ImageObservation:
         """Return an observation corrected by the velocity in the image before."""
         return observation.swept(self._readout.seconds * self.twist_camera)
 
-    def refined(self, tracked_pose: TrackedPose, before: TrackedPose, points_world: Points) -> TrackedPose:
+    def refine(self, tracked_pose: TrackedPose, before: TrackedPose, points_world: Points) -> TrackedPose:
         """Return a pose and its observation, corrected by the motion that both the poses and the image show.
 
         Args:
@@ -88,13 +88,12 @@ class RollingShutter:
 
     def twist_body(self, observation: ImageObservation) -> Twist:
         """Return the velocity in the last image, in the body's axes."""
-        twist = adjoint(observation.T_body_camera) @ self.twist_camera
-        return Twist(twist[:3], twist[3:])
+        return Twist.of(adjoint(observation.T_body_camera) @ self.twist_camera)
 
-    def corrected(self, observation: ImageObservation, twist_body: Twist) -> ImageObservation:
+    def correct(self, observation: ImageObservation, twist_body: Twist) -> ImageObservation:
         """Return an observation corrected by a velocity of the body."""
-        twist = np.concatenate([twist_body.rotation_radps, twist_body.translation_mps])
-        return observation.swept(self._readout.seconds * adjoint(inverse(observation.T_body_camera)) @ twist)
+        twist = adjoint(inverse(observation.T_body_camera)) @ twist_body.vector
+        return observation.swept(self._readout.seconds * twist)
 
 
 @njit(cache=True, nogil=True)

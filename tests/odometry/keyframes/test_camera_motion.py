@@ -107,6 +107,8 @@ def test_features_that_move_become_no_landmarks(frames):
     with_depth = np.flatnonzero(pose.observation.has_depth).astype(np.int32)
     moving, still = with_depth[:20], with_depth[20:]
     pose = replace(pose, landmark_of_feature=np.full(len(pose.observation), -1, np.int32), moving=moving)
-    landmarks = odometry._add_keyframe(pose, neighbour=0).landmark_of_feature
+    landmarks = odometry._mapping.add_keyframe(
+        pose, neighbour=0, twist_camera=np.zeros(6)
+    ).landmark_of_feature
     assert (landmarks[moving] < 0).all()
     assert (landmarks[still] >= 0).all()

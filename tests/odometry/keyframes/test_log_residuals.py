@@ -4,7 +4,7 @@ import numpy as np
 
 from mapper.core.geometry import transform
 from mapper.graph.noise import with_model_error
-from mapper.odometry.keyframes.log_residuals import LogResiduals
+from mapper.odometry.keyframes.local_mapping import LogResiduals
 from mapper.registration.variance_factor import ResidualStatistics
 
 INFORMATION = np.diag([1e7] * 3 + [1e6] * 3)
@@ -15,7 +15,7 @@ def honest(*statistics):
     residuals = LogResiduals()
     for one in statistics:
         residuals.add(one)
-    return residuals.honest(INFORMATION, T_I_J)
+    return residuals.rescale(INFORMATION, T_I_J)
 
 
 def sigma_m(information):

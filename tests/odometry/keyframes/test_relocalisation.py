@@ -126,7 +126,7 @@ def test_of_two_weak_poses_that_of_more_inliers_counts(frames, order):
     config = LocalMapConfig(weak_inliers=10_000)
     odometry = build_frame_odometry(config)
     tracked(frames[:12], odometry)
-    relocalizer, observation = odometry._relocalizer, odometry.observe(frames[12])
+    relocalizer, observation = odometry._tracking._relocalizer, odometry.observe(frames[12])
     keyframes = range(len(odometry._map.keyframes))[::order]
     alone = [relocalizer.best_among([k], observation, method="alone") for k in keyframes]
 

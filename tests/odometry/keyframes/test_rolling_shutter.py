@@ -125,7 +125,7 @@ def test_what_the_odometry_knows_of_the_shutter_it_tells():
     assert isinstance(odometry, SensorCheck)
     assert odometry.sensor_notes() == []
     for _ in range(60):
-        odometry._readout.learn(information=1e7, gradient=1e7 * (odometry._readout.seconds + 0.01))
+        odometry._map.readout.learn(information=1e7, gradient=1e7 * (odometry._map.readout.seconds + 0.01))
     assert [note[:64] for note in odometry.sensor_notes()] == [
         "rolling shutter: rows are read within 10 ms from the bottom, as "
     ]

@@ -1,0 +1,222 @@
+"""Local mapping: which frames become keyframes, the map around them, and the factors between them."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from mapper.core.geometry import Array, Transform, inverse
+from mapper.graph.model import BetweenFactor
+from mapper.graph.noise import inflated, with_model_error
+from mapper.odometry.config import KeyframeOdometryConfig
+from mapper.odometry.keyframes.focal_length import WINDOW_KEYFRAMES, FocalLengthCheck
+from mapper.odometry.keyframes.frame_doubts import UNDOUBTED, Assessment
+from mapper.odometry.keyframes.landmarks import MIN_SHARED_LANDMARKS, LandmarkMap
+from mapper.odometry.keyframes.pose_tracker import TrackedPose
+from mapper.odometry.keyframes.relocalizer import Relocalizer
+from mapper.registration.variance_factor import ResidualStatistics
+
+_FACTORS_PER_KEYFRAME = 4
+"""Factors of each keyframe, to the earlier ones that share most landmarks with it."""
+
+_MIN_GAP = 4
+"""Frames for which the last keyframe is young."""
+_YOUNG_SHARE = 2.0 / 3.0
+"""Share of ``keyframe_ratio`` that counts while the last keyframe is young and the inliers are not weak."""
+_DEPTH_OVERLAP = 0.9
+"""With less overlap of the surfaces a frame without landmarks becomes a keyframe: what is left may not show
+every motion."""
+
+_MIN_KEYFRAMES = 5
+"""With fewer keyframes, features count as their weights say, with the whole model error."""
+_NO_EFFECT, _FULL_EFFECT = 1.0, 1.5
+"""Design effects at which residuals show no model error, and all of it. Synthetic logs without errors of
+calibration have 0.75 to 1.0, real and uncalibrated ones 1.5 to 2.3."""
+_MIN_MODEL_ERROR = 0.125
+"""Share of the model error that is always added."""
+
+
+class LocalMapping:
+    """Local mapping (Mur-Artal, Montiel & Tardós 2015, §VI): keyframes, bundle adjustment, culling."""
+
+    def __init__(
+        self, config: KeyframeOdometryConfig, landmark_map: LandmarkMap, relocalizer: Relocalizer
+    ) -> None:
+        self._config = config
+        self._map = landmark_map
+        self._relocalizer = relocalizer
+        self._residuals = LogResiduals()
+        self._focal_length = FocalLengthCheck()
+
+    def add_keyframe(
+        self,
+        tracked_pose: TrackedPose,
+        *,
+        neighbour: int | None,
+        twist_camera: Array,
+        assessed: Assessment = UNDOUBTED,
+    ) -> TrackedPose:
+        """Turn a tracked frame into a keyframe, refine the map around it, and return its refined pose.
+
+        Args:
+            tracked_pose: Pose of the frame, with its landmarks.
+            neighbour: Keyframe of the sub-map in which it was tracked; None begins a new one.
+            twist_camera: (6,) velocity of the camera in its own axes, rad/s and m/s.
+            assessed: Doubts about the pose.
+        """
+        observation = tracked_pose.observation
+        is_new = observation.has_depth & (tracked_pose.landmark_of_feature < 0)
+        is_new[tracked_pose.moving] = False
+        index = self._map.add_keyframe(
+            observation,
+            tracked_pose.T_camera_world,
+            tracked_pose.landmark_of_feature,
+            new=is_new,
+            neighbour=neighbour,
+            twist_camera=twist_camera,
+            depth_information=None if tracked_pose.depth is None else tracked_pose.depth.information,
+        )
+        self._relocalizer.add(index)
+        self._map.refine(index, window=self._config.bundle_keyframes)
+        self._map.follow_readout()
+        self._map.cull()
+        self._check_focal_length()
+        if (statistics := self._map.residual_statistics(index)) is not None:
+            self._residuals.add(statistics)
+        keyframe = self._map.keyframes[index]
+        keyframe.doubt_rad, keyframe.doubt_m = assessed.sigma_rad, assessed.sigma_m
+        return replace(
+            tracked_pose,
+            observation=self._map.observation(index),
+            T_camera_world=keyframe.T_camera_world,
+            landmark_of_feature=keyframe.landmark_of_feature,
+            reference=index,
+        )
+
+    def factor(self, i: int, j: int, *, shared_by: int = 1) -> BetweenFactor:
+        """Return the relative pose of two keyframes in the current map.
+
+        ``shared_by`` factors of j rest largely on the same features. Were these the same, each factor would
+        have that share of their information, were they others, all: it has the geometric mean.
+        """
+        keyframes = self._map.keyframes
+        T_i_j = inverse(keyframes[i].body_pose) @ keyframes[j].body_pose
+        information = self._map.information(i, j) + self._map.depth_information(i, j)
+        information = self.rescale(information, T_i_j) / math.sqrt(shared_by)
+        doubtful = self._map.keyframes[j]
+        if doubtful.doubt_m > 0.0:
+            information = inflated(information, sigma_rad=doubtful.doubt_rad, sigma_m=doubtful.doubt_m)
+        return BetweenFactor(i, j, T_i_j, information)
+
+    def factors(self) -> Sequence[BetweenFactor]:
+        """Return a factor from every keyframe to those earlier ones that share most landmarks with it.
+
+        The first keyframe of a sub-map has none, as its pose in other sub-maps is unknown.
+        """
+        factors = []
+        for j, keyframe in enumerate(self._map.keyframes):
+            if j == keyframe.origin:
+                continue
+            earlier = [(k, shared) for k, shared in self._map.covisible(j, min_shared=1) if k < j]
+            strong = [k for k, shared in earlier if shared >= MIN_SHARED_LANDMARKS]
+            weak = [k for k, _ in earlier[:1]] or [self._map.previous(j)]
+            linked = [keyframe.depth_link.reference] if keyframe.depth_link is not None else []
+            targets = dict.fromkeys([*(strong[:_FACTORS_PER_KEYFRAME] or linked or weak), *linked])
+            factors += [self.factor(i, j, shared_by=len(targets)) for i in targets]
+        return factors
+
+    def rescale(self, information: Array, T_i_j: Transform) -> Array:
+        """Return the (6, 6) information of a relative pose as the residuals of the log show it."""
+        return self._residuals.rescale(information, T_i_j)
+
+    def calibration_warnings(self) -> Sequence[str]:
+        """Return whether the images contradict the focal length that they are said to have."""
+        if not self._map.keyframes:
+            return ()
+        sentence = self._focal_length.contradiction(self._map.observation(0).intrinsics[0])
+        return (sentence,) if sentence else ()
+
+    def _check_focal_length(self) -> None:
+        """Check the newest keyframes of a sub-map together, once there are enough since the last check."""
+        newest = range(len(self._map.keyframes) - WINDOW_KEYFRAMES, len(self._map.keyframes))
+        origins = {self._map.keyframes[k].origin for k in newest if k >= 0}
+        if len(self._map.keyframes) % WINDOW_KEYFRAMES or len(origins) > 1 or self._focal_length.is_complete:
+            return
+        self._focal_length.add(self._map.bundle(newest))
+
+
+class KeyframeDecision:
+    """Decision whether a tracked frame becomes a keyframe (after Mur-Artal & Tardós 2017, §III-E)."""
+
+    def __init__(self, config: KeyframeOdometryConfig) -> None:
+        self._config = config
+        self._most_inliers = 0
+        self._frames = 0  # since the last keyframe
+
+    def restart(self) -> None:
+        """Begin anew after a keyframe."""
+        self._most_inliers = 0
+        self._frames = 0
+
+    def is_due(self, tracked_pose: TrackedPose, assessed: Assessment) -> bool:
+        """Return whether the next tracked frame becomes a keyframe.
+
+        A doubtful frame with enough inliers does not: tracking goes on without it. A motion that was not
+        observed is uncertain in the factor too, so it is no hindrance.
+        """
+        config, inliers = self._config, tracked_pose.inliers
+        self._frames += 1
+        self._most_inliers = max(self._most_inliers, inliers)
+        if assessed.doubts and inliers >= config.weak_inliers:
+            return False
+        is_blind = tracked_pose.depth is not None and bool(tracked_pose.depth.unobservable)
+        if len(tracked_pose.doubts) > is_blind:
+            return False
+        if is_blind and tracked_pose.depth is not None and tracked_pose.depth.observes_next:
+            return True
+        if self._frames >= config.max_keyframe_gap:
+            return True
+        if tracked_pose.depth is not None and inliers < config.min_inliers:
+            is_textured = (
+                tracked_pose.observation.has_depth.sum() >= config.weak_inliers and self._frames >= _MIN_GAP
+            )
+            return is_textured or tracked_pose.depth.overlap < _DEPTH_OVERLAP
+        kept_ratio = inliers / self._most_inliers
+        is_young = self._frames < _MIN_GAP and inliers >= config.weak_inliers
+        share = _YOUNG_SHARE if is_young else 1.0
+        # Landmarks at one edge of the image constrain the pose badly, however many they are.
+        mapped_ratio = inliers / max(int(tracked_pose.observation.has_depth.sum()), 1)
+        # Unless the map is searched, features without a landmark are not new.
+        is_new = mapped_ratio < config.mapped_ratio and (config.local_keyframes > 0 or not is_young)
+        return is_new or kept_ratio < share * config.keyframe_ratio
+
+
+class LogResiduals:
+    """Medians of the keyframes' residual statistics.
+
+    Errors of calibration, shutter and depth move neighbouring features alike, so residuals that depend on
+    each other tell how much of such errors a log has.
+    """
+
+    def __init__(self) -> None:
+        self._keyframes: list[ResidualStatistics] = []
+        self._variance_factor = self._model_error = 1.0
+
+    def add(self, keyframe: ResidualStatistics) -> None:
+        """Add a keyframe's."""
+        self._keyframes.append(keyframe)
+        if len(self._keyframes) >= _MIN_KEYFRAMES:
+            self._variance_factor = float(np.median([known.variance_factor for known in self._keyframes]))
+            effect = float(np.median([known.design_effect for known in self._keyframes]))
+            share = (effect - _NO_EFFECT) / (_FULL_EFFECT - _NO_EFFECT)
+            self._model_error = float(np.clip(share, _MIN_MODEL_ERROR, 1.0))
+
+    def rescale(self, information: Array, T_i_j: Transform) -> Array:
+        """Return the (6, 6) information of a relative pose by what the residuals show.
+
+        Args:
+            information: (6, 6) from features whose errors are independent, and as large as their weights say.
+            T_i_j: (4, 4) the measurement.
+        """
+        return with_model_error(information / self._variance_factor, T_i_j, scale=self._model_error)
