@@ -29,9 +29,8 @@ from mapper.core.timebase import nearest
 from mapper.core.trajectory import Trajectory
 from mapper.merging.merge import merge
 from mapper.merging.placing import Placing, as_built
-from mapper.octree.map import OctreeMap
+from mapper.octree.map import OctreeMap, read_octree
 from mapper.octree.map_file import write_map
-from mapper.octree.reading import read_octree
 from mapper.run.folder import Run, open_run
 from mapper.run.manifest import Input, Manifest
 from mapper.run.writer import write_run

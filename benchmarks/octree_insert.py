@@ -22,11 +22,10 @@ import pyoctomap
 from mapper.core.frames import Scan
 from mapper.core.geometry import Transform, apply, inverse
 from mapper.core.timebase import nearest
-from mapper.octree import kernels
+from mapper.octree import casting_kernels as kernels
 from mapper.octree.config import OctreeConfig
-from mapper.octree.map import OctreeMap
+from mapper.octree.map import OctreeMap, read_octree
 from mapper.octree.octomap_file import write_bt, write_ot
-from mapper.octree.reading import read_octree
 from mapper.sources import open_source
 from mapper.sources.config import SourceConfig
 from mapper.sources.trajectory_files import read_kitti

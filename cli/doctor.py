@@ -88,7 +88,7 @@ def _warmed(progress: "Progress") -> "list[Finding]":
 
 
 def _accept(run: Path | None, names: "Sequence[str]") -> None:
-    from mapper.octree.grid_file import read_grid
+    from mapper.octree.grid import read_grid
     from mapper.run import files
     from mapper.run.folder import open_run
 

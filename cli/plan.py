@@ -72,7 +72,7 @@ def plan(
     from mapper.navigation.planner import plan_2d, plan_3d
     from mapper.navigation.storey_planner import plan_storeys
     from mapper.octree.grid import with_obstacles
-    from mapper.octree.reading import read_octree
+    from mapper.octree.map import read_octree
     from mapper.run import files
     from mapper.run.folder import Run
 

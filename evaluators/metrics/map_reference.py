@@ -16,8 +16,7 @@ from mapper.evaluators.metrics.occupancy import (
     assess_by_points,
 )
 from mapper.evaluators.metrics.scenes import SCENE, scene_distance
-from mapper.octree.map import OctreeMap
-from mapper.octree.reading import read_octree
+from mapper.octree.map import OctreeMap, read_octree
 from mapper.run.files import OCTREE_MAP
 from mapper.sources.cloud_files import ENDINGS, read_cloud
 

@@ -11,8 +11,8 @@ from mapper.core.errors import DataError
 from mapper.core.geometry import Array, Points
 from mapper.evaluators.metrics.metric import Metric
 from mapper.octree.keys import KEY_COUNT, KEY_ZERO
-from mapper.octree.leaves import Leaves
 from mapper.octree.map import OctreeMap
+from mapper.octree.queries import Leaves
 
 SignedDistance = Callable[[Points], Array]
 """Maps (N, 3) points in metres to their distances from the nearest surface, negative inside solids."""

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from mapper.core.paths import AnyPath
-from mapper.octree import reading
+from mapper.octree import map as octree_map
 from mapper.octree.config import OctreeConfig
 from mapper.octree.map import OctreeMap
 from mapper.run import files
@@ -29,4 +29,4 @@ def read_octree(path: AnyPath, config: OctreeConfig | None = None) -> OctreeMap:
     path = Path(path)
     if path.is_dir():
         path = open_run(path).file(files.OCTREE_MAP)
-    return reading.read_octree(path, config)
+    return octree_map.read_octree(path, config)

@@ -10,13 +10,16 @@ from mapper.core.errors import DataError
 from mapper.export.page import round_length
 from mapper.export.palette import FREE_CELL, INK, OCCUPIED_CELL, PAPER, UNKNOWN_CELL
 from mapper.navigation.costmap import Costmap
-from mapper.octree.grid import FREE, OCCUPIED, OccupancyGrid, shrunk
-from mapper.octree.grid_file import (
+from mapper.octree.grid import (
+    FREE,
     FREE_PIXEL,
     FREE_THRESHOLD,
+    OCCUPIED,
     OCCUPIED_PIXEL,
     OCCUPIED_THRESHOLD,
     UNKNOWN_PIXEL,
+    OccupancyGrid,
+    shrunk,
 )
 from mapper.runtime.atomic import write_bytes, write_text
 

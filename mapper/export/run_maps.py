@@ -14,8 +14,7 @@ from mapper.mapping.edits import MapEditor
 from mapper.mapping.fusion import Maps, Snapshot
 from mapper.navigation.floor import reachable_floor
 from mapper.navigation.traversable import TraversableFloor, traversable
-from mapper.octree.grid import OccupancyGrid
-from mapper.octree.grid_file import stored_grid_if_any
+from mapper.octree.grid import OccupancyGrid, stored_grid_if_any
 from mapper.run import files
 from mapper.run.cloud import Cloud, read_cloud
 from mapper.run.folder import Run

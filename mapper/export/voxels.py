@@ -10,8 +10,8 @@ from mapper.export.mesh_files import Triangles, write_mesh
 from mapper.export.ply import write_ply
 from mapper.mapping.cloud import height_colors
 from mapper.octree.keys import KEY_ZERO
-from mapper.octree.leaves import Leaves
-from mapper.octree.reading import read_octree
+from mapper.octree.map import read_octree
+from mapper.octree.queries import Leaves
 from mapper.run import files
 from mapper.run.folder import Run
 from mapper.runtime.progress import Progress

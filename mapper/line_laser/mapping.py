@@ -12,8 +12,8 @@ from mapper.core.errors import DataError, MapSizeError
 from mapper.core.geometry import Array, Points
 from mapper.line_laser.config import LineLaserMapConfig
 from mapper.line_laser.ranging import LineScan
+from mapper.octree.blocks import log_odds
 from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
-from mapper.octree.sensor_model import log_odds
 from mapper.runtime.progress import SILENT, Progress
 
 _MARGIN_CELLS = 2

@@ -11,9 +11,8 @@ from mapper.core.frames import Points32
 from mapper.core.geometry import Array, Points, Transform, apply
 from mapper.mapping.config import AppliedEdit, Edits, Region
 from mapper.navigation.traversable import Storey, TraversableFloor, trimmed
-from mapper.octree.columns import NOWHERE, Columns
+from mapper.octree.columns import NOWHERE, Columns, DrivenGround, nearest_heights
 from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
-from mapper.octree.ground_height import DrivenGround, nearest_heights
 from mapper.octree.keys import BLOCK_BITS, BLOCK_VOXELS, KEY_BITS, KEY_MASK, KEY_ZERO, block_keys, gather
 from mapper.octree.map import OctreeMap
 

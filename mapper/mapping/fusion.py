@@ -24,8 +24,14 @@ from mapper.octree.config import OctreeConfig
 from mapper.octree.grid import OccupancyGrid
 from mapper.octree.map import OctreeMap
 from mapper.octree.moving_objects import MovingObjects, remove_moving_objects
-from mapper.octree.scan_update import ScanUpdate, pack
-from mapper.octree.scan_update_file import CachedUpdate, ScanUpdateFile, ScanUpdateWriter, cache_update
+from mapper.octree.scan_updates import (
+    CachedUpdate,
+    ScanUpdate,
+    ScanUpdateFile,
+    ScanUpdateWriter,
+    cache_update,
+    pack,
+)
 from mapper.octree.slice import Band, cut_slice
 from mapper.runtime.ordered_map import ordered_map
 from mapper.runtime.progress import Progress
@@ -275,7 +281,7 @@ def _fuse_scans(
         progress.note(f"fused again: {moved} of {len(trajectory)} frames, which had moved or were not known")
     if config.octree.moving != "removed":
         return octree, None
-    with updates.reopened() as written:
+    with updates.reopen() as written:
         return octree, remove_moving_objects(
             octree, lambda: ordered_map(CachedUpdate.update, written.entries(), workers=config.workers)
         )

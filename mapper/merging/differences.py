@@ -14,8 +14,8 @@ from mapper.core.clusters import cluster_numbers
 from mapper.core.errors import ConfigError
 from mapper.core.geometry import Array, Points, Transform, apply, inverse
 from mapper.merging.placing import Placed
+from mapper.octree.blocks import log_odds
 from mapper.octree.map import OctreeMap
-from mapper.octree.sensor_model import log_odds
 
 _TOLERANCE_VOXELS = 2.0
 _MIN_VOXELS = 8

@@ -12,8 +12,8 @@ from mapper.merging.jobs import SplitRun, stays_within_m
 from mapper.merging.merged_map import FUSED, MapManifest, MergedMap, RunInMap, Tile
 from mapper.merging.placing import InMap, Placed, farthest_m
 from mapper.merging.tiling import Tiling
+from mapper.octree.blocks import Overlap
 from mapper.octree.config import OctreeConfig
-from mapper.octree.summing import Overlap
 from mapper.run import files
 from mapper.run.fingerprint import fingerprint
 from mapper.run.folder import Run, open_run

@@ -14,7 +14,7 @@ from mapper.navigation.config import TraversableConfig
 from mapper.navigation.floor import Floor, floor_of, margin_for
 from mapper.navigation.traversable import TraversableFloor, traversable
 from mapper.octree.columns import block_extent, columns_of, occupied_voxels
-from mapper.octree.reading import read_octree
+from mapper.octree.map import read_octree
 from mapper.run.folder import Run
 
 MOST_COLUMNS = 1 << 25

@@ -21,18 +21,16 @@ from mapper.mapping.fusion import fuse_octree
 from mapper.merging.merged_map import TILES
 from mapper.merging.tiling import Tiling
 from mapper.octree.attributes import UNSET
-from mapper.octree.color_tree import colored
-from mapper.octree.columns import block_extent, occupied_voxels
+from mapper.octree.blocks import Overlap
+from mapper.octree.color_tree import color_nodes
+from mapper.octree.columns import block_extent, lowest_occupied, occupied_voxels
 from mapper.octree.config import OctreeConfig
-from mapper.octree.ground_height import lowest_occupied
-from mapper.octree.map import OctreeMap
+from mapper.octree.map import OctreeMap, read_octree
 from mapper.octree.map_file import write_map
-from mapper.octree.reading import read_octree
+from mapper.octree.octomap_tree import children_in, nodes_in_preorder, words_in_preorder
 from mapper.octree.resampling import blocks_reached, resampled
-from mapper.octree.scan_update_file import ScanUpdateWriter, open_scan_updates
+from mapper.octree.scan_updates import ScanUpdateWriter, open_scan_updates
 from mapper.octree.slice import Band
-from mapper.octree.summing import Overlap
-from mapper.octree.tree import children_in, nodes_in_preorder, words_in_preorder
 from mapper.run.folder import open_run
 from mapper.runtime.atomic import atomic_file, write_bytes
 from mapper.runtime.progress import SILENT
@@ -262,7 +260,7 @@ def _described(
     nodes = nodes_in_preorder(octree.blocks, root_depth=depth)
     color = (UNSET, UNSET, UNSET)
     if workspace.has_colors and octree.attributes is not None:
-        nodes = colored(nodes, octree.blocks, octree.attributes, root_depth=depth, root_code=tile)
+        nodes = color_nodes(nodes, octree.blocks, octree.attributes, root_depth=depth, root_code=tile)
         color = tuple(nodes["rgb"][0].tolist())
     words, state = words_in_preorder(octree.blocks, octree.occupied_log_odds, root_depth=depth)
     write_bytes(workspace.piece(tile, "ot"), nodes.tobytes())

@@ -22,10 +22,8 @@ from mapper.mapping.config import Region
 from mapper.merging.joint_graph import Tie
 from mapper.navigation.config import CostmapConfig, TraversableConfig
 from mapper.octree.config import OctreeConfig, SliceConfig
-from mapper.octree.grid import OccupancyGrid
-from mapper.octree.grid_file import stored_grid, stored_grid_if_any
-from mapper.octree.map import OctreeMap
-from mapper.octree.reading import read_octree
+from mapper.octree.grid import OccupancyGrid, stored_grid, stored_grid_if_any
+from mapper.octree.map import OctreeMap, read_octree
 from mapper.run import files
 from mapper.run.manifest import is_merged_map
 from mapper.runtime.atomic import MANIFEST_NAME, FolderKind, partial_of, write_text

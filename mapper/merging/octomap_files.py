@@ -14,7 +14,7 @@ from mapper.merging.jobs import JoinedTile, Workspace
 from mapper.octree.attributes import UNSET
 from mapper.octree.color_tree import COLOR_NODE, parent_color
 from mapper.octree.octomap_file import LEAF_ROOT, write_tree
-from mapper.octree.tree import NODE, UpperNodes, children_in, preorder, upper_nodes, word_of
+from mapper.octree.octomap_tree import NODE, UpperNodes, children_in, preorder, upper_nodes, word_of
 
 Tiles = Mapping[int, JoinedTile]
 

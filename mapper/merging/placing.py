@@ -15,7 +15,7 @@ from mapper.core.trajectory import Trajectory
 from mapper.mapping.config import edits_of
 from mapper.merging.joint_graph import JointGraph
 from mapper.octree.config import OctreeConfig
-from mapper.octree.scan_update_file import displacement_m, longest_ray_m
+from mapper.octree.scan_updates import displacement_m, longest_ray_m
 from mapper.run import files
 from mapper.run.doubtful_frames import without_doubtful
 from mapper.run.edits_file import edits_text, parse_edits

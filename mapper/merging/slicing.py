@@ -31,8 +31,7 @@ from mapper.merging.placing import Placed
 from mapper.merging.stages import Stages
 from mapper.navigation.floor import Floor, driven_ground
 from mapper.navigation.traversable import TraversableFloor, traversable
-from mapper.octree.grid import OccupancyGrid, overlap_of, with_obstacles
-from mapper.octree.ground_height import (
+from mapper.octree.columns import (
     NOTHING,
     DrivenGround,
     ground_from_lowest,
@@ -40,6 +39,7 @@ from mapper.octree.ground_height import (
     nearest_heights,
     snap_to_floor,
 )
+from mapper.octree.grid import OccupancyGrid, overlap_of, with_obstacles
 from mapper.octree.slice import Band
 
 _MAX_TILT_RAD = np.deg2rad(5.0)

@@ -20,8 +20,7 @@ from mapper.navigation.flood import (
 )
 from mapper.navigation.footprint import with_footprint
 from mapper.navigation.path_ground import PathGround, joined, path_ground
-from mapper.octree.columns import NOWHERE, Columns, occupied_columns
-from mapper.octree.ground_height import DrivenGround
+from mapper.octree.columns import NOWHERE, Columns, DrivenGround, occupied_columns
 from mapper.octree.map import OctreeMap
 
 

@@ -14,9 +14,8 @@ from mapper.navigation.planner import Plan, Space, clearance_of, point_text, spa
 from mapper.navigation.search import shortest_path
 from mapper.navigation.traversable import Storey, TraversableFloor
 from mapper.navigation.voxels import layer
-from mapper.octree.columns import NOWHERE
+from mapper.octree.columns import NOWHERE, nearest_heights
 from mapper.octree.grid import UNKNOWN, OccupancyGrid
-from mapper.octree.ground_height import nearest_heights
 
 
 def plan_storeys(

@@ -12,9 +12,8 @@ from mapper.navigation.distance_transform import NONE, squares_to_boxes
 from mapper.navigation.flood import Limits, Mask
 from mapper.navigation.floor import Floor
 from mapper.navigation.storeys import Heights, storeys_of
-from mapper.octree.columns import NOWHERE, Columns
+from mapper.octree.columns import NOWHERE, Columns, nearest_heights
 from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
-from mapper.octree.ground_height import nearest_heights
 from mapper.octree.keys import KEY_ZERO
 
 _ALLOWANCE = 1e-6

@@ -48,7 +48,7 @@ def neighbours_of(codes: NDArray[np.int64]) -> NDArray[np.int64]:
     return found
 
 
-def dilated(words: Words, neighbours: NDArray[np.int64], *, absent: np.uint64) -> Words:
+def dilate(words: Words, neighbours: NDArray[np.int64], *, absent: np.uint64) -> Words:
     """Return a plane with a bit set where one is set among the 27 voxels around, its own included.
 
     One axis follows another: from a block to one that shares only an edge with it, a bit spreads through the
@@ -59,7 +59,7 @@ def dilated(words: Words, neighbours: NDArray[np.int64], *, absent: np.uint64) -
         neighbours: Its blocks' neighbours, from ``neighbours_of``.
         absent: Every word of blocks that are absent.
     """
-    grown: Words = _dilated(words, neighbours, _LAYERS, absent)
+    grown: Words = _dilate(words, neighbours, _LAYERS, absent)
     return grown
 
 
@@ -77,7 +77,7 @@ def _neighbours(codes, index):
 
 
 @njit(cache=True, nogil=True)
-def _dilated(words, neighbours, layers, absent):
+def _dilate(words, neighbours, layers, absent):
     before = words
     for axis in range(3):
         after = np.empty_like(words)

@@ -1,4 +1,4 @@
-"""A sparse grid of voxels: a hash table from Morton codes to 8³ blocks of log-odds.
+"""A sparse grid of log-odds: a hash table from Morton codes to 8³ blocks, and OctoMap's sensor model.
 
 Its layout is not that of ``mapper.core.voxel_index``: a code and its slot lie side by side, so that a query
 of a random point costs one cache miss. With the shared index insertion is as fast, but queries of a room's
@@ -11,10 +11,12 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
+from numpy import float32
 from numpy.typing import NDArray
 
 from mapper.core.errors import MapSizeError
 from mapper.core.voxel_index import FIBONACCI
+from mapper.octree.config import OctreeConfig
 from mapper.octree.keys import BLOCK_VOXELS
 from mapper.runtime.file_array import FileArray
 
@@ -23,6 +25,30 @@ _FIRST_BLOCKS = 64
 _GROWTH = 1.25
 """A pool that doubles would hold half its memory in reserve."""
 _VACANT = -1
+
+
+class SensorModel(NamedTuple):
+    """Float32 log-odds: increments of a hit and a miss, clamping limits (Hornung et al. 2013, eq. 2 to 4)."""
+
+    hit: np.float32
+    miss: np.float32
+    lowest: np.float32
+    highest: np.float32
+
+
+def sensor_model(config: OctreeConfig) -> SensorModel:
+    """Return the sensor model of a map's settings."""
+    return SensorModel(
+        hit=log_odds(config.hit_probability),
+        miss=log_odds(config.miss_probability),
+        lowest=log_odds(config.clamp_min_probability),
+        highest=log_odds(config.clamp_max_probability),
+    )
+
+
+def log_odds(probability: float) -> np.float32:
+    """Return ln(p / (1 − p)) rounded to float32, as OctoMap stores it."""
+    return np.float32(np.log(probability / (1.0 - probability)))
 
 
 class BlockTable(NamedTuple):
@@ -36,6 +62,20 @@ class BlockTable(NamedTuple):
 
     entries: NDArray[np.int64]
     values: NDArray[np.float32]
+
+
+class Overlap(NamedTuple):
+    """Agreement of two maps about their common voxels.
+
+    Attributes:
+        shared: Number of voxels that are known in both maps.
+        both_occupied: Number of voxels that are occupied in both.
+        either_occupied: Number of voxels that are occupied in at least one.
+    """
+
+    shared: int
+    both_occupied: int
+    either_occupied: int
 
 
 class BlockStore:
@@ -204,3 +244,42 @@ def _move_known(values, codes_by_slot, count):
                 known += 1
                 break
     return kept[:known]
+
+
+@njit(cache=True, nogil=True)
+def count_known(values):
+    """Return the number of known voxels in (B, 512) log-odds."""
+    known = 0
+    for b in range(len(values)):
+        for voxel in range(BLOCK_VOXELS):
+            known += values[b, voxel] == values[b, voxel]
+    return known
+
+
+@njit(cache=True, nogil=True)
+def add_blocks(stored, slots, others, other_slots, threshold):
+    """Add another map's log-odds block by block; a voxel that is known in one map keeps that value.
+
+    Args:
+        stored: (capacity, 512) float32 log-odds, updated; NaN is unknown.
+        slots: (B,) rows of the blocks.
+        others: (C, 512) float32 log-odds of the other map.
+        other_slots: (B,) rows of the same blocks there.
+        threshold: Log-odds from which a voxel is occupied.
+
+    Returns:
+        The three counts of an Overlap.
+    """
+    shared, both, either = 0, 0, 0
+    for b in range(len(slots)):
+        own, other = stored[slots[b]], others[other_slots[b]]
+        for i in range(BLOCK_VOXELS):
+            here, there = own[i], other[i]
+            if here == here and there == there:
+                shared += 1
+                both += (here >= threshold) & (there >= threshold)
+                either += (here >= threshold) | (there >= threshold)
+                own[i] = float32(here + there)
+            elif there == there:
+                own[i] = there
+    return shared, both, either

@@ -1,21 +1,25 @@
 """Ray casting of a scan at its pose: the free and occupied voxels, before a map is updated with them."""
 
+import mmap
+from contextlib import suppress
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import ValidationError
 
-from mapper.core.errors import DataError
+from mapper.core.errors import DataError, MapSizeError
 from mapper.core.frames import Points32, Scan
 from mapper.core.geometry import Array, Transform, apply
-from mapper.octree import kernels
+from mapper.octree import casting_kernels as kernels
+from mapper.octree.casting_kernels import Window
 from mapper.octree.config import OctreeConfig
-from mapper.octree.keys import KEY_COUNT, KEY_ZERO
-from mapper.octree.window import Window, WindowBuffer, block_codes, take_touched
+from mapper.octree.keys import BLOCK_BITS, BLOCK_VOXELS, KEY_BITS, KEY_COUNT, KEY_ZERO
 from mapper.sensing.depth_limit import DepthLimit
 
 _NO_POINTS: Points32 = np.empty((0, 3), np.float32)
+_LIMIT_BYTES = 1 << 33
+"""Limit of a window. Address space, not memory: only pages that a ray crosses are ever backed by memory."""
 
 
 class Cast(NamedTuple):
@@ -32,6 +36,86 @@ class Cast(NamedTuple):
     codes: NDArray[np.int64]
 
 
+class WindowBuffer:
+    """Memory of the window, which is kept from scan to scan and only grows."""
+
+    def __init__(self) -> None:
+        self._cells = np.zeros(0, dtype=np.uint8)
+        self._touched = np.zeros(0, dtype=np.uint8)
+
+    def window(
+        self, lowest: NDArray[np.int64], highest: NDArray[np.int64], *, origin: NDArray[np.int64]
+    ) -> Window:
+        """Return a window in which no two voxels between two corners share a cell.
+
+        Args:
+            lowest: (3,) smallest keys that rays can reach.
+            highest: (3,) largest keys that rays can reach.
+            origin: (3,) key of the rays' origin.
+
+        Raises:
+            MapSizeError: The scan is too large for its resolution; nothing has been allocated then.
+        """
+        blocks = (highest >> BLOCK_BITS) - (lowest >> BLOCK_BITS) + 1
+        lengths = tuple(BLOCK_BITS + (int(n) - 1).bit_length() for n in blocks)
+        size = 1 << sum(lengths)
+        extent = "×".join(str(n) for n in highest - lowest + 1)
+        if size > _LIMIT_BYTES:
+            raise MapSizeError(
+                f"a scan of {extent} voxels needs {size / 2**30:.0f} GiB of working space, "
+                f"the limit is {_LIMIT_BYTES >> 30}; raise resolution_m or lower max_range_m"
+            )
+        if size > len(self._cells):
+            try:
+                self._cells = sparse_zeros(size)
+            except OSError:
+                raise MapSizeError(
+                    f"a scan of {extent} voxels needs {size / 2**30:.0f} GiB of address space, which the "
+                    "system refuses; raise resolution_m or lower max_range_m"
+                ) from None
+            self._touched = np.zeros(size // BLOCK_VOXELS, dtype=np.uint8)
+        bits, cell_bits, offsets = _layout(lengths)
+        base = origin >> BLOCK_BITS << BLOCK_BITS
+        wrap = np.array([(1 << n) - 1 for n in lengths], dtype=np.int64)
+        return Window(
+            self._cells[:size], self._touched[: size // BLOCK_VOXELS], base, wrap, bits, cell_bits, offsets
+        )
+
+
+def sparse_zeros(size: int) -> NDArray[np.uint8]:
+    """Return (size,) zeros that take memory only where they are written.
+
+    ``np.zeros`` allocates huge pages: a ray that enters one would pay for clearing and keeping 2 MiB.
+    """
+    advice = getattr(mmap, "MADV_NOHUGEPAGE", None)
+    if advice is None:  # no Linux
+        return np.zeros(size, dtype=np.uint8)
+    memory = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+    with suppress(OSError):  # a kernel without huge pages refuses advice about them
+        memory.madvise(advice)
+    return np.frombuffer(memory, dtype=np.uint8)
+
+
+@lru_cache(maxsize=64)
+def _layout(lengths: tuple[int, ...]) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """Return (bits, cell_bits, offsets) of a window with 2^n cells per axis, interleaved from the bottom."""
+    bits = np.zeros(3, dtype=np.int64)
+    cell_bits = np.zeros((3, 1 << max(lengths)), dtype=np.int64)
+    offsets = np.zeros((4, 256), dtype=np.int64)
+    position = 0
+    for level in range(max(lengths)):
+        for axis in range(3):
+            if level < lengths[axis]:
+                n = np.arange(1 << lengths[axis])
+                cell_bits[axis, : len(n)] |= (n >> level & 1) << position
+                bits[axis] |= 1 << position
+                if level >= BLOCK_BITS:
+                    byte, bit = divmod(position - 3 * BLOCK_BITS, 8)
+                    offsets[byte] += (np.arange(256) >> bit & 1) << (level - BLOCK_BITS + KEY_BITS * axis)
+                position += 1
+    return bits, cell_bits, offsets
+
+
 class Caster:
     """Ray caster: rasterises scans, one at a time, in working memory that it keeps from scan to scan."""
 
@@ -39,11 +123,6 @@ class Caster:
         self.config = config
         self._depth_limit = depth_limit_of(config)
         self._buffer = WindowBuffer()
-
-    @property
-    def memory_bytes(self) -> int:
-        """Bytes of address space held."""
-        return self._buffer.memory_bytes
 
     def reset(self) -> None:
         """Drop the working memory, together with a cast in it that is not going to be read."""
@@ -65,18 +144,6 @@ class Caster:
         counting, free_body = self._depth_limit.split(scan)
         ends_world = self._ends(np.ascontiguousarray(counting.points_body), T)
         return self._rays(ends_world, origin_world, free_world=self._ends(free_body, T))
-
-    def cast_points(self, points_world: Points32, origin_world: Array) -> Cast:
-        """Rasterise rays from a (3,) origin to (N, 3) world points, metres.
-
-        Raises:
-            DataError: The points are not (N, 3), or one of them or the origin has no key.
-            MapSizeError: The scan is too large for its resolution.
-        """
-        if points_world.ndim != 2 or points_world.shape[1] != 3:
-            raise DataError(f"octree: points {points_world.shape}, want (N, 3)")
-        points_world = np.ascontiguousarray(points_world, dtype=np.float32)
-        return self._rays(self._ends(points_world, np.eye(4)), origin_world)
 
     def _ends(self, points_body: Points32, T_world_body: Transform) -> Points32:
         """Return the world points where rays end: one per end voxel, its centre, or one per point."""
@@ -103,8 +170,9 @@ class Caster:
         hits[obstacles:] = False
         window = self._buffer.window(lowest, highest, origin=base)
         kernels.cast_rays(stops, hits, origin, resolution_m, window)
-        positions = take_touched(window)
-        return Cast(window, positions, block_codes(window, positions, lowest))
+        positions: NDArray[np.int64] = np.flatnonzero(window.touched.view(np.bool_))
+        window.touched[positions] = 0
+        return Cast(window, positions, kernels.block_codes(window, positions, lowest))
 
     def _refuse(self, outside: int, total: int) -> None:
         if outside:
@@ -121,20 +189,6 @@ def depth_limit_of(config: OctreeConfig) -> DepthLimit | None:
     if config.depth_noise is None or config.max_range_m is not None:
         return None
     return DepthLimit(config.depth_noise, max_sigma_m=config.resolution_m)
-
-
-def octree_config(config: OctreeConfig | float) -> OctreeConfig:
-    """Return a configuration, or that of OctoMap's sensor model with voxels of an edge, metres.
-
-    Raises:
-        DataError: The edge is no positive number.
-    """
-    if isinstance(config, OctreeConfig):
-        return config
-    try:
-        return OctreeConfig(resolution_m=config)
-    except ValidationError:
-        raise DataError(f"octree: voxels of {config!r} m; want metres > 0, or an OctreeConfig") from None
 
 
 def origin_key(origin: NDArray[np.float32], resolution_m: float) -> NDArray[np.int64]:

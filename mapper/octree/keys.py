@@ -18,6 +18,7 @@ KEY_MASK = KEY_COUNT - 1
 
 BLOCK_BITS = 3
 """A block is 8³ voxels: the lowest three levels of the tree."""
+BLOCK_EDGE = 1 << BLOCK_BITS
 BLOCK_VOXELS = 1 << (3 * BLOCK_BITS)
 BLOCK_DEPTH = KEY_BITS - BLOCK_BITS
 """Depth of the tree node that a block is."""
@@ -61,9 +62,14 @@ def gather(code):
     return (key | (key >> 16)) & 0xFFFF
 
 
+def keys_of(codes: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the (N, 3) keys of (N,) Morton codes."""
+    return np.column_stack([gather.py_func(codes >> axis) for axis in range(3)])
+
+
 def block_keys(codes: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return the (B, 3) key of the lowest voxel of each block, given the blocks' (B,) Morton codes."""
-    return np.column_stack([gather.py_func(codes >> axis) << BLOCK_BITS for axis in range(3)])
+    return keys_of(codes) << BLOCK_BITS
 
 
 @njit(cache=True, nogil=True)
@@ -72,9 +78,9 @@ def morton(x, y, z):
     return spread(x) | (spread(y) << 1) | (spread(z) << 2)
 
 
-def codes_of_blocks(blocks: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the (B,) Morton codes of blocks from their (B, 3) numbers, keys >> 3."""
-    x, y, z = (spread.py_func(blocks[:, axis]) for axis in range(3))
+def codes_of_keys(keys: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the (N,) Morton codes of (N, 3) keys: the inverse of :func:`keys_of`."""
+    x, y, z = (spread.py_func(keys[:, axis]) for axis in range(3))
     codes: NDArray[np.int64] = x | (y << 1) | (z << 2)
     return codes
 

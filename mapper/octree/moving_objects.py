@@ -41,21 +41,26 @@ from numpy.typing import NDArray
 
 from mapper.core.frames import Points32
 from mapper.core.geometry import Points
-from mapper.core.voxel_index import row_of, voxel_index
 from mapper.octree.bit_planes import (
     ALL_SET,
     NONE_SET,
     WORD_BITS,
     WORDS,
     Words,
-    dilated,
+    dilate,
     neighbours_of,
     words_of,
 )
 from mapper.octree.blocks import BlockStore, find_slots
-from mapper.octree.keys import BLOCK_BITS, KEY_COUNT, codes_of, codes_of_blocks, gather
+from mapper.octree.keys import (
+    BLOCK_BITS,
+    KEY_COUNT,
+    codes_of,
+    codes_of_keys,
+    keys_of,
+)
 from mapper.octree.map import OctreeMap
-from mapper.octree.scan_update import ScanUpdate
+from mapper.octree.scan_updates import ScanUpdate
 
 _LEAST_SEEN_THROUGH, _SEEN_THROUGH_RATIO = 2, 0.5
 _LEAST_PASSES, _PASSES_RATIO = 8, 2.0
@@ -97,7 +102,7 @@ class MovingObjects:
         if not moving.any():
             return moving
         below = _codes_below(codes[moving])
-        candidates = np.flatnonzero(_are_among(codes, voxel_index(len(below), below)) & ~moving)
+        candidates = np.flatnonzero(np.isin(codes, below) & ~moving)
         lowered = points_world[candidates].astype(np.float64) - [0.0, 0.0, self.resolution_m]
         is_ground = self._lie_in(self.surfaces, codes[candidates])
         is_ground |= self._lie_in(self.surfaces, self._codes_of(lowered))
@@ -134,18 +139,18 @@ def remove_moving_objects(octree: OctreeMap, scans: Callable[[], Iterable[ScanUp
     for scan in scans():
         _mark(words_of(scan.occupied), _slots_of(blocks, scan), ever)
     starts, count = _number(ever)
-    hits, voids, passes, seen_through = _counted(blocks, scans(), ever, starts, count)
+    hits, voids, passes, seen_through = _count_scans(blocks, scans(), ever, starts, count)
     often = (seen_through >= _LEAST_SEEN_THROUGH) & (seen_through > _SEEN_THROUGH_RATIO * hits)
     often |= (passes >= _LEAST_PASSES) & (passes > _PASSES_RATIO * hits)
     inside = _inside(octree)
     surfaces = ever & ~inside
-    near_surfaces = dilated(surfaces, neighbours_of(blocks.codes), absent=NONE_SET)
-    moved = often & _gathered(inside & ~near_surfaces, ever, count)
+    near_surfaces = dilate(surfaces, neighbours_of(blocks.codes), absent=NONE_SET)
+    moved = often & _gather_at(inside & ~near_surfaces, ever, count)
     passed = (passes >= _LEAST_PASSES_NEARBY) & (passes > _PASSES_RATIO * hits)
     adjacent, nearby = np.zeros((2, count), np.int32)
     counted = np.zeros_like(ever)
     for done in range(max(_ATTACHED_ROUNDS, ceil(_ATTACHED_M / octree.resolution_m))):
-        removed = _scattered(moved, ever)
+        removed = _scatter(moved, ever)
         for scan in scans():
             hit, slots = words_of(scan.occupied), _slots_of(blocks, scan)
             near, before = hit & removed[slots], hit & counted[slots]
@@ -153,7 +158,7 @@ def remove_moving_objects(octree: OctreeMap, scans: Callable[[], Iterable[ScanUp
                 continue
             neighbours = neighbours_of(scan.codes)
             for counts in (adjacent, nearby):
-                near, before = (dilated(plane, neighbours, absent=NONE_SET) for plane in (near, before))
+                near, before = (dilate(plane, neighbours, absent=NONE_SET) for plane in (near, before))
                 _count_one(hit & near & ~before, slots, ever, starts, counts)
         counted = removed
         least = hits * (_ATTACHED_RATIO if done < _ATTACHED_ROUNDS else 1.0)
@@ -161,23 +166,21 @@ def remove_moving_objects(octree: OctreeMap, scans: Callable[[], Iterable[ScanUp
         if not (attached & ~moved).any():
             break
         moved |= attached
-    octree.lower_known(
-        _decide(
-            blocks.table.values, ever, moved, hits, voids, passes, octree.sensor, octree.occupied_log_odds
-        )
+    _write_log_odds(
+        blocks.table.values, ever, moved, hits, voids, passes, octree.sensor, octree.occupied_log_odds
     )
-    return MovingObjects(blocks, _scattered(moved, ever), surfaces, octree.resolution_m)
+    return MovingObjects(blocks, _scatter(moved, ever), surfaces, octree.resolution_m)
 
 
 def _evidence(scan: ScanUpdate) -> tuple[Words, Words, Words]:
     """Return where a scan hit, where it is void, and where it passes."""
     free, hit = words_of(scan.free), words_of(scan.occupied)
     neighbours = neighbours_of(scan.codes)
-    void = free & ~dilated(~(free | hit), neighbours, absent=ALL_SET)
-    return hit, void, free & ~dilated(hit, neighbours, absent=NONE_SET)
+    void = free & ~dilate(~(free | hit), neighbours, absent=ALL_SET)
+    return hit, void, free & ~dilate(hit, neighbours, absent=NONE_SET)
 
 
-def _counted(
+def _count_scans(
     blocks: BlockStore,
     scans: Iterable[ScanUpdate],
     ever: Words,
@@ -201,14 +204,13 @@ def _slots_of(blocks: BlockStore, scan: ScanUpdate) -> NDArray[np.int64]:
 def _inside(octree: OctreeMap) -> Words:
     """Return the voxels with nothing unknown among the voxels around."""
     known: Words = _known(octree.blocks.table.values, len(octree.blocks))
-    return known & ~dilated(~known, neighbours_of(octree.blocks.codes), absent=ALL_SET)
+    return known & ~dilate(~known, neighbours_of(octree.blocks.codes), absent=ALL_SET)
 
 
 def _codes_below(codes: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return the codes of the voxels up to two below some, and up to one aside of these."""
-    keys = np.column_stack([gather.py_func(np.unique(codes) >> axis) for axis in range(3)])
-    around = (keys[:, np.newaxis] + _BELOW).reshape(-1, 3)
-    return np.unique(codes_of_blocks(around[((around >= 0) & (around < KEY_COUNT)).all(axis=1)]))
+    around = (keys_of(np.unique(codes))[:, np.newaxis] + _BELOW).reshape(-1, 3)
+    return np.unique(codes_of_keys(around[((around >= 0) & (around < KEY_COUNT)).all(axis=1)]))
 
 
 @njit(cache=True, nogil=True)
@@ -285,7 +287,7 @@ def _count_one(words, slots, ever, starts, counts):
 
 
 @njit(cache=True, nogil=True)
-def _gathered(plane, ever, count):
+def _gather_at(plane, ever, count):
     """Return (count,) bool: a plane at the voxels that were ever hit."""
     flags, row = np.empty(count, np.bool_), 0
     for i in range(len(ever)):
@@ -298,8 +300,8 @@ def _gathered(plane, ever, count):
 
 
 @njit(cache=True, nogil=True)
-def _scattered(flags, ever):
-    """Return the plane of flagged voxels: the inverse of ``_gathered``."""
+def _scatter(flags, ever):
+    """Return the plane of flagged voxels: the inverse of ``_gather_at``."""
     plane, row = np.zeros_like(ever), 0
     for i in range(len(ever)):
         for k in range(WORDS):
@@ -311,9 +313,9 @@ def _scattered(flags, ever):
 
 
 @njit(cache=True, nogil=True)
-def _decide(values, ever, moved, hits, voids, passes, sensor, occupied_log_odds):
-    """Write the log-odds of all voxels that were ever hit; return how many became unknown."""
-    row, forgotten = 0, 0
+def _write_log_odds(values, ever, moved, hits, voids, passes, sensor, occupied_log_odds):
+    """Write the log-odds of all voxels that were ever hit."""
+    row = 0
     for i in range(len(ever)):
         for k in range(WORDS):
             for bit in range(WORD_BITS):
@@ -324,22 +326,11 @@ def _decide(values, ever, moved, hits, voids, passes, sensor, occupied_log_odds)
                     values[i, voxel] = sensor.lowest
                 elif moved[row]:
                     values[i, voxel] = np.nan
-                    forgotten += 1
                 elif values[i, voxel] < occupied_log_odds:
                     weighed = float32(hits[row]) * sensor.hit + float32(voids[row]) * sensor.miss
                     if weighed >= occupied_log_odds:
                         values[i, voxel] = min(weighed, sensor.highest)
                 row += 1
-    return forgotten
-
-
-@njit(cache=True, nogil=True)
-def _are_among(codes, index):
-    """Return (N,) bool: whether codes are in an index."""
-    flags = np.empty(len(codes), np.bool_)
-    for i in range(len(codes)):
-        flags[i] = row_of(index, codes[i]) >= 0
-    return flags
 
 
 @njit(cache=True, nogil=True)

@@ -3,22 +3,33 @@
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from numba import njit
+from numpy import float32, int64, uint8
 from numpy.typing import NDArray
 
 from mapper.core.errors import MapFileError
-from mapper.octree import tree_reader
 from mapper.octree.attributes import UNSET
-from mapper.octree.color_tree import COLOR_NODE, colored
-from mapper.octree.keys import KEY_BITS
-from mapper.octree.sensor_model import SensorModel
-from mapper.octree.tree import NODE, children_in, nodes_in_preorder, preorder_of, words_in_preorder
+from mapper.octree.blocks import BLOCK_BYTES, BlockStore, SensorModel, check_memory
+from mapper.octree.color_tree import COLOR_NODE, color_nodes
+from mapper.octree.keys import BLOCK_BITS, BLOCK_DEPTH, BLOCK_VOXELS, KEY_BITS
+from mapper.octree.octomap_tree import (
+    NODE,
+    children_in,
+    enter_next_child,
+    nodes_in_preorder,
+    preorder_of,
+    words_in_preorder,
+)
 from mapper.runtime import atomic
 
 if TYPE_CHECKING:
     from mapper.octree.map import OctreeMap
+
+WHOLE, CUT_SHORT, TRAILING, TOO_DEEP, CHILDLESS = range(5)
+"""Verdicts on the records of a file: a whole tree, or the fault that was found."""
 
 _FULL = b"# Octomap OcTree file"
 _BINARY = b"# Octomap OcTree binary file"
@@ -27,10 +38,10 @@ LEAF_ROOT = np.zeros(1, "<u2")
 _TREE_NAMES = {"OcTree": "OcTree", "1": "OcTree", "ColorOcTree": "ColorOcTree"}
 
 _FAULTS = {
-    tree_reader.CUT_SHORT: "ends before its tree does; it is truncated",
-    tree_reader.TRAILING: "goes on after its tree has ended; it is damaged",
-    tree_reader.TOO_DEEP: f"has nodes deeper than {KEY_BITS} levels; it is damaged",
-    tree_reader.CHILDLESS: "has an inner node without children; it is damaged",
+    CUT_SHORT: "ends before its tree does; it is truncated",
+    TRAILING: "goes on after its tree has ended; it is damaged",
+    TOO_DEEP: f"has nodes deeper than {KEY_BITS} levels; it is damaged",
+    CHILDLESS: "has an inner node without children; it is damaged",
 }
 
 
@@ -46,10 +57,10 @@ def write_ot(path: Path, octree: "OctreeMap") -> None:
     """Write all log-odds as an OcTree, pruned, or as a ColorOcTree if the map has colours; atomic."""
     pieces: Iterable[NDArray[np.void]] = ()
     count, tree_name = 0, "OcTree"
-    if len(octree) and octree.attributes is not None and octree.attributes.has_colors:
-        nodes = colored(nodes_in_preorder(octree.blocks), octree.blocks, octree.attributes)
+    if len(octree.blocks) and octree.attributes is not None and octree.attributes.has_colors:
+        nodes = color_nodes(nodes_in_preorder(octree.blocks), octree.blocks, octree.attributes)
         pieces, count, tree_name = [nodes], len(nodes), "ColorOcTree"
-    elif len(octree):
+    elif len(octree.blocks):
         tree = preorder_of(octree.blocks)
         pieces, count = tree.pieces(), tree.count
     write_tree(
@@ -76,7 +87,7 @@ def bt_bytes(octree: "OctreeMap") -> int:
 
 def _bt_words(octree: "OctreeMap") -> tuple[NDArray[np.uint16], int]:
     """Return the words of a ``.bt`` file and the number of nodes that they describe."""
-    if not len(octree):
+    if not len(octree.blocks):
         return np.empty(0, "<u2"), 0
     words, _ = words_in_preorder(octree.blocks, octree.occupied_log_odds)
     words = words if len(words) else LEAF_ROOT
@@ -115,6 +126,20 @@ def _header_bytes(first_line: bytes, node_count: int, resolution_m: float, tree_
     ).encode("ascii")
 
 
+class TreeLeaves(NamedTuple):
+    """Leaves of a pruned tree in Morton order.
+
+    Attributes:
+        codes: (L,) int64 Morton code of each leaf's first voxel.
+        depths: (L,) uint8, 16 for a single voxel.
+        values: (L,) float32 log-odds.
+    """
+
+    codes: NDArray[np.int64]
+    depths: NDArray[np.uint8]
+    values: NDArray[np.float32]
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class OctomapTree:
     """Content of an OctoMap file.
@@ -126,7 +151,7 @@ class OctomapTree:
     """
 
     resolution_m: float
-    leaves: tree_reader.TreeLeaves | None = None
+    leaves: TreeLeaves | None = None
     colors: NDArray[np.uint8] | None = None
 
 
@@ -191,16 +216,14 @@ def _parse_header(path: Path, data: bytes) -> tuple[_Header, int]:
     return _Header(binary, _TREE_NAMES[fields["id"]], node_count, resolution_m), start
 
 
-def _binary_leaves(
-    path: Path, header: _Header, payload: memoryview, sensor: SensorModel
-) -> tree_reader.TreeLeaves:
+def _binary_leaves(path: Path, header: _Header, payload: memoryview, sensor: SensorModel) -> TreeLeaves:
     # A word describes at most eight nodes, which bounds the memory that a damaged count can claim.
     if len(payload) % 2 or header.node_count > 1 + 4 * len(payload):
         raise MapFileError(
             f"{path}: {len(payload)} bytes cannot hold {header.node_count} nodes; it is truncated"
         )
-    leaves: tree_reader.TreeLeaves
-    leaves, nodes, fault = tree_reader.leaves_of_words(
+    leaves: TreeLeaves
+    leaves, nodes, fault = leaves_of_words(
         np.frombuffer(payload, dtype="<u2"),
         header.node_count,
         sensor.lowest,
@@ -214,9 +237,7 @@ def _binary_leaves(
     return leaves
 
 
-def _full_leaves(
-    path: Path, header: _Header, payload: memoryview
-) -> tuple[tree_reader.TreeLeaves, NDArray[np.uint8]]:
+def _full_leaves(path: Path, header: _Header, payload: memoryview) -> tuple[TreeLeaves, NDArray[np.uint8]]:
     """Return the leaves and their (L, 3) uint8 colours, white where there are none."""
     record = COLOR_NODE if header.tree_name == "ColorOcTree" else NODE
     if len(payload) != header.node_count * record.itemsize:
@@ -226,8 +247,8 @@ def _full_leaves(
         )
     nodes = np.frombuffer(payload, dtype=record)
     values: NDArray[np.float32] = np.ascontiguousarray(nodes["value"], dtype=np.float32)
-    leaves: tree_reader.TreeLeaves
-    leaves, fault = tree_reader.leaves_of_nodes(values, np.ascontiguousarray(nodes["mask"]))
+    leaves: TreeLeaves
+    leaves, fault = leaves_of_nodes(values, np.ascontiguousarray(nodes["mask"]))
     if fault:
         raise MapFileError(f"{path}: {_FAULTS[fault]}")
     if not np.isfinite(leaves.values).all():
@@ -235,3 +256,137 @@ def _full_leaves(
     if record is NODE:
         return leaves, np.full((len(leaves.codes), 3), UNSET, np.uint8)
     return leaves, nodes["rgb"][nodes["mask"] == 0]
+
+
+def fill(store: BlockStore, leaves: TreeLeaves) -> None:
+    """Write leaves into an empty store at the finest level.
+
+    Raises:
+        MapSizeError: Expanded, the map would not fit into this machine's memory.
+    """
+    edge_levels = np.maximum(BLOCK_DEPTH - leaves.depths.astype(np.int64), 0)
+    large = int((np.int64(1) << (3 * edge_levels[edge_levels > 0])).sum())
+    small_codes = leaves.codes[edge_levels == 0] >> (3 * BLOCK_BITS)
+    small = int(np.count_nonzero(np.diff(small_codes))) + (len(small_codes) > 0)
+    check_memory((large + small) * BLOCK_BYTES, "the map with its pruned leaves expanded")
+    slots = store.claim(_block_codes(leaves, large + small))
+    _fill_blocks(leaves, slots, store.table.values)
+
+
+@njit(cache=True, nogil=True)
+def leaves_of_nodes(values, masks):
+    """Return the leaves of an ``.ot`` file's (M,) records in preorder, and the verdict on them."""
+    n = len(masks)
+    codes, depths, found = np.empty(n, int64), np.empty(n, uint8), np.empty(n, float32)
+    pending = np.zeros(KEY_BITS + 1, int64)  # per depth on the path: children still to come
+    prefix = np.zeros(KEY_BITS + 2, int64)
+    depth, count, verdict = 0, 0, WHOLE
+    for i in range(n):
+        if depth < 0:
+            verdict = TRAILING
+            break
+        if masks[i] == 0:
+            codes[count] = prefix[depth] << (3 * (KEY_BITS - depth))
+            depths[count], found[count] = depth, values[i]
+            count += 1
+            depth -= 1
+        elif depth == KEY_BITS:
+            verdict = TOO_DEEP
+            break
+        else:
+            pending[depth] = masks[i]
+        while depth >= 0 and pending[depth] == 0:
+            depth -= 1
+        if depth >= 0:
+            depth = enter_next_child(pending, prefix, depth)
+    if depth >= 0 and verdict == WHOLE:
+        verdict = CUT_SHORT
+    return TreeLeaves(codes[:count], depths[:count], found[:count]), verdict
+
+
+@njit(cache=True, nogil=True)
+def leaves_of_words(words, node_count, free, occupied):
+    """Return the leaves of a ``.bt`` file's words, the number of nodes they describe, and the verdict.
+
+    Args:
+        words: (W,) uint16 in preorder.
+        node_count: Number of nodes by the header; bounds the leaves.
+        free: Log-odds of free leaves.
+        occupied: Log-odds of occupied leaves.
+    """
+    codes, depths = np.empty(node_count, int64), np.empty(node_count, uint8)
+    values = np.empty(node_count, float32)
+    pending = np.zeros(KEY_BITS + 1, int64)  # per depth on the path: the word, finished children zeroed
+    prefix = np.zeros(KEY_BITS + 2, int64)
+    count, nodes, at, verdict = 0, 1, 1, WHOLE
+    pending[0] = words[0]
+    depth = 0
+    while depth >= 0:
+        if pending[depth] == 0:
+            depth -= 1
+            continue
+        child = 0
+        while not (pending[depth] >> (2 * child)) & 3:
+            child += 1
+        state = (pending[depth] >> (2 * child)) & 3
+        pending[depth] &= ~(3 << (2 * child))
+        prefix[depth + 1] = (prefix[depth] << 3) | child
+        nodes += 1
+        if nodes > node_count:
+            break
+        if state == 3:
+            depth += 1
+            if depth == KEY_BITS:
+                verdict = TOO_DEEP
+            elif at == len(words):
+                verdict = CUT_SHORT
+            elif words[at] == 0:
+                verdict = CHILDLESS
+            if verdict != WHOLE:
+                break
+            pending[depth] = words[at]
+            at += 1
+        else:
+            codes[count] = prefix[depth + 1] << (3 * (KEY_BITS - depth - 1))
+            depths[count], values[count] = depth + 1, free if state == 1 else occupied
+            count += 1
+    if depth < 0 and at < len(words):
+        verdict = TRAILING
+    return TreeLeaves(codes[:count], depths[:count], values[:count]), nodes, verdict
+
+
+@njit(cache=True, nogil=True)
+def _block_codes(leaves, count):
+    """Return the (count,) distinct block codes of leaves; Morton order keeps equal ones together."""
+    codes = np.empty(count, int64)
+    at = 0
+    for i in range(len(leaves.codes)):
+        code = leaves.codes[i] >> (3 * BLOCK_BITS)
+        spanned = 1 << (3 * max(BLOCK_DEPTH - int64(leaves.depths[i]), 0))
+        if at and codes[at - 1] == code:
+            continue
+        for block in range(spanned):
+            codes[at] = code + block
+            at += 1
+    return codes
+
+
+@njit(cache=True, nogil=True)
+def _fill_blocks(leaves, slots, stored):
+    """Write leaves into the blocks that :func:`_block_codes` listed."""
+    at, previous = -1, int64(-1)
+    for i in range(len(leaves.codes)):
+        code = leaves.codes[i] >> (3 * BLOCK_BITS)
+        if code != previous:
+            at += 1
+            previous = code
+        depth = int64(leaves.depths[i])
+        if depth < BLOCK_DEPTH:
+            spanned = 1 << (3 * (BLOCK_DEPTH - depth))
+            for block in range(spanned):
+                stored[slots[at + block]] = leaves.values[i]
+            at += spanned - 1
+            previous = code + spanned - 1
+        else:
+            first = leaves.codes[i] & (BLOCK_VOXELS - 1)
+            stored[slots[at], first : first + (1 << (3 * (KEY_BITS - depth)))] = leaves.values[i]

@@ -1,145 +1,301 @@
-"""Compiled look-ups in the map: log-odds of points, and rays that stop at obstacles."""
+"""Queries of an occupancy map: points, voxels, rays, nearest obstacles, and nodes of coarser levels."""
 
-from math import sqrt
+from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
-from numpy import float32, float64, int64
+from numpy.typing import ArrayLike, NDArray
 
-from mapper.octree.blocks import slot_of
-from mapper.octree.keys import (
-    BLOCK_BITS,
-    BLOCK_VOXELS,
-    KEY_COUNT,
-    KEY_ZERO,
-    centre_of,
-    gather,
-    have_keys,
-    morton,
-)
+from mapper.core.errors import DataError
+from mapper.core.expect import expect_shape
+from mapper.core.frames import Points32
+from mapper.core.geometry import Array, Points, point_rows
+from mapper.octree import query_kernels as kernels
+from mapper.octree.blocks import BlockStore, count_known, log_odds
+from mapper.octree.casting import origin_key
+from mapper.octree.config import OctreeConfig, Parent
+from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+from mapper.octree.keys import BLOCK_BITS, BLOCK_DEPTH, KEY_BITS, KEY_ZERO, codes_of, keys_of
 
-HIT, STOPPED_UNKNOWN, STOPPED_RANGE = 1, 2, 3
-"""Outcomes of a ray: it ended in an occupied voxel, in an unknown one, or at the range or map's border."""
-
-_CHUNK = 256  # points worked on at a time: their codes stay in the first-level cache
-_NOWHERE = int64(1) << 60  # a Morton code that no voxel has
-_NEVER = float64(np.finfo(np.float64).max)
+_CHUNK = 1 << 12
+"""Blocks whose voxels are listed at once: 70 MB at most."""
 
 
-@njit(cache=True, nogil=True)
-def _value_at(table, code):
-    """Return the log-odds of a voxel by its Morton code; NaN is unknown."""
-    slot = slot_of(table, code >> (3 * BLOCK_BITS))
-    value = table.values[max(slot, 0), code & (BLOCK_VOXELS - 1)]  # read anyway: a branch would cost more
-    return value if slot >= 0 else float32(np.nan)
+@dataclass(frozen=True, slots=True, eq=False)
+class Leaves:
+    """Known voxels, or nodes above them, in Morton order.
 
-
-@njit(cache=True, nogil=True)
-def values_at(table, points_world, resolution_m):
-    """Return the (N,) float32 log-odds of (N, 3) float64 points, metres; NaN is unknown or out of range."""
-    n = len(points_world)
-    inverse_resolution = 1.0 / resolution_m
-    found = np.empty(n, float32)
-    x_m, y_m, z_m = np.empty(_CHUNK), np.empty(_CHUNK), np.empty(_CHUNK)
-    codes = np.empty(_CHUNK, int64)
-    for start in range(0, n, _CHUNK):
-        size = min(_CHUNK, n - start)
-        for j in range(size):
-            point = points_world[start + j]
-            x_m[j], y_m[j], z_m[j] = point[0], point[1], point[2]
-        for j in range(size):  # this loop vectorises: one array per axis, no branch
-            x = np.floor(inverse_resolution * x_m[j]) + KEY_ZERO
-            y = np.floor(inverse_resolution * y_m[j]) + KEY_ZERO
-            z = np.floor(inverse_resolution * z_m[j]) + KEY_ZERO
-            codes[j] = morton(int64(x), int64(y), int64(z)) if have_keys(x, y, z) else _NOWHERE
-        for j in range(size):
-            found[start + j] = _value_at(table, codes[j])
-    return found
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def first_obstacles(table, origins, directions, resolution_m, max_range_m, threshold, through_unknown):
-    """Follow rays voxel by voxel as OctoMap's ``castRay`` does (Amanatides & Woo 1987).
-
-    Args:
-        table: The map.
-        origins: (N, 3) float32 metres, inside the key range.
-        directions: (N, 3) float32, any length but zero.
-        resolution_m: Voxel edge.
-        max_range_m: From the origin to the last voxel's centre.
-        threshold: Log-odds from which a voxel is occupied.
-        through_unknown: Whether rays pass unknown voxels.
-
-    Returns:
-        (N, 3) int64 key of the last voxel and (N,) uint8 outcome of the ray.
+    Attributes:
+        keys: (N, 3) uint16 keys as in OctoMap; above the voxels they count nodes.
+        log_odds: (N,) float32.
+        resolution_m: Edge of a voxel.
+        depth: Depth of the nodes in the tree; 16 is that of the voxels.
     """
-    n = len(origins)
-    last = np.empty((n, 3), int64)
-    outcome = np.empty(n, np.uint8)
-    step, key = np.empty(3, int64), np.empty(3, int64)
-    time, delta = np.empty(3), np.empty(3)
-    for i in range(n):
-        dx, dy, dz = directions[i, 0], directions[i, 1], directions[i, 2]
-        norm = float32(sqrt(float64(dx * dx + dy * dy + dz * dz)))
-        for axis in range(3):
-            key[axis] = int64(np.floor((1.0 / resolution_m) * float64(origins[i, axis]))) + KEY_ZERO
-            direction = float64(directions[i, axis] / norm)
-            step[axis] = int64(np.sign(direction))
-            time[axis] = delta[axis] = _NEVER
-            if step[axis] != 0:
-                border = centre_of(key[axis], resolution_m) + step[axis] * resolution_m * 0.5
-                time[axis] = (border - float64(origins[i, axis])) / direction
-                delta[axis] = resolution_m / abs(direction)
-        while True:
-            value = _value_at(table, morton(key[0], key[1], key[2]))
-            if value >= threshold:
-                outcome[i] = HIT
-                break
-            if value != value and not through_unknown:
-                outcome[i] = STOPPED_UNKNOWN
-                break
-            axis = 0 if time[0] < time[1] else 1
-            axis = axis if time[axis] < time[2] else 2
-            if key[axis] + step[axis] < 0 or key[axis] + step[axis] >= KEY_COUNT:
-                outcome[i] = STOPPED_RANGE
-                break
-            key[axis] += step[axis]
-            time[axis] += delta[axis]
-            square = 0.0
-            for j in range(3):
-                offset = float32(centre_of(key[j], resolution_m)) - origins[i, j]
-                square += float64(offset * offset)
-            if square > max_range_m * max_range_m:
-                outcome[i] = STOPPED_RANGE
-                break
-        for j in range(3):
-            last[i, j] = key[j]
-    return last, outcome
+
+    keys: NDArray[np.uint16]
+    log_odds: NDArray[np.float32]
+    resolution_m: float
+    depth: int = KEY_BITS
+
+    @property
+    def edge_m(self) -> float:
+        """Edge of a node."""
+        return self.resolution_m * (1 << (KEY_BITS - self.depth))
+
+    @property
+    def centres_world(self) -> Points:
+        """(N, 3) float64 centres, metres."""
+        voxels = 1 << (KEY_BITS - self.depth)
+        return (self.keys.astype(np.float64) * voxels - (KEY_ZERO - 0.5 * voxels)) * self.resolution_m
 
 
-@njit(cache=True, nogil=True)
-def known_voxels(codes, slots, values):
-    """Return the (K, 3) uint16 keys and (K,) float32 log-odds of blocks' known voxels, in the given order.
+@dataclass(frozen=True, slots=True, eq=False)
+class RayEnds:
+    """Ends of rays cast through the map.
 
-    Args:
-        codes: (B,) int64 Morton codes of the blocks.
-        slots: (B,) int64 their rows in ``values``.
-        values: (capacity, 512) float32.
+    Attributes:
+        centres_world: (N, 3) float64 centre of the last voxel, metres.
+        distances_m: (N,) float64 from the ray's origin to that centre.
+        hits: (N,) bool, true where that voxel is occupied.
     """
-    count = 0
-    for b in range(len(slots)):
-        for voxel in range(BLOCK_VOXELS):
-            count += values[slots[b], voxel] == values[slots[b], voxel]
-    keys = np.empty((count, 3), np.uint16)
-    log_odds = np.empty(count, float32)
-    k = 0
-    for b in range(len(slots)):
-        for voxel in range(BLOCK_VOXELS):
-            value = values[slots[b], voxel]
-            if value == value:
-                code = (codes[b] << (3 * BLOCK_BITS)) | voxel
-                for axis in range(3):
-                    keys[k, axis] = gather(code >> axis)
-                log_odds[k] = value
-                k += 1
-    return keys, log_odds
+
+    centres_world: Points
+    distances_m: Array
+    hits: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Nearest:
+    """Nearest obstacles of N points.
+
+    Attributes:
+        centres_world: (N, 3) float64 centre of the nearest occupied voxel, metres; NaN if none is in range.
+            Of equally near ones it is the first in Morton order.
+        distances_m: (N,) float64 to that centre; inf where none is in range.
+    """
+
+    centres_world: Points
+    distances_m: Array
+
+
+class MapView:
+    """What can be asked of an occupancy map; an absent voxel is unknown."""
+
+    config: OctreeConfig
+    blocks: BlockStore
+
+    @property
+    def resolution_m(self) -> float:
+        """Edge of a voxel."""
+        return self.config.resolution_m
+
+    @property
+    def occupied_log_odds(self) -> np.float32:
+        """Least log-odds of an occupied voxel."""
+        return log_odds(self.config.occupied_probability)
+
+    def __len__(self) -> int:
+        """Return the number of known voxels, all at the finest level; counted at every call."""
+        return int(count_known(self.blocks.table.values[: len(self.blocks)]))
+
+    def count_occupied(self) -> int:
+        """Return how many of the known voxels are occupied; the others are free."""
+        used = self.blocks.table.values[: len(self.blocks)]
+        return int(np.count_nonzero(used >= self.occupied_log_odds))
+
+    def __repr__(self) -> str:
+        known, occupied = len(self), self.count_occupied()
+        return (
+            f"OctreeMap of {self.resolution_m:g} m voxels: {known} known, "
+            f"{occupied} occupied and {known - occupied} free"
+        )
+
+    def query(self, points_world: ArrayLike) -> NDArray[np.int8]:
+        """Return the states of points: 100 occupied, 0 free, -1 unknown or out of range.
+
+        Args:
+            points_world: (..., 3) metres, world frame.
+
+        Returns:
+            (...) int8 of ``OCCUPIED``, ``FREE`` and ``UNKNOWN`` of :mod:`mapper.octree.grid`.
+
+        Raises:
+            DataError: The points are not (..., 3) numbers.
+        """
+        values = self.log_odds_at(points_world)
+        known = np.where(values >= self.occupied_log_odds, np.int8(OCCUPIED), np.int8(FREE))
+        return np.where(np.isnan(values), np.int8(UNKNOWN), known)
+
+    def probability(self, points_world: ArrayLike) -> NDArray[np.float32]:
+        """Return the (...) probabilities, 0 … 1, that (..., 3) points are occupied; NaN where unknown."""
+        odds: NDArray[np.float32] = np.exp(self.log_odds_at(points_world))
+        return odds / (1.0 + odds)
+
+    def log_odds_at(
+        self, points_world: ArrayLike, *, depth: int = KEY_BITS, parent: Parent = "max"
+    ) -> NDArray[np.float32]:
+        """Return the (...) log-odds of (..., 3) points in metres; NaN where unknown or out of range.
+
+        Args:
+            points_world: Any points.
+            depth: Level of the tree, 0 (root) … 16 (voxels). Others than 16 are computed for the whole map at
+                every call.
+            parent: Log-odds of a node above the voxels: ``max`` or ``mean`` of its known children.
+
+        Raises:
+            DataError: The points are not (..., 3) numbers, or there is no such depth or parent.
+        """
+        shape, rows = point_rows(points_world, "octree")
+        found: NDArray[np.float32]
+        if depth == KEY_BITS:
+            found = kernels.values_at(self.blocks.table, rows, self.resolution_m)
+            return found.reshape(shape)
+        codes, values = self._nodes(depth, parent)
+        values = np.append(values, np.float32(np.nan))
+        wanted = codes_of(rows, self.resolution_m) >> (3 * (KEY_BITS - depth))  # −1 stays −1
+        at = np.searchsorted(codes, wanted)
+        at[np.append(codes, -2)[at] != wanted] = len(codes)
+        found = values[at]
+        return found.reshape(shape)
+
+    def are_occupied(self, points_world: ArrayLike) -> NDArray[np.bool_]:
+        """Return the (...) mask of the (..., 3) points, metres, that lie in occupied voxels."""
+        return self.log_odds_at(points_world) >= self.occupied_log_odds
+
+    def are_near_occupied(
+        self, points_world: Points | Points32, *, max_distance_m: float
+    ) -> NDArray[np.bool_]:
+        """Return the (N,) mask of (N, 3) points, metres, in occupied voxels or near the centre of one."""
+        near = self.are_occupied(points_world)
+        nearest = self.nearest_obstacles(points_world[~near], max_range_m=max_distance_m)
+        near[~near] = np.isfinite(nearest.distances_m)
+        return near
+
+    def occupied(self) -> Points:
+        """Return the (N, 3) float64 centres of all occupied voxels, metres, in Morton order."""
+        return self._centres(occupied=True)
+
+    def free(self) -> Points:
+        """Return the (N, 3) float64 centres of all free voxels, metres, in Morton order."""
+        return self._centres(occupied=False)
+
+    def leaves(self, *, depth: int = KEY_BITS, parent: Parent = "max") -> Leaves:
+        """Return every known voxel in Morton order, which does not depend on the order of the scans.
+
+        Args:
+            depth: 16, or the depth of the nodes to return instead: see :meth:`log_odds_at`.
+            parent: See :meth:`log_odds_at`.
+
+        Raises:
+            DataError: No such depth or parent.
+        """
+        if depth == KEY_BITS:
+            return self._known_in(self.blocks.sorted_slots())
+        codes, values = self._nodes(depth, parent)
+        return Leaves(keys_of(codes).astype(np.uint16), values, self.resolution_m, depth)
+
+    def slice(self, z_min: float, z_max: float | None = None) -> OccupancyGrid:
+        """Return the 2D map of the voxels with centres between two heights; occupied beats free.
+
+        Args:
+            z_min: Lower height, metres, world frame.
+            z_max: Upper height; None: the voxels that ``z_min`` lies in.
+
+        Raises:
+            DataError: No voxel, or none that is known, has its centre there.
+        """
+        from mapper.octree.slice import cut_between
+
+        return cut_between(self, z_min, z_max)
+
+    def cast_rays(
+        self, origins_world: Points, directions_world: Points, *, max_range_m: float, through_unknown: bool
+    ) -> RayEnds:
+        """Return the first occupied voxel along N rays, as OctoMap's ``castRay`` finds it.
+
+        Args:
+            origins_world: (N, 3) metres.
+            directions_world: (N, 3) of any length but zero.
+            max_range_m: Rays end without a hit once a voxel's centre is further away.
+            through_unknown: Pass unknown voxels; otherwise a ray ends, without a hit, in the first.
+
+        Raises:
+            DataError: Shapes differ, a direction is zero or not finite, or an origin has no key.
+        """
+        origins = np.ascontiguousarray(origins_world, dtype=np.float32)
+        directions = np.ascontiguousarray(directions_world, dtype=np.float32)
+        expect_shape(origins, "N,3", "octree: origins of rays")
+        expect_shape(directions, f"{len(origins)},3", "octree: directions of rays")
+        if not np.isfinite(directions).all() or not directions.any(axis=1).all():
+            raise DataError("octree: every ray needs a finite direction other than zero")
+        for corner in (origins.min(axis=0, initial=0.0), origins.max(axis=0, initial=0.0)):
+            origin_key(corner, self.resolution_m)
+        keys, outcomes = kernels.cast_rays(
+            self.blocks.table,
+            origins,
+            directions,
+            self.resolution_m,
+            max_range_m,
+            self.occupied_log_odds,
+            through_unknown,
+        )
+        centres_world = self._centres_of(keys)
+        distances_m = np.linalg.norm(centres_world - origins_world, axis=1)
+        return RayEnds(centres_world, distances_m, outcomes == kernels.HIT)
+
+    def nearest_obstacles(self, points_world: Points | Points32, *, max_range_m: float) -> Nearest:
+        """Return the occupied voxel whose centre is nearest to each point, without a distance field.
+
+        Args:
+            points_world: (N, 3) metres, inside the map or not.
+            max_range_m: Range of the search; inf searches everywhere.
+
+        Raises:
+            DataError: The points are not (N, 3) or not finite, or the range is negative.
+        """
+        points = np.asarray(points_world, dtype=np.float64)
+        expect_shape(points, "N,3", "octree: nearest obstacles of points")
+        if not np.isfinite(points).all() or not max_range_m >= 0.0:
+            raise DataError(
+                f"octree: nearest obstacles within {max_range_m} m, want finite points and a range ≥ 0"
+            )
+        codes, squares = kernels.find_nearest(
+            self.blocks.table,
+            self.blocks.codes,
+            points / self.resolution_m + (KEY_ZERO - 0.5),
+            max_range_m / self.resolution_m,
+            self.occupied_log_odds,
+        )
+        centres_world = self._centres_of(keys_of(codes))
+        centres_world[codes < 0] = np.nan
+        return Nearest(centres_world, np.sqrt(squares) * self.resolution_m)
+
+    def _centres_of(self, keys: NDArray[np.int64]) -> Points:
+        centres_world: Points = (keys.astype(np.float64) - (KEY_ZERO - 0.5)) * self.resolution_m
+        return centres_world
+
+    def _known_in(self, slots: NDArray[np.int64]) -> Leaves:
+        keys, values = kernels.known_voxels(self.blocks.codes[slots], slots, self.blocks.table.values)
+        return Leaves(keys, values, self.resolution_m)
+
+    def _centres(self, *, occupied: bool) -> Points:
+        slots, parts = self.blocks.sorted_slots(), [np.empty((0, 3))]
+        for first in range(0, len(slots), _CHUNK):
+            known = self._known_in(slots[first : first + _CHUNK])
+            kept = (known.log_odds >= self.occupied_log_odds) == occupied
+            parts.append(known.centres_world[kept])
+        return np.concatenate(parts)
+
+    def _nodes(self, depth: int, parent: Parent) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+        """Return (M,) Morton codes and (M,) log-odds of the nodes of one depth in which anything is known."""
+        if not 0 <= depth <= KEY_BITS:
+            raise DataError(f"octree: depth {depth}, want 0 (root) … {KEY_BITS} (voxels)")
+        if parent not in ("max", "mean"):
+            raise DataError(f"octree: parent {parent!r}, want 'max' or 'mean'")
+        slots, mean = self.blocks.sorted_slots(), parent == "mean"
+        levels = min(KEY_BITS - depth, BLOCK_BITS)
+        found: tuple[NDArray[np.int64], NDArray[np.float32]] = kernels.block_nodes(
+            self.blocks.codes[slots], slots, self.blocks.table.values, levels, mean
+        )
+        for _ in range(depth, BLOCK_DEPTH):
+            found = kernels.parents_of(*found, mean)
+        return found

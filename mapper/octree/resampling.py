@@ -24,7 +24,7 @@ from mapper.octree.keys import (
     KEY_ZERO,
     block_keys,
     centre_of,
-    codes_of_blocks,
+    codes_of_keys,
     gather,
     morton,
 )
@@ -56,7 +56,7 @@ def blocks_reached(octree: OctreeMap, T_map_world: Transform) -> NDArray[np.int6
     found = []
     for step in np.ndindex(3, 3, 3):  # a rotated block is at most √3 blocks wide
         blocks = lowest + step
-        found.append(np.unique(codes_of_blocks(blocks[(blocks <= highest).all(axis=1)] + limit)))
+        found.append(np.unique(codes_of_keys(blocks[(blocks <= highest).all(axis=1)] + limit)))
     return np.unique(np.concatenate(found))
 
 

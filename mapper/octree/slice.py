@@ -11,14 +11,13 @@ from numpy.typing import NDArray
 
 from mapper.core.errors import DataError
 from mapper.core.geometry import Array
-from mapper.octree.columns import block_extent
+from mapper.octree.columns import DrivenGround, block_extent, ground_heights, known_floor, nearest_heights
 from mapper.octree.config import SliceConfig
 from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
-from mapper.octree.ground_height import DrivenGround, ground_heights, known_floor, nearest_heights
 from mapper.octree.keys import BLOCK_BITS, BLOCK_VOXELS, KEY_ZERO, block_keys, gather
 
 if TYPE_CHECKING:
-    from mapper.octree.map import OctreeMap
+    from mapper.octree.queries import MapView
 
 _SEEN_FREE, _SEEN_OCCUPIED = 1, 2
 
@@ -39,7 +38,7 @@ class Band:
 
     def flags(
         self,
-        octree: "OctreeMap",
+        octree: "MapView",
         *,
         first: NDArray[np.int64],
         shape: tuple[int, int],
@@ -142,7 +141,7 @@ class Band:
         return lowest, highest
 
 
-def cut_between(octree: "OctreeMap", z_min: float, z_max: float | None) -> OccupancyGrid:
+def cut_between(octree: "MapView", z_min: float, z_max: float | None) -> OccupancyGrid:
     """Return the band between two heights of the world; without the upper one, the voxels at the lower.
 
     Raises:
@@ -157,9 +156,7 @@ def cut_between(octree: "OctreeMap", z_min: float, z_max: float | None) -> Occup
     return cut_slice(octree, SliceConfig(min_height_m=z_min, max_height_m=z_max))
 
 
-def cut_slice(
-    octree: "OctreeMap", config: SliceConfig, *, driven: DrivenGround | None = None
-) -> OccupancyGrid:
+def cut_slice(octree: "MapView", config: SliceConfig, *, driven: DrivenGround | None = None) -> OccupancyGrid:
     """Return the band between two heights above the floor, z = 0, as a grid just large enough for it.
 
     A voxel belongs to the band if its centre does. A cell is occupied if any voxel of its column is, else

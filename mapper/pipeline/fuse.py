@@ -24,7 +24,7 @@ from mapper.mapping.fusion import Maps, fuse_log
 from mapper.mapping.measured_noise import measure_noise
 from mapper.octree.map_file import write_map
 from mapper.octree.octomap_file import write_bt, write_ot
-from mapper.octree.scan_update_file import ScanUpdateWriter, open_scan_updates
+from mapper.octree.scan_updates import ScanUpdateWriter, open_scan_updates
 from mapper.pipeline.checkpoints import Checkpoints
 from mapper.pipeline.fuse_checkpoints import MarkedUpdates, known_updates
 from mapper.pipeline.settings_trial import try_settings

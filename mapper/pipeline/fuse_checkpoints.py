@@ -1,7 +1,7 @@
 """Checkpoints while frames are fused: what of the file of their updates is on the disk.
 
 Another process merges these updates again and casts the other frames only, to the same bits; see
-``mapper.octree.scan_update_file``.
+``mapper.octree.scan_updates``.
 """
 
 import hashlib
@@ -14,7 +14,7 @@ from typing import Any
 
 from mapper.core.errors import DataError
 from mapper.octree.config import OctreeConfig
-from mapper.octree.scan_update_file import CachedUpdate, ScanUpdateWriter, open_scan_updates
+from mapper.octree.scan_updates import CachedUpdate, ScanUpdateWriter, open_scan_updates
 from mapper.pipeline.checkpoints import Checkpoints
 from mapper.run import files
 from mapper.runtime.atomic import flush_to_disk

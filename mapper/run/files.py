@@ -87,7 +87,7 @@ RUN_FILES = (
     RunFiles((OCTREE_BT, OCTREE_OT), "the octree, as OctoMap's C++ library reads it", "maps"),
     RunFiles(
         (OCTREE_MAP,),
-        "the octree with all its data, compressed: `mapper.octree.reading.read_octree`",
+        "the octree with all its data, compressed: `mapper.octree.map.read_octree`",
         "maps",
     ),
     RunFiles(_grid(SLICE), "the 2D map for ROS map_server and nav2, and a picture of it", "maps"),

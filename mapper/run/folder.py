@@ -150,7 +150,7 @@ class Run:
     @cached_property
     def octree(self) -> "OctreeMap":
         """Occupancy map, with colours and times if it was built with ``octree.attributes``."""
-        from mapper.octree.reading import read_octree
+        from mapper.octree.map import read_octree
 
         return read_octree(self.file(files.OCTREE_MAP))
 
@@ -164,21 +164,21 @@ class Run:
     @cached_property
     def slice(self) -> "OccupancyGrid":
         """2D navigation map: the band of heights above the floor of ``config.slice``."""
-        from mapper.octree.grid_file import stored_grid
+        from mapper.octree.grid import stored_grid
 
         return stored_grid(self, files.SLICE)
 
     @cached_property
     def traversable(self) -> "OccupancyGrid":
         """Floor that a robot can drive on, of the storey on which the log begins."""
-        from mapper.octree.grid_file import stored_grid
+        from mapper.octree.grid import stored_grid
 
         return stored_grid(self, files.TRAVERSABLE)
 
     @cached_property
     def keepout(self) -> "OccupancyGrid | None":
         """Keep-out regions in the slice's cells; None if there are none."""
-        from mapper.octree.grid_file import stored_grid_if_any
+        from mapper.octree.grid import stored_grid_if_any
 
         return stored_grid_if_any(self, files.KEEPOUT)
 

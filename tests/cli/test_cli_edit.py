@@ -5,9 +5,8 @@ import shutil
 import numpy as np
 import pytest
 
-from mapper.octree.grid import FREE, OCCUPIED
-from mapper.octree.grid_file import read_grid
-from mapper.octree.reading import read_octree
+from mapper.octree.grid import FREE, OCCUPIED, read_grid
+from mapper.octree.map import read_octree
 from mapper.run.folder import open_run
 from tests.support.command_line import mapper
 from tests.support.files import files_of

@@ -9,7 +9,7 @@ import pytest
 from mapper.core.geometry import exp
 from mapper.core.trajectory import Trajectory
 from mapper.navigation.distance import distance_2d
-from mapper.octree.grid_file import read_grid
+from mapper.octree.grid import read_grid
 from mapper.run.folder import open_run
 from mapper.sources.trajectory_files import read_tum, write_tum
 from tests.support.command_line import mapper

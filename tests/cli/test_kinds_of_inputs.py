@@ -7,7 +7,7 @@ import pytest
 
 from mapper.merging.placing import as_built
 from mapper.navigation.distance import distance_2d
-from mapper.octree.grid_file import read_grid
+from mapper.octree.grid import read_grid
 from mapper.run.folder import open_run
 from tests.support.command_line import invoke
 from tests.support.merged_runs import merged_map_of

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import zstandard
 
-from mapper.octree.reading import read_octree
+from mapper.octree.map import read_octree
 from mapper.run.files import RUN_FILES
 from mapper.run.manifest import Manifest
 from tests.support.command_line import mapper

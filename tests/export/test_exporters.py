@@ -13,9 +13,8 @@ from mapper.config.loading import load_config, overridden
 from mapper.core.errors import ConfigError, DependencyError, MapSizeError, RunError, WriteError
 from mapper.export.exporters import EXPORTERS, export
 from mapper.graph.g2o import read_g2o
-from mapper.octree.grid import OCCUPIED, UNKNOWN
-from mapper.octree.grid_file import read_grid
-from mapper.octree.reading import read_octree
+from mapper.octree.grid import OCCUPIED, UNKNOWN, read_grid
+from mapper.octree.map import read_octree
 from mapper.pipeline.build import build
 from mapper.run.checks import check_run
 from mapper.run.folder import moved_log, open_run

@@ -5,8 +5,7 @@ import pytest
 from mapper.core.errors import MapFileError
 from mapper.export.grid import write_grid
 from mapper.export.palette import INK
-from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
-from mapper.octree.grid_file import read_grid
+from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, read_grid
 
 
 @pytest.fixture

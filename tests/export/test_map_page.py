@@ -15,8 +15,8 @@ from mapper.export.report.map_page import write_map_page
 from mapper.export.report.packing import pack_layers, pack_points
 from mapper.loops.closure import LoopClosure
 from mapper.octree.keys import codes_of
-from mapper.octree.reading import read_octree
-from mapper.octree.scan_update_file import open_scan_updates
+from mapper.octree.map import read_octree
+from mapper.octree.scan_updates import open_scan_updates
 from tests.support.chromium import AXE, CHROMIUM, MISSING, NO_AXE
 from tests.support.command_line import invoke
 from tests.support.map_page import MapPage, change

@@ -7,8 +7,7 @@ from mapper.core.errors import ConfigError, RunError
 from mapper.export.exporters import export
 from mapper.export.nav2 import keepout_mask, slowed_percent
 from mapper.navigation.config import CostmapConfig
-from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
-from mapper.octree.grid_file import read_grid
+from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, read_grid
 
 
 def grid_of(text, *, origin=(0.0, 0.0)):

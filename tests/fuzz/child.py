@@ -31,7 +31,7 @@ def read_all(path: Path) -> str:
         MapperError: It is damaged, or a frame of it is.
     """
     if path.suffix in (".octree", ".ot", ".bt"):
-        from mapper.octree.reading import read_octree
+        from mapper.octree.map import read_octree
 
         read_octree(path).leaves()
         return ""

@@ -18,8 +18,7 @@ from mapper.line_laser.simulation.render import take
 from mapper.line_laser.simulation.room import Patch, Room, make_board, make_room
 from mapper.line_laser.survey import drive, scan_images
 from mapper.line_laser.survey import sensor_poses as drive_poses
-from mapper.octree.grid import OCCUPIED
-from mapper.octree.grid_file import read_grid
+from mapper.octree.grid import OCCUPIED, read_grid
 from mapper.sources.image_files.reading import decode_colour
 from tests.support.command_line import invoke
 

@@ -8,7 +8,7 @@ from mapper.core.frames import Scan
 from mapper.core.trajectory import Trajectory
 from mapper.mapping.config import Edits
 from mapper.mapping.fusion import fuse_log
-from mapper.octree.scan_update_file import ScanUpdateWriter
+from mapper.octree.scan_updates import ScanUpdateWriter
 from mapper.runtime.progress import SILENT
 from mapper.simulation import CameraSimulator
 from mapper.simulation.config import SynthConfig

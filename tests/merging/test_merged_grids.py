@@ -17,10 +17,8 @@ from mapper.navigation.floor import driven_ground, floor_of, margin_for
 from mapper.navigation.traversable import traversable
 from mapper.octree.columns import occupied_columns
 from mapper.octree.config import SliceConfig
-from mapper.octree.grid import FREE, OCCUPIED
-from mapper.octree.grid_file import read_grid
-from mapper.octree.map import OctreeMap
-from mapper.octree.reading import read_octree
+from mapper.octree.grid import FREE, OCCUPIED, read_grid
+from mapper.octree.map import OctreeMap, read_octree
 from mapper.octree.slice import cut_slice
 from tests.support.command_line import mapper
 from tests.support.floor_scenes import two_storeys

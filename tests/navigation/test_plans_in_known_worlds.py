@@ -13,8 +13,7 @@ from mapper.navigation.planner import plan_2d, plan_3d
 from mapper.navigation.traversable import traversable
 from mapper.navigation.voxels import known_box
 from mapper.octree.config import OctreeConfig, SliceConfig
-from mapper.octree.grid import FREE, OCCUPIED
-from mapper.octree.grid_file import read_grid
+from mapper.octree.grid import FREE, OCCUPIED, read_grid
 from mapper.octree.map import OctreeMap
 from mapper.octree.slice import cut_slice
 from mapper.simulation import Boxes, CameraSimulator

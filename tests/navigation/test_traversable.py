@@ -9,9 +9,8 @@ from mapper.octree import blocks
 from mapper.octree.columns import occupied_columns
 from mapper.octree.config import OctreeConfig, SliceConfig
 from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN
-from mapper.octree.map import OctreeMap
+from mapper.octree.map import OctreeMap, read_octree
 from mapper.octree.octomap_file import write_ot
-from mapper.octree.reading import read_octree
 from mapper.octree.slice import cut_slice
 
 CELL = 0.05

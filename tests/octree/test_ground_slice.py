@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 
 from mapper.core.frames import Scan
-from mapper.octree.columns import NOWHERE
+from mapper.octree.columns import NOWHERE, DrivenGround, ground_heights
 from mapper.octree.config import OctreeConfig, SliceConfig
 from mapper.octree.grid import FREE, OCCUPIED
-from mapper.octree.ground_height import DrivenGround, ground_heights
 from mapper.octree.keys import KEY_ZERO
 from mapper.octree.map import OctreeMap
 from mapper.octree.slice import cut_slice

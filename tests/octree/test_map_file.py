@@ -9,9 +9,8 @@ from mapper.core.errors import MapFileError, MapSizeError, WriteError
 from mapper.core.frames import Scan
 from mapper.octree import blocks
 from mapper.octree.config import OctreeConfig
-from mapper.octree.map import OctreeMap
+from mapper.octree.map import OctreeMap, read_octree
 from mapper.octree.map_file import MAGIC, write_map
-from mapper.octree.reading import read_octree
 from tests.support.octree_maps import attributes_of_leaves
 
 HEADER = len(MAGIC) + 12
@@ -39,7 +38,7 @@ def test_a_map_written_some_blocks_at_a_time_is_the_same(attributes, tmp_path, m
     octree = mapped(attributes=attributes)
     write_map(tmp_path / "at once.octree", octree)
     monkeypatch.setattr("mapper.octree.map_file._CHUNK", 5)
-    monkeypatch.setattr("mapper.octree.leaves._CHUNK", 5)
+    monkeypatch.setattr("mapper.octree.queries._CHUNK", 5)
 
     write_map(tmp_path / "map.octree", octree)
 

@@ -4,11 +4,13 @@ import numpy as np
 import pytest
 
 from mapper.core.frames import Scan
+from mapper.octree.bit_planes import ALL_SET, NONE_SET, dilate, neighbours_of, words_of
 from mapper.octree.casting import Caster
 from mapper.octree.config import OctreeConfig
+from mapper.octree.keys import codes_of_keys, keys_of
 from mapper.octree.map import OctreeMap
 from mapper.octree.moving_objects import remove_moving_objects
-from mapper.octree.scan_update import pack
+from mapper.octree.scan_updates import pack
 
 CONFIG = OctreeConfig(resolution_m=0.2, max_range_m=30.0)
 EYE_M = 1.62
@@ -210,17 +212,44 @@ def test_a_scene_without_motion_loses_nothing_and_time_may_run_backwards(street)
     np.testing.assert_array_equal(one.leaves().log_odds, other.leaves().log_odds)
 
 
-def test_the_number_of_known_voxels_stays_right(street):
-    octree, updates = fused(street)
-
-    remove_moving_objects(octree, lambda: updates)
-
-    assert len(octree) == np.isfinite(octree.blocks.table.values[: len(octree.blocks)]).sum()
-
-
 def test_points_without_a_voxel_are_in_no_moving_thing(street):
     octree, updates = fused(street)
     objects = remove_moving_objects(octree, lambda: updates)
 
     far = np.array([[1e9, 0.0, 0.0], [np.nan, 0.0, 0.0], [500.0, 500.0, 500.0]])
     assert not objects.contain(far).any()
+
+
+def dense(codes, plane, *, absent):
+    """Return a (48, 48, 48) bool array of 6³ blocks, and the indices of the plane's voxels in it."""
+    where = tuple((keys_of(codes)[:, None] * 8 + keys_of(np.arange(512))).reshape(-1, 3).T)
+    voxels = np.full((48, 48, 48), absent)
+    voxels[where] = np.unpackbits(plane, axis=1, bitorder="little").reshape(-1)
+    return voxels, where
+
+
+@pytest.mark.parametrize("absent", [NONE_SET, ALL_SET])
+@pytest.mark.parametrize("density", [0.002, 0.5, 0.998])
+def test_a_bit_is_set_where_one_of_27_is(absent, density):
+    rng = np.random.default_rng(int(1000 * density))
+    blocks = np.argwhere(rng.random((4, 4, 4)) < (0.6 if absent else 1.1)) + 1
+    codes = np.sort(codes_of_keys(blocks))
+    plane = np.packbits(rng.random((len(codes), 512)) < density, axis=1, bitorder="little")
+    before = plane.copy()
+
+    grown = dilate(words_of(plane), neighbours_of(codes), absent=absent)
+
+    voxels, where = dense(codes, plane, absent=bool(absent))
+    expected = np.zeros_like(voxels)
+    for shift in np.ndindex(3, 3, 3):
+        expected |= np.roll(voxels, np.array(shift) - 1, axis=(0, 1, 2))
+    np.testing.assert_array_equal(dense(codes, grown.view(np.uint8), absent=False)[0][where], expected[where])
+    np.testing.assert_array_equal(plane, before)
+
+
+def test_neighbours_at_the_ends_of_the_key_range_wrap_to_absent_blocks():
+    codes = codes_of_keys(np.array([[0, 0, 0], [8191, 8191, 8191]]))
+
+    rows = neighbours_of(np.sort(codes))
+
+    assert (rows == -1).all()

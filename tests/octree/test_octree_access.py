@@ -6,8 +6,8 @@ import pytest
 from mapper.core.errors import DataError, MapFileError
 from mapper.octree.config import SliceConfig
 from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN
+from mapper.octree.map import read_octree
 from mapper.octree.octomap_file import write_bt, write_ot
-from mapper.octree.reading import read_octree
 from mapper.octree.slice import cut_slice
 from tests.support.octree_maps import octree_of
 

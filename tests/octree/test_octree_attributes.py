@@ -7,11 +7,10 @@ from mapper.core.frames import Scan
 from mapper.core.geometry import exp
 from mapper.octree import attributes as layer_module
 from mapper.octree.attributes import NEVER_SEEN
+from mapper.octree.blocks import log_odds
 from mapper.octree.config import OctreeConfig
-from mapper.octree.map import OctreeMap
+from mapper.octree.map import OctreeMap, read_octree
 from mapper.octree.octomap_file import write_bt, write_ot
-from mapper.octree.reading import read_octree
-from mapper.octree.sensor_model import log_odds
 from tests.support.octree_maps import attributes_of_leaves
 
 BOTH_MODES = pytest.mark.parametrize("discretize", [True, False], ids=["discretize", "every-point"])

@@ -108,68 +108,6 @@ def test_what_is_no_level_is_refused(octree, depth, parent):
         octree.log_odds_at(np.zeros((1, 3)), depth=depth, parent=parent)
 
 
-@pytest.mark.parametrize("edge_m", [0.0, 0.07, 0.4, 3.0, 100.0])
-def test_boxes_count_the_voxels_that_they_overlap(octree, points, edge_m):
-    lower, upper = points[:60] - edge_m / 2, points[:60] + edge_m / 2
-    leaves = octree.leaves()
-    low_edges = (leaves.keys.astype(np.int64) - 32768) * 0.05
-    occupied = leaves.log_odds >= octree.occupied_log_odds
-
-    counts = octree.count_boxes(lower, upper)
-
-    for i in range(len(lower)):
-        inside = ((low_edges + 0.05 > lower[i]) & (low_edges < upper[i])).all(axis=1)
-        assert counts.occupied[i] == np.count_nonzero(inside & occupied)
-        assert counts.free[i] == np.count_nonzero(inside & ~occupied)
-    total = np.prod(np.ceil(upper / 0.05) - np.floor(lower / 0.05), axis=1)
-    np.testing.assert_array_equal(counts.occupied + counts.free + counts.unknown, np.maximum(total, 1))
-
-
-def test_boxes_count_obstacles_and_free_space():
-    octree = OctreeMap(OctreeConfig())
-    octree.insert_points(np.array([[1.025, 0.025, 0.025]], np.float32), np.array([0.025, 0.025, 0.025]))
-    lower = np.array([[0.2, 0.01, 0.01], [0.2, 0.01, 0.01], [1.01, 0.01, 0.01], [0.2, -0.01, 0.01]])
-    upper = np.array([[0.8, 0.04, 0.04], [1.1, 0.04, 0.04], [1.04, 0.04, 0.04], [0.8, 0.04, 0.04]])
-
-    counts = octree.count_boxes(lower, upper)
-
-    assert counts.any_occupied.tolist() == [False, True, True, False]
-    assert counts.all_free.tolist() == [True, False, False, False]
-    assert counts.unknown.tolist()[2:] == [0, 12]
-
-
-def test_boxes_whose_faces_lie_on_borders_have_no_layer_more():
-    """0.15 / 0.05 is below 3."""
-    octree = OctreeMap(0.05)
-    lower = np.array([[0.15, 0.3, 0.35], [-0.35, -0.3, -0.15]])
-    counts = octree.count_boxes(lower, lower + 0.3)
-    assert counts.unknown.tolist() == [6**3, 6**3]
-    at = np.array([[0.15, 0.3, 0.35]])
-    octree.insert_points((at + 0.01).astype(np.float32), np.array([0.0, 0.0, 0.0]))
-    assert octree.query(at).tolist() == [100]
-    assert octree.count_boxes(at, at).occupied.tolist() == [1]
-
-
-def test_boxes_beyond_the_key_range_hold_nothing(octree):
-    counts = octree.count_boxes(np.full((1, 3), 1e8), np.full((1, 3), 2e8))
-
-    assert (counts.occupied.tolist(), counts.free.tolist(), counts.unknown.tolist()) == ([0], [0], [0])
-    assert not counts.all_free.any()
-    everything = octree.count_boxes(np.full((1, 3), -1e8), np.full((1, 3), 1e8))
-    assert everything.occupied + everything.free == len(octree)
-    assert everything.unknown == 2**48 - len(octree)
-
-
-@pytest.mark.parametrize(
-    ("lower", "upper"),
-    [([[1.0, 0, 0]], [[0.0, 0, 0]]), ([[np.nan, 0, 0]], [[1.0, 0, 0]]), ([[0.0, 0, 0]], [[1.0, 1]])],
-    ids=["swapped", "nan", "shape"],
-)
-def test_boxes_that_are_none_are_refused(octree, lower, upper):
-    with pytest.raises(DataError, match=r"^octree: (every box|boxes)"):
-        octree.count_boxes(np.array(lower), np.array(upper))
-
-
 @pytest.mark.parametrize("max_range_m", [0.0, 0.03, 0.4, 2.0, np.inf])
 @pytest.mark.parametrize("seed", range(3))
 def test_nearest_obstacles_equal_brute_force(seed, max_range_m):

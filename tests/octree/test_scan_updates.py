@@ -16,8 +16,7 @@ from mapper.mapping.fusion import fuse_log
 from mapper.octree.casting import Caster
 from mapper.octree.config import OctreeConfig
 from mapper.octree.map import OctreeMap
-from mapper.octree.scan_update import decompressed, pack
-from mapper.octree.scan_update_file import ScanUpdateWriter, displacement_m, open_scan_updates
+from mapper.octree.scan_updates import ScanUpdateWriter, decompress, displacement_m, open_scan_updates, pack
 from mapper.runtime.progress import SILENT
 from mapper.simulation import CameraSimulator
 from mapper.simulation.config import SynthConfig
@@ -188,7 +187,7 @@ def test_merging_a_scan_update_is_inserting_its_scan(discretize):
         T_world_body = exp(rng.normal(0.0, 1.0, 3), rng.normal(0.0, 3.0, 3))
         inserted.insert(scan, T_world_body)
         update = pack(caster.cast(scan, T_world_body))
-        merged.merge(decompressed(update.compressed(), blocks=len(update)))
+        merged.merge(decompress(update.compress(), blocks=len(update)))
 
     assert len(inserted) == len(merged)
     assert_same_bits(inserted, merged)
@@ -208,4 +207,4 @@ def test_damaged_files_are_refused_in_one_line(first, tmp_path):
         open_scan_updates(tmp_path / "missing.bin")
     for garbled in (b"garbled", b"x\x9c\x03\x00\x00\x00\x00\x01"):
         with pytest.raises(DataError, match="scan update of 3 blocks: damaged"):
-            decompressed(garbled, blocks=3)
+            decompress(garbled, blocks=3)

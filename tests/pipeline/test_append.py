@@ -11,7 +11,7 @@ from mapper.config.loading import overridden
 from mapper.core.errors import ConfigError, RunError
 from mapper.evaluators.metrics.trajectory import align, associate, ate
 from mapper.loops.config import NoLoopsConfig
-from mapper.octree.reading import read_octree
+from mapper.octree.map import read_octree
 from mapper.pipeline.append import append
 from mapper.pipeline.fuse import fuse
 from mapper.run.folder import moved_log, open_run

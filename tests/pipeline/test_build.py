@@ -11,8 +11,8 @@ from mapper.config.loading import load_config, overridden
 from mapper.core.errors import ConfigError, RunError, TrackingError
 from mapper.evaluators.metrics.trajectory import align, associate, ate
 from mapper.export.run_maps import maps_of
-from mapper.octree.grid_file import read_grid
-from mapper.octree.reading import read_octree
+from mapper.octree.grid import read_grid
+from mapper.octree.map import read_octree
 from mapper.pipeline.build import build
 from mapper.pipeline.fuse import fuse
 from mapper.run.folder import open_run

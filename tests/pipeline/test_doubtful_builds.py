@@ -11,8 +11,8 @@ from mapper.core.errors import TrackingError
 from mapper.core.geometry import exp
 from mapper.evaluators.metrics.trajectory import align, associate, ate
 from mapper.export.mesh_views import mesh_views
-from mapper.octree.reading import read_octree
-from mapper.octree.scan_update_file import open_scan_updates
+from mapper.octree.map import read_octree
+from mapper.octree.scan_updates import open_scan_updates
 from mapper.pipeline.append import append
 from mapper.pipeline.build import build
 from mapper.pipeline.fuse import fuse

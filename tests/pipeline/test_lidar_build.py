@@ -8,8 +8,7 @@ from mapper.cli.summary import summary_text
 from mapper.config.loading import load_config, overridden
 from mapper.core.errors import TrackingError
 from mapper.evaluators.metrics.evaluate import evaluate
-from mapper.octree.grid import FREE
-from mapper.octree.grid_file import read_grid
+from mapper.octree.grid import FREE, read_grid
 from mapper.pipeline.build import build
 from mapper.pipeline.fuse import fuse
 from mapper.run.folder import open_run

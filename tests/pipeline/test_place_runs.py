@@ -21,7 +21,7 @@ from mapper.loops.scan_context_proposer import ScanPlace
 from mapper.merging.merge import merge
 from mapper.merging.merged_map import open_map
 from mapper.merging.placing import Placed, Placing, by_truth
-from mapper.octree.reading import read_octree
+from mapper.octree.map import read_octree
 from mapper.pipeline import place_runs
 from mapper.pipeline.build import build
 from mapper.pipeline.fuse import fuse

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from mapper.doctor.machine import processors
-from mapper.octree.window import sparse_zeros
+from mapper.octree.casting import sparse_zeros
 from mapper.runtime import atomic
 from mapper.runtime.atomic import FolderKind, atomic_folder, flush_to_disk
 from mapper.runtime.file_array import FileArray

@@ -11,7 +11,7 @@ from mapper.navigation.traversable import traversable
 from mapper.octree.columns import NOWHERE
 from mapper.octree.config import OctreeConfig
 from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN
-from mapper.octree.keys import BLOCK_BITS, BLOCK_VOXELS, KEY_ZERO, codes_of_blocks
+from mapper.octree.keys import BLOCK_BITS, BLOCK_VOXELS, KEY_ZERO, codes_of_keys
 from mapper.octree.map import OctreeMap
 
 THICK_M = 0.2
@@ -276,9 +276,9 @@ def path_codes(world, storeys):
 def octree_of_keys(keys, cell_m):
     """Return a map whose occupied voxels have these (N, 3) keys; nothing else is known."""
     octree = OctreeMap(OctreeConfig(resolution_m=cell_m, max_range_m=1e3))
-    blocks = codes_of_blocks(keys >> BLOCK_BITS)
+    blocks = codes_of_keys(keys >> BLOCK_BITS)
     codes, slot = np.unique(blocks, return_inverse=True)
-    voxel = codes_of_blocks(keys & ((1 << BLOCK_BITS) - 1))  # the order in a block is that of the blocks
+    voxel = codes_of_keys(keys & ((1 << BLOCK_BITS) - 1))  # the order in a block is that of the blocks
     known = np.zeros((len(codes), BLOCK_VOXELS), bool)
     known[slot, voxel] = True
     octree.restore_blocks(codes, known, np.full(int(known.sum()), 2.0, np.float32))

@@ -18,8 +18,8 @@ from mapper.graph.model import PoseGraph
 from mapper.loops.closure import LoopClosure
 from mapper.mapping.thumbnails import encode_jpeg
 from mapper.octree.grid import OccupancyGrid
+from mapper.octree.map import read_octree
 from mapper.octree.octomap_file import bt_bytes
-from mapper.octree.reading import read_octree
 from mapper.run import files
 from mapper.run.folder import Run
 from mapper.run.results import RunResults

@@ -18,10 +18,9 @@ from mapper.export.report.packing import Plane, pack_layers, pack_points
 from mapper.export.run_maps import snapshots_of
 from mapper.mapping.fusion import Snapshot
 from mapper.mapping.thumbnails import encode_jpeg
-from mapper.octree.keys import KEY_BITS, codes_of, codes_of_blocks
-from mapper.octree.leaves import Leaves
-from mapper.octree.levels import keys_at_depth
+from mapper.octree.keys import KEY_BITS, codes_of, codes_of_keys, keys_of
 from mapper.octree.map import OctreeMap
+from mapper.octree.queries import Leaves
 from mapper.run.frame_outcomes import stamps_of
 
 MOST_POINTS = 2_000_000
@@ -116,7 +115,7 @@ def no_map() -> dict[str, Any]:
 def _occupied_codes(octree: OctreeMap) -> NDArray[np.int64]:
     """Return the Morton codes of the occupied voxels, increasing."""
     known = octree.leaves()
-    return codes_of_blocks(known.keys[known.log_odds >= octree.occupied_log_odds].astype(np.int64))
+    return codes_of_keys(known.keys[known.log_odds >= octree.occupied_log_odds].astype(np.int64))
 
 
 def _voxels(
@@ -133,7 +132,9 @@ def _voxels(
         codes, levels = np.unique(codes >> 3), levels + 1
     if observed is not None:
         observed = observed.coarser(levels)
-    nodes = Leaves(keys_at_depth(codes), np.zeros(len(codes), np.float32), resolution_m, KEY_BITS - levels)
+    nodes = Leaves(
+        keys_of(codes).astype(np.uint16), np.zeros(len(codes), np.float32), resolution_m, KEY_BITS - levels
+    )
     planes = _observation_planes(codes, observed, stamps_ns)
     return pack_points(nodes.centres_world, planes, step_m=nodes.edge_m, most=most) | {"edge_m": nodes.edge_m}
 

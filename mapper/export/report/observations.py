@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.octree.keys import BLOCK_BITS, BLOCK_VOXELS
-from mapper.octree.scan_update_file import open_scan_updates
+from mapper.octree.scan_updates import open_scan_updates
 from mapper.run.folder import Run
 
 NEVER_NS = np.iinfo(np.int64).max

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.octree.keys import codes_of_blocks
+from mapper.octree.keys import codes_of_keys
 
 _STEPS = 65535
 """Largest number of steps along an axis: positions are 16-bit integers."""
@@ -33,7 +33,7 @@ def pack_points(
     reach_m = float((points.max(axis=0) - low).max()) if len(points) else 0.0
     step_m = max(step_m, reach_m / _STEPS)
     steps = np.rint((points - low) / step_m).astype(np.int64)
-    order = np.argsort(codes_of_blocks(steps), kind="stable")
+    order = np.argsort(codes_of_keys(steps), kind="stable")
     if len(order) > most:
         order = order[np.arange(most) * len(order) // most]
     planes = [steps[order, axis].astype(np.uint16) for axis in range(3)] + [plane[order] for plane in values]

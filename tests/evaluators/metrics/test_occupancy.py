@@ -11,7 +11,7 @@ from mapper.octree.casting import Caster
 from mapper.octree.config import OctreeConfig
 from mapper.octree.map import OctreeMap
 from mapper.octree.moving_objects import remove_moving_objects
-from mapper.octree.scan_update import pack
+from mapper.octree.scan_updates import pack
 from mapper.simulation import Boxes, CameraSimulator, read_scene, write_tum_log
 from mapper.simulation.config import SynthConfig
 from tests.support.ideal_sensors import IDEAL_SENSOR

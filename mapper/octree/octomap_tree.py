@@ -1,4 +1,4 @@
-"""The octree that blocks imply: pruned as OctoMap prunes, in the order in which its files list the nodes.
+"""OctoMap's trees in blocks and back: nodes pruned as OctoMap prunes them, in the order of its files.
 
 OctoMap's tree is canonical: an inner node holds the maximum of its children, and eight children that are
 leaves of equal value become one leaf. So the voxels alone determine it, and files come out equal to the byte.
@@ -345,3 +345,20 @@ def _write_upper_word(upper, node, payload, at, values, masks):
             values[i], masks[i] = upper.nodes[child].value, upper.nodes[child].mask
             child += 1
     return _write_word(payload, at, values, masks, 0)
+
+
+@njit(cache=True, nogil=True)
+def enter_next_child(pending, prefix, depth):
+    """Go down from a node to its lowest child that is still to come; return the child's depth.
+
+    Args:
+        pending: Bits, by depth on the path, for each child that is still to come; the child's is cleared.
+        prefix: Morton codes, by depth, of the nodes on the path; the child's is written.
+        depth: Depth of the node.
+    """
+    child = 0
+    while not (pending[depth] >> child) & 1:
+        child += 1
+    pending[depth] &= ~(1 << child)
+    prefix[depth + 1] = (prefix[depth] << 3) | child
+    return depth + 1

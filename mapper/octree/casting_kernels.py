@@ -2,24 +2,105 @@
 
 OctoMap (Hornung et al. 2013, release 1.10) computes in a mixture of float32 and float64. The casts below
 repeat that mixture; without ``fastmath`` the compiler neither fuses nor reorders them.
+
+A scan is first rasterised into a dense window: a ray loop that looks every voxel up in a hash table is slow.
+In the window a voxel's cell is the union of three masked integers, and a step along an axis adds one number
+to one of them. The window wraps around at powers of two, so scans may lie anywhere. Cells are in Morton order
+while all axes have bits left; the lowest nine bits number the voxels of a block.
 """
 
 from math import sqrt
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy import float32, float64, int32, int64
+from numpy.typing import NDArray
 
 from mapper.core.voxel_index import FIBONACCI
-from mapper.octree.keys import BLOCK_BITS, BLOCK_VOXELS, KEY_COUNT, KEY_ZERO, centre_of, have_keys, key_of
-from mapper.octree.window import FREE, OCCUPIED, UNTOUCHED, cell_of
+from mapper.octree.keys import (
+    BLOCK_BITS,
+    BLOCK_VOXELS,
+    KEY_BITS,
+    KEY_COUNT,
+    KEY_MASK,
+    KEY_ZERO,
+    centre_of,
+    have_keys,
+    key_of,
+    morton,
+)
+
+UNTOUCHED, FREE, OCCUPIED = range(3)
+"""States of a cell after a scan, ordered so that occupied wins."""
 
 _CHUNK = 256  # points worked on at a time: their scratch arrays stay in the first-level cache
 _RECENT = 1 << 15  # entries of the table of recent voxels: 256 KiB
-_RAYS = 16  # rays that step together
+_RAYS = 16  # rays that step together: two vectors of eight float64
 _STEPS = 8  # steps before ended rays are looked for
-_Y, _Z, _BETWEEN, _REACH, _END, _GOES_ON = (row * _RAYS for row in (1, 2, 3, 6, 6, 7))
-_NEVER = float64(np.finfo(np.float64).max)  # OctoMap's tMax along an axis that the ray does not move on
+NEVER = float64(np.finfo(np.float64).max)
+"""OctoMap's tMax along an axis that the ray does not move on."""
+
+_T_MAX, _T_DELTA, _T_END = (_RAYS * row for row in (0, 3, 6))
+_CELL, _STEP, _END, _GOES_ON = (_RAYS * row for row in (0, 3, 6, 7))
+_Y, _Z = _RAYS, 2 * _RAYS
+"""Rows of the two arrays of ``_step_along``: a quantity's first row is that of x; y and z follow."""
+
+
+class Window(NamedTuple):
+    """The arrays of a window around one scan.
+
+    Attributes:
+        cells: (C,) uint8, all UNTOUCHED between scans.
+        touched: (C / 512,) uint8, 1 for each block with a cell that is not UNTOUCHED.
+        base: (3,) int64 lowest key of the block that holds the ray origin; its cell is 0.
+        wrap: (3,) int64 cells per axis − 1.
+        bits: (3,) int64 mask of the bits of a cell's index that belong to each axis.
+        cell_bits: (3, S) int64 index of each axis's n-th cell: n with its bits deposited into ``bits``.
+        offsets: (4, 256) int64 the inverse for blocks: the share of each byte of a block's position in its
+            offset from ``base``, x in bits 0 … 15, y in 16 … 31, z in 32 … 47.
+    """
+
+    cells: NDArray[np.uint8]
+    touched: NDArray[np.uint8]
+    base: NDArray[np.int64]
+    wrap: NDArray[np.int64]
+    bits: NDArray[np.int64]
+    cell_bits: NDArray[np.int64]
+    offsets: NDArray[np.int64]
+
+
+@njit(cache=True, nogil=True)
+def cell_of(window, x, y, z):
+    """Return the cell of three keys."""
+    return (
+        window.cell_bits[0, (x - window.base[0]) & window.wrap[0]]
+        | window.cell_bits[1, (y - window.base[1]) & window.wrap[1]]
+        | window.cell_bits[2, (z - window.base[2]) & window.wrap[2]]
+    )
+
+
+@njit(cache=True, nogil=True)
+def block_codes(window, positions, lowest):
+    """Return the (B,) Morton codes of blocks.
+
+    Args:
+        window: The window with the blocks.
+        positions: (B,) int64 positions of the blocks in it.
+        lowest: (3,) int64 smallest keys of the window, which resolve the wrap-around.
+    """
+    codes = np.empty(len(positions), np.int64)
+    key = np.empty(3, np.int64)
+    for i in range(len(positions)):
+        packed = 0
+        for byte in range(4):
+            packed += window.offsets[byte, (positions[i] >> (8 * byte)) & 0xFF]
+        for axis in range(3):
+            first = lowest[axis] >> BLOCK_BITS
+            beyond = (window.base[axis] >> BLOCK_BITS) + ((packed >> (KEY_BITS * axis)) & KEY_MASK) - first
+            key[axis] = (first + (beyond & (window.wrap[axis] >> BLOCK_BITS))) & (KEY_MASK >> BLOCK_BITS)
+        codes[i] = morton(key[0], key[1], key[2])
+    return codes
 
 
 @njit(cache=True, nogil=True)
@@ -159,30 +240,33 @@ def cast_rays(stops, hits, origin, resolution_m, window):
         borders[axis, 1] = centre + half - float64(origin[axis])
     first = cell_of(window, keys[0], keys[1], keys[2])
     ends = np.empty(len(stops), int64)
-    vectors = np.ones(3 * _RAYS, float32)
-    lengths = np.empty(_RAYS, float32)
-    times, places = np.empty(7 * _RAYS, float64), np.zeros(8 * _RAYS, int64)
+    rays = np.ones(3 * _RAYS, float32)
+    norms = np.empty(_RAYS, float32)
+    t, at = np.empty(7 * _RAYS, float64), np.zeros(8 * _RAYS, int64)
     path = np.empty(_STEPS * _RAYS, int64)
     for start in range(0, len(stops), _RAYS):
         size = min(_RAYS, len(stops) - start)
         for j in range(size):
             for axis in range(3):
-                vectors[axis * _RAYS + j] = stops[start + j, axis] - origin[axis]
-        _measure(vectors, lengths, times)
+                rays[axis * _RAYS + j] = stops[start + j, axis] - origin[axis]
+        _measure(rays, norms, t)
         # Each axis by a call of its own: with known rows the loop within vectorises.
-        _aim(0, vectors, lengths, borders[0], first, bits[0], resolution_m, times, places)
-        _aim(1, vectors, lengths, borders[1], first, bits[1], resolution_m, times, places)
-        _aim(2, vectors, lengths, borders[2], first, bits[2], resolution_m, times, places)
+        _initialise(0, rays, norms, borders[0], first, bits[0], resolution_m, t, at)
+        _initialise(1, rays, norms, borders[1], first, bits[1], resolution_m, t, at)
+        _initialise(2, rays, norms, borders[2], first, bits[2], resolution_m, t, at)
         going = 0
         for j in range(_RAYS):
-            places[_GOES_ON + j] = 0
+            at[_GOES_ON + j] = 0
         for j in range(size):
-            end = _stop_cell(window, stops, start + j, inverse_resolution)
-            ends[start + j] = places[_END + j] = end
-            places[_GOES_ON + j] = end != first
+            x = key_of(stops[start + j, 0], inverse_resolution)
+            y = key_of(stops[start + j, 1], inverse_resolution)
+            z = key_of(stops[start + j, 2], inverse_resolution)
+            end = cell_of(window, x, y, z)
+            ends[start + j] = at[_END + j] = end
+            at[_GOES_ON + j] = end != first
             going += end != first
         while going:
-            going = _step(times, places, path, first, bits[0], bits[1], bits[2])
+            going = _step_along(t, at, path, first, bits[0], bits[1], bits[2])
             for j in range(_STEPS * _RAYS):
                 cell = path[j]
                 cells[cell] = FREE
@@ -194,100 +278,91 @@ def cast_rays(stops, hits, origin, resolution_m, window):
             touched[cell >> (3 * BLOCK_BITS)] = 1
 
 
-@njit(cache=True, nogil=True)
-def _stop_cell(window, stops, i, inverse_resolution):
-    x = key_of(stops[i, 0], inverse_resolution)
-    y = key_of(stops[i, 1], inverse_resolution)
-    z = key_of(stops[i, 2], inverse_resolution)
-    return cell_of(window, x, y, z)
-
-
 @njit(cache=True, nogil=True, error_model="numpy")
-def _measure(vectors, lengths, times):
-    """Write the lengths of rays in both precisions: (R,) float32, and a row of ``times``."""
+def _measure(rays, norms, t):
+    """Write the lengths of rays in both precisions: (R,) float32, and the row t_end."""
     for j in range(_RAYS):
-        x, y, z = vectors[j], vectors[_Y + j], vectors[_Z + j]
-        length = float32(sqrt(float64(x * x + y * y + z * z)))
-        lengths[j] = length
-        times[_REACH + j] = float64(length)
+        x, y, z = rays[j], rays[_Y + j], rays[_Z + j]
+        norm = float32(sqrt(float64(x * x + y * y + z * z)))
+        norms[j] = norm
+        t[_T_END + j] = float64(norm)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _aim(axis, vectors, lengths, borders, first, bits, resolution_m, times, places):
-    """Write the rows of one axis as they are where the rays begin.
+def _initialise(axis, rays, norms, borders, first, bits, resolution_m, t, at):
+    """Write tMax, tDelta, step and cell of one axis as they are where the rays begin.
 
     Args:
         axis: 0, 1 or 2.
-        vectors: (3 · R,) float32 rows: the rays.
-        lengths: (R,) float32 their lengths.
+        rays: (3 · R,) float32 rows x, y, z from the origin to the stops.
+        norms: (R,) float32 their lengths.
         borders: (2,) float64 where the lower and the higher border of the origin's voxel are.
         first: Cell of the origin.
         bits: Mask of the axis's bits in a cell's index.
         resolution_m: Voxel edge.
-        times: As in ``_step``.
-        places: As in ``_step``.
+        t: As in ``_step_along``.
+        at: As in ``_step_along``.
     """
     behind, ahead = borders[0], borders[1]
     for j in range(_RAYS):
-        direction = float64(vectors[axis * _RAYS + j] / lengths[j])
+        direction = float64(rays[axis * _RAYS + j] / norms[j])
         moves = direction != 0.0
-        time = (ahead if direction > 0.0 else behind) / direction
-        between = resolution_m / abs(direction)
-        times[axis * _RAYS + j] = time if moves else _NEVER
-        times[(3 + axis) * _RAYS + j] = between if moves else _NEVER
+        t_max = (ahead if direction > 0.0 else behind) / direction
+        t_delta = resolution_m / abs(direction)
+        t[_T_MAX + axis * _RAYS + j] = t_max if moves else NEVER
+        t[_T_DELTA + axis * _RAYS + j] = t_delta if moves else NEVER
         # Subtracting the mask adds one in the masked bits: the carry runs through all the others.
         step = -bits if direction > 0.0 else int64(-1)
-        places[(3 + axis) * _RAYS + j] = step if moves else int64(0)
-        places[axis * _RAYS + j] = first & bits
+        at[_STEP + axis * _RAYS + j] = step if moves else int64(0)
+        at[_CELL + axis * _RAYS + j] = first & bits
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _step(times, places, path, first, x_bits, y_bits, z_bits):
+def _step_along(t, at, path, first, x_bits, y_bits, z_bits):
     """Take some steps along every ray, and return how many rays have not ended then.
 
     The inner loop vectorises: all its rows are at constant distances in two arrays, and it has no branch.
 
     Args:
-        times: (7 · R,) float64 rows: lengths to the next border along x, y, z; between borders; of the ray.
-        places: (8 · R,) int64 rows: bits of the cell along x, y, z; their steps; the last cell; 1 while the
-            ray goes on.
+        t: (7 · R,) float64 rows of lengths along the ray: tMax along x, y, z; tDelta along x, y, z; its end.
+        at: (8 · R,) int64 rows: bits of the cell along x, y, z; step along x, y, z; the last cell; 1 while
+            the ray goes on.
         path: (S · R,) int64 result: the cells in which the steps begin; ``first`` where a ray has ended.
         first: Cell of the origin.
         x_bits: Mask of the bits of a cell's index along x.
         y_bits: Mask of those along y.
         z_bits: Mask of those along z.
     """
-    for step in range(_STEPS):
+    for n in range(_STEPS):
         for j in range(_RAYS):
-            x, y, z = places[j], places[_Y + j], places[_Z + j]
-            x_time, y_time, z_time = times[j], times[_Y + j], times[_Z + j]
-            goes_on = places[_GOES_ON + j]
-            cell = x | y | z
-            path[step * _RAYS + j] = cell if goes_on != 0 else first
-            along_x = (x_time < y_time) & (x_time < z_time)
-            along_y = (not x_time < y_time) & (y_time < z_time)
+            x, y, z = at[_CELL + j], at[_CELL + _Y + j], at[_CELL + _Z + j]
+            t_max_x, t_max_y, t_max_z = t[_T_MAX + j], t[_T_MAX + _Y + j], t[_T_MAX + _Z + j]
+            goes_on = at[_GOES_ON + j]
+            path[n * _RAYS + j] = x | y | z if goes_on != 0 else first
+            along_x = (t_max_x < t_max_y) & (t_max_x < t_max_z)
+            along_y = (not t_max_x < t_max_y) & (t_max_y < t_max_z)
             along_z = not (along_x | along_y)
-            next_x = (x + places[_BETWEEN + j]) & x_bits
-            next_y = (y + places[_BETWEEN + _Y + j]) & y_bits
-            next_z = (z + places[_BETWEEN + _Z + j]) & z_bits
+            next_x = (x + at[_STEP + j]) & x_bits
+            next_y = (y + at[_STEP + _Y + j]) & y_bits
+            next_z = (z + at[_STEP + _Z + j]) & z_bits
             x = next_x if along_x else x
             y = next_y if along_y else y
             z = next_z if along_z else z
-            x_next = x_time + times[_BETWEEN + j]
-            y_next = y_time + times[_BETWEEN + _Y + j]
-            z_next = z_time + times[_BETWEEN + _Z + j]
-            x_time = x_next if along_x else x_time
-            y_time = y_next if along_y else y_time
-            z_time = z_next if along_z else z_time
-            places[j], places[_Y + j], places[_Z + j] = x, y, z
-            times[j], times[_Y + j], times[_Z + j] = x_time, y_time, z_time
-            reach = times[_REACH + j]
-            is_beyond = (x_time > reach) & (y_time > reach) & (z_time > reach)
-            has_ended = ((x | y | z) == places[_END + j]) | is_beyond
-            places[_GOES_ON + j] = int64(0) if has_ended else goes_on
+            t_next_x = t_max_x + t[_T_DELTA + j]
+            t_next_y = t_max_y + t[_T_DELTA + _Y + j]
+            t_next_z = t_max_z + t[_T_DELTA + _Z + j]
+            t_max_x = t_next_x if along_x else t_max_x
+            t_max_y = t_next_y if along_y else t_max_y
+            t_max_z = t_next_z if along_z else t_max_z
+            at[_CELL + j], at[_CELL + _Y + j], at[_CELL + _Z + j] = x, y, z
+            t[_T_MAX + j], t[_T_MAX + _Y + j], t[_T_MAX + _Z + j] = t_max_x, t_max_y, t_max_z
+            t_end = t[_T_END + j]
+            is_beyond = (t_max_x > t_end) & (t_max_y > t_end) & (t_max_z > t_end)
+            has_ended = ((x | y | z) == at[_END + j]) | is_beyond
+            at[_GOES_ON + j] = int64(0) if has_ended else goes_on
     going = int64(0)
     for j in range(_RAYS):
-        going += places[_GOES_ON + j]
+        going += at[_GOES_ON + j]
     return going
 
 
@@ -301,22 +376,16 @@ def merge(cells, positions, slots, values, sensor):
         slots: (B,) int64 rows of the same blocks in ``values``.
         values: (capacity, 512) float32 log-odds; NaN is unknown.
         sensor: Increments and clamps.
-
-    Returns:
-        Number of voxels that became known.
     """
     hit, miss, lowest, highest = sensor.hit, sensor.miss, sensor.lowest, sensor.highest
-    added = 0
     for i in range(len(positions)):
         start = positions[i] * BLOCK_VOXELS
         seen_block = cells[start : start + BLOCK_VOXELS]
         block = values[slots[i]]
-        block_added = int32(0)
         for j in range(BLOCK_VOXELS):  # this loop vectorises: selections only, no branch
             seen = int32(seen_block[j])
             old = block[j]
-            unknown = old != old
-            value = float32(0.0) if unknown else old
+            value = float32(0.0) if old != old else old
             new = value + (hit if seen == OCCUPIED else miss)
             new = lowest if new < lowest else new
             new = highest if new > highest else new
@@ -324,7 +393,4 @@ def merge(cells, positions, slots, values, sensor):
             clamped = value >= highest if seen == OCCUPIED else value <= lowest
             new = value if clamped else new
             block[j] = old if seen == UNTOUCHED else new
-            block_added += int32(unknown & (seen != UNTOUCHED))
-        added += block_added
         seen_block[:] = UNTOUCHED
-    return added

@@ -1,9 +1,9 @@
-"""File of all frames' scan updates, from which a map is fused again without reading frames that did not move.
+"""Scan updates: the free and occupied voxels of one scan, packed, and the file of those of all frames.
 
-One line of JSON has the settings that the rays depend on. Then each frame in time order: a little-endian head
-(stamp, T_world_body, number of blocks, number of bytes) and its compressed update. A map is a fold over
-updates, so merging those that still hold and casting the others again gives the same bits as fusing from
-scratch.
+From them a map is fused again without reading frames that did not move. One line of JSON has the settings
+that the rays depend on. Then each frame in time order: a little-endian head (stamp, T_world_body, number of
+blocks, number of bytes) and its compressed update. A map is a fold over updates, so merging those that still
+hold and casting the others again gives the same bits as fusing from scratch.
 """
 
 import json
@@ -15,19 +15,86 @@ from types import TracebackType
 from typing import Self
 
 import numpy as np
+from isal import isal_zlib
+from numba import njit
 from numpy.typing import NDArray
 
-from mapper.core.errors import MapFileError
+from mapper.core.errors import DataError, MapFileError
 from mapper.core.geometry import Transform, angle_between
-from mapper.octree.casting import depth_limit_of
+from mapper.octree.casting import Cast, depth_limit_of
+from mapper.octree.casting_kernels import FREE, OCCUPIED, UNTOUCHED
 from mapper.octree.config import OctreeConfig
-from mapper.octree.scan_update import ScanUpdate, decompressed
+from mapper.octree.keys import BLOCK_VOXELS
 from mapper.runtime.atomic import writing
 
+PACKED_BYTES = BLOCK_VOXELS // 8
+"""Bytes of one bit per voxel of a block."""
+
+_LEVEL = 1  # of compression: cells are mostly runs, which higher levels shrink little further
 _FORMAT = "mapper sights 1"  # the updates' former name: files with it are still read
 _RAY_SETTINGS = {"resolution_m", "max_range_m", "depth_noise", "discretize"}
 """Settings that casting depends on; probabilities only matter when updates are merged."""
 _HEAD = np.dtype([("stamp_ns", "<i8"), ("T_world_body", "<f8", (4, 4)), ("blocks", "<u4"), ("size", "<u4")])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScanUpdate:
+    """Free and occupied voxels of one scan, by block.
+
+    Attributes:
+        codes: (B,) int64 Morton codes of the blocks, increasing.
+        free: (B, 64) uint8, bit v of a block set where voxel v, in Morton order, is free.
+        occupied: (B, 64) uint8, the same where it is occupied.
+    """
+
+    codes: NDArray[np.int64]
+    free: NDArray[np.uint8]
+    occupied: NDArray[np.uint8]
+
+    def __post_init__(self) -> None:
+        planes = (len(self.codes), PACKED_BYTES)
+        if self.free.shape != planes or self.occupied.shape != planes:
+            raise DataError(f"scan update: planes {self.free.shape} and {self.occupied.shape}, want {planes}")
+
+    def __len__(self) -> int:
+        """Return the number of blocks."""
+        return len(self.codes)
+
+    def cells(self) -> NDArray[np.uint8]:
+        """Return the (B · 512,) uint8 cells, as casting writes them into a window."""
+        cells = np.empty(len(self) * BLOCK_VOXELS, np.uint8)
+        _unpack(self.free.reshape(-1), self.occupied.reshape(-1), cells)
+        return cells
+
+    def compress(self) -> bytes:
+        """Return the update as compressed bytes, the same for the same update."""
+        steps = np.diff(self.codes, prepend=np.int64(0)).astype("<i8")
+        return isal_zlib.compress(steps.tobytes() + self.free.tobytes() + self.occupied.tobytes(), _LEVEL)
+
+
+def pack(cast: Cast) -> ScanUpdate:
+    """Return the update of a cast scan, and reset its window's cells to UNTOUCHED."""
+    order = np.argsort(cast.codes)
+    free, occupied = (np.empty((len(order), PACKED_BYTES), np.uint8) for _ in range(2))
+    _pack(cast.window.cells, cast.positions[order], free, occupied)
+    return ScanUpdate(cast.codes[order], free, occupied)
+
+
+def decompress(data: bytes, *, blocks: int) -> ScanUpdate:
+    """Return the update of a number of blocks from the bytes of ``ScanUpdate.compress``.
+
+    Raises:
+        DataError: The bytes are damaged.
+    """
+    try:
+        plain = isal_zlib.decompress(data)
+    except isal_zlib.error as error:  # type: ignore[misc]  # its stub says: an instance
+        raise DataError(f"scan update of {blocks} blocks: damaged: {error}") from None
+    if len(plain) != blocks * (8 + 2 * PACKED_BYTES):
+        raise DataError(f"scan update of {blocks} blocks: damaged: {len(plain)} bytes")
+    steps = np.frombuffer(plain, "<i8", count=blocks)
+    free, occupied = np.frombuffer(plain, np.uint8, offset=8 * blocks).reshape(2, blocks, PACKED_BYTES)
+    return ScanUpdate(np.cumsum(steps), free, occupied)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,17 +114,17 @@ class CachedUpdate:
     data: bytes = field(repr=False)
 
     def update(self) -> ScanUpdate:
-        """Return the update, decompressed.
+        """Return the update, decompress.
 
         Raises:
             DataError: It is damaged.
         """
-        return decompressed(self.data, blocks=self.blocks)
+        return decompress(self.data, blocks=self.blocks)
 
 
 def cache_update(stamp_ns: int, T_world_body: Transform, update: ScanUpdate) -> CachedUpdate:
     """Return a frame's update, compressed to be written."""
-    return CachedUpdate(stamp_ns, T_world_body, len(update), update.compressed())
+    return CachedUpdate(stamp_ns, T_world_body, len(update), update.compress())
 
 
 class ScanUpdateWriter:
@@ -95,7 +162,7 @@ class ScanUpdateWriter:
         with writing(self._path):
             self._file.flush()
 
-    def reopened(self) -> "ScanUpdateFile":
+    def reopen(self) -> "ScanUpdateFile":
         """Return a reader of what was written so far."""
         self.flush()
         return open_scan_updates(self._path)
@@ -208,3 +275,25 @@ def _head(raw: bytes) -> NDArray[np.void]:
 def _first_line(config: OctreeConfig) -> bytes:
     settings = {"format": _FORMAT, **config.model_dump(mode="json", include=_RAY_SETTINGS)}
     return json.dumps(settings).encode() + b"\n"
+
+
+@njit(cache=True, nogil=True)
+def _pack(cells, positions, free, occupied):
+    for i in range(len(positions)):
+        start = positions[i] * BLOCK_VOXELS
+        for byte in range(PACKED_BYTES):
+            first = start + 8 * byte
+            free_bits, occupied_bits = 0, 0
+            for bit in range(8):
+                free_bits |= (cells[first + bit] == FREE) << bit
+                occupied_bits |= (cells[first + bit] == OCCUPIED) << bit
+            free[i, byte], occupied[i, byte] = free_bits, occupied_bits
+        cells[start : start + BLOCK_VOXELS] = UNTOUCHED
+
+
+@njit(cache=True, nogil=True)
+def _unpack(free, occupied, cells):
+    """Write one cell per bit of the (N,) planes."""
+    for i in range(len(free)):
+        for bit in range(8):
+            cells[8 * i + bit] = ((free[i] >> bit) & 1) * FREE + ((occupied[i] >> bit) & 1) * OCCUPIED
