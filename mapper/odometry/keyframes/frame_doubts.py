@@ -1,21 +1,21 @@
 """Doubts of RGB-D frames: what speaks against a tracked pose, measured against what is usual in this log."""
 
 import math
-from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
 
 from mapper.core.doubts import Doubt
 from mapper.core.geometry import Array, Transform, inverse, log
+from mapper.core.running_median import RunningMedian
 from mapper.odometry.camera.image_observation import FEW_MOVING
 from mapper.odometry.keyframes.earlier_depth import Displacement
 from mapper.odometry.keyframes.pose_tracker import TrackedPose
 
 _MEMORY = 100
-"""Undoubted frames whose medians are the usual."""
+"""Undoubted frames over which medians are taken."""
 _FEWEST = 10
-"""With fewer of them nothing is known to be usual."""
+"""With fewer of them the medians are not known."""
 _LOOSE_M = 0.025
 """A translation this uncertain is doubtful where the usual is far better: 1 % of a view 2 to 3 m deep."""
 _LOOSE_RATIO = 4.0
@@ -57,7 +57,7 @@ class FrameDoubts:
 
     def __init__(self) -> None:
         names = ("sigma_m", "agreement", "jump_rad_s", "jump_m_s", "speed_rad_s", "speed_m_s")
-        self._figures: dict[str, deque[float]] = {name: deque(maxlen=_MEMORY) for name in names}
+        self._figures = {name: RunningMedian(memory=_MEMORY, fewest=_FEWEST) for name in names}
         self._shown_since_ns = 0
 
     def assess(
@@ -91,7 +91,7 @@ class FrameDoubts:
         doubts = list(tracked_pose.doubts)
         if tracked_pose.depth is not None:  # landmarks were few, so what is usual of them says nothing
             return Assessment(tuple(doubts), sigma_rad, sigma_m) if doubts else UNDOUBTED
-        usual_m, usual_agreement = self._usual("sigma_m"), self._usual("agreement")
+        usual_m, usual_agreement = self._median("sigma_m"), self._median("agreement")
         agreement = tracked_pose.agreement
         if sigma_m > max(_LOOSE_M, _LOOSE_RATIO * usual_m):
             doubts.append(
@@ -127,7 +127,7 @@ class FrameDoubts:
         if doubts:
             # How far off it may be: as far as the prediction says, or as the camera moves in the time.
             off = [
-                max(abs(miss) if math.isfinite(miss) else 0.0, self._usual(name) * shown_s)
+                max(abs(miss) if math.isfinite(miss) else 0.0, self._median(name) * shown_s)
                 for miss, name in zip(jump, ("speed_rad_s", "speed_m_s"), strict=True)
             ]
             return Assessment(tuple(doubts), max(off[0], sigma_rad), max(off[1], sigma_m))
@@ -139,7 +139,7 @@ class FrameDoubts:
         return UNDOUBTED
 
     def _jumps(self, jump: tuple[float, float], elapsed_s: float) -> list[Doubt]:
-        usual_rad, usual_m = (self._usual(name) * elapsed_s for name in ("jump_rad_s", "jump_m_s"))
+        usual_rad, usual_m = (self._median(name) * elapsed_s for name in ("jump_rad_s", "jump_m_s"))
         doubts = []
         if usual_rad and jump[0] > _JUMP_RATIO * usual_rad:
             doubts.append(
@@ -155,14 +155,12 @@ class FrameDoubts:
             )
         return doubts
 
-    def _usual(self, name: str) -> float:
-        """Return the median of a figure; 0 while too little is known."""
-        figures = self._figures[name]
-        return float(np.median(figures)) if len(figures) >= _FEWEST else 0.0
+    def _median(self, name: str) -> float:
+        return self._figures[name].median
 
     def _learn(self, **figures: float) -> None:
         for name, figure in figures.items():
-            self._figures[name].append(figure)
+            self._figures[name].add(figure)
 
 
 def _motion(T_camera_world: Transform, T_before_world: Transform) -> tuple[float, float]:

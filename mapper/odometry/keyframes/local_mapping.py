@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from mapper.core.geometry import Array, Transform, inverse
+from mapper.core.running_median import RunningMedian
 from mapper.graph.model import BetweenFactor
 from mapper.graph.noise import inflated, with_model_error
 from mapper.odometry.config import KeyframeOdometryConfig
@@ -200,17 +201,13 @@ class LogResiduals:
     """
 
     def __init__(self) -> None:
-        self._keyframes: list[ResidualStatistics] = []
-        self._variance_factor = self._model_error = 1.0
+        self._variance_factor = RunningMedian(memory=None, fewest=_MIN_KEYFRAMES)
+        self._design_effect = RunningMedian(memory=None, fewest=_MIN_KEYFRAMES)
 
     def add(self, keyframe: ResidualStatistics) -> None:
         """Add a keyframe's."""
-        self._keyframes.append(keyframe)
-        if len(self._keyframes) >= _MIN_KEYFRAMES:
-            self._variance_factor = float(np.median([known.variance_factor for known in self._keyframes]))
-            effect = float(np.median([known.design_effect for known in self._keyframes]))
-            share = (effect - _NO_EFFECT) / (_FULL_EFFECT - _NO_EFFECT)
-            self._model_error = float(np.clip(share, _MIN_MODEL_ERROR, 1.0))
+        self._variance_factor.add(keyframe.variance_factor)
+        self._design_effect.add(keyframe.design_effect)
 
     def rescale(self, information: Array, T_i_j: Transform) -> Array:
         """Return the (6, 6) information of a relative pose by what the residuals show.
@@ -219,4 +216,8 @@ class LogResiduals:
             information: (6, 6) from features whose errors are independent, and as large as their weights say.
             T_i_j: (4, 4) the measurement.
         """
-        return with_model_error(information / self._variance_factor, T_i_j, scale=self._model_error)
+        if not self._variance_factor.is_known:
+            return with_model_error(information, T_i_j)
+        share = (self._design_effect.median - _NO_EFFECT) / (_FULL_EFFECT - _NO_EFFECT)
+        model_error = float(np.clip(share, _MIN_MODEL_ERROR, 1.0))
+        return with_model_error(information / self._variance_factor.median, T_i_j, scale=model_error)

@@ -1,12 +1,12 @@
 """Constant-velocity model of the sensor's motion, with the errors that its predictions had in this log."""
 
-from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
 
 from mapper.core.deskew import STILL, Twist, twist_between
 from mapper.core.geometry import Array, Transform, angle_between, inverse
+from mapper.core.running_median import RunningMedian
 from mapper.core.timebase import NS_PER_S
 
 _MIN_ELAPSED_S = 0.005  # over less, an error of millimetres becomes a large velocity
@@ -38,8 +38,7 @@ class MotionModel:
         self._elapsed_s = 0.0
         self._placed = 0
         self._covariance = np.zeros((6, 6))
-        self._median = np.zeros(2)
-        self._errors: deque[tuple[float, float]] = deque(maxlen=_ERRORS)
+        self._turn_errors, self._shift_errors = RunningMedian(memory=_ERRORS), RunningMedian(memory=_ERRORS)
 
     def elapsed_s(self, time_ns: int) -> float:
         """Return the seconds since the last scan that was placed."""
@@ -55,10 +54,10 @@ class MotionModel:
         Errors are accelerations: they grow with the time since the last scan and since the one before it. A
         steady log is given two hundredths of the motion, so that its first acceleration is no surprise.
         """
-        if len(self._errors) < _FEWEST_ERRORS:
+        if len(self._turn_errors) < _FEWEST_ERRORS:
             return None
         elapsed_s = self.elapsed_s(time_ns)
-        rotation, translation = self._median
+        rotation, translation = self._accelerations()
         moved = float(np.linalg.norm(self.twist.translation_mps)) * elapsed_s
         turned = float(np.linalg.norm(self.twist.rotation_radps)) * elapsed_s
         time_s2 = _time_s2(elapsed_s, self._elapsed_s)
@@ -69,11 +68,15 @@ class MotionModel:
 
     def acceleration(self, time_ns: int, T_world_body: Transform, twist: Twist) -> float:
         """Return the angular acceleration to a velocity at a pose, at least the usual one, rad/s²."""
-        usual, elapsed_s = float(self._median[0]), self.elapsed_s(time_ns)
+        usual, elapsed_s = self._accelerations()[0], self.elapsed_s(time_ns)
         if elapsed_s < _MIN_ELAPSED_S:
             return usual
         change = twist.rotation_radps - self.mean_twist(time_ns, T_world_body).rotation_radps
         return max(usual, 2.0 * float(np.linalg.norm(change)) / elapsed_s)
+
+    def _accelerations(self) -> tuple[float, float]:
+        """Return the standard deviations of the accelerations that predictions lacked, rad/s² and m/s²."""
+        return self._turn_errors.median / _MEDIAN_LENGTH, self._shift_errors.median / _MEDIAN_LENGTH
 
     def velocity(self, time_ns: int, T_world_body: Transform) -> tuple[Twist, Array]:
         """Return the expected velocity at a pose, and its (6, 6) covariance, rotation before translation.
@@ -128,8 +131,8 @@ class MotionModel:
                 error = inverse(self.predicted(time_ns)) @ T_world_body
                 lengths = angle_between(np.eye(3), error[:3, :3]), float(np.linalg.norm(error[:3, 3]))
                 time_s2 = _time_s2(elapsed_s, self._elapsed_s)
-                self._errors.append((lengths[0] / time_s2, lengths[1] / time_s2))
-                self._median = np.median(np.array(self._errors), axis=0) / _MEDIAN_LENGTH
+                self._turn_errors.add(lengths[0] / time_s2)
+                self._shift_errors.add(lengths[1] / time_s2)
             if measured is None:
                 covariance = np.diag(self.velocity_sigmas(time_ns) ** 2)
                 self.twist, self._covariance = self.mean_twist(time_ns, T_world_body), covariance

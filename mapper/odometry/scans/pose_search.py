@@ -1,153 +1,163 @@
-"""Search of a scan's pose: by prediction, and where that fits less than usual, by all other ways."""
+"""Search of a scan's pose: from the prediction, and where that fits less than most, by other hypotheses."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mapper.core.doubts import Doubt
-from mapper.core.geometry import Array, Transform, angle_between, exp, inverse
+from mapper.core.geometry import Transform, angle_between, exp, inverse
 from mapper.odometry.scans.config import ScanOdometryConfig
-from mapper.odometry.scans.motion_model import MotionModel
-from mapper.odometry.scans.observed_part import observed_part
-from mapper.odometry.scans.scan_fit import ScanFit, ScanKeyframe, contradiction, described, fit_of
+from mapper.odometry.scans.motion_model import MotionModel, Spread
+from mapper.odometry.scans.pose_assessment import PoseAssessment
+from mapper.odometry.scans.pose_candidate import PoseCandidate, Shares, fuse_with_prediction, jump_between
+from mapper.odometry.scans.scan_fit import ScanKeyframe, contradiction, described, fit_of
 from mapper.odometry.scans.scan_matcher import DeskewedScan, ScanMatcher
-from mapper.odometry.scans.usual_fit import Jump, Shares, UsualFit, jump_between
 from mapper.registration.base import Aligner
 from mapper.registration.factory import build_registration
+from mapper.registration.free_space import ScanDescription
 from mapper.registration.refining import refined_motion
 
 _TURNS_RAD = (0.3, -0.3, 0.6, -0.6, 1.0, -1.0)  # about the vertical, from the predicted pose
 _PAIR_DISTANCES = (4.0, 2.0, 1.0)  # of a scan to the last keyframe or scan, in largest pair distances
-_CONTRADICTION_WEIGHT = 15.0
 _ALIKE = 0.1  # scores nearer than this do not decide
-_GOOD = 0.75  # a score of this part of the usual one ends the search
-_FAIR, _GUESSES = 0.5, 3  # and so does one of this part to which so many guesses lead
+_GOOD = 0.75  # a score of this part of the median one ends the search
+_FAIR, _GUESSES = 0.5, 3  # and so does one of this part to which this number of guesses leads
 _SAME_VOXELS, _SAME_RAD = 0.25, 0.01  # two answers of a registration that differ less are one
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PoseCandidate:
-    """A pose of the body in the middle of a scan's sweep.
+class KnownPath:
+    """What is known of the path before a scan.
 
     Attributes:
-        keyframe: That it was compared with.
-        T_world_middle: (4, 4) the pose.
-        fit: On that keyframe.
-        shares: What of it is compared with the usual.
-        jump: From the predicted pose.
-        open_m: (6,) errors of the motions that were predicted instead of measured.
+        keyframes: The last keyframes, the newest first.
+        doubtful: Keyframe after them whose pose is in doubt.
+        last: The last scan, if it is not a keyframe.
+        motion: Motion until then.
+    """
+
+    keyframes: Sequence[ScanKeyframe]
+    doubtful: ScanKeyframe | None
+    last: ScanKeyframe | None
+    motion: MotionModel
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Scan:
+    """A scan with the pose that is predicted for it."""
+
+    deskewed: DeskewedScan
+    T_world_predicted: Transform
+    spread: Spread | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Hypothesis:
+    """A pose that a registration found, to be compared with a keyframe.
+
+    Attributes:
+        T_world_middle: (4, 4) the pose; None if the registration found none.
+        keyframe: The keyframe.
+        guess: Number of the guess that led to it; 0 is the predicted pose.
         method: Step that found it.
     """
 
+    T_world_middle: Transform | None
     keyframe: ScanKeyframe
-    T_world_middle: Transform
-    fit: ScanFit
-    shares: Shares
-    jump: Jump
-    open_m: Array
+    guess: int
     method: str
-
-    @property
-    def is_measured(self) -> bool:
-        """Whether surfaces show all of the motion."""
-        return bool(self.fit.observability.min() >= 1.0)
-
-    @property
-    def score(self) -> float:
-        """Agreement less what contradicts, weighted; overlap does not tell, as ground lies on any ground."""
-        return _score(self.shares)
 
 
 class PoseSearch:
     """Search by a matcher and by registration to the last keyframes."""
 
-    def __init__(self, config: ScanOdometryConfig, matcher: ScanMatcher) -> None:
-        self.usual = UsualFit()
+    def __init__(self, config: ScanOdometryConfig, matcher: ScanMatcher, assessment: PoseAssessment) -> None:
         self._config = config
         self._matcher = matcher
+        self._assessment = assessment
+        self._believes_all = config.usual_ratio == 0.0
         self._rescue = build_registration(config.rescue) if config.rescue is not None else None
         self._rescuer: tuple[DeskewedScan, Aligner] | None = None
 
     def find(
-        self,
-        deskewed: DeskewedScan,
-        keyframes: Sequence[ScanKeyframe],
-        doubtful: ScanKeyframe | None,
-        last: ScanKeyframe | None,
-        motion: MotionModel,
-        time_ns: int,
-        T_world_guess: Transform | None = None,
+        self, deskewed: DeskewedScan, path: KnownPath, time_ns: int, T_world_guess: Transform | None = None
     ) -> PoseCandidate | None:
-        """Return the pose that fits best; None if no method finds one.
+        """Return the pose that fits best; None if no method finds one, or next to nothing agrees.
 
         Args:
             deskewed: The scan.
-            keyframes: The last ones, the newest first.
-            doubtful: Keyframe after them whose pose is in doubt.
-            last: The last scan, if it is not a keyframe.
-            motion: For the predicted pose.
-            time_ns: Of the middle of the sweep.
+            path: The path before it.
+            time_ns: Time of the middle of the sweep.
             T_world_guess: (4, 4) where the matcher begins; None is the predicted pose.
         """
-        T_world_predicted = motion.predicted(time_ns)
-        spread = motion.spread(time_ns)
-        is_believed = self._config.usual_ratio == 0.0
+        scan = _Scan(deskewed, path.motion.predicted(time_ns), path.motion.spread(time_ns))
+        found = self._track(scan, path.keyframes, T_world_guess)
+        if found is None or (not self._believes_all and self._assessment.is_suspect(found)):
+            found = self._search(scan, path, found)
+        return None if found is None or self._assessment.is_lost(found) else found
 
-        def assessed(found: Transform | None, key: ScanKeyframe, method: str) -> PoseCandidate | None:
-            if found is None:
-                return None
-            fit = fit_of(
-                key,
-                deskewed,
-                inverse(key.T_world_middle) @ found,
-                max_pair_distance_m=self._config.max_pair_distance_m,
-            )
-            if fit is None:
-                return None
-            shares = Shares(fit.overlap, fit.agreement, fit.contradicting)
-            T_world_middle, open_m = found, np.zeros(6)
-            if not is_believed:
-                voxel_m = deskewed.prepared.voxel_m
-                T_world_middle, open_m = observed_part(fit, T_world_predicted, found, spread, voxel_m=voxel_m)
-            jump = jump_between(T_world_predicted, T_world_middle, spread)
-            return PoseCandidate(key, T_world_middle, fit, shares, jump, open_m, method)
-
-        T_world_begin = T_world_predicted if T_world_guess is None else T_world_guess
-        T_world_near = self._matcher.match(deskewed, T_world_begin, reach="near")
+    def _track(
+        self, scan: _Scan, keyframes: Sequence[ScanKeyframe], T_world_guess: Transform | None
+    ) -> PoseCandidate | None:
+        """Match a scan near the prediction, and compare the pose with the keyframe that shows most of it."""
+        T_world_begin = scan.T_world_predicted if T_world_guess is None else T_world_guess
+        T_world_near = self._matcher.match(scan.deskewed, T_world_begin, reach="near")
         best: PoseCandidate | None = None
-        for key in keyframes:
-            near = assessed(T_world_near, key, "map")
-            if near is not None and (is_believed or (not self.is_suspect(near) and near.is_measured)):
+        for keyframe in keyframes:
+            near = self._candidate(scan, _Hypothesis(T_world_near, keyframe, 0, "map"))
+            if near is not None and self._believes_all:
+                return near
+            if near is not None and near.is_measured and not self._assessment.is_suspect(near):
                 return near
             best = self._preferred(best, near)
-        if best is not None and not self.is_suspect(best):
-            return best
-        description = described(deskewed)
+        return best
 
-        def compared(candidate: PoseCandidate) -> PoseCandidate:
-            """Return a candidate with the contradictions of both scans."""
-            T_key_scan = inverse(candidate.keyframe.T_world_middle) @ candidate.T_world_middle
-            share = contradiction(candidate.keyframe, description, T_key_scan)
-            return replace(candidate, shares=replace(candidate.shares, contradicting=share))
+    def _search(self, scan: _Scan, path: KnownPath, tracked: PoseCandidate | None) -> PoseCandidate | None:
+        """Return the best of the hypotheses, those that need no guess only if none of the others fits."""
+        description = described(scan.deskewed)
+        candidates = [] if tracked is None else [_compare_both(tracked, description)]
+        answers = Answers(scan.deskewed.prepared.voxel_m, [c.T_world_middle for c in candidates])
 
-        candidates = [] if best is None else [compared(best)]
-        answers = Answers(deskewed.prepared.voxel_m, [c.T_world_middle for c in candidates])
-        for way in (self._nearby, self._globally):
-            if way == self._globally and any(map(self.fits, candidates)):
-                break
-            for key in (keyframes[0], doubtful) if doubtful is not None else (keyframes[0],):
-                for guess, T_world_middle, method in way(deskewed, key, last, motion, T_world_predicted):
-                    if T_world_middle is None:
-                        continue
-                    if answers.add(T_world_middle, guess):
-                        found = assessed(T_world_middle, key, method)
-                        if found is not None:
-                            candidates.append(compared(found))
-                    best = _best(candidates)
-                    if best is not None and self._is_enough(best, answers):
-                        return best
+        def try_all(hypotheses: Iterable[_Hypothesis]) -> bool:
+            """Add the candidates of some hypotheses until one is enough; return whether one is."""
+            for hypothesis in hypotheses:
+                T_world_middle = hypothesis.T_world_middle
+                if T_world_middle is not None and answers.add(T_world_middle, hypothesis.guess):
+                    candidate = self._candidate(scan, hypothesis)
+                    if candidate is not None:
+                        candidates.append(_compare_both(candidate, description))
+                best = _best(candidates)
+                if best is not None and self._is_enough(best, answers):
+                    return True
+            return False
+
+        if not try_all(self._nearby(scan, path)) and not any(map(self._assessment.fits, candidates)):
+            try_all(self._globally(scan, path))
         return _best(candidates)
+
+    def _candidate(self, scan: _Scan, hypothesis: _Hypothesis) -> PoseCandidate | None:
+        """Return a hypothesis with its fit, fused with the prediction; None if it fits nothing."""
+        keyframe, T_world_found = hypothesis.keyframe, hypothesis.T_world_middle
+        if T_world_found is None:
+            return None
+        T_key_scan = inverse(keyframe.T_world_middle) @ T_world_found
+        fit = fit_of(
+            keyframe, scan.deskewed, T_key_scan, max_pair_distance_m=self._config.max_pair_distance_m
+        )
+        if fit is None:
+            return None
+        T_world_middle, open_m = T_world_found, np.zeros(6)
+        if not self._believes_all:
+            T_world_middle, open_m = fuse_with_prediction(
+                fit,
+                scan.T_world_predicted,
+                T_world_found,
+                scan.spread,
+                voxel_m=scan.deskewed.prepared.voxel_m,
+            )
+        jump = jump_between(scan.T_world_predicted, T_world_middle, scan.spread)
+        shares = Shares(fit.overlap, fit.agreement, fit.contradicting)
+        return PoseCandidate(keyframe, T_world_middle, fit, shares, jump, open_m, hypothesis.method)
 
     def _preferred(self, one: PoseCandidate | None, other: PoseCandidate | None) -> PoseCandidate | None:
         """Return the one that is less suspect and whose keyframe shows more of the motion."""
@@ -157,142 +167,70 @@ class PoseSearch:
         def rank(candidate: PoseCandidate) -> tuple[bool, float, float]:
             fit = candidate.fit
             shown = float(fit.observability.min()), float(fit.degeneracy.shares[0])
-            return not self.is_suspect(candidate), *shown
+            return not self._assessment.is_suspect(candidate), *shown
 
         return other if rank(other) > rank(one) else one
 
-    def is_suspect(self, candidate: PoseCandidate) -> bool:
-        """Return whether a pose fits less than usual, or is a surprise, so that others are tried."""
-        return (
-            candidate.jump.is_unusual
-            or self.usual.agrees_little(candidate.shares)
-            or not self.fits(candidate)
-        )
-
     def _is_enough(self, best: PoseCandidate, answers: "Answers") -> bool:
         """Return whether no other pose has to be tried: it fits well, or several guesses lead to it."""
-        usual = _score(self.usual.usual)
-        if best.score >= _GOOD * usual and not self.is_suspect(best):
+        median = self._assessment.statistics.median.score
+        if best.score >= _GOOD * median and not self._assessment.is_suspect(best):
             return True
-        return best.score >= _FAIR * usual and answers.guesses_of(best.T_world_middle) >= _GUESSES
+        return best.score >= _FAIR * median and answers.guesses_of(best.T_world_middle) >= _GUESSES
 
-    def fits(self, candidate: PoseCandidate) -> bool:
-        """Return whether a pose fits as usual."""
-        usual, shares = self.usual, candidate.shares
-        return not (
-            usual.has_little_overlap(shares, usual_ratio=self._config.usual_ratio)
-            or usual.contradicts(shares)
-            or usual.disagrees(shares)
-        )
-
-    def is_lost(self, candidate: PoseCandidate) -> bool:
-        """Return whether next to nothing agrees, or too much speaks against the pose."""
-        if self._config.lost_ratio == 0.0:
-            return False
-        usual, shares = self.usual, candidate.shares
-        if not usual.is_known:  # in a field half of the points have partners
-            return shares.overlap < 0.5 * self._config.lost_ratio
-        share = shares.overlap / usual.usual.overlap
-        little = usual.has_little_overlap(shares, usual_ratio=self._config.usual_ratio)
-        if little and usual.excludes(shares):
-            return True
-        speaks_against = usual.contradicts(shares) or usual.disagrees(shares)
-        return share < (self._config.lost_ratio if speaks_against else 0.5 * self._config.lost_ratio)
-
-    def doubts(self, candidate: PoseCandidate) -> tuple[Doubt, ...]:
-        """Return what speaks against a pose; empty if it is believed.
-
-        Little overlap alone is a new room, and a jump alone a sudden turn.
-        """
-        if self._config.usual_ratio == 0.0:
-            return ()
-        usual, shares = self.usual, candidate.shares
-        little = usual.has_little_overlap(shares, usual_ratio=self._config.usual_ratio)
-        contradicts, disagrees = usual.contradicts(shares), usual.disagrees(shares)
-        jumps = candidate.jump.is_unusual
-        if not usual.is_known:
-            little = disagrees = False
-        is_alone = not contradicts and little + disagrees + jumps < 2
-        if is_alone and not (jumps and candidate.method == "rescued"):
-            return ()
-        doubts = []
-        if little:
-            doubts.append(
-                Doubt(
-                    "disagreement",
-                    f"{shares.overlap:.0%} of the points agree, {usual.usual.overlap:.0%} is usual",
-                )
-            )
-        if contradicts:
-            doubts.append(
-                Doubt(
-                    "elsewhere",
-                    f"{shares.contradicting:.1%} of the points stand where rays passed, "
-                    f"{usual.usual.contradicting:.1%} is usual",
-                )
-            )
-        if disagrees:
-            doubts.append(
-                Doubt(
-                    "disagreement",
-                    f"{shares.agreement:.0%} agree in the weakest direction, "
-                    f"{usual.usual.agreement:.0%} is usual",
-                )
-            )
-        if jumps:
-            doubts.append(Doubt("jump", candidate.jump.text))
-        return tuple(doubts)
-
-    def _nearby(
-        self,
-        deskewed: DeskewedScan,
-        keyframe: ScanKeyframe,
-        last: ScanKeyframe | None,
-        motion: MotionModel,
-        T_world_predicted: Transform,
-    ) -> Iterator[tuple[int, Transform | None, str]]:
-        """Yield poses that are found from the predicted one, from no motion, and from turns of both.
-
-        Each comes with the number of its guess; that of the predicted pose is 0.
-        """
-        yield 0, self._matcher.match(deskewed, T_world_predicted, reach="far"), "far"
+    def _nearby(self, scan: _Scan, path: KnownPath) -> Iterator[_Hypothesis]:
+        """Yield poses that are found from the predicted one, from no motion, and from turns of both."""
+        deskewed, T_world_predicted = scan.deskewed, scan.T_world_predicted
         up = T_world_predicted[2, :3]
         turned = [T_world_predicted @ exp(turn * up, np.zeros(3)) for turn in _TURNS_RAD]
-        for guess, T_world_guess in enumerate((T_world_predicted, *turned, motion.T_world_last)):
-            if self._matcher.uses_guess and guess > 0:  # from the predicted pose it was the first try
-                yield guess, self._matcher.match(deskewed, T_world_guess, reach="near"), "turned"
-            for key in (keyframe, last) if last is not None else (keyframe,):
-                T_key_scan = refined_motion(
-                    key.deskewed.prepared,
-                    deskewed.prepared,
-                    inverse(key.T_world_middle) @ T_world_guess,
-                    kind="plane-icp",
-                    pair_distances_m=[k * self._config.max_pair_distance_m for k in _PAIR_DISTANCES],
-                )
-                if not isinstance(T_key_scan, str):
-                    T_world_found = key.T_world_middle @ T_key_scan
-                    method = "keyframe" if key is keyframe else "scan"
-                    yield guess, self._matcher.match(deskewed, T_world_found, reach="near"), method
-                    yield guess, T_world_found, method
+        distances_m = [k * self._config.max_pair_distance_m for k in _PAIR_DISTANCES]
+        for keyframe in _ends(path):
+            far = self._matcher.match(deskewed, T_world_predicted, reach="far")
+            yield _Hypothesis(far, keyframe, 0, "far")
+            for guess, T_world_guess in enumerate((T_world_predicted, *turned, path.motion.T_world_last)):
+                if self._matcher.uses_guess and guess > 0:  # from the predicted pose it was the first try
+                    near = self._matcher.match(deskewed, T_world_guess, reach="near")
+                    yield _Hypothesis(near, keyframe, guess, "turned")
+                for target in (keyframe, path.last) if path.last is not None else (keyframe,):
+                    T_target_scan = refined_motion(
+                        target.deskewed.prepared,
+                        deskewed.prepared,
+                        inverse(target.T_world_middle) @ T_world_guess,
+                        kind="plane-icp",
+                        pair_distances_m=distances_m,
+                    )
+                    if not isinstance(T_target_scan, str):
+                        T_world_found = target.T_world_middle @ T_target_scan
+                        method = "keyframe" if target is keyframe else "scan"
+                        near = self._matcher.match(deskewed, T_world_found, reach="near")
+                        yield _Hypothesis(near, keyframe, guess, method)
+                        yield _Hypothesis(T_world_found, keyframe, guess, method)
 
-    def _globally(
-        self,
-        deskewed: DeskewedScan,
-        keyframe: ScanKeyframe,
-        last: ScanKeyframe | None,  # noqa: ARG002
-        motion: MotionModel,  # noqa: ARG002
-        T_world_predicted: Transform,  # noqa: ARG002
-    ) -> Iterator[tuple[int, Transform | None, str]]:
-        """Yield the pose that is found without a guess."""
+    def _globally(self, scan: _Scan, path: KnownPath) -> Iterator[_Hypothesis]:
+        """Yield the poses that are found without a guess."""
         if self._rescue is None:
             return
-        if self._rescuer is None or self._rescuer[0] is not keyframe.deskewed:
-            self._rescuer = keyframe.deskewed, self._rescue.prepare(keyframe.deskewed.scan)
-        found = self._rescuer[1].align(deskewed.scan, np.eye(4))
-        if found.converged:
-            T_world_found = keyframe.T_world_middle @ found.T_target_source
-            yield len(_TURNS_RAD) + 2, self._matcher.match(deskewed, T_world_found, reach="near"), "rescued"
-            yield len(_TURNS_RAD) + 2, T_world_found, "rescued"
+        for keyframe in _ends(path):
+            if self._rescuer is None or self._rescuer[0] is not keyframe.deskewed:
+                self._rescuer = keyframe.deskewed, self._rescue.prepare(keyframe.deskewed.scan)
+            found = self._rescuer[1].align(scan.deskewed.scan, np.eye(4))
+            if found.converged:
+                T_world_found = keyframe.T_world_middle @ found.T_target_source
+                near = self._matcher.match(scan.deskewed, T_world_found, reach="near")
+                yield _Hypothesis(near, keyframe, len(_TURNS_RAD) + 2, "rescued")
+                yield _Hypothesis(T_world_found, keyframe, len(_TURNS_RAD) + 2, "rescued")
+
+
+def _ends(path: KnownPath) -> Sequence[ScanKeyframe]:
+    """Return the keyframes that a scan may continue from."""
+    return (path.keyframes[0],) if path.doubtful is None else (path.keyframes[0], path.doubtful)
+
+
+def _compare_both(candidate: PoseCandidate, description: ScanDescription) -> PoseCandidate:
+    """Return a candidate with the contradictions of both scans."""
+    T_key_scan = inverse(candidate.keyframe.T_world_middle) @ candidate.T_world_middle
+    share = contradiction(candidate.keyframe, description, T_key_scan)
+    return replace(candidate, shares=replace(candidate.shares, contradicting=share))
 
 
 class Answers:
@@ -324,10 +262,6 @@ class Answers:
             ):
                 return guesses
         return None
-
-
-def _score(shares: Shares) -> float:
-    return shares.agreement - _CONTRADICTION_WEIGHT * shares.contradicting
 
 
 def _best(candidates: Sequence[PoseCandidate]) -> PoseCandidate | None:

@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from mapper.core.doubts import Doubt
 from mapper.core.geometry import Array, Transform
+from mapper.odometry.scans.pose_candidate import Jump
 from mapper.odometry.scans.scan_fit import ScanFit
-from mapper.odometry.scans.usual_fit import Jump
 
 _SECTORS = 12  # of azimuth, each of two elevations
 _FEWEST = 10  # points of a sector that tells how much its distances agree

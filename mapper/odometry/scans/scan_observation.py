@@ -7,6 +7,7 @@ import numpy as np
 from mapper.core.deskew import STILL, Twist, deskewed
 from mapper.core.errors import FrameError
 from mapper.core.frames import Frame, Scan
+from mapper.core.timebase import NS_PER_S
 from mapper.core.voxel_grid import thin
 from mapper.features.frame_view import ScanView
 from mapper.odometry.scans.config import ScanOdometryConfig
@@ -37,6 +38,11 @@ class ScanObservation:
     range_m: float
     deskewed: DeskewedScan | None
     voxel_m: float
+
+    @property
+    def middle_ns(self) -> int:
+        """Time of the middle of the sweep."""
+        return self.scan.stamp_ns + round(self.middle_s * NS_PER_S)
 
     def deskew(self, twist: Twist) -> DeskewedScan:
         """Return the scan as taken all at once in the middle of the sweep, under a constant velocity.

@@ -10,13 +10,13 @@ from mapper.core.geometry import angle_between, apply, exp, inverse, log
 from mapper.odometry.scans.config import GicpOdometryConfig
 from mapper.odometry.scans.gicp import GicpMatcher
 from mapper.odometry.scans.motion_model import MotionModel, Spread
-from mapper.odometry.scans.observed_part import observed_part
 from mapper.odometry.scans.odometry import ScanOdometry
+from mapper.odometry.scans.pose_assessment import FitStatistics
+from mapper.odometry.scans.pose_candidate import Shares, fuse_with_prediction, jump_between
 from mapper.odometry.scans.pose_search import Answers
 from mapper.odometry.scans.scan_fit import ScanKeyframe, contradiction, described, fit_of
 from mapper.odometry.scans.scan_matcher import DeskewedScan
 from mapper.odometry.scans.scan_noise import ScanNoise, surface_covariance
-from mapper.odometry.scans.usual_fit import Shares, UsualFit, jump_between
 from mapper.registration.refining import refine
 from mapper.registration.surfaces import prepared
 
@@ -106,7 +106,7 @@ def test_a_search_ends_when_several_guesses_lead_to_one_pose(monkeypatch):
     odometry = ScanOdometry(INDOOR, matcher)
     for k in range(8):
         odometry.track(odometry.observe(room_scan(k * 500_000_000, seed=k)))
-    monkeypatch.setattr(UsualFit, "agrees_little", lambda *_: True)
+    monkeypatch.setattr(FitStatistics, "agrees_little", lambda *_: True)
     matcher.count = 0
     track = odometry.track(odometry.observe(room_scan(4_000_000_000, seed=8)))
 
@@ -176,17 +176,17 @@ def test_what_a_tunnel_does_not_show_is_predicted_and_doubted():
 
 
 def test_unusual_shares():
-    usual = UsualFit()
+    log = FitStatistics()
     for k in range(20):
-        usual.add(Shares(0.98 - 0.002 * (k % 3), 0.9, 0.001))
+        log.add(Shares(0.98 - 0.002 * (k % 3), 0.9, 0.001))
 
-    assert usual.has_little_overlap(Shares(0.56, 0.5, 0.0), usual_ratio=0.8)
-    assert not usual.has_little_overlap(Shares(0.85, 0.8, 0.0), usual_ratio=0.8)
-    assert usual.contradicts(Shares(0.9, 0.9, 0.05))
-    assert not usual.contradicts(Shares(0.9, 0.9, 0.008))
-    assert usual.disagrees(Shares(0.9, 0.3, 0.0))
-    usual.clear()
-    assert not usual.has_little_overlap(Shares(0.82, 0.5, 0.0), usual_ratio=0.8)
+    assert log.has_little_overlap(Shares(0.56, 0.5, 0.0), usual_ratio=0.8)
+    assert not log.has_little_overlap(Shares(0.85, 0.8, 0.0), usual_ratio=0.8)
+    assert log.contradicts(Shares(0.9, 0.9, 0.05))
+    assert not log.contradicts(Shares(0.9, 0.9, 0.008))
+    assert log.disagrees(Shares(0.9, 0.3, 0.0))
+    log.clear()
+    assert not log.has_little_overlap(Shares(0.82, 0.5, 0.0), usual_ratio=0.8)
 
 
 def test_the_spread_of_predictions_is_the_logs_own():
@@ -255,8 +255,8 @@ def test_a_prediction_fills_only_what_surfaces_do_not_show():
     predicted = exp(np.zeros(3), np.array([1.0, 0.3, 0.0]))
     fit = fit_of(key, scan, found, max_pair_distance_m=0.5)
 
-    pose, open_m = observed_part(fit, predicted, found, Spread(0.001, 0.05), voxel_m=0.4)
-    near, _ = observed_part(fit, predicted, found, Spread(0.5, 2.0), voxel_m=0.4)
+    pose, open_m = fuse_with_prediction(fit, predicted, found, Spread(0.001, 0.05), voxel_m=0.4)
+    near, _ = fuse_with_prediction(fit, predicted, found, Spread(0.5, 2.0), voxel_m=0.4)
 
     assert fit.unobservable.startswith("translation along x")
     np.testing.assert_allclose(pose[:3, 3], [1.0, 0.02, 0.0], atol=0.02)

@@ -13,7 +13,7 @@ from mapper.odometry.scans.motion_model import MotionModel
 from mapper.odometry.scans.odometry import ScanOdometry
 from mapper.odometry.scans.scan_fit import ScanKeyframe
 from mapper.odometry.scans.scan_matcher import DeskewedScan
-from mapper.odometry.scans.sweep_motion import sweep_motion
+from mapper.odometry.scans.sweep_registration import fit_sweep_motion
 from mapper.registration.surfaces import prepared
 
 TURNING = Twist(np.array([0.1, -0.2, 2.0]), np.array([0.6, 0.2, 0.0]))
@@ -48,7 +48,9 @@ def test_pose_and_velocity_are_found_together():
     sweep = swept_room(T_world_middle, TURNING, seed=2)
     guess = T_world_middle @ exp(np.array([0.0, 0.0, 0.05]), np.array([0.05, -0.05, 0.02]))
 
-    found = sweep_motion([room_keyframe()], sweep, guess, STILL, WIDE, start=STILL, max_pair_distance_m=0.25)
+    found = fit_sweep_motion(
+        [room_keyframe()], sweep, guess, STILL, WIDE, start=STILL, max_pair_distance_m=0.25
+    )
 
     sigmas = np.sqrt(np.diag(found.covariance))
     np.testing.assert_allclose(found.twist.rotation_radps, TURNING.rotation_radps, atol=0.15)
@@ -61,7 +63,7 @@ def test_pose_and_velocity_are_found_together():
 def test_a_certain_velocity_is_kept():
     sweep = swept_room(np.eye(4), TURNING, seed=2)
 
-    found = sweep_motion(
+    found = fit_sweep_motion(
         [room_keyframe()], sweep, np.eye(4), TURNING, 1e-8 * WIDE, start=STILL, max_pair_distance_m=0.25
     )
 
@@ -71,7 +73,9 @@ def test_a_certain_velocity_is_kept():
 def test_too_few_pairs_tell_no_velocity():
     sweep, far = swept_room(np.eye(4), STILL), exp(np.zeros(3), np.array([80.0, 0.0, 0.0]))
 
-    found = sweep_motion([room_keyframe()], sweep, far, STILL, WIDE, start=STILL, max_pair_distance_m=0.25)
+    found = fit_sweep_motion(
+        [room_keyframe()], sweep, far, STILL, WIDE, start=STILL, max_pair_distance_m=0.25
+    )
 
     assert found is None
 
