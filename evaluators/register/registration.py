@@ -75,7 +75,7 @@ def register(
     hough = None
     if isinstance(config, IsvdOdometryConfig):
         began = time.process_time()
-        from mapper.odometry.isvd.pair import align_images
+        from mapper.odometry.isvd.odometry import align_images
 
         alignment, seconds = align_images(target, source, config)
     else:

@@ -72,7 +72,7 @@ def register(
     )
     config = overridden(register_config(method, target_sensor, source_sensor), settings=settings).registration
     if isinstance(config, IsvdOdometryConfig):
-        from mapper.odometry.isvd.pair import align_images
+        from mapper.odometry.isvd.odometry import align_images
 
         return align_images(target_frame, source_frame, config)[0]
     return build_registration(config).prepare(target_frame.scan()).align(source_frame.scan(), T_target_source)

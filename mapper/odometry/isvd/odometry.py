@@ -1,6 +1,7 @@
 """ISVD odometry: each frame registered against several earlier ones (Somlyai, PhD thesis, alg. 7)."""
 
 import math
+import time
 from collections import deque
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -9,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.deskew import Twist
-from mapper.core.errors import FrameError
+from mapper.core.errors import ConfigError, FrameError
 from mapper.core.frames import Frame, PinholeCamera, RgbdFrame
-from mapper.core.geometry import Array, Transform, apply, exp, inverse, log, mean_rotation, transform
+from mapper.core.geometry import Array, Transform, apply, inverse, mean_pose, mean_rotation, transform
 from mapper.features.base import Detector
 from mapper.features.factory import build_detector
 from mapper.features.frame_view import ImageView
@@ -30,13 +31,16 @@ from mapper.odometry.config import IsvdOdometryConfig, MatchConfig
 from mapper.odometry.isvd.registration import IsvdObservation, PairRegistration, RegisterPair, matched_pairs
 from mapper.odometry.sharpest_keyframe import SharpestKeyframes
 from mapper.registration.base import Alignment
+from mapper.registration.reprojection import (
+    VIRTUAL_BASELINE_PX_M,
+    disparity_sigmas_px,
+    image_measurements,
+)
 from mapper.runtime.archived import Archived, archived
 from mapper.sensing.config import KINECT_NOISE
 from mapper.sensing.depth_filter import dif
 from mapper.sensing.depth_noise import depth_sigma_m, feature_depth_m
 
-_VIRTUAL_BASELINE_PX_M = 40.0
-"""bf: depth z counts as the disparity bf / z (Mur-Artal & Tardós 2017)."""
 _DEPTH_SHARE = 0.01
 """Error of depths beside the sensor's noise, as a share: its scale, and the slope where a feature lies."""
 _NEW_VIEW, _NEAR_VIEW = 0.15, 0.6
@@ -148,17 +152,20 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
         rays = (at - [camera.cx_px, camera.cy_px]) / [camera.fx_px, camera.fy_px]
         sigma_px = self._detector.scale_factor ** features.octave.astype(np.float64)
         sigma_m = np.hypot(depth_sigma_m(config.depth_noise or KINECT_NOISE, z), _DEPTH_SHARE * z)
-        # Without depth the weight is not used, but it is a factor in sums.
-        disparity_sigma_px = np.where(np.isnan(z), 1.0, _VIRTUAL_BASELINE_PX_M / z**2 * sigma_m)
+        measured, weights, intrinsics = image_measurements(
+            pixels,
+            z,
+            camera.intrinsics,
+            sigma_px=sigma_px,
+            disparity_sigma_px=disparity_sigmas_px(z, sigma_m),
+        )
         return IsvdObservation(
             stamp_ns=frame.stamp_ns,
             features=features,
             points_body=apply(frame.T_body_camera, np.column_stack([rays * z[:, None], z])),
-            measured=np.column_stack([pixels, _VIRTUAL_BASELINE_PX_M / z]),
-            weights=np.column_stack([sigma_px, sigma_px, disparity_sigma_px]) ** -2.0,
-            intrinsics=np.array(
-                [camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px, _VIRTUAL_BASELINE_PX_M]
-            ),
+            measured=measured,
+            weights=weights,
+            intrinsics=intrinsics,
             camera=camera,
             T_body_camera=frame.T_body_camera,
         )
@@ -190,7 +197,7 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
             sigma_px=self._detector.scale_factor ** features.octave.astype(np.float64),
             descriptors=features.descriptors,
             points_camera=apply(inverse(observation.T_body_camera), observation.points_body),
-            intrinsics=np.array([camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px]),
+            intrinsics=camera.intrinsics,
             T_body_camera=observation.T_body_camera,
         )
 
@@ -227,7 +234,7 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
         if not others:
             return np.empty(0)
         poses = np.array([other.T_world_body for other in others])
-        depth_m = np.nanmedian(_VIRTUAL_BASELINE_PX_M / frame.observation.measured[:, 2])
+        depth_m = np.nanmedian(VIRTUAL_BASELINE_PX_M / frame.observation.measured[:, 2])
         shift = np.linalg.norm(poses[:, :3, 3] - frame.T_world_body[:3, 3], axis=1) / depth_m
         traces = np.einsum("nij,ij->n", poses[:, :3, :3], frame.T_world_body[:3, :3])
         turn = np.arccos(np.clip(0.5 * (traces - 1.0), -1.0, 1.0)) / _HALF_VIEW_RAD
@@ -260,14 +267,11 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
     def _combine(self, candidates: Sequence[PoseCandidate]) -> Transform:
         """Return T_world_body; the nearest earlier frame comes first (alg. 7, lines 21–27)."""
         if self._config.average == "information":
-            first = candidates[0].T_world_body
-            total = np.sum([candidate.information for candidate in candidates], axis=0)
-            pull = np.sum(
-                [c.information @ np.concatenate(log(inverse(first) @ c.T_world_body)) for c in candidates],
-                axis=0,
+            return mean_pose(
+                candidates[0].T_world_body,
+                (candidate.T_world_body for candidate in candidates),
+                [candidate.information for candidate in candidates],
             )
-            mean = np.linalg.solve(total, pull)
-            return first @ exp(mean[:3], mean[3:])
         weights = np.array([candidate.weight for candidate in candidates])
         if self._config.average == "mean":
             weights = np.ones(len(candidates))
@@ -344,3 +348,31 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
             factors=factors,
             links=factors,
         )
+
+
+def align_images(
+    target: Frame, source: Frame, config: IsvdOdometryConfig
+) -> tuple[Alignment, dict[str, float]]:
+    """Return the motion between two frames' features, and the seconds that "prepare" and "align" took.
+
+    Args:
+        target: Frame that stays.
+        source: Frame that is aligned to it.
+        config: The method; its fallback is tried where the first matching leads to no motion.
+
+    Raises:
+        ConfigError: A frame is a scan.
+    """
+    if not isinstance(target, RgbdFrame) or not isinstance(source, RgbdFrame):
+        raise ConfigError("method isvd matches images, and these are scans; name frames of an RGB-D log")
+    odometry = IsvdOdometry(config)
+    began = time.perf_counter()
+    seen_target = odometry.observe(target)
+    detected = time.perf_counter()
+    seen_source = odometry.observe(source)
+    register = PairRegistration(config.registration, by_pixels=config.residual == "pixels")
+    for match in (config.match, config.fallback):
+        alignment, _, _ = register(seen_target, seen_source, match)
+        if alignment.converged:
+            break
+    return alignment, {"prepare": detected - began, "align": time.perf_counter() - detected}
