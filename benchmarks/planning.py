@@ -1,4 +1,4 @@
-"""Planning and distance transforms compared with simple implementations, in one process; results must agree.
+"""Planning compared with a simple implementation, in one process; results must agree.
 
 Run: .venv/bin/python benchmarks/planning.py
 """
@@ -13,9 +13,7 @@ import numpy as np
 
 from mapper.core.geometry import path_length
 from mapper.navigation.distance import DistanceField, signed_distances
-from mapper.navigation.distance_transform import squares_to_centres
-from mapper.navigation.line_of_sight import shortened
-from mapper.navigation.search import shortest_path
+from mapper.navigation.path_search import shorten, shortest_path
 
 EDGE_CELLS = 1000
 REPEATS = 3
@@ -85,22 +83,10 @@ def main() -> None:
     )
 
     field = DistanceField(signed_distances(~free, 1.0), np.zeros(3), 1.0)
-    shortened(field, found.cells[:50] + 0.5, radius_m=0.0)
-    tight_s, tight = cpu_s(lambda: shortened(field, found.cells + 0.5, radius_m=0.0))
+    shorten(field, found.cells[:50] + 0.5, radius_m=0.0)
+    tight_s, tight = cpu_s(lambda: shorten(field, found.cells + 0.5, radius_m=0.0))
     gain = 1.0 - path_length(tight) / length
     print(f"pulled tight in {tight_s:.2f} s: {100 * gain:.1f} % shorter, {len(tight)} corners")
-
-    from scipy import ndimage
-
-    targets = np.random.default_rng(0).random((60, 300, 300)) < 0.01
-    squares_to_centres(targets[:4])
-    ours_s, squares = cpu_s(lambda: squares_to_centres(targets))
-    peer_s, distances = cpu_s(lambda: ndimage.distance_transform_edt(~targets))
-    assert np.array_equal(squares, np.rint(distances**2))
-    print(
-        f"distances in {targets.size / 1e6:.1f} M voxels: {ours_s:.2f} s; "
-        f"scipy {peer_s:.2f} s; {peer_s / ours_s:.1f}×"
-    )
 
 
 if __name__ == "__main__":

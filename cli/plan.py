@@ -69,8 +69,7 @@ def plan(
     from mapper.merging.floors import keep_out_of, traversable_of
     from mapper.merging.map_folders import open_map_folder
     from mapper.navigation.config import PlanConfig
-    from mapper.navigation.planner import plan_2d, plan_3d
-    from mapper.navigation.storey_planner import plan_storeys
+    from mapper.navigation.planner import plan_2d, plan_3d, plan_storeys
     from mapper.octree.grid import with_obstacles
     from mapper.octree.map import read_octree
     from mapper.run import files

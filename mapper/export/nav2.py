@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from mapper.core.errors import DataError
 from mapper.export.grid import write_grid, write_values
 from mapper.navigation.config import CostmapConfig
-from mapper.navigation.distance_transform import plane_distances
+from mapper.navigation.distance import plane_distances
 from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, overlap_of, with_obstacles
 from mapper.run.map_folder import MapFolder
 from mapper.runtime.atomic import MANIFEST_NAME, FolderKind, atomic_folder, write_text

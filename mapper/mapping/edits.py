@@ -10,7 +10,7 @@ from mapper.core.errors import DataError
 from mapper.core.frames import Points32
 from mapper.core.geometry import Array, Points, Transform, apply
 from mapper.mapping.config import AppliedEdit, Edits, Region
-from mapper.navigation.traversable import Storey, TraversableFloor, trimmed
+from mapper.navigation.traversable import Storey, TraversableFloor, trim
 from mapper.octree.columns import NOWHERE, Columns, DrivenGround, nearest_heights
 from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from mapper.octree.keys import BLOCK_BITS, BLOCK_VOXELS, KEY_BITS, KEY_MASK, KEY_ZERO, block_keys, gather
@@ -132,7 +132,7 @@ class MapEditor:
     def _edited(self, storey: Storey, blocked: NDArray[np.int64]) -> Storey:
         """Return a storey after the edits; add the cells that each keep-out region blocks to (K,) counts."""
         if not (storey.heights > NOWHERE).any():
-            return trimmed(storey)
+            return trim(storey)
         cells = storey.grid.cells.copy()
         heights, _ = nearest_heights(storey.heights)
         floor = _Cells(storey.grid.origin_world_m, heights, storey.grid.resolution_m)
@@ -142,7 +142,7 @@ class MapEditor:
             inside = self._on_floor((region,), floor)
             blocked[number] += np.count_nonzero(cells[inside] != OCCUPIED)
             cells[inside] = OCCUPIED
-        return trimmed(replace(storey, grid=replace(storey.grid, cells=cells)))
+        return trim(replace(storey, grid=replace(storey.grid, cells=cells)))
 
     def _voxels(self, octree: OctreeMap, region: Region) -> Iterator[tuple[NDArray[np.int64], Mask]]:
         """Yield (B,) slots of blocks that a region may overlap, and the (B, 512) mask of its voxels."""

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from mapper.core.errors import DataError
 from mapper.core.geometry import Array
-from mapper.navigation.distance_transform import plane_distances
+from mapper.navigation.distance import plane_distances
 from mapper.octree.grid import OCCUPIED, UNKNOWN, OccupancyGrid
 
 NO_INFORMATION, LETHAL, INSCRIBED, FREE_SPACE = 255, 254, 253, 0

@@ -1,21 +1,92 @@
-"""Signed Euclidean distance fields in 2D and 3D: distances to the nearest obstacle."""
+"""Distances to obstacles: of a grid's cells, and signed distance fields of the map's voxels.
+
+The transform to whole voxels is exact, in integers (after Meijster, Roerdink & Hesselink 2000). As in
+Felzenszwalb & Huttenlocher (2012) the lower envelope of parabolas is taken axis after axis, in linear time;
+borders between parabolas are kept as the first whole cell, so nothing is rounded.
+``scipy.ndimage.distance_transform_edt`` has distances to centres only, and takes three times as long.
+"""
 
 from dataclasses import dataclass
+from math import prod
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from mapper.core.errors import DataError
+from mapper.core.errors import DataError, MapSizeError
+from mapper.core.expect import expect_shape
 from mapper.core.geometry import Array, Points
-from mapper.navigation.distance_transform import NONE, squares_to_boxes
-from mapper.navigation.voxels import Box, VoxelGrid, cut_box, layer
-from mapper.octree.grid import OccupancyGrid
+from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+from mapper.octree.keys import BLOCK_BITS, BLOCK_EDGE, BLOCK_VOXELS, KEY_ZERO, block_keys, gather
 from mapper.octree.map import OctreeMap
 
 Distances = NDArray[np.float32]
+Squares = NDArray[np.int32]
+Line = NDArray[np.int64]
 
-_BYTES_PER_VOXEL = 14  # states, blocked, two int32 transforms, the float32 result
+LIMIT_BYTES = 2 << 30
+"""Limit of the working space of a plan."""
+NONE = np.iinfo(np.int32).max
+"""Squared distance where there is no target at all."""
+
+_MOST_CELLS = 13_000  # along an edge: three squares of twice as many still fit into an int32
+_LINES = 16  # processed together: 16 int32 fill a cache line
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class VoxelGrid:
+    """States of every voxel of a box; a slice is a grid of one layer.
+
+    Attributes:
+        states: (Z, Y, X) int8 of UNKNOWN, FREE and OCCUPIED.
+        corner_world_m: (3,) lower x, y, z of voxel [0, 0, 0].
+        resolution_m: Edge of a voxel.
+    """
+
+    states: NDArray[np.int8]
+    corner_world_m: Array
+    resolution_m: float
+
+    def blocked(self, *, unknown_blocks: bool) -> NDArray[np.bool_]:
+        """Return the (Z, Y, X) mask of occupied voxels and, if they block, of unknown ones."""
+        blocked: NDArray[np.bool_] = (self.states == OCCUPIED) | ((self.states == UNKNOWN) & unknown_blocks)
+        return blocked
+
+
+def dense_voxels(octree: OctreeMap, *, bytes_per_voxel: int) -> VoxelGrid:
+    """Return the states of all voxels of the map's 8³ blocks, with a layer of unknown voxels around them.
+
+    Args:
+        octree: The map.
+        bytes_per_voxel: Working space of the caller per voxel, these states included.
+
+    Raises:
+        MapSizeError: More space is needed; nothing has been allocated then.
+        DataError: The map is empty.
+    """
+    codes = octree.blocks.codes
+    if not len(codes):
+        raise DataError("octree: the map is empty; fuse scans into it first")
+    keys = block_keys(codes)
+    first = keys.min(axis=0) - 1
+    counts = [int(n) for n in keys.max(axis=0) + BLOCK_EDGE + 1 - first]
+    needed_bytes = bytes_per_voxel * prod(counts)
+    if needed_bytes > LIMIT_BYTES:
+        raise MapSizeError(
+            f"a box of {'×'.join(str(n) for n in counts)} voxels needs {needed_bytes / 2**30:.1f} GiB of "
+            f"working space, the limit is {LIMIT_BYTES / 2**30:.1f}; plan in a smaller or a coarser map"
+        )
+    states = np.full(counts[::-1], UNKNOWN, dtype=np.int8)
+    _fill_states(codes, octree.blocks.table.values, octree.occupied_log_odds, first, states)
+    corner_world_m = (first - KEY_ZERO).astype(np.float64) * octree.resolution_m
+    return VoxelGrid(states, corner_world_m, octree.resolution_m)
+
+
+def layer(grid: OccupancyGrid) -> VoxelGrid:
+    """Return a 2D grid as one layer of voxels, surrounded by a ring of unknown cells."""
+    states = np.pad(grid.cells, 1, constant_values=UNKNOWN)[np.newaxis]
+    x, y = grid.origin_world_m - grid.resolution_m
+    return VoxelGrid(states, np.array([x, y, -grid.resolution_m / 2.0]), grid.resolution_m)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,52 +109,10 @@ class DistanceField:
         Raises:
             DataError: The points are not (N, 3).
         """
-        return self._interpolated(points_world)[:, 0]
-
-    def gradient(self, points_world: Points) -> Distances:
-        """Return the (N, 3) gradient of that interpolation, which points away from the nearest obstacle.
-
-        Raises:
-            DataError: The points are not (N, 3).
-        """
-        return self._interpolated(points_world)[:, 1:]
-
-    def _interpolated(self, points_world: Points) -> Distances:
-        if points_world.ndim != 2 or points_world.shape[1] != 3:
-            raise DataError(f"distance field: points {points_world.shape}, want (N, 3)")
-        points = np.ascontiguousarray(points_world, dtype=np.float64)
-        found: Distances = _interpolate(self.distances_m, self.corner_world_m, self.resolution_m, points)
+        expect_shape(points_world, "N,3", "distance field: points")
+        cells = np.ascontiguousarray((points_world - self.corner_world_m) / self.resolution_m, np.float64)
+        found: Distances = _interpolate(self.distances_m, cells)
         return found
-
-
-def distance_2d(grid: OccupancyGrid, *, unknown_blocks: bool) -> Distances:
-    """Return the signed distance of every cell of a grid; the space around the grid is unknown.
-
-    Args:
-        grid: The slice or the floor.
-        unknown_blocks: Whether unknown cells count as obstacles.
-
-    Returns:
-        (H, W) float32 metres as of :func:`signed_distances`; row 0 has the lowest y.
-    """
-    voxels = layer(grid)
-    distances_m = signed_distances(voxels.blocked(unknown_blocks=unknown_blocks), grid.resolution_m)
-    return np.ascontiguousarray(distances_m[0, 1:-1, 1:-1])
-
-
-def distance_3d(octree: OctreeMap, box: Box, *, unknown_blocks: bool) -> DistanceField:
-    """Return the distance field of a box of the map; obstacles outside the box do not count.
-
-    Args:
-        octree: The map.
-        box: Part of the map; larger than the wanted part by the distance of interest.
-        unknown_blocks: Whether unknown voxels count as obstacles.
-
-    Raises:
-        MapSizeError: More space is needed; nothing has been allocated then.
-    """
-    voxels = cut_box(octree, box, bytes_per_voxel=_BYTES_PER_VOXEL)
-    return distance_field(voxels, unknown_blocks=unknown_blocks)
 
 
 def distance_field(voxels: VoxelGrid, *, unknown_blocks: bool) -> DistanceField:
@@ -109,67 +138,191 @@ def signed_distances(blocked: NDArray[np.bool_], resolution_m: float) -> Distanc
     return distances
 
 
-def _half_cells(squares: NDArray[np.int32]) -> Distances:
+def _half_cells(squares: Squares) -> Distances:
     distances = np.sqrt(squares, dtype=np.float32)
     distances[squares == NONE] = np.inf
     return distances
 
 
+def plane_distances(targets: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Return (H, W) distance of every cell's centre to that of the nearest target of (H, W), in cells.
+
+    It is +inf where there is no target.
+    """
+    from scipy.ndimage import distance_transform_edt  # takes a while to load, which most maps do not need
+
+    if not targets.any():
+        return np.full(targets.shape, np.inf)
+    return np.asarray(distance_transform_edt(~targets), np.float64)
+
+
+def squares_to_boxes(targets: NDArray[np.bool_]) -> Squares:
+    """Return the squared distance of every cell's centre to the nearest target's surface, in quarter cells².
+
+    A target is its whole square or cube, and distances are counted in half cells, which keeps them integers.
+
+    Args:
+        targets: (Z, Y, X); a plane is (1, H, W).
+
+    Returns:
+        (Z, Y, X) int32, 0 on targets; NONE everywhere if there is no target.
+
+    Raises:
+        MapSizeError: An edge is too long for the squares to fit into an int32.
+    """
+    depth, height, width = targets.shape
+    if max(targets.shape) > _MOST_CELLS:
+        raise MapSizeError(
+            f"distances in {depth}×{height}×{width} cells: an edge may have {_MOST_CELLS}; "
+            "choose a smaller box or a coarser map"
+        )
+    squares = np.empty(targets.shape, np.int32)
+    _along_rows(np.ascontiguousarray(targets), squares)
+    _across_rows(squares)
+    _across_rows(squares.reshape(1, depth, height * width))
+    return squares
+
+
 @njit(cache=True, nogil=True)
-def _interpolate(distances: Distances, corner: Array, resolution_m: float, points: Points) -> Distances:
-    """Return the (N, 4) trilinear value and its gradient along x, y, z; NaN outside the box."""
-    found = np.full((len(points), 4), np.nan, np.float32)
+def _along_rows(targets: NDArray[np.bool_], squares: Squares) -> None:
+    """Write the squared distance to the nearest target of the same row."""
+    depth, height, width = targets.shape
+    for z in range(depth):
+        for y in range(height):
+            gap = width
+            for x in range(width):
+                gap = 0 if targets[z, y, x] else gap + 1
+                squares[z, y, x] = gap
+            found = gap < width
+            gap = width
+            for x in range(width - 1, -1, -1):
+                gap = 0 if targets[z, y, x] else gap + 1
+                nearest = max(2 * min(gap, squares[z, y, x]) - 1, 0)
+                squares[z, y, x] = nearest * nearest if found else NONE
+
+
+@njit(cache=True, nogil=True)
+def _across_rows(squares: Squares) -> None:
+    """Replace every value of (A, N, M) by the minimum over i of squares[a, i, m] + distance(n, i)²."""
+    count, length, width = squares.shape
+    if length == 1:
+        return
+    lines, lowest = np.empty((_LINES, length), np.int64), np.empty(length, np.int64)
+    heights = np.empty(length + 1, np.int64)
+    owner, begin = np.empty(length + 1, np.int64), np.empty(length + 1, np.int64)
+    for a in range(count):
+        for left in range(0, width, _LINES):
+            together = min(_LINES, width - left)
+            for n in range(length):
+                for k in range(together):
+                    lines[k, n] = squares[a, n, left + k]
+            for k in range(together):
+                line = lines[k]
+                # A cell's two faces across this axis; neighbours share one. Between them the cell's own
+                # value holds, which is the lowest parabola's apex or less.
+                heights[0], heights[length] = line[0], line[length - 1]
+                for n in range(1, length):
+                    heights[n] = min(line[n - 1], line[n])
+                _take_envelope(heights, lowest, owner, begin)
+                for n in range(length):
+                    line[n] = min(line[n], lowest[n])
+            for n in range(length):
+                for k in range(together):
+                    squares[a, n, left + k] = min(lines[k, n], NONE)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _take_envelope(heights: Line, lowest: Line, owner: Line, begin: Line) -> None:
+    """Write the lower envelope of parabolas heights[i] + (2 n − p_i)² with apex p_i = 2 i − 1, in half cells.
+
+    Args:
+        heights: (N + 1,) of the apexes.
+        lowest: (N,) result at the cells' centres.
+        owner: (N + 1,) scratch: the parabolas of the envelope, from the left.
+        begin: (N + 1,) scratch: the n from which each is the lowest.
+    """
+    top = -1
+    for k in range(len(heights)):
+        if heights[k] >= NONE:
+            continue
+        apex, start = 2 * k - 1, 0
+        while top >= 0:
+            rival, q = 2 * owner[top] - 1, 2 * begin[top]
+            if (q - rival) ** 2 + heights[owner[top]] <= (q - apex) ** 2 + heights[k]:
+                rise = apex * apex - rival * rival + heights[k] - heights[owner[top]]
+                start = 1 + rise // (4 * (apex - rival))
+                break
+            top -= 1
+        if start < len(lowest):
+            top += 1
+            owner[top], begin[top] = k, start
+    if top < 0:
+        lowest[:] = NONE
+        return
+    for n in range(len(lowest) - 1, -1, -1):
+        lowest[n] = (2 * n - 2 * owner[top] + 1) ** 2 + heights[owner[top]]
+        if n == begin[top]:
+            top -= 1
+
+
+@njit(cache=True, nogil=True)
+def _interpolate(distances: Distances, points: Points) -> Distances:
+    """Return the (N,) trilinear values at (N, 3) x, y, z in cells; NaN outside the box."""
+    found = np.full(len(points), np.nan, np.float32)
     depth, height, width = distances.shape
     for i in range(len(points)):
-        x = (points[i, 0] - corner[0]) / resolution_m
-        y = (points[i, 1] - corner[1]) / resolution_m
-        z = (points[i, 2] - corner[2]) / resolution_m
+        x, y, z = points[i]
         if 0.0 <= x <= width and 0.0 <= y <= height and 0.0 <= z <= depth:
-            value, slope_z, slope_y, slope_x = interpolated(distances, z, y, x)
-            found[i, 0] = value
-            found[i, 1], found[i, 2], found[i, 3] = (
-                slope_x / resolution_m,
-                slope_y / resolution_m,
-                slope_z / resolution_m,
-            )
+            found[i] = interpolate_at(distances, z, y, x)
     return found
 
 
 @njit(cache=True, nogil=True)
-def interpolated(distances: Distances, z: float, y: float, x: float) -> tuple[float, float, float, float]:
-    """Return the trilinear value at a position in cells, and its change per cell along z, y, x.
+def interpolate_at(distances: Distances, z: float, y: float, x: float) -> float:
+    """Return the trilinear value at a position in cells: cell [0, 0, 0] spans 0 … 1.
 
-    Cell [0, 0, 0] spans 0 … 1. Beyond the outermost centres the value is constant.
+    Beyond the outermost centres the value is constant.
     """
     depth, height, width = distances.shape
-    z0, z1, up_z, slope_z = _between(z, depth)
-    y0, y1, up_y, slope_y = _between(y, height)
-    x0, x1, up_x, slope_x = _between(x, width)
+    z0, z1, up_z = _between(z, depth)
+    y0, y1, up_y = _between(y, height)
+    x0, x1, up_x = _between(x, width)
     if np.isinf(distances[z0, y0, x0]):
-        return distances[z0, y0, x0], np.nan, np.nan, np.nan  # then all are infinite, without a slope
+        return float(distances[z0, y0, x0])  # then all are infinite
     a, b = _mix(distances, z0, y0, x0, x1, up_x), _mix(distances, z0, y1, x0, x1, up_x)
     c, d = _mix(distances, z1, y0, x0, x1, up_x), _mix(distances, z1, y1, x0, x1, up_x)
     low, high = a + up_y * (b - a), c + up_y * (d - c)
-    along_y = (b - a) + up_z * ((d - c) - (b - a))
-    rows = (1.0 - up_z) * (1.0 - up_y), (1.0 - up_z) * up_y, up_z * (1.0 - up_y), up_z * up_y
-    along_x = (
-        rows[0] * (distances[z0, y0, x1] - distances[z0, y0, x0])
-        + rows[1] * (distances[z0, y1, x1] - distances[z0, y1, x0])
-        + rows[2] * (distances[z1, y0, x1] - distances[z1, y0, x0])
-        + rows[3] * (distances[z1, y1, x1] - distances[z1, y1, x0])
-    )
-    return low + up_z * (high - low), (high - low) * slope_z, along_y * slope_y, along_x * slope_x
+    value: float = low + up_z * (high - low)
+    return value
 
 
 @njit(cache=True, nogil=True)
-def _between(position: float, count: int) -> tuple[int, int, float, float]:
-    """Return the cells with centres around a position, its fraction between them, and 1, or 0 beyond them."""
+def _between(position: float, count: int) -> tuple[int, int, float]:
+    """Return the cells with centres around a position, and its fraction between them."""
     clamped = min(max(position - 0.5, 0.0), count - 1.0)
     low = int(clamped)
-    return low, min(low + 1, count - 1), clamped - low, 1.0 if clamped == position - 0.5 else 0.0
+    return low, min(low + 1, count - 1), clamped - low
 
 
 @njit(cache=True, nogil=True)
 def _mix(distances: Distances, z: int, y: int, x0: int, x1: int, up: float) -> float:
     low, high = float(distances[z, y, x0]), float(distances[z, y, x1])
     return low + up * (high - low)
+
+
+@njit(cache=True, nogil=True)
+def _fill_states(
+    codes: NDArray[np.int64],
+    values: NDArray[np.float32],
+    threshold: np.float32,
+    first: NDArray[np.int64],
+    states: NDArray[np.int8],
+) -> None:
+    """Write the states of the blocks' voxels to ``states`` (Z, Y, X); voxel [0, 0, 0] has key ``first``."""
+    for b in range(len(codes)):
+        for voxel in range(BLOCK_VOXELS):
+            value = values[b, voxel]
+            if value == value:
+                code = (codes[b] << (3 * BLOCK_BITS)) | voxel
+                x, y, z = gather(code) - first[0], gather(code >> 1) - first[1], gather(code >> 2) - first[2]
+                states[z, y, x] = OCCUPIED if value >= threshold else FREE

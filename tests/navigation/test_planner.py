@@ -4,9 +4,9 @@ import pytest
 from mapper.core.errors import MapSizeError, PlanError
 from mapper.core.geometry import path_length
 from mapper.navigation.config import PlanConfig
-from mapper.navigation.distance import distance_2d
+from mapper.navigation.distance import distance_field, layer
+from mapper.navigation.path_search import shortest_path
 from mapper.navigation.planner import plan_2d, plan_3d
-from mapper.navigation.search import shortest_path
 from mapper.octree.config import OctreeConfig
 from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from mapper.octree.map import OctreeMap
@@ -112,7 +112,7 @@ def test_every_point_of_a_path_keeps_the_radius(seed):
     assert true_clearance_m > 0.12 - 0.1 * CELL  # between centres distances are interpolated
     assert plan.min_clearance_m >= 0.12 - 1e-5
     straight_m = np.linalg.norm(ends[1] - ends[0])
-    free = distance_2d(grid, unknown_blocks=True) >= 0.12
+    free = distance_field(layer(grid), unknown_blocks=True).distances_m[0, 1:-1, 1:-1] >= 0.12
     start, goal = ((0, *np.floor((end - grid.origin_world_m) / CELL).astype(int)[::-1]) for end in ends)
     over_centres_m = CELL * path_length(shortest_path(free[np.newaxis], start, goal).cells)
     assert straight_m <= plan.length_m <= over_centres_m + 2 * CELL  # both ends lie off their cells' centres
@@ -238,6 +238,6 @@ def test_in_space_a_ball_keeps_out_of_regions(chamber):
 
 
 def test_a_map_too_large_is_refused(chamber, monkeypatch):
-    monkeypatch.setattr("mapper.navigation.voxels.LIMIT_BYTES", 1000)
+    monkeypatch.setattr("mapper.navigation.distance.LIMIT_BYTES", 1000)
     with pytest.raises(MapSizeError, match=r"needs .* GiB of working space"):
         plan_3d(chamber, np.zeros(3), np.ones(3), config=POINT)

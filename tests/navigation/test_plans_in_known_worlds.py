@@ -7,11 +7,10 @@ import pytest
 
 from mapper.export.grid import write_grid
 from mapper.navigation.config import PlanConfig, TraversableConfig
-from mapper.navigation.distance import distance_3d
+from mapper.navigation.distance import dense_voxels, distance_field
 from mapper.navigation.floor import reachable_floor
 from mapper.navigation.planner import plan_2d, plan_3d
 from mapper.navigation.traversable import traversable
-from mapper.navigation.voxels import known_box
 from mapper.octree.config import OctreeConfig, SliceConfig
 from mapper.octree.grid import FREE, OCCUPIED, read_grid
 from mapper.octree.map import OctreeMap
@@ -112,7 +111,7 @@ def test_a_path_in_space_is_collision_free_in_the_true_flat(source, octree, walk
 
 def test_distances_agree_with_the_true_solids(source, octree):
     """Where the nearest obstacle has been seen, the field is the true distance within a voxel and a half."""
-    field = distance_3d(octree, known_box(octree), unknown_blocks=False)
+    field = distance_field(dense_voxels(octree, bytes_per_voxel=1), unknown_blocks=False)
     points = source.truth.positions_world
     true_m = source.scene.boxes.signed_distance_m(points)
     assert (field.distance(points) > true_m - 1.5 * CELL).all()  # never an obstacle that is not there

@@ -6,7 +6,7 @@ import pytest
 from mapper.core.errors import PlanError
 from mapper.navigation.config import PlanConfig, TraversableConfig
 from mapper.navigation.floor import reachable_floor
-from mapper.navigation.storey_planner import plan_storeys
+from mapper.navigation.planner import plan_storeys
 from mapper.navigation.traversable import traversable
 from tests.support.floor_scenes import bridge, two_storeys
 from tests.support.floor_worlds import Block, Slab, World

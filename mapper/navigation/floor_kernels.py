@@ -1,4 +1,4 @@
-"""Surfaces of columns of voxels that steps connect, and the planes through them."""
+"""Compiled steps of the floor: surfaces that steps connect, planes through them, and a path's footprint."""
 
 from typing import NamedTuple
 
@@ -6,8 +6,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from mapper.core.geometry import Array
 from mapper.navigation.config import TraversableConfig
-from mapper.octree.columns import Columns, Tops
+from mapper.octree.columns import NOWHERE, Columns, Tops
 
 _ALLOWANCE = 1e-6  # of a voxel: 0.1 m is two voxels of 5 cm, whatever the rounding of the division
 OFF_PLANE = 0.75
@@ -313,3 +314,77 @@ def _is_at_floor(columns: Columns, column: int, top: int, limits: Limits, floor:
             if _within_step(starts, tops, at, top, limits.step, floor) >= 0:
                 return True
     return False
+
+
+@njit(cache=True, nogil=True)
+def find_swept(
+    columns: Columns,
+    places: Array,
+    heights: Array,
+    rooms: Indices,
+    radius: float,
+    step: int,
+    near: int,
+) -> tuple[Indices, Indices]:
+    """Return the columns within a radius of the path and the ground in each, as often as passed.
+
+    Args:
+        columns: The map's occupied voxels.
+        places: (N, 2) x and y of the path in columns.
+        heights: (N,) height of the ground in voxels.
+        rooms: (N,) number of voxels above the ground in which an obstacle blocks.
+        radius: Radius of the footprint, in columns.
+        step: Largest step of the robot, in voxels.
+        near: A surface within this distance of the path's ground, in the path's own column, is that ground.
+    """
+    height, width = columns.shape
+    passed, found = [], []
+    for i in range(len(places)):
+        x, y = places[i]
+        for row in range(int(np.floor(y - radius)), int(np.floor(y + radius)) + 1):
+            for column in range(int(np.floor(x - radius)), int(np.floor(x + radius)) + 1):
+                if not (0 <= row < height and 0 <= column < width):
+                    continue
+                aside_x = max(column - x, 0.0, x - column - 1)
+                aside_y = max(row - y, 0.0, y - row - 1)
+                is_own = aside_x == 0.0 and aside_y == 0.0
+                if not is_own and aside_x * aside_x + aside_y * aside_y >= radius * radius:
+                    continue
+                limits = step, rooms[i], near if is_own else step
+                top = _ground_in(columns, row * width + column, heights[i], limits, is_own)
+                if top != NOWHERE:
+                    passed.append(row * width + column)
+                    found.append(top)
+    return np.array(passed, dtype=np.int64), np.array(found, dtype=np.int64)
+
+
+@njit(cache=True, nogil=True)
+def _ground_in(
+    columns: Columns, column: int, height: float, limits: tuple[int, int, int], crosses_drops: bool
+) -> int:
+    """Return the top of the path's ground in a column, seen or not; NOWHERE if it is blocked."""
+    tops, begin, end = columns.tops, columns.starts[column], columns.starts[column + 1]
+    best = NOWHERE
+    step, room, near = limits
+    for n in range(begin, end):
+        is_surface = n + 1 == end or tops[n + 1] - tops[n] > room
+        away = abs(tops[n] - height)
+        if is_surface and away <= near + 0.5 and (best == NOWHERE or away < abs(best - height)):
+            best = int(tops[n])
+    if best != NOWHERE:
+        return best
+    for n in range(begin, end):
+        rise = tops[n] - height
+        if step < rise <= room or (not crosses_drops and -room <= rise < -step):
+            return NOWHERE
+    return int(np.rint(height))
+
+
+@njit(cache=True, nogil=True)
+def mask_tops(columns: Columns, wanted: Indices, tops: Tops) -> Mask:
+    """Return the mask of the voxels with some tops, each in its column."""
+    found = np.zeros(len(columns.tops), np.bool_)
+    for i in range(len(wanted)):
+        for n in range(columns.starts[wanted[i]], columns.starts[wanted[i] + 1]):
+            found[n] |= columns.tops[n] == tops[i]
+    return found
