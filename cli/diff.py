@@ -54,8 +54,7 @@ def diff(
 
     Example: mapper diff runs/monday runs/tuesday --out diffs/tuesday
     """
-    from mapper.merging.difference_files import summary, write_differences
-    from mapper.merging.differences import differences_of
+    from mapper.merging.differences import differences_of, summary, write_differences
     from mapper.run.folder import open_run
     from mapper.runtime.executor import IN_PROCESS
 

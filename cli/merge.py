@@ -62,9 +62,9 @@ def merge(
     Example: mapper merge runs/monday runs/tuesday --out maps/campus --processes 2, or: mapper merge runs/*
     --out maps/city --place truth --scheduler tcp://10.0.0.1:8786
     """
-    from mapper.merging.extending import runs_of
     from mapper.merging.merge import merge as merge_runs
     from mapper.merging.merged_map import open_map
+    from mapper.merging.runs_in_map import runs_of
     from mapper.run.folder import open_run
     from mapper.run.manifest import is_merged_map
 

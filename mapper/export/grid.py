@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from mapper.core.errors import DataError
 from mapper.export.page import round_length
 from mapper.export.palette import FREE_CELL, INK, OCCUPIED_CELL, PAPER, UNKNOWN_CELL
-from mapper.navigation.costmap import Costmap
 from mapper.octree.grid import (
     FREE,
     FREE_PIXEL,
@@ -44,22 +43,20 @@ def write_grid(folder: Path, stem: str, grid: OccupancyGrid) -> None:
     _write_image(folder, stem, pixels, grid, mode="trinary")
 
 
-def write_values(
-    folder: Path, stem: str, values: NDArray[np.uint8], geometry: OccupancyGrid | Costmap
-) -> None:
+def write_values(folder: Path, stem: str, values: NDArray[np.uint8], geometry: OccupancyGrid) -> None:
     """Write ``stem.pgm`` and ``stem.yaml`` in map_server's mode "raw", each atomically.
 
     Args:
         folder: Folder of the files; made if missing.
         stem: Name of the files without ending.
         values: (H, W) what the cells are published as: 0 … 100, or 255 for unknown.
-        geometry: A grid or costmap of these cells.
+        geometry: A grid of these cells.
     """
     _write_image(folder, stem, values, geometry, mode="raw")
 
 
 def _write_image(
-    folder: Path, stem: str, pixels: NDArray[np.uint8], geometry: OccupancyGrid | Costmap, *, mode: str
+    folder: Path, stem: str, pixels: NDArray[np.uint8], geometry: OccupancyGrid, *, mode: str
 ) -> None:
     height, width = pixels.shape
     header = f"P5\n# CREATOR: mapper {geometry.resolution_m:.3f} m/pix\n{width} {height}\n255\n"

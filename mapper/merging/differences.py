@@ -1,11 +1,13 @@
 """Differences of two runs' maps: what appeared, what vanished, and what was not looked at again.
 
 Only what both runs looked at is compared: a surface has appeared where the earlier run's rays passed free
-space, and vanished where the later run's did. Weak evidence, one hit or a few misses, is no change.
+space, and vanished where the later run's did. Weak evidence, one hit or a few misses, is no change. They are
+written as clouds of what changed, a list of it, and a picture.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,9 +15,14 @@ from numpy.typing import NDArray
 from mapper.core.clusters import cluster_numbers
 from mapper.core.errors import ConfigError
 from mapper.core.geometry import Array, Points, Transform, apply, inverse
+from mapper.export.palette import APPEARED, NOT_SEEN_AGAIN, VANISHED, Rgb
+from mapper.export.picture import write_layers
+from mapper.export.ply import write_ply
 from mapper.merging.placing import Placed
 from mapper.octree.blocks import log_odds
 from mapper.octree.map import OctreeMap
+from mapper.run.folder import Run
+from mapper.runtime.atomic import MANIFEST_NAME, FolderKind, atomic_folder, write_json
 
 _TOLERANCE_VOXELS = 2.0
 _MIN_VOXELS = 8
@@ -24,6 +31,13 @@ _LEAST_SAME = 0.8
 """Most of a place stays as it is from one session to the next."""
 _NEIGHBOUR_VOXELS = 1.8
 """Voxels that share a corner belong to one cluster: √3, and the rounding of a turned grid."""
+
+_PICTURE = "diff.png"
+_FOLDER = FolderKind(
+    "a comparison of two runs",
+    manifest_keys=frozenset({"before", "after", "T_before_after"}),
+    files=frozenset({_PICTURE, "*.ply"}),
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -126,8 +140,8 @@ def compare_maps(
         min_voxels: Smaller clusters are counted, not listed.
     """
     old, new = _surely_occupied(before), apply(T_before_after, _surely_occupied(after))
-    old_is = _compared(old, after, inverse(T_before_after), tolerance_m)
-    new_is = _compared(new, before, np.eye(4), tolerance_m)
+    old_is = _compare(old, after, inverse(T_before_after), tolerance_m)
+    new_is = _compare(new, before, np.eye(4), tolerance_m)
     appeared, few_new = _clusters(new[new_is.free], before.resolution_m, min_voxels)
     vanished, few_old = _clusters(old[old_is.free], before.resolution_m, min_voxels)
     return Differences(
@@ -156,7 +170,7 @@ def _surely_occupied(octree: OctreeMap) -> Points:
     return leaves.centres_world[leaves.log_odds >= max(least, octree.occupied_log_odds)]
 
 
-def _compared(centres: Points, other: OctreeMap, T_other_centres: Transform, tolerance_m: float) -> _Compared:
+def _compare(centres: Points, other: OctreeMap, T_other_centres: Transform, tolerance_m: float) -> _Compared:
     points = apply(T_other_centres, centres)
     values = other.log_odds_at(points)
     occupied = other.are_near_occupied(points, max_distance_m=tolerance_m)
@@ -173,3 +187,73 @@ def _clusters(centres: Points, resolution_m: float, min_voxels: int) -> tuple[li
     order = large[np.argsort(-sizes[large], kind="stable")]
     clusters = [Cluster(centres[cluster_of == number]) for number in order]
     return clusters, int(sizes.sum() - sizes[large].sum())
+
+
+def write_differences(
+    out: Path, found: Differences, before: Run, after: Run, *, placed: str, overwrite: bool = False
+) -> None:
+    """Write a list (``manifest.json``), a picture (``diff.png``) and a cloud of voxels for each kind.
+
+    Args:
+        out: Folder to create.
+        found: The differences.
+        before: The earlier run, whose slice lies below the picture.
+        after: The later run.
+        placed: Source of the later run's pose, in a few words.
+        overwrite: Replace a folder of such files.
+
+    Raises:
+        RunError: OUT is there already.
+    """
+    layers: dict[str, tuple[Points, Rgb]] = {
+        "not seen again": (found.not_seen_again, NOT_SEEN_AGAIN),
+        "vanished": (_join(found.vanished), VANISHED),
+        "appeared": (_join(found.appeared), APPEARED),
+    }
+    resolution_m = before.config.octree.resolution_m
+    with atomic_folder(out, _FOLDER, overwrite=overwrite) as folder:
+        for name, (centres, color) in layers.items():
+            colors = np.tile(np.array(color, np.uint8), (len(centres), 1))
+            write_ply(folder / f"{name.replace(' ', '_')}.ply", centres.astype(np.float32), colors)
+        write_layers(
+            folder / _PICTURE,
+            grid=before.slice,
+            layers=layers,
+            title=f"{before.path.resolve().name} → {after.path.resolve().name}",
+            lines=[summary(found), placed],
+        )
+        record = {
+            "before": str(before.path.resolve()),
+            "after": str(after.path.resolve()),
+            "T_before_after": found.T_before_after.tolist(),
+            "placed": placed,
+            "appeared": [_describe(cluster, resolution_m) for cluster in found.appeared],
+            "vanished": [_describe(cluster, resolution_m) for cluster in found.vanished],
+            "voxels": {
+                "same": found.same,
+                "not_seen_again": len(found.not_seen_again),
+                "newly_seen": len(found.newly_seen),
+                "in_small_clusters": found.small,
+            },
+        }
+        write_json(folder / MANIFEST_NAME, record)
+
+
+def summary(found: Differences) -> str:
+    """Return the counts in one line."""
+    return (
+        f"{len(found.appeared)} appeared, {len(found.vanished)} vanished; {found.same} of {found.seen_again} "
+        f"voxels seen again are the same, {len(found.not_seen_again)} were not seen again"
+    )
+
+
+def _join(clusters: Sequence[Cluster]) -> Points:
+    return np.concatenate([np.empty((0, 3)), *(cluster.centres_world for cluster in clusters)])
+
+
+def _describe(cluster: Cluster, resolution_m: float) -> dict[str, object]:
+    return {
+        "centre_m": np.round(cluster.centre_world, 3).tolist(),
+        "size_m": np.round(cluster.size_m(resolution_m), 3).tolist(),
+        "voxels": len(cluster.centres_world),
+    }

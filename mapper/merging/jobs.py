@@ -2,10 +2,14 @@
 
 Each reads files, writes files and returns a few numbers, so it can run on any machine that sees them. A job
 that is run again writes the same files again.
+
+Each tile has its pieces of the map's OctoMap files. Tiles stand in Morton order, and these files list nodes
+in preorder: between the pieces there are only the few nodes above the tiles. The bytes are those of the whole
+map written in one piece.
 """
 
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,16 +22,25 @@ from mapper.core.geometry import Transform, inverse
 from mapper.core.trajectory import Trajectory
 from mapper.mapping.config import edits_of
 from mapper.mapping.fusion import fuse_octree
-from mapper.merging.merged_map import TILES
-from mapper.merging.tiling import Tiling
+from mapper.merging.merged_map import TILES, Tiling
 from mapper.octree.attributes import UNSET
 from mapper.octree.blocks import Overlap
-from mapper.octree.color_tree import color_nodes
+from mapper.octree.color_tree import COLOR_NODE, color_nodes, parent_color
 from mapper.octree.columns import block_extent, lowest_occupied, occupied_voxels
 from mapper.octree.config import OctreeConfig
 from mapper.octree.map import OctreeMap, read_octree
 from mapper.octree.map_file import write_map
-from mapper.octree.octomap_tree import children_in, nodes_in_preorder, words_in_preorder
+from mapper.octree.octomap_file import LEAF_ROOT, write_tree
+from mapper.octree.octomap_tree import (
+    NODE,
+    UpperNodes,
+    children_in,
+    nodes_in_preorder,
+    preorder,
+    upper_nodes,
+    word_of,
+    words_in_preorder,
+)
 from mapper.octree.resampling import blocks_reached, resampled
 from mapper.octree.scan_updates import ScanUpdateWriter, open_scan_updates
 from mapper.octree.slice import Band
@@ -188,31 +201,31 @@ def split_run(
     octree = read_octree(path)
     part_bytes: dict[int, int] = {}
     has_colors = False
-    for tile, part in _parts(workspace, octree, T_map_world, only):
+    for tile, part in _cut(workspace, octree, T_map_world, only):
         write_map(workspace.part(tile, run), part)
         part_bytes[tile] = workspace.part(tile, run).stat().st_size
         has_colors |= part.attributes is not None and part.attributes.has_colors
     return SplitRun(part_bytes=part_bytes, voxels=len(octree), has_colors=has_colors)
 
 
-def _parts(
+def _cut(
     workspace: Workspace, octree: OctreeMap, T_map_world: Transform | None, only: frozenset[int] | None
 ) -> Iterator[tuple[int, OctreeMap]]:
     if T_map_world is None:
         slots = octree.blocks.sorted_slots()
-        for tile, some in _by_tile(workspace.tiling, octree.blocks.codes[slots], only):
+        for tile, some in _slices_by_tile(workspace.tiling, octree.blocks.codes[slots], only):
             part = OctreeMap(workspace.config)
             part.add(octree, slots=slots[some])
             yield tile, part
     else:
         codes = blocks_reached(octree, T_map_world)
-        for tile, some in _by_tile(workspace.tiling, codes, only):
+        for tile, some in _slices_by_tile(workspace.tiling, codes, only):
             part = resampled(octree, inverse(T_map_world), codes[some], workspace.config)
             if len(part):
                 yield tile, part
 
 
-def _by_tile(
+def _slices_by_tile(
     tiling: Tiling, codes: NDArray[np.int64], only: frozenset[int] | None
 ) -> Iterator[tuple[int, slice]]:
     """Yield each wanted tile and the slice of its blocks in increasing codes."""
@@ -235,7 +248,7 @@ def join_tile(workspace: Workspace, tile: int, runs: Sequence[int]) -> JoinedTil
     overlaps = tuple(octree.add(read_octree(workspace.part(tile, run))) for run in runs)
     octree.clamp()
     write_map(workspace.tile(tile), octree)
-    return _described(workspace, tile, octree, overlaps)
+    return _describe(workspace, tile, octree, overlaps)
 
 
 def keep_tile(workspace: Workspace, tile: int, known: Path, overlaps: Sequence[Overlap]) -> JoinedTile:
@@ -249,10 +262,10 @@ def keep_tile(workspace: Workspace, tile: int, known: Path, overlaps: Sequence[O
     """
     with atomic_file(workspace.tile(tile)) as part:
         shutil.copyfile(known, part)
-    return _described(workspace, tile, read_octree(workspace.tile(tile)), tuple(overlaps))
+    return _describe(workspace, tile, read_octree(workspace.tile(tile)), tuple(overlaps))
 
 
-def _described(
+def _describe(
     workspace: Workspace, tile: int, octree: OctreeMap, overlaps: tuple[Overlap, ...]
 ) -> JoinedTile:
     """Write the pieces of a finished tile."""
@@ -310,3 +323,83 @@ def save_array(path: Path, array: NDArray[np.generic]) -> None:
     """Write an array as a ``.npy`` file; atomic."""
     with atomic_file(path) as part, part.open("wb") as file:
         np.save(file, array)
+
+
+def write_whole_ot(path: Path, workspace: Workspace, tiles: Mapping[int, JoinedTile]) -> None:
+    """Write the log-odds of all tiles as one ``.ot`` file; atomic.
+
+    Args:
+        path: File to write.
+        workspace: Files of the merge, with the tiles' pieces.
+        tiles: Results of the tiles, in Morton order.
+    """
+    ordered = list(tiles)
+    upper = _nodes_above(workspace, tiles, [joined.top for joined in tiles.values()])
+    visited = preorder(upper).tolist()
+    colors = _colors_above(upper, tiles) if workspace.has_colors else None
+
+    def payload() -> Iterator[NDArray[np.generic]]:
+        for node in visited:
+            if node < len(tiles):
+                yield np.fromfile(workspace.piece(ordered[node], "ot"), np.uint8)
+            elif colors is None:
+                yield upper.nodes[node : node + 1]
+            else:
+                record = np.zeros(1, COLOR_NODE)
+                record["value"], record["mask"] = upper.nodes[node]["value"], upper.nodes[node]["mask"]
+                record["rgb"] = colors[node]
+                yield record
+
+    write_tree(
+        path,
+        payload(),
+        binary=False,
+        node_count=sum(tiles[ordered[node]].nodes if node < len(tiles) else 1 for node in visited),
+        resolution_m=workspace.tiling.resolution_m,
+        tree_name="ColorOcTree" if workspace.has_colors else "OcTree",
+    )
+
+
+def write_whole_bt(path: Path, workspace: Workspace, tiles: Mapping[int, JoinedTile]) -> None:
+    """Write all tiles, each voxel free or occupied, as one ``.bt`` file; atomic."""
+    ordered = list(tiles)
+    upper = _nodes_above(workspace, tiles, [joined.state for joined in tiles.values()])
+    visited = preorder(upper).tolist()
+    words = {
+        node: word_of(upper, node) for node in visited if node >= len(tiles) and upper.nodes[node]["mask"]
+    }
+    children = sum(children_in(word) for word in words.values())
+    children += sum(tiles[ordered[node]].children for node in visited if node < len(tiles))
+
+    def payload() -> Iterator[NDArray[np.generic]]:
+        for node in visited:
+            if node < len(tiles):
+                yield np.fromfile(workspace.piece(ordered[node], "bt"), np.uint8)
+            elif node in words:
+                yield words[node].astype("<u2", copy=False)
+        if not children:
+            yield LEAF_ROOT
+
+    write_tree(
+        path, payload(), binary=True, node_count=1 + children, resolution_m=workspace.tiling.resolution_m
+    )
+
+
+def _nodes_above(
+    workspace: Workspace, tiles: Mapping[int, JoinedTile], tops: list[tuple[float, int]]
+) -> UpperNodes:
+    codes = np.fromiter(tiles, np.int64, len(tiles))
+    return upper_nodes(codes, np.array(tops, NODE), np.arange(len(tiles) + 1), levels=workspace.tiling.depth)
+
+
+def _colors_above(upper: UpperNodes, tiles: Mapping[int, JoinedTile]) -> NDArray[np.uint8]:
+    """Return the (M, 3) colours of the nodes down to the tops of tiles, children before their parents."""
+    colors = np.full((len(upper.nodes), 3), UNSET, np.uint8)
+    colors[: len(tiles)] = [joined.color for joined in tiles.values()]
+    firsts = upper.first_children[len(tiles) :]
+    ends = [*firsts[1:], len(upper.nodes) - 1]
+    for node, (first, end) in enumerate(zip(firsts, ends, strict=True), start=len(tiles)):
+        children = np.full((8, 3), UNSET, np.uint8)
+        children[: end - first] = colors[first:end]  # a pruned node had all eight, so places do not matter
+        colors[node] = parent_color(children, pruned=upper.nodes[node]["mask"] == 0)
+    return colors

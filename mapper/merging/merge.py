@@ -9,10 +9,9 @@ from pathlib import Path
 import numpy as np
 from pydantic import ValidationError
 
-from mapper.core.errors import ConfigError, RunError
-from mapper.core.geometry import apply
+from mapper.core.errors import RunError
 from mapper.export.grid import write_grid
-from mapper.merging.extending import KnownTile, KnownTiles, kept_in, known_tiles
+from mapper.export.picture import write_merged
 from mapper.merging.jobs import (
     JoinedTile,
     SlicedColumn,
@@ -22,6 +21,8 @@ from mapper.merging.jobs import (
     keep_tile,
     split_run,
     stays_within_m,
+    write_whole_bt,
+    write_whole_ot,
 )
 from mapper.merging.merged_map import (
     MERGED_MAP,
@@ -32,31 +33,32 @@ from mapper.merging.merged_map import (
     RunInMap,
     Tile,
     open_map,
+    tiling_for,
 )
-from mapper.merging.octomap_files import write_whole_bt, write_whole_ot
 from mapper.merging.placing import Placed, Placing, warnings_about
-from mapper.merging.runs_in_map import described_runs, fuse_runs, runs_to_fuse, write_poses
-from mapper.merging.slicing import Sliced, draw, slice_map
-from mapper.merging.stages import Cost, Stages
-from mapper.merging.tiling import tiling_for
+from mapper.merging.runs_in_map import (
+    KnownTile,
+    KnownTiles,
+    common_config,
+    describe_runs,
+    floor_z_m,
+    fuse_runs,
+    keep_runs,
+    known_tiles,
+    runs_to_fuse,
+    write_poses,
+)
+from mapper.merging.slicing import Sliced, slice_map
 from mapper.octree.config import OctreeConfig
+from mapper.octree.grid import OccupancyGrid
 from mapper.run import files
 from mapper.run.warnings import merge_warnings
 from mapper.runtime.atomic import MANIFEST_NAME, atomic_folder
 from mapper.runtime.executor import IN_PROCESS, Workers, make_executor
 from mapper.runtime.progress import SILENT, Progress
-from mapper.runtime.resumable_jobs import JobRunner
+from mapper.runtime.resumable_jobs import Cost, JobRunner, Stages
 
 DEFAULT_TILE_M = 50.0
-
-_MUST_AGREE = (
-    "resolution_m",
-    "hit_probability",
-    "miss_probability",
-    "clamp_min_probability",
-    "clamp_max_probability",
-    "occupied_probability",
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,9 +110,9 @@ def merge(
         ConfigError: The runs do not agree in resolution or sensor model, or the tiles' edge is impossible.
         RunError: OUT is there already, a run comes twice or lacks its map, or a job failed.
     """
-    config = _common_config(placing.placed)
+    config = common_config(placing.placed)
     if known is not None:
-        placing = replace(placing, placed=kept_in(known, placing.placed, config))
+        placing = replace(placing, placed=keep_runs(known, placing.placed, config))
     placed = placing.placed
     tiling = tiling_for(config.resolution_m, tile_m)
     bent, rigid = runs_to_fuse(placed, within_m=stays_within_m(config))
@@ -137,7 +139,7 @@ def merge(
         write_whole_ot(folder / files.OCTREE_OT, workspace, joined)
         write_whole_bt(folder / files.OCTREE_BT, workspace, joined)
         sliced = slice_map(workspace, stages, joined, manifest, placed)
-        manifest = _completed(manifest, workspace, split, joined, sliced.columns)
+        manifest = _complete(manifest, workspace, split, joined, sliced.columns)
         missing = [reason for reason in (sliced.no_floor, sliced.no_slice) if reason]
         notes = [*missing, *_disagreements(manifest.runs)]
         for note in notes:
@@ -153,29 +155,6 @@ def merge(
     )
 
 
-def _common_config(placed: Sequence[Placed]) -> OctreeConfig:
-    """Return the configuration of the map, after checking that the runs can be merged."""
-    if not placed:
-        raise ConfigError("nothing to merge; name the run folders")
-    first = placed[0].run
-    seen: set[Path] = set()
-    for run in (item.run for item in placed):
-        if not (run.path / files.OCTREE_MAP).is_file():
-            raise RunError(f"{run.path}: has no {files.OCTREE_MAP}; make it with mapper fuse {run.path}")
-        if run.path.resolve() in seen:
-            raise RunError(f"{run.path}: given twice, and its evidence would count twice; name it once")
-        seen.add(run.path.resolve())
-        for name in _MUST_AGREE:
-            value, wanted = getattr(run.config.octree, name), getattr(first.config.octree, name)
-            if value != wanted:
-                raise ConfigError(
-                    f"{run.path}: octree.{name} is {value:g}, but {wanted:g} in {first.path}; make its maps "
-                    f"again with mapper fuse {run.path} --set octree.{name}={wanted:g}"
-                )
-    attributes = all(item.run.config.octree.attributes for item in placed)
-    return first.config.octree.model_copy(update={"attributes": attributes})
-
-
 def _first_manifest(
     placing: Placing, config: OctreeConfig, *, tile_m: float, fused_again: set[int]
 ) -> MapManifest:
@@ -188,19 +167,23 @@ def _first_manifest(
         traversable=first.run.config.traversable,
         costmap=first.run.config.costmap,
         tile_m=tile_m,
-        floor_z_m=_floor_z_m(first),
-        runs=described_runs(placing, fused_again=fused_again),
+        floor_z_m=floor_z_m(first),
+        runs=describe_runs(placing, fused_again=fused_again),
         ties=() if placing.joint is None else placing.joint.ties,
         left_out=dict(placing.left_out),
     )
 
 
-def _floor_z_m(first: Placed) -> float:
-    """Return the height in the map of the first run's floor, below the middle of its path."""
-    if first.stays:
-        return 0.0
-    middle = first.run.trajectory.positions_world.mean(axis=0) * [1.0, 1.0, 0.0]
-    return float(apply(first.T_map_world, middle[np.newaxis])[0, 2])
+def draw(path: Path, grid: OccupancyGrid, placed: Sequence[Placed], manifest: MapManifest) -> None:
+    """Draw the runs' paths over the slice."""
+    write_merged(
+        path,
+        grid=grid,
+        paths_world={item.run.path.name: item.trajectory_map.positions_world for item in placed},
+        tile_m=manifest.tile_m,
+        title=f"{len(placed)} runs merged",
+        lines=[manifest.summary],
+    )
 
 
 def _write_grids(folder: Path, sliced: Sliced, placed: Sequence[Placed], manifest: MapManifest) -> None:
@@ -262,7 +245,7 @@ def _split(
     again = [number for number in sorted(kept) if changed & known.tiles_of(number)]
     done |= dict(stages.run("split", jobs(again, changed), SplitRun))
     split = [
-        known.completed(number, done.get(f"{number:04d}"), changed)
+        known.complete(number, done.get(f"{number:04d}"), changed)
         if number in kept
         else done[f"{number:04d}"]
         for number in range(len(placed))
@@ -296,7 +279,7 @@ def _join(
     return {tile: done[tile] for tile in tiles}
 
 
-def _completed(
+def _complete(
     manifest: MapManifest,
     workspace: Workspace,
     split: Sequence[SplitRun],

@@ -1,19 +1,21 @@
-"""Merged map on disk: its manifest, and the opening of a part of it."""
+"""Merged map on disk: its manifest, its tiling, and the opening of all or a part of it."""
 
 import json
 from collections.abc import Iterable, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
+from math import log2
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import ValidationError
 
 import mapper
 from mapper.config.build import BuildConfig
 from mapper.core.config import Config, drop_unknown
-from mapper.core.errors import RunError
+from mapper.core.errors import ConfigError, RunError
 from mapper.core.geometry import Array
 from mapper.core.trajectory import Trajectory
 from mapper.graph.g2o import read_g2o
@@ -23,8 +25,10 @@ from mapper.merging.joint_graph import Tie
 from mapper.navigation.config import CostmapConfig, TraversableConfig
 from mapper.octree.config import OctreeConfig, SliceConfig
 from mapper.octree.grid import OccupancyGrid, stored_grid, stored_grid_if_any
+from mapper.octree.keys import BLOCK_BITS, KEY_BITS, KEY_ZERO, keys_of
 from mapper.octree.map import OctreeMap, read_octree
 from mapper.run import files
+from mapper.run.folder import Run, open_run
 from mapper.run.manifest import is_merged_map
 from mapper.runtime.atomic import MANIFEST_NAME, FolderKind, partial_of, write_text
 from mapper.sources.trajectory_files import read_tum
@@ -127,6 +131,69 @@ class MapManifest(Config):
     def save(self, folder: Path) -> None:
         """Write the manifest atomically."""
         write_text(folder / MANIFEST_NAME, self.model_dump_json(indent=2) + "\n")
+
+
+@dataclass(frozen=True, slots=True)
+class Tiling:
+    """The cubes that a map is cut into, nodes of its octree at one depth and in its order.
+
+    Attributes:
+        resolution_m: Edge of a voxel.
+        levels: Levels of the octree below a tile's top: its edge is 2 to this power, in voxels.
+    """
+
+    resolution_m: float
+    levels: int
+
+    @property
+    def depth(self) -> int:
+        """Depth of the tiles' tops in the octree."""
+        return KEY_BITS - self.levels
+
+    @property
+    def voxels(self) -> int:
+        """Edge of a tile in voxels."""
+        return 1 << self.levels
+
+    @property
+    def edge_m(self) -> float:
+        """Edge of a tile."""
+        return self.voxels * self.resolution_m
+
+    def tiles_of(self, block_codes: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return the tile, a Morton code at the tiles' depth, of each of (B,) block codes."""
+        return block_codes >> (3 * (self.levels - BLOCK_BITS))
+
+    def name_of(self, tile: int) -> str:
+        """Return the path down the octree: a digit 0 … 7 for the child taken at each depth."""
+        return f"{tile:0{self.depth}o}"
+
+    def tile_named(self, name: str) -> int:
+        """Return the tile of a name."""
+        return int(name, 8)
+
+    def first_key(self, tile: int) -> NDArray[np.int64]:
+        """Return the (3,) key of a tile's lowest voxel."""
+        key: NDArray[np.int64] = keys_of(np.array([tile]))[0] << self.levels
+        return key
+
+    def lower_m(self, tile: int) -> Array:
+        """Return the (3,) lower corner of a tile in the map, metres."""
+        return (self.first_key(tile) - KEY_ZERO).astype(np.float64) * self.resolution_m
+
+
+def tiling_for(resolution_m: float, tile_m: float) -> Tiling:
+    """Return the tiling whose edge, a power of two in voxels, is nearest to a length by ratio.
+
+    Raises:
+        ConfigError: The length is shorter than a block or longer than half of what keys can number.
+    """
+    lowest_m, highest_m = (resolution_m * (1 << bits) for bits in (BLOCK_BITS, KEY_BITS - 1))
+    if not lowest_m <= tile_m <= highest_m:
+        raise ConfigError(
+            f"tile edge {tile_m:g} m: want {lowest_m:g} to {highest_m:g} m at {resolution_m:g} m a voxel"
+        )
+    return Tiling(resolution_m, round(log2(tile_m / resolution_m)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -259,3 +326,12 @@ def open_map(folder: Path) -> MergedMap:
         costmap=manifest.costmap,
     )
     return MergedMap(folder, manifest, config)
+
+
+def open_map_folder(path: Path) -> Run | MergedMap:
+    """Return a finished run or a finished merged map.
+
+    Raises:
+        RunError: The folder is missing, is neither, or is not finished.
+    """
+    return open_map(path) if is_merged_map(path) else open_run(path)

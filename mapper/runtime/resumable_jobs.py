@@ -5,18 +5,25 @@ import math
 import re
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
+from functools import partial
+from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, TypeVar
 
-from mapper.core.errors import DataError
+from pydantic import BaseModel
+
+from mapper.core.errors import DataError, RunError
 from mapper.runtime.atomic import write_text
 from mapper.runtime.executor import Executor, run_jobs
 from mapper.runtime.progress import SILENT, Progress
+from mapper.runtime.timing import peak_memory_mb
 from mapper.runtime.worker_process import Failure
 
 Record = Mapping[str, Any]
 """Names with text, finite numbers, None, or lists and mappings of these."""
+
+Result = TypeVar("Result", bound=BaseModel)
 
 _FORMAT = "mapper cell 1"
 _KEY = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,199}")
@@ -140,3 +147,71 @@ def _checked(record: Record) -> Record:
 def _write(folder: Path, result: JobResult) -> None:
     text = json.dumps({"format": _FORMAT, **asdict(result)}, indent=1, ensure_ascii=False, allow_nan=False)
     write_text(folder / f"{result.key}.json", text + "\n")
+
+
+class Cost(NamedTuple):
+    """Cost of a job.
+
+    Attributes:
+        seconds: Wall time.
+        peak_memory_mb: Peak memory of its process, since that began.
+    """
+
+    seconds: float
+    peak_memory_mb: float
+
+
+@dataclass(frozen=True, slots=True)
+class Stages:
+    """Stages of work: lists of jobs, one after the other, whose results are kept until all of it is done.
+
+    Attributes:
+        runner: Keeps their results, so that work that was stopped is resumed.
+        executor: Executor of the jobs.
+        progress: Receives how many are done.
+        costs: Costs of the jobs of every stage so far, in no order.
+    """
+
+    runner: JobRunner
+    executor: Executor
+    progress: Progress
+    costs: dict[str, list[Cost]] = field(default_factory=dict)
+
+    def run(
+        self, stage: str, work: Mapping[str, Callable[[], Result]], kind: type[Result]
+    ) -> Iterator[tuple[str, Result]]:
+        """Yield the name and the result of every job, those known from an earlier session first.
+
+        Args:
+            stage: Name of the jobs together.
+            work: Functions by job name; work that is started again recognises its jobs by these names.
+            kind: Type of the results.
+
+        Raises:
+            RunError: A job failed twice; the others were done.
+        """
+        jobs = {
+            f"{stage}-{name}": Job(f"{stage}-{name}", f"{stage} {name}", partial(_as_records, one))
+            for name, one in work.items()
+        }
+        finished = self.runner.finished(jobs.values())
+        left = [job for key, job in jobs.items() if key not in finished]
+        failures: list[str] = []
+        costs = self.costs.setdefault(stage, [])
+        with self.progress.stage(stage) as report:
+            results = chain(finished.values(), self.runner.run(left, self.executor))
+            for count, result in enumerate(results, start=1):
+                report(count, len(jobs))
+                if result.failure:
+                    failures.append(f"{result.label}: {result.failure}")
+                    continue
+                record, memory = result.records
+                costs.append(Cost(result.seconds, memory["peak_memory_mb"]))
+                yield result.key.removeprefix(f"{stage}-"), kind.model_validate(record)
+        if failures:
+            more = f" (and {len(failures) - 1} more)" if len(failures) > 1 else ""
+            raise RunError(f"{failures[0]}{more}; finished jobs are kept: give the same command to resume")
+
+
+def _as_records(work: Callable[[], BaseModel]) -> list[Record]:
+    return [work().model_dump(mode="json"), {"peak_memory_mb": peak_memory_mb()}]

@@ -10,8 +10,8 @@ from mapper.cli.main import app
 from mapper.core.errors import RunError
 from mapper.core.geometry import apply, exp
 from mapper.mapping.config import AppliedEdit, Region
-from mapper.merging.floors import floor_of_map
 from mapper.merging.placing import Placed, as_built
+from mapper.merging.slicing import floor_of_map
 from mapper.navigation.config import TraversableConfig
 from mapper.navigation.floor import driven_ground, floor_of, margin_for
 from mapper.navigation.traversable import traversable

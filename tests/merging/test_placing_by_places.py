@@ -7,7 +7,7 @@ from mapper.core.geometry import angle_between, exp, inverse
 from mapper.loops.closure import LoopClosure
 from mapper.loops.config import GateConfig
 from mapper.loops.shared_places import SharedPlace
-from mapper.merging.placing_by_places import solve_worlds
+from mapper.merging.joint_graph import solve_worlds
 
 GATE = GateConfig()
 WORLDS = [

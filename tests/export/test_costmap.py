@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from mapper.core.errors import DataError
-from mapper.navigation.costmap import FREE_SPACE, INSCRIBED, LETHAL, NO_INFORMATION, inflate
+from mapper.export.costmap import FREE_SPACE, INSCRIBED, LETHAL, NO_INFORMATION, inflate
 from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 
 
@@ -27,16 +27,16 @@ def test_costs_fall_as_nav2_s_do():
 
     expected = [nav2_cost(n, radius_m=0.2, scaling=3.0) for n in range(30)]
     reach = int(np.ceil(0.55 / 0.05))
-    assert got.costs[0, : reach + 1].tolist() == expected[: reach + 1]
-    assert (got.costs[0, reach + 1 :] == FREE_SPACE).all()
-    assert got.costs[0, 4] == INSCRIBED  # 0.2 m is on the radius, whatever 4 · 0.05 rounds to
-    assert got.costs.dtype == np.uint8
+    assert got[0, : reach + 1].tolist() == expected[: reach + 1]
+    assert (got[0, reach + 1 :] == FREE_SPACE).all()
+    assert got[0, 4] == INSCRIBED  # 0.2 m is on the radius, whatever 4 · 0.05 rounds to
+    assert got.dtype == np.uint8
 
 
 def test_costs_depend_on_the_straight_distance():
     cells = np.full((11, 11), FREE)
     cells[5, 5] = OCCUPIED
-    got = inflate(grid_of(cells), robot_radius_m=0.0, inflation_radius_m=1.0, cost_scaling=5.0).costs
+    got = inflate(grid_of(cells), robot_radius_m=0.0, inflation_radius_m=1.0, cost_scaling=5.0)
     assert got[8, 9] == got[5, 10] == nav2_cost(5.0, radius_m=0.0, scaling=5.0)  # 3-4-5
     np.testing.assert_array_equal(got, got.T)
 
@@ -44,13 +44,13 @@ def test_costs_depend_on_the_straight_distance():
 def test_unknown_stays_unknown_unless_the_robot_would_touch():
     cells = np.full((1, 10), UNKNOWN)
     cells[0, 0] = OCCUPIED
-    got = inflate(grid_of(cells), robot_radius_m=0.1, inflation_radius_m=0.5, cost_scaling=1.0).costs[0]
+    got = inflate(grid_of(cells), robot_radius_m=0.1, inflation_radius_m=0.5, cost_scaling=1.0)[0]
     assert got.tolist() == [LETHAL, INSCRIBED, INSCRIBED] + [NO_INFORMATION] * 7
 
 
 def test_without_obstacles_everything_is_free():
     got = inflate(grid_of([[FREE, FREE]]), robot_radius_m=0.1, inflation_radius_m=0.5, cost_scaling=1.0)
-    assert got.costs.tolist() == [[FREE_SPACE, FREE_SPACE]]
+    assert got.tolist() == [[FREE_SPACE, FREE_SPACE]]
 
 
 @pytest.mark.parametrize(
