@@ -15,7 +15,7 @@ from mapper.runtime.progress import SILENT
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from mapper.doctor.finding import Finding
+    from mapper.doctor.machine import Finding
     from mapper.runtime.progress import Progress
 
 _MARKS = {"well": "ok  ", "warning": "warn", "failed": "FAIL"}
@@ -48,10 +48,10 @@ def doctor(
     *,
     output: Output,
 ) -> Answer:
-    """Check the machine, try every library in a separate process, and print what to do.
+    """Check the machine, import every library in a separate process, and print what to do.
 
     With RUN, compare all its files with the sizes and digests in its manifest instead; with --warm, compile
-    the kernels, and keep the bytecode of what builds import. The exit status is 1 if anything failed.
+    the kernels. The exit status is 1 if anything failed.
 
     Example: mapper doctor --json, or: mapper doctor runs/xyz, or after pip install: mapper doctor --warm
     """
@@ -65,7 +65,7 @@ def doctor(
     if warm:
         findings = _warmed(progress)
     elif run is None:
-        from mapper.doctor.examination import examine
+        from mapper.doctor.libraries import examine
 
         findings = examine(progress=progress)
     else:

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Makes .venv, installs the project with all its extras, compiles kernels and bytecode; the second time it does nothing.
+# Makes .venv, installs the project with all its extras, compiles the kernels; the second time it does nothing.
 # usage: bash scripts/setup.sh [--dev]
 #   --dev   adds what the tests need, and axe-core if npm is installed
 set -euo pipefail
@@ -134,7 +134,7 @@ compile_kernels() {
   fi
 }
 
-# Most of what the wheels bring is never imported; the bytecode of what is, mapper doctor --warm keeps.
+# Most of what the wheels bring is never imported; Python keeps the bytecode of what is.
 install() {
   "$venv/bin/python" -m pip install --quiet --disable-pip-version-check --no-compile "$@" >&2
   install_missing_libraries

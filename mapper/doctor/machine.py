@@ -1,43 +1,102 @@
-"""Checks of the machine: interpreter, C library, processors, memory, disk, places for compiled code."""
+"""Checks of the machine: processors, memory, disk, system libraries, the place of compiled kernels."""
 
+import ctypes
 import os
 import platform
 import re
 import shutil
 import sys
-import tempfile
+from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import mapper
-from mapper.doctor.finding import Finding
-from mapper.runtime.bytecode import has_bytecode
+from mapper.core.errors import DataError
 
-_LEAST_PYTHON = (3, 11)
-_LEAST_GLIBC = (2, 35)
-_LEAST_MEMORY_GB = 2.0
-_LEAST_DISK_GB = 1.0
-_THREADS = "OMP_NUM_THREADS"
-
-
-def check_python() -> Finding:
-    """Return our version and the interpreter's."""
-    machine = f"{sys.platform} {platform.machine()}"
-    text = f"mapper {mapper.__version__} on Python {platform.python_version()}, {machine}"
-    if sys.version_info < _LEAST_PYTHON:
-        return Finding("python", "failed", text, "use Python 3.11 or newer")
-    return Finding("python", "well", text)
+_LEAST_GB = 2.0
+PACKAGES = {
+    "libEGL.so.1": "libegl1",
+    "libGL.so.1": "libgl1",
+    "libX11.so.6": "libx11-6",
+    "libgomp.so.1": "libgomp1",
+    "libstdc++.so.6": "libstdc++6",
+    "libusb-1.0.so.0": "libusb-1.0-0",
+}
+"""System libraries that our wheels need, without libc, and the Debian packages that hold them."""
 
 
-def check_glibc() -> Finding:
-    """Return the C library's version; wheels are built for one and run on any later."""
-    name, version = platform.libc_ver()
-    text = f"{name or 'another C library than glibc'} {version}".strip()
-    numbers = tuple(int(number) for number in re.findall(r"\d+", version)[:2])
-    if name == "glibc" and numbers < _LEAST_GLIBC:
-        return Finding(
-            "glibc", "failed", f"{text}, Open3D's wheel needs 2.35", "use Debian 12, Ubuntu 22.04 or newer"
-        )
-    return Finding("glibc", "well", text)
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """Result of one check.
+
+    Attributes:
+        name: Name of the check.
+        verdict: "warning" is worth knowing; "failed" keeps some verb from working.
+        detail: Result in one line.
+        remedy: Instruction to the user; empty when all is well.
+    """
+
+    name: str
+    verdict: Literal["well", "warning", "failed"]
+    detail: str
+    remedy: str = ""
+
+    def __post_init__(self) -> None:
+        if (self.verdict == "well") == bool(self.remedy):
+            raise DataError(f"{self.name}: verdict {self.verdict!r} with remedy {self.remedy!r}")
+
+
+def machine_findings() -> list[Finding]:
+    """Return the findings about this machine."""
+    return [check_machine(), check_room(), check_system_libraries(), check_kernels()]
+
+
+def check_machine() -> Finding:
+    """Return our version, the interpreter's, and the number of processors."""
+    text = (
+        f"mapper {mapper.__version__} on Python {platform.python_version()}, {sys.platform} "
+        f"{platform.machine()}, {processors()} processors"
+    )
+    if os.environ.get("OMP_NUM_THREADS", "1") != "1":
+        return Finding("machine", "warning", text, "unset OMP_NUM_THREADS: small matrices are slower with it")
+    return Finding("machine", "well", text)
+
+
+def check_room() -> Finding:
+    """Return the memory that is available, and the room for runs here."""
+    room = {"disk": shutil.disk_usage(Path.cwd()).free / 1e9}
+    meminfo = Path("/proc/meminfo")
+    if meminfo.exists():
+        lines = re.findall(r"^(\w+): +(\d+) kB", meminfo.read_text(encoding="ascii"), re.MULTILINE)
+        room["memory"] = {name: int(value) for name, value in lines}["MemAvailable"] * 1024 / 1e9
+    text = ", ".join(f"{free_gb:.1f} GB of {name} free" for name, free_gb in room.items())
+    if min(room.values()) < _LEAST_GB:
+        remedy = "end other programs, choose an --out elsewhere, or build with --set workers=0"
+        return Finding("room", "warning", text, remedy)
+    return Finding("room", "well", text)
+
+
+def check_system_libraries(wanted: Iterable[str] = tuple(PACKAGES)) -> Finding:
+    """Return which shared objects the loader does not find."""
+    wanted = list(wanted)
+    missing = [name for name in wanted if not _loads(name)]
+    if missing:
+        return Finding("system libraries", "failed", f"missing {', '.join(missing)}", apt_line(missing))
+    return Finding("system libraries", "well", f"all {len(wanted)} are there")
+
+
+def check_kernels() -> Finding:
+    """Return where compiled kernels are kept, whether they can be, and how many there are by now."""
+    folder, compiled = kernel_folder(), compiled_kernels()
+    text = f"{len(compiled)} compiled kernels kept in {folder}"
+    existing = next(place for place in (folder, *folder.parents) if place.exists())
+    if not os.access(existing, os.W_OK):
+        remedy = "set NUMBA_CACHE_DIR to a folder that may be written"
+        return Finding("numba cache", "failed", f"{text}, which cannot be written", remedy)
+    if not compiled:
+        return Finding("numba cache", "warning", text, "mapper doctor --warm compiles them")
+    return Finding("numba cache", "well", text)
 
 
 def processors() -> int:
@@ -45,64 +104,6 @@ def processors() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))  # a container may have fewer than the machine
     return os.cpu_count() or 1
-
-
-def check_threads() -> Finding:
-    """Return how many processors are available, and whether libraries start threads of their own."""
-    each = os.environ.get(_THREADS, "unset")
-    text = f"{processors()} processors available, {_THREADS} is {each}"
-    if each != "1":
-        return Finding(
-            "threads", "warning", text, f"unset {_THREADS}: small matrices are slower with several"
-        )
-    return Finding("threads", "well", text)
-
-
-def check_memory() -> Finding:
-    """Return the machine's memory."""
-    meminfo = Path("/proc/meminfo")
-    if not meminfo.exists():
-        return Finding("memory", "well", "this system does not report it")
-    lines = re.findall(r"^(\w+): +(\d+) kB", meminfo.read_text(encoding="ascii"), re.MULTILINE)
-    kilobytes = {name: int(value) for name, value in lines}
-    total_gb, free_gb = (kilobytes[name] * 1024 / 1e9 for name in ("MemTotal", "MemAvailable"))
-    text = f"{free_gb:.1f} GB of {total_gb:.1f} GB available"
-    if free_gb < _LEAST_MEMORY_GB:
-        return Finding("memory", "warning", text, "end other programs, or build with --set workers=0")
-    return Finding("memory", "well", text)
-
-
-def check_disk() -> Finding:
-    """Return how much room there is for runs here, and for scratch files."""
-    places = {"here": Path.cwd(), "scratch": Path(tempfile.gettempdir())}
-    free_gb = {name: shutil.disk_usage(place).free / 1e9 for name, place in places.items()}
-    text = ", ".join(f"{free_gb[name]:.1f} GB free in {place} ({name})" for name, place in places.items())
-    if min(free_gb.values()) < _LEAST_DISK_GB:
-        return Finding("disk", "warning", text, "make room, or choose an --out and a TMPDIR elsewhere")
-    return Finding("disk", "well", text)
-
-
-def check_bytecode() -> Finding:
-    """Return whether the next start need not compile Python's own modules and numpy's again."""
-    modules = [module for name, module in sys.modules.items() if name.split(".")[0] in ("mapper", "numpy")]
-    missing = sum(not has_bytecode(module) for module in modules)
-    if not missing:
-        return Finding("bytecode", "well", "kept")
-    why = ": PYTHONDONTWRITEBYTECODE is set" if sys.dont_write_bytecode else ""
-    text = f"{missing} of {len(modules)} modules are compiled at every start{why}"
-    return Finding("bytecode", "warning", text, "mapper doctor --warm keeps them, and halves the start")
-
-
-def check_kernels() -> Finding:
-    """Return where compiled kernels are kept, whether they can be, and how many there are by now."""
-    folder, compiled = kernel_folder(), compiled_kernels()
-    text = f"{len(compiled)} compiled kernels kept in {folder}"
-    if not os.access(_nearest_existing(folder), os.W_OK):
-        remedy = "set NUMBA_CACHE_DIR to a folder that may be written"
-        return Finding("numba cache", "failed", f"{text}, which cannot be written", remedy)
-    if not compiled:
-        return Finding("numba cache", "warning", text, "mapper doctor --warm compiles them")
-    return Finding("numba cache", "well", text)
 
 
 def kernel_folder() -> Path:
@@ -115,5 +116,18 @@ def compiled_kernels() -> set[Path]:
     return {file.with_name(file.name.rpartition("-")[0]) for file in kernel_folder().rglob("*.nbi")}
 
 
-def _nearest_existing(folder: Path) -> Path:
-    return next(place for place in (folder, *folder.parents) if place.exists())
+def apt_line(missing: Iterable[str]) -> str:
+    """Return the command that brings shared objects to Debian or Ubuntu."""
+    missing = list(missing)
+    known = [PACKAGES[name] for name in missing if name in PACKAGES]
+    if len(known) < len(missing):
+        return f"find the package with: apt-file search {missing[0]}"
+    return f"sudo apt-get install {' '.join(known)}"
+
+
+def _loads(name: str) -> bool:
+    try:
+        ctypes.CDLL(name)
+    except OSError:
+        return False
+    return True

@@ -5,7 +5,7 @@ from functools import partial
 from pathlib import Path
 
 from mapper.core.errors import MapperError
-from mapper.doctor.finding import Finding
+from mapper.doctor.machine import Finding
 from mapper.run import files
 from mapper.run.digests import fault_of
 from mapper.run.folder import Run, open_run

@@ -65,7 +65,6 @@ ASKS_UPWARDS = {
 """Imports against the order, loaded when they are used: ``run.plot()`` and notebooks draw a run, and
 ``mapper.evaluate`` is named beside the library's other functions."""
 
-TRIES_THEM_ALL = "mapper/doctor/self_tests.py"
 HOMES = {
     "gtsam": ("mapper/graph/",),
     "mcap": ("mapper/export/mcap_log.py", "mapper/sources/ros/"),
@@ -182,7 +181,7 @@ def test_settings_build_nothing():
 
 @pytest.mark.parametrize("library", HOMES)
 def test_each_big_library_has_one_home(library):
-    homes = (*HOMES[library], TRIES_THEM_ALL)
+    homes = HOMES[library]
     for package in OURS:
         for path, line, module in imports_of(package):
             root = package_of(module)

@@ -1,15 +1,14 @@
 """JPEG decoding that refuses damaged files.
 
 OpenCV decodes whatever it can make of a file and prints libjpeg's warnings to stderr, out of any program's
-reach. libjpeg-turbo's own interface reports them; its pixels are the same, and it takes less time. What it
-decodes without a warning is checked by its codes (``mapper.sources.image_files.jpeg_entropy``).
+reach. libjpeg-turbo's own interface reports them; its pixels are the same, and it takes less time. A JPEG has
+no checksum, so damage that leaves valid codes passes.
 """
 
 import simplejpeg
 
 from mapper.core.errors import DataError
 from mapper.core.frames import Image
-from mapper.sources.image_files.jpeg_entropy import check_entropy
 
 START = b"\xff\xd8\xff"
 
@@ -37,7 +36,7 @@ def decode(data: bytes, *, colour: bool) -> Image:
     """Return the (H, W, 3) RGB or (H, W) grey pixels of a JPEG file.
 
     Raises:
-        DataError: The file is cut short or damaged, as far as its markers and codes show.
+        DataError: The file is cut short or damaged, as far as the decoder notices.
     """
     scans = data.count(_SCAN)
     if scans > _MOST_SCANS:
@@ -46,7 +45,6 @@ def decode(data: bytes, *, colour: bool) -> Image:
         pixels: Image = simplejpeg.decode_jpeg(data, "RGB" if colour else "GRAY")
     except ValueError as error:
         raise _damage(data, error) from None
-    check_entropy(data)
     return pixels if colour else pixels[:, :, 0]
 
 
