@@ -41,7 +41,7 @@ def export(
     """
     from mapper.config.loading import overridden
     from mapper.export.exporters import export as export_run
-    from mapper.merging.merged_map import open_map_folder
+    from mapper.merging import open_map_folder
     from mapper.run.folder import moved_log, open_run
     from mapper.run.map_folder import MapFolder
 

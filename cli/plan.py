@@ -66,7 +66,7 @@ def plan(
     """
     from mapper.config.loading import overridden
     from mapper.export.plan import draw_plan, plan_json, write_plan
-    from mapper.merging.merged_map import open_map_folder
+    from mapper.merging import open_map_folder
     from mapper.merging.slicing import keep_out_of, traversable_of
     from mapper.navigation.config import PlanConfig
     from mapper.navigation.planner import plan_2d, plan_3d, plan_storeys

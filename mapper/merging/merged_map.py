@@ -28,7 +28,6 @@ from mapper.octree.grid import OccupancyGrid, stored_grid, stored_grid_if_any
 from mapper.octree.keys import BLOCK_BITS, KEY_BITS, KEY_ZERO, keys_of
 from mapper.octree.map import OctreeMap, read_octree
 from mapper.run import files
-from mapper.run.folder import Run, open_run
 from mapper.run.manifest import is_merged_map
 from mapper.runtime.atomic import MANIFEST_NAME, FolderKind, partial_of, write_text
 from mapper.sources.trajectory_files import read_tum
@@ -326,12 +325,3 @@ def open_map(folder: Path) -> MergedMap:
         costmap=manifest.costmap,
     )
     return MergedMap(folder, manifest, config)
-
-
-def open_map_folder(path: Path) -> Run | MergedMap:
-    """Return a finished run or a finished merged map.
-
-    Raises:
-        RunError: The folder is missing, is neither, or is not finished.
-    """
-    return open_map(path) if is_merged_map(path) else open_run(path)

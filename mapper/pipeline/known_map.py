@@ -17,7 +17,8 @@ from mapper.loops.config import AnyLoops, PlaceLoopsConfig, ScanLoopsConfig
 from mapper.loops.factory import build_verifier, keyframe_loops
 from mapper.loops.map_constraints import KnownPlaces
 from mapper.loops.place_file import AnyPlace, read_places
-from mapper.merging.merged_map import MergedMap, open_map_folder
+from mapper.merging import open_map_folder
+from mapper.merging.merged_map import MergedMap
 from mapper.merging.runs_in_map import runs_of
 from mapper.octree.grid import OccupancyGrid
 from mapper.pipeline.reobserve import reobserve

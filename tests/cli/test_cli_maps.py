@@ -8,7 +8,7 @@ import pytest
 
 from mapper.core.geometry import exp
 from mapper.core.trajectory import Trajectory
-from mapper.navigation.distance import distance_2d
+from mapper.navigation.distance import distance_field, layer
 from mapper.octree.grid import read_grid
 from mapper.run.folder import open_run
 from mapper.sources.trajectory_files import read_tum, write_tum
@@ -22,7 +22,7 @@ def run_folder(desk_run, tmp_path):
 
 def test_plan_leads_from_start_to_goal(run_folder):
     grid = read_grid(run_folder / "slice.yaml")
-    clearance = distance_2d(grid, unknown_blocks=True)
+    clearance = distance_field(layer(grid), unknown_blocks=True).distances_m[0, 1:-1, 1:-1]
     row, column = np.unravel_index(np.argmax(clearance), clearance.shape)
     away = int((clearance[row, column] - 0.1) / grid.resolution_m)
     assert away >= 1, "the widest free place must hold a path"

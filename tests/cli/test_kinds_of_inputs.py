@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mapper.merging.placing import as_built
-from mapper.navigation.distance import distance_2d
+from mapper.navigation.distance import distance_field, layer
 from mapper.octree.grid import read_grid
 from mapper.run.folder import open_run
 from tests.support.command_line import invoke
@@ -59,7 +59,7 @@ def inputs(desk_run, desk_log, tmp_path_factory):
 def options(inputs, tmp_path_factory):
     out = tmp_path_factory.mktemp("made")
     grid = read_grid(inputs["run"] / "slice.yaml")
-    clearance_m = distance_2d(grid, unknown_blocks=True)
+    clearance_m = distance_field(layer(grid), unknown_blocks=True).distances_m[0, 1:-1, 1:-1]
     row, column = np.unravel_index(np.argmax(clearance_m), clearance_m.shape)
     point = np.asarray(grid.origin_world_m) + (np.array([column, row]) + 0.5) * grid.resolution_m
     return {
