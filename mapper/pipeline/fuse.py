@@ -27,7 +27,6 @@ from mapper.octree.octomap_file import write_bt, write_ot
 from mapper.octree.scan_updates import ScanUpdateWriter, open_scan_updates
 from mapper.pipeline.checkpoints import Checkpoints
 from mapper.pipeline.fuse_checkpoints import MarkedUpdates, known_updates
-from mapper.pipeline.settings_trial import try_settings
 from mapper.run import files
 from mapper.run.edits_file import edits_text, parse_edits, write_edits
 from mapper.run.folder import Run, moved_log, open_run
@@ -37,8 +36,7 @@ from mapper.run.manifest import DepthReach, Solve, Status, Timing
 from mapper.run.observers import NULL_OBSERVER, Observer
 from mapper.run.results import RunResults
 from mapper.run.stored_tracking import StoredTracking, load_tracking, save_solved
-from mapper.run.verdict import TRACKING_KINDS, verdict_of
-from mapper.run.warnings import FLOOR, find_warnings, floor_warnings
+from mapper.run.warnings import FLOOR, find_warnings, floor_warnings, verdict_of
 from mapper.run.writer import RunWriter, write_run
 from mapper.runtime.atomic import is_temporary
 from mapper.runtime.progress import SILENT, Progress
@@ -227,7 +225,8 @@ def fuse_into(
     others = [warning for warning in writer.manifest.warnings if warning.kind != FLOOR]
     found = floor_warnings(config.traversable, config.octree.resolution_m, has_path=maps.has_path)
     writer.update(warnings=(*others, *found), edits=maps.edits)
-    _write_verdict(writer, source, config, results, progress)
+    warnings = find_warnings(results, writer.manifest)
+    writer.update(warnings=tuple(warnings), verdict=verdict_of(warnings))
     _write_counts(writer, maps, results.trajectory)
     observer.on_mapped(Run(writer.folder, config, writer.manifest), results, maps)
 
@@ -245,22 +244,6 @@ def _write_counts(writer: RunWriter, maps: Maps, trajectory: Trajectory) -> None
     writer.update(counts=counts)
     log_s = _duration_s(trajectory, [log.begins_ns for log in writer.manifest.input.appended])
     writer.record_timing(log_s=log_s, frames=counts.read)
-
-
-def _write_verdict(
-    writer: RunWriter, source: Log, config: BuildConfig, results: RunResults, progress: Progress
-) -> None:
-    """Write all warnings and the verdict into a run's manifest.
-
-    Where frames were lost or doubtful, other settings are tried, unless the manifest has a trial already.
-    """
-    warnings = find_warnings(results, writer.manifest)
-    trial = writer.manifest.trial
-    is_poor = any(warning.kind in TRACKING_KINDS and warning.weight != "note" for warning in warnings)
-    if is_poor and trial is None:
-        with writer.clock.stage("track"):
-            trial = try_settings(source, config, results, progress=progress)
-    writer.update(warnings=tuple(warnings), trial=trial, verdict=verdict_of(warnings, trial))
 
 
 def _with_depth_noise(writer: RunWriter, source: Log, config: BuildConfig, progress: Progress) -> BuildConfig:

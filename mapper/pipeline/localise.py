@@ -35,8 +35,7 @@ from mapper.run.manifest import Solve
 from mapper.run.pose_covariances import uncertain_poses, write_poses
 from mapper.run.results import RunResults
 from mapper.run.stored_tracking import save_frames
-from mapper.run.verdict import verdict_of
-from mapper.run.warnings import localisation_warnings
+from mapper.run.warnings import localisation_warnings, verdict_of
 from mapper.run.writer import RunWriter, first_manifest, write_run
 from mapper.runtime.progress import SILENT, Progress
 from mapper.sources.base import Log

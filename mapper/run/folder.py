@@ -32,8 +32,7 @@ from mapper.run.manifest import (
 )
 from mapper.run.pose_covariances import UncertainPoses, read_poses
 from mapper.run.results import RunResults, aligned_truth
-from mapper.run.verdict import verdict_of
-from mapper.run.warnings import find_warnings
+from mapper.run.warnings import find_warnings, verdict_of
 from mapper.runtime.atomic import partial_of
 from mapper.sources import open_source
 from mapper.sources.base import Log

@@ -11,7 +11,7 @@ from pydantic import Field, ValidationError
 from pydantic_core import from_json
 
 import mapper
-from mapper.core.config import Config
+from mapper.core.config import Config, drop_unknown
 from mapper.core.errors import DataError, RunError
 from mapper.mapping.config import AppliedEdit
 from mapper.runtime.atomic import MANIFEST_NAME, write_text
@@ -118,7 +118,7 @@ class RunWarning(Config):
     """Warning: something suspicious about a run."""
 
     kind: str
-    """E.g. "gap", "loops", "depth"; docs/VERDICT.md lists them."""
+    """E.g. "gap", "loops", "depth"; docs/verdict.md lists them."""
     sentence: str
     """Finding, with the value and the limit."""
     suggestion: str = ""
@@ -133,29 +133,6 @@ class RunWarning(Config):
         """All of it in one line."""
         text = f"{self.sentence} (at {self.where})" if self.where else self.sentence
         return f"{text}; try: {self.suggestion}" if self.suggestion else text
-
-
-class Trial(Config):
-    """Other settings of the odometry, tried on a short stretch in which frames were lost or doubtful."""
-
-    where: str
-    """Seconds of the log."""
-    frames: int
-    unplaced: int
-    """Frames lost or doubtful there by the run's own settings, tracked from the stretch's first frame."""
-    tried: dict[str, int] = Field(default_factory=dict)
-    """The same by each other setting."""
-
-    @property
-    def text(self) -> str:
-        """Suggestion: the setting that lost and doubted least, if any helped by half."""
-        best = min(self.tried, key=self.tried.__getitem__, default="")
-        if best and self.tried[best] < self.unplaced and self.tried[best] <= self.unplaced // 2:
-            return (
-                f"--set {best} (of {self.frames} frames at {self.where}, {self.tried[best]} were lost or "
-                f"doubtful with it, {self.unplaced} without)"
-            )
-        return f"nothing tried helped ({', '.join(self.tried) or 'no other setting applies'})"
 
 
 class Verdict(Config):
@@ -278,8 +255,6 @@ class Manifest(Config):
     skipped: tuple[SkippedFrame, ...] = ()
     warnings: tuple[RunWarning, ...] = ()
     """All that is suspicious about the run, what weighs most first; older runs have none."""
-    trial: Trial | None = None
-    """Made where too many frames were lost or doubtful."""
     verdict: Verdict | None = None
     """None in runs of before 2026-11-22."""
     solve: Solve | None = None
@@ -312,7 +287,9 @@ def read_manifest_of(path: Path, kind: type[AnyManifest]) -> AnyManifest:
         RunError: There is none, or it is not one that this version wrote.
     """
     try:
-        return kind.model_validate_json(read_regular(path, most_bytes=MOST_TEXT_BYTES))
+        tree = from_json(read_regular(path, most_bytes=MOST_TEXT_BYTES))
+        drop_unknown(kind, tree)  # what another version wrote in addition
+        return kind.model_validate(tree)
     except OSError as error:
         raise RunError(f"{path}: cannot be read: {error.strerror}; is {path.parent} a run folder?") from None
     except DataError as error:
@@ -321,6 +298,8 @@ def read_manifest_of(path: Path, kind: type[AnyManifest]) -> AnyManifest:
         first = error.errors()[0]
         name = ".".join(str(part) for part in first["loc"])
         raise RunError(f"{path}: {name or 'manifest'}: {first['msg']}") from None
+    except ValueError as error:
+        raise RunError(f"{path}: no JSON: {error}") from None
 
 
 def library_versions() -> dict[str, str]:

@@ -17,7 +17,7 @@ from mapper.run.graph_warnings import (
     uncertainty_warnings,
     wheel_warnings,
 )
-from mapper.run.manifest import Manifest, RunWarning, Weight
+from mapper.run.manifest import Manifest, RunWarning, Verdict, Weight
 from mapper.run.results import RunResults, with_truth
 from mapper.run.timeline import TimeLine, counted
 
@@ -43,7 +43,7 @@ def find_warnings(results: RunResults, manifest: Manifest) -> list[RunWarning]:
     """Return all that is suspicious about a run, what weighs most first.
 
     What was found while the log was read is taken from the manifest, all else is worked out anew.
-    docs/VERDICT.md lists the kinds and their limits.
+    docs/verdict.md lists the kinds and their limits.
 
     Args:
         results: Results of the solved run.
@@ -72,6 +72,14 @@ def find_warnings(results: RunResults, manifest: Manifest) -> list[RunWarning]:
         *_truth(results),
     ]
     return sorted(found, key=lambda warning: _ORDER.index(warning.weight))
+
+
+def verdict_of(warnings: Sequence[RunWarning]) -> Verdict:
+    """Return the verdict: the heaviest weight of any warning, and the sentences above a note."""
+    heavy = [warning for warning in warnings if warning.weight != "note"]
+    weights = {warning.weight for warning in heavy}
+    state = "broken in parts" if "break" in weights else "doubtful" if "doubt" in weights else "trusted"
+    return Verdict(state=state, sentences=tuple(warning.text for warning in heavy))
 
 
 def merge_warnings(name: str, *, agreement: float | None, shared_voxels: int) -> list[RunWarning]:

@@ -269,3 +269,11 @@ def test_a_cloud_that_no_run_writes_is_refused(tmp_path, old, new, complaint):
     path.write_bytes(path.read_bytes().replace(old, new))
     with pytest.raises(FrameError, match=rf"cloud\.ply: {complaint}"):
         read_cloud(path)
+
+
+def test_what_another_version_wrote_in_addition_is_ignored(tmp_path):
+    (tmp_path / "manifest.json").write_text(
+        '{"status": "complete", "trial": {}, '
+        '"input": {"path": "log", "kind": "tum", "fingerprint": "", "later": 1}}'
+    )
+    assert read_manifest(tmp_path / "manifest.json").input.kind == "tum"

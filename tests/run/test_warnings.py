@@ -11,10 +11,9 @@ from mapper.core.trajectory import Trajectory
 from mapper.graph.model import BetweenFactor, PoseSigmas
 from mapper.loops.closure import Discrepancy, LoopClosure
 from mapper.run.frame_outcomes import DISCONNECTED
-from mapper.run.manifest import AppendedLog, Levelling, RunWarning, SkippedFrame, Trial
+from mapper.run.manifest import AppendedLog, Levelling, RunWarning, SkippedFrame
 from mapper.run.pose_covariances import uncertain_poses
 from mapper.run.results import aligned_truth
-from mapper.run.verdict import with_trial
 from mapper.run.warnings import find_warnings, merge_warnings
 from mapper.sources.config import SourceConfig
 from tests.support.run_results import MANIFEST, STEP_NS, doubted, lost, results_of
@@ -105,8 +104,6 @@ def test_motions_that_nothing_shows_have_another_remedy_than_settings():
     unseen = doubted(unobservable="translation along x")
     warning = only(results_of(changed=dict.fromkeys(range(11, 19), unseen)))
     assert "wheel odometry" in warning.suggestion
-    trial = Trial(where="1 … 2 s", frames=15, unplaced=8, tried={"odometry.voxel_m=0.2": 1})
-    assert with_trial(warning, trial) == warning
 
     results = results_of(changed=dict.fromkeys(range(11, 19), unseen), sigmas=PoseSigmas(0.04, 0.05))
     (uncertain,) = found(results, kind="uncertainty")
