@@ -19,7 +19,7 @@ from mapper.pipeline.checkpoints import Checkpoints
 from mapper.run import files
 from mapper.runtime.atomic import flush_to_disk
 from mapper.runtime.journal import StateFile, opened_state
-from mapper.runtime.state_pickle import dump, load
+from mapper.runtime.state_file import dump, load
 
 _KNOWN = "updates.bin"
 """The updates that earlier processes have cast; the folder's other names are those of marks."""

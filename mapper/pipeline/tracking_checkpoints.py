@@ -21,7 +21,7 @@ from mapper.pipeline.checkpoints import Checkpoints
 from mapper.places.vocabulary import Vocabulary
 from mapper.runtime.archive import pack, unpack
 from mapper.runtime.journal import StateFile
-from mapper.runtime.state_pickle import dumps, fixed_parts, loads
+from mapper.runtime.state_file import dumps, fixed_parts, loads
 from mapper.sensing.wheel_kinematics import Odometer
 from mapper.sources.base import Skipped
 from mapper.sources.reading_checks import ReadingChecks

@@ -14,7 +14,7 @@ from isal import isal_zlib
 
 from mapper.runtime.archived import Archivable, Archived, refer
 from mapper.runtime.journal import Journal
-from mapper.runtime.state_pickle import dumps, loads
+from mapper.runtime.state_file import dumps, loads
 
 RECENT_BYTES = 128 << 20
 """Size of the data in memory that is on the disk as well: some 500 keyframes of 1000 features."""

@@ -17,7 +17,7 @@ from isal import igzip
 
 from mapper.core.errors import DataError
 from mapper.runtime.atomic import flush_to_disk
-from mapper.runtime.state_pickle import Writes
+from mapper.runtime.state_file import Writes
 
 _packed_file: Any = igzip.IGzipFile  # the library has no types
 _HEAD = struct.Struct("<Q16s")

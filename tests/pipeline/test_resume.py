@@ -20,7 +20,7 @@ from mapper.run.folder import open_run
 from mapper.run.manifest import read_manifest
 from mapper.runtime.atomic import locked, partial_of
 from mapper.runtime.journal import StateFile, opened_state
-from mapper.runtime.state_pickle import load
+from mapper.runtime.state_file import load
 from tests.support.command_line import mapper
 from tests.support.desk import REPEATABLE
 from tests.support.files import files_of
