@@ -2,7 +2,7 @@
 
 OpenCV's detector finds the same scores but is slower for the two thresholds per cell of uniform ORB: the
 finest level of a 640×480 image takes 0.7 ms here, 1.5 ms by one call at the lower threshold, before corners
-are chosen by cell, and 4.7 ms by one call per cell (CPU time on fr1/xyz, benchmarks/fast_corners.py). A whole
+are chosen by cell, and 4.7 ms by one call per cell (CPU time on fr1/xyz). A whole
 detection takes 8 ms here, and would take 13 or 20 ms. OpenCV also drops both of two equal neighbours where
 the first is kept here, so 6 % of the key points would change.
 """
