@@ -41,7 +41,7 @@ from mapper.octree.octomap_tree import (
     word_of,
     words_in_preorder,
 )
-from mapper.octree.resampling import blocks_reached, resampled
+from mapper.octree.resampling import blocks_reached, resample
 from mapper.octree.scan_updates import ScanUpdateWriter, open_scan_updates
 from mapper.octree.slice import Band
 from mapper.run.folder import open_run
@@ -220,7 +220,7 @@ def _cut(
     else:
         codes = blocks_reached(octree, T_map_world)
         for tile, some in _slices_by_tile(workspace.tiling, codes, only):
-            part = resampled(octree, inverse(T_map_world), codes[some], workspace.config)
+            part = resample(octree, inverse(T_map_world), codes[some], workspace.config)
             if len(part):
                 yield tile, part
 

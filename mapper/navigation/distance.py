@@ -17,7 +17,7 @@ from mapper.core.errors import DataError, MapSizeError
 from mapper.core.expect import expect_shape
 from mapper.core.geometry import Array, Points
 from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
-from mapper.octree.keys import BLOCK_BITS, BLOCK_EDGE, BLOCK_VOXELS, KEY_ZERO, block_keys, gather
+from mapper.octree.keys import BLOCK_EDGE, KEY_ZERO, block_keys
 from mapper.octree.map import OctreeMap
 
 Distances = NDArray[np.float32]
@@ -77,7 +77,9 @@ def dense_voxels(octree: OctreeMap, *, bytes_per_voxel: int) -> VoxelGrid:
             f"working space, the limit is {LIMIT_BYTES / 2**30:.1f}; plan in a smaller or a coarser map"
         )
     states = np.full(counts[::-1], UNKNOWN, dtype=np.int8)
-    _fill_states(codes, octree.blocks.table.values, octree.occupied_log_odds, first, states)
+    for known in octree.leaves_by_part():
+        x, y, z = (known.keys - first).T
+        states[z, y, x] = np.where(known.log_odds >= octree.occupied_log_odds, OCCUPIED, FREE)
     corner_world_m = (first - KEY_ZERO).astype(np.float64) * octree.resolution_m
     return VoxelGrid(states, corner_world_m, octree.resolution_m)
 
@@ -308,21 +310,3 @@ def _between(position: float, count: int) -> tuple[int, int, float]:
 def _mix(distances: Distances, z: int, y: int, x0: int, x1: int, up: float) -> float:
     low, high = float(distances[z, y, x0]), float(distances[z, y, x1])
     return low + up * (high - low)
-
-
-@njit(cache=True, nogil=True)
-def _fill_states(
-    codes: NDArray[np.int64],
-    values: NDArray[np.float32],
-    threshold: np.float32,
-    first: NDArray[np.int64],
-    states: NDArray[np.int8],
-) -> None:
-    """Write the states of the blocks' voxels to ``states`` (Z, Y, X); voxel [0, 0, 0] has key ``first``."""
-    for b in range(len(codes)):
-        for voxel in range(BLOCK_VOXELS):
-            value = values[b, voxel]
-            if value == value:
-                code = (codes[b] << (3 * BLOCK_BITS)) | voxel
-                x, y, z = gather(code) - first[0], gather(code >> 1) - first[1], gather(code >> 2) - first[2]
-                states[z, y, x] = OCCUPIED if value >= threshold else FREE

@@ -4,7 +4,7 @@ The ground under a trajectory, where what carried the sensor stood or rolled, is
 footprint swept is floor, too, where it was not seen.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -38,30 +38,20 @@ class PathGround:
     Attributes:
         points_world: (N, 3) metres: x and y of the sensor, z of the ground below it; a voxel apart at most.
         sensor_m: (N,) height of the sensor above it.
-        share_seen: Share of these points that have a surface of the map at them.
     """
 
     points_world: Points
     sensor_m: Array
-    share_seen: float
 
     def __len__(self) -> int:
         return len(self.points_world)
 
 
-NO_PATH = PathGround(np.empty((0, 3)), np.empty(0), 0.0)
-
-
-def join_paths(paths: Iterable[PathGround]) -> PathGround:
-    """Return the ground along several paths, one after the other."""
-    known = [path for path in paths if len(path)]
-    if len(known) <= 1:
-        return known[0] if known else NO_PATH
-    lengths = [len(path) for path in known]
+def join_paths(paths: Sequence[PathGround]) -> PathGround:
+    """Return the ground along several paths, one after the other; there is at least one."""
     return PathGround(
-        np.concatenate([path.points_world for path in known]),
-        np.concatenate([path.sensor_m for path in known]),
-        float(np.average([path.share_seen for path in known], weights=lengths)),
+        np.concatenate([path.points_world for path in paths]),
+        np.concatenate([path.sensor_m for path in paths]),
     )
 
 
@@ -125,16 +115,8 @@ def floor_of(
         floor_z_m: Height of the floor in the world.
     """
     limits = limits_of(config, columns.resolution_m)
-    path = join_paths(
-        path_ground(
-            columns,
-            positions_world,
-            radius_m=config.footprint_m,
-            room_m=config.head_room_m,
-            floor_z_m=floor_z_m,
-        )
-        for positions_world in paths_world
-    )
+    settings = {"radius_m": config.footprint_m, "room_m": config.head_room_m, "floor_z_m": floor_z_m}
+    path = join_paths([path_ground(columns, path_world, **settings) for path_world in paths_world])
     columns, driven = add_footprint(columns, path, limits, radius_m=config.footprint_m)
     is_surface = kernels.find_surfaces(columns, limits.room) | driven
     seeds = np.flatnonzero(driven)
@@ -190,8 +172,6 @@ def path_ground(
     """
     cell_m = columns.resolution_m
     points, breaks = _sampled(positions_world, cell_m)
-    if not len(points):
-        return NO_PATH
     highest = int(np.ceil(_MAX_HEIGHT_M / cell_m))
     low = (points[:, :2] / cell_m - (columns.first - KEY_ZERO)).astype(np.float64)
     votes = _vote_heights(columns, low, points[:, 2] / cell_m, radius_m / cell_m, room_m / cell_m, highest)
@@ -199,9 +179,7 @@ def path_ground(
     seen = votes[np.arange(len(points)), height] > 0.0
     ground = points - np.column_stack([np.zeros((len(points), 2)), height * cell_m])
     kept = _driven(ground, height * cell_m, seen, breaks, floor_z_m)
-    if not kept.any():
-        return NO_PATH
-    return PathGround(ground[kept], height[kept] * cell_m, float(seen[kept].mean()))
+    return PathGround(ground[kept], height[kept] * cell_m)
 
 
 def _sampled(positions_world: Points, spacing_m: float) -> tuple[Points, NDArray[np.int64]]:

@@ -10,7 +10,7 @@ from mapper.core.geometry import Array
 from mapper.navigation.config import TraversableConfig
 from mapper.octree.columns import NOWHERE, Columns, Tops
 
-_ALLOWANCE = 1e-6  # of a voxel: 0.1 m is two voxels of 5 cm, whatever the rounding of the division
+ALLOWANCE = 1e-6  # of a voxel: 0.1 m is two voxels of 5 cm, whatever the rounding of the division
 OFF_PLANE = 0.75
 """Largest distance of floor from its plane, in voxels: rounding to voxels moves a surface by half of one."""
 _SAMPLES = 4  # of a slope's window, on each side
@@ -44,14 +44,14 @@ def limits_of(config: TraversableConfig, cell_m: float) -> Limits:
 
     A step lower than a voxel cannot be distinguished from noise and counts as one voxel.
     """
-    step = max(1, int(config.max_step_m / cell_m + _ALLOWANCE))
+    step = max(1, int(config.max_step_m / cell_m + ALLOWANCE))
     slope = float(np.tan(config.max_slope_rad))
     # The plane through a step in the middle of n columns rises by 1.5 / n of it.
-    least_window = int(np.ceil((1.5 * step / slope - 1.0) / 2.0 - _ALLOWANCE))
+    least_window = int(np.ceil((1.5 * step / slope - 1.0) / 2.0 - ALLOWANCE))
     return Limits(
         step=step,
-        room=int(np.ceil(config.head_room_m / cell_m - _ALLOWANCE)),
-        gap=int(config.max_gap_m / cell_m + _ALLOWANCE),
+        room=int(np.ceil(config.head_room_m / cell_m - ALLOWANCE)),
+        gap=int(config.max_gap_m / cell_m + ALLOWANCE),
         window=max(least_window, round((config.slope_window_m / cell_m - 1.0) / 2.0), 1),
         least_window=max(least_window, 1),
         slope=slope,

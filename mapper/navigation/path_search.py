@@ -21,9 +21,8 @@ _UNREACHED = 254
 _ROOT_2, _ROOT_3 = np.sqrt([2.0, 3.0])
 _SAMPLES_PER_CELL = 4
 _GAIN = 1e-4  # of the length: a round that shortens by less is the last
-_MOST_ROUNDS = 30
 _MOST_POINTS = 4000
-_STEEPEST = 3.0**0.5  # slope of a trilinear mix of distances that differ by at most 1 between neighbours
+_STEEPEST = _ROOT_3  # slope of a trilinear mix of distances that differ by at most 1 between neighbours
 _LEAST_STEP = 0.2  # cells, where a line's clearance is just the radius
 
 
@@ -212,14 +211,13 @@ def shorten(field: DistanceField, path: Array, *, radius_m: float) -> Array:
         (M, 3) corners.
     """
     best = _corners(field, path, radius_m)
-    for _ in range(_MOST_ROUNDS):
+    while True:
         length = path_length(best)
         forth = _corners(field, _sampled(best), radius_m)
         back = _corners(field, _sampled(forth)[::-1], radius_m)[::-1]
         best = min(best, forth, back, key=path_length)
-        if path_length(best) > (1.0 - _GAIN) * length:
-            break
-    return best
+        if path_length(best) >= (1.0 - _GAIN) * length:
+            return best
 
 
 def in_sight(field: DistanceField, begin: Array, end: Array, *, radius_m: float) -> bool:

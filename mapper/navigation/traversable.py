@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from mapper.navigation.config import TraversableConfig
 from mapper.navigation.distance import NONE, squares_to_boxes
 from mapper.navigation.floor import Floor
-from mapper.navigation.floor_kernels import Indices, Limits, Mask, around
-from mapper.octree.columns import NOWHERE, Columns, nearest_heights, starts_of
+from mapper.navigation.floor_kernels import ALLOWANCE, Indices, Limits, Mask, around
+from mapper.octree.columns import NEAR_FLOOR_M, NOWHERE, Columns, nearest_heights, starts_of
 from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from mapper.octree.keys import KEY_ZERO
 
@@ -22,10 +22,7 @@ Heights = NDArray[np.int32]
 _LEAST_AREA_M2 = 1.0
 _OVERLAP_M = 3.0
 _NONE = -1
-_ALLOWANCE = 1e-6
-_NEAR_M = 1.0
 _RISER_M = 0.4
-_FAR = 1e6  # voxels: the key range is smaller
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -109,7 +106,7 @@ def _storey(floor: Floor, heights: Heights, config: TraversableConfig) -> Storey
     cells = np.full(columns.shape, UNKNOWN, np.int8)
     if reached.any():
         level, distances = nearest_heights(heights)
-        is_near = distances * columns.resolution_m <= _NEAR_M
+        is_near = distances * columns.resolution_m <= NEAR_FLOOR_M
         blocked = _find_obstacles(columns, limits, floor.steep, level, ~reached, is_near)
         riser = max(limits.step, round(_RISER_M / columns.resolution_m))
         _add_edges(heights, _driven(floor, heights), limits.step, riser, blocked)
@@ -206,10 +203,8 @@ def _close_gaps(reached: Mask, gap: int) -> Mask:
 def _is_edge(heights: Heights, limits: Limits) -> Mask:
     """Return the mask of the columns within a gap of which floor lies that no slope joins."""
     square = np.ones((2 * limits.gap + 1, 2 * limits.gap + 1), np.uint8)
-    missing = heights == NOWHERE
-    highest, lowest = heights.astype(np.float32), heights.astype(np.float32)
-    highest[missing], lowest[missing] = -_FAR, _FAR
-    rise = cv2.dilate(highest, square) - cv2.erode(lowest, square)
+    lowest = np.where(heights == NOWHERE, -NOWHERE, heights).astype(np.float32)
+    rise = cv2.dilate(heights.astype(np.float32), square) - cv2.erode(lowest, square)
     edge: Mask = rise > limits.step + limits.slope * len(square)
     return edge
 
@@ -219,7 +214,7 @@ def _within(obstacles: Mask, radius: float) -> Mask:
     if radius <= 0.0:
         return np.zeros_like(obstacles)
     squares = squares_to_boxes(obstacles[np.newaxis])[0]
-    near: Mask = (squares != NONE) & (np.sqrt(squares) / 2.0 < radius - _ALLOWANCE)
+    near: Mask = (squares != NONE) & (np.sqrt(squares) / 2.0 < radius - ALLOWANCE)
     return near
 
 

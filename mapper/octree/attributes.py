@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from mapper.core.frames import Points32
 from mapper.core.geometry import Array, Points, Transform
-from mapper.octree.blocks import BlockStore, check_memory, find_slots, slot_of
+from mapper.octree.blocks import FIRST_BLOCKS, GROWTH, BlockStore, check_memory, find_slots, slot_of
 from mapper.octree.casting_kernels import OCCUPIED
 from mapper.octree.config import OctreeConfig
 from mapper.octree.keys import (
@@ -35,9 +35,7 @@ UNSET = 255
 """Each channel of OctoMap's colour for "none": white."""
 
 _VOXEL_BYTES = 3 * 4 + 4 + 4 + 8
-_GROWTH = 1.25
 _FULL_WEIGHT = 1 << 24  # 255 times as much still fits into 32 bits
-_FIRST_ROWS = 64
 
 
 class LayerArrays(NamedTuple):
@@ -82,7 +80,7 @@ class AttributeLayer:
         self._blocks = blocks
         self._resolution_m = resolution_m
         self._count = 0
-        self._arrays = _grown(None, slots=0, rows=_FIRST_ROWS)
+        self._arrays = _grow(None, slots=0, rows=FIRST_BLOCKS)
 
     @property
     def memory_bytes(self) -> int:
@@ -113,13 +111,13 @@ class AttributeLayer:
         """
         capacity = len(self._arrays.rows)
         if len(self._blocks) > capacity:
-            self._arrays = _grown(self._arrays, slots=len(self._blocks), rows=len(self._arrays.hits))
+            self._arrays = _grow(self._arrays, slots=len(self._blocks), rows=len(self._arrays.hits))
         missing = slots[self._arrays.rows[slots] < 0]
         count = self._count + len(missing)
         if count > len(self._arrays.hits):
             check_memory(count * BLOCK_VOXELS * _VOXEL_BYTES, f"attributes of {count} blocks of 8³ voxels")
-            rows = max(count, int(len(self._arrays.hits) * _GROWTH))
-            self._arrays = _grown(self._arrays, slots=len(self._blocks), rows=rows)
+            rows = max(count, int(len(self._arrays.hits) * GROWTH))
+            self._arrays = _grow(self._arrays, slots=len(self._blocks), rows=rows)
         self._arrays.rows[missing] = np.arange(self._count, count)
         self._count = count
         return self._arrays.rows[slots]
@@ -234,7 +232,7 @@ class AttributeLayer:
         return VoxelAttributes(colors, weights > 0, hits, last_seen_ns)
 
 
-def _grown(old: LayerArrays | None, *, slots: int, rows: int) -> LayerArrays:
+def _grow(old: LayerArrays | None, *, slots: int, rows: int) -> LayerArrays:
     """Return a layer of a larger size that begins with the old one."""
     new = LayerArrays(
         np.full(slots, -1, np.int32),

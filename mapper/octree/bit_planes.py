@@ -10,17 +10,17 @@ from numpy import int64, uint64
 from numpy.typing import NDArray
 
 from mapper.core.voxel_index import row_of, voxel_index
-from mapper.octree.keys import BLOCK_VOXELS, KEY_BITS, spread
+from mapper.octree.keys import BLOCK_VOXELS, KEY_MASK, spread
 
 WORD_BITS = 64
 WORDS = BLOCK_VOXELS // WORD_BITS
-ALL_SET = np.uint64(0xFFFFFFFFFFFFFFFF)
 NONE_SET = np.uint64(0)
+ALL_SET = ~NONE_SET
 
 Words = NDArray[np.uint64]
 """(B, 8) uint64: a plane of B blocks."""
 
-_AXIS_BITS = int(spread.py_func((1 << KEY_BITS) - 1))
+_AXIS_BITS = int(spread.py_func(KEY_MASK))
 """Bits of a code that belong to x."""
 
 

@@ -20,9 +20,11 @@ from mapper.octree.config import OctreeConfig
 from mapper.octree.keys import BLOCK_VOXELS
 from mapper.runtime.file_array import FileArray
 
-BLOCK_BYTES = BLOCK_VOXELS * 4
-_FIRST_BLOCKS = 64
-_GROWTH = 1.25
+BLOCK_BYTES = BLOCK_VOXELS * np.dtype(np.float32).itemsize
+BLOCKS_AT_ONCE = 1 << 12
+"""Blocks whose voxels are listed or copied at once: 70 MB at most."""
+FIRST_BLOCKS = 64
+GROWTH = 1.25
 """A pool that doubles would hold half its memory in reserve."""
 _VACANT = -1
 
@@ -91,8 +93,8 @@ class BlockStore:
         self._folder, self._max_memory_bytes = folder, max_memory_bytes
         self._file: FileArray | None = None
         self._count = 0
-        self._codes = np.full(_FIRST_BLOCKS, _VACANT, dtype=np.int64)  # by slot
-        self.table = _table(_FIRST_BLOCKS, values=np.empty((_FIRST_BLOCKS, BLOCK_VOXELS), np.float32))
+        self._codes = np.full(FIRST_BLOCKS, _VACANT, dtype=np.int64)  # by slot
+        self.table = _table(FIRST_BLOCKS, values=np.empty((FIRST_BLOCKS, BLOCK_VOXELS), np.float32))
 
     def __len__(self) -> int:
         return self._count
@@ -132,14 +134,14 @@ class BlockStore:
         kept: NDArray[np.int64] = _move_known(self.table.values, self._codes, self._count)
         if len(kept) < self._count:
             self._count = len(kept)
-            self.table = _table(max(self._count, _FIRST_BLOCKS), values=self.table.values)
+            self.table = _table(max(self._count, FIRST_BLOCKS), values=self.table.values)
             _index(self.table, self.codes)
         return kept
 
     def _reserve(self, count: int) -> None:
         capacity = len(self._codes)
         if count > capacity:
-            capacity = max(count, int(capacity * _GROWTH))
+            capacity = max(count, int(capacity * GROWTH))
             values = self._more_values(count, capacity)
             self._codes = np.concatenate([self._codes, np.empty(capacity - len(self._codes), np.int64)])
             self.table = self.table._replace(values=values)

@@ -17,7 +17,6 @@ from mapper.octree.config import OctreeConfig
 from mapper.octree.keys import BLOCK_BITS, BLOCK_VOXELS, KEY_BITS, KEY_COUNT, KEY_ZERO
 from mapper.sensing.depth_limit import DepthLimit
 
-_NO_POINTS: Points32 = np.empty((0, 3), np.float32)
 _LIMIT_BYTES = 1 << 33
 """Limit of a window. Address space, not memory: only pages that a ray crosses are ever backed by memory."""
 
@@ -155,10 +154,10 @@ class Caster:
         self._refuse(outside, len(points_body))
         return centres_world
 
-    def _rays(self, ends_world: Points32, origin_world: Array, *, free_world: Points32 = _NO_POINTS) -> Cast:
+    def _rays(self, ends_world: Points32, origin_world: Array, *, free_world: Points32 | None = None) -> Cast:
         """Rasterise rays to obstacles, and rays to points where there is none."""
         obstacles = len(ends_world)
-        if len(free_world):
+        if free_world is not None:
             ends_world = np.concatenate([ends_world, free_world])
         resolution_m = self.config.resolution_m
         origin = np.asarray(origin_world, dtype=np.float32)

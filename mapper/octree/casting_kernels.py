@@ -42,8 +42,8 @@ NEVER = float64(np.finfo(np.float64).max)
 """OctoMap's tMax along an axis that the ray does not move on."""
 
 _T_MAX, _T_DELTA, _T_END = (_RAYS * row for row in (0, 3, 6))
-_CELL, _STEP, _END, _GOES_ON = (_RAYS * row for row in (0, 3, 6, 7))
-_Y, _Z = _RAYS, 2 * _RAYS
+_CELL, _STEP, _END = _T_MAX, _T_DELTA, _T_END
+_GOES_ON, _Y, _Z = _END + _RAYS, _RAYS, _RAYS + _RAYS
 """Rows of the two arrays of ``_step_along``: a quantity's first row is that of x; y and z follow."""
 
 

@@ -6,12 +6,11 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from mapper.core.geometry import Array
 from mapper.octree.blocks import check_memory
-from mapper.octree.keys import BLOCK_BITS, BLOCK_VOXELS, KEY_COUNT, KEY_MASK, KEY_ZERO, block_keys, gather
+from mapper.octree.keys import BLOCK_BITS, KEY_COUNT, KEY_MASK, KEY_ZERO, block_keys
 
 if TYPE_CHECKING:
     from mapper.octree.queries import MapView
@@ -28,7 +27,8 @@ _MAX_SLOPE = 0.3
 _LOW_PERCENT = 20.0  # below it are reflections
 _START_M = 0.5
 _MIN_COLUMNS = 4
-_NEAR_FLOOR_M = 1.0
+NEAR_FLOOR_M = 1.0
+"""Near floor the ground is at its height, and drops are obstacles."""
 NOTHING = np.iinfo(np.int32).max
 """Value of ``lowest_occupied`` for a column without an occupied voxel."""
 
@@ -99,10 +99,11 @@ def occupied_columns(octree: "MapView", *, margin: int) -> Columns:
 
 def occupied_voxels(octree: "MapView") -> NDArray[np.int64]:
     """Return the (N,) occupied voxels of a map, or of a part of one, for ``columns_of``."""
-    voxels: NDArray[np.int64] = _occupied(
-        octree.blocks.codes, octree.blocks.table.values, octree.occupied_log_odds
-    )
-    return voxels
+    parts = [np.empty(0, np.int64)]
+    for known in octree.leaves_by_part():
+        x, y, z = known.keys[known.log_odds >= octree.occupied_log_odds].T.astype(np.int64)
+        parts.append((y << 32) | (x << 16) | z)
+    return np.concatenate(parts)
 
 
 def columns_of(
@@ -136,26 +137,6 @@ def columns_of(
     starts = starts_of(columns, height * width)
     tops = ((voxels & KEY_MASK) + 1 - KEY_ZERO).astype(np.int32)
     return Columns(starts, tops, (height, width), first, resolution_m)
-
-
-@njit(cache=True, nogil=True)
-def _occupied(
-    codes: NDArray[np.int64], values: NDArray[np.float32], threshold: np.float32
-) -> NDArray[np.int64]:
-    """Return the keys of all occupied voxels as y · 2³² + x · 2¹⁶ + z."""
-    count = 0
-    for b in range(len(codes)):
-        for voxel in range(BLOCK_VOXELS):
-            count += values[b, voxel] >= threshold
-    packed = np.empty(count, np.int64)
-    count = 0
-    for b in range(len(codes)):
-        for voxel in range(BLOCK_VOXELS):
-            if values[b, voxel] >= threshold:
-                code = (codes[b] << (3 * BLOCK_BITS)) | voxel
-                packed[count] = (gather(code >> 1) << 32) | (gather(code) << 16) | gather(code >> 2)
-                count += 1
-    return packed
 
 
 class Rows(Protocol):
@@ -269,7 +250,7 @@ def snap_to_floor(
         distances: (H, W) distances to it in columns, from there too.
         resolution_m: Edge of a voxel.
     """
-    near = distances * resolution_m <= _NEAR_FLOOR_M
+    near = distances * resolution_m <= NEAR_FLOOR_M
     heights_m[near] = level[near] * resolution_m
 
 
@@ -293,9 +274,11 @@ def lowest_occupied(
     A column without one has ``NOTHING``, so that the minimum joins several maps.
     """
     lowest = np.full(shape, NOTHING, dtype=np.int32)
-    slots = octree.blocks.sorted_slots()
-    codes = octree.blocks.codes[slots]
-    _lowest_occupied(codes, slots, octree.blocks.table.values, octree.occupied_log_odds, first, lowest)
+    for known in octree.leaves_by_part():
+        x, y, z = known.keys[known.log_odds >= octree.occupied_log_odds].T.astype(np.int64)
+        rows, columns = y - first[1], x - first[0]
+        inside = (rows >= 0) & (rows < shape[0]) & (columns >= 0) & (columns < shape[1])
+        np.minimum.at(lowest, (rows[inside], columns[inside]), (z[inside] - KEY_ZERO + 1).astype(np.int32))
     return lowest
 
 
@@ -330,19 +313,6 @@ def ground_from_lowest(
         heights_m[start] = low_m[start]
     _follow(low_m, heights_m, max_step_m=_MAX_SLOPE * columns * resolution_m)
     return GroundHeights(heights_m, first, columns)
-
-
-@njit(cache=True, nogil=True)
-def _lowest_occupied(codes, slots, values, threshold, first, lowest):
-    """Lower ``lowest`` (H, W) to the top of each column's lowest occupied voxel, in voxels above z = 0."""
-    for b in range(len(codes)):
-        for voxel in range(BLOCK_VOXELS):
-            if values[slots[b], voxel] >= threshold:
-                code = (codes[b] << (3 * BLOCK_BITS)) | voxel
-                row, column = gather(code >> 1) - first[1], gather(code) - first[0]
-                if 0 <= row < lowest.shape[0] and 0 <= column < lowest.shape[1]:
-                    top = gather(code >> 2) - KEY_ZERO + 1
-                    lowest[row, column] = min(lowest[row, column], top)
 
 
 def _cells(tops: Rows, columns: int, percent: float, nothing: int) -> Array:

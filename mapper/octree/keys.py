@@ -20,6 +20,8 @@ BLOCK_BITS = 3
 """A block is 8³ voxels: the lowest three levels of the tree."""
 BLOCK_EDGE = 1 << BLOCK_BITS
 BLOCK_VOXELS = 1 << (3 * BLOCK_BITS)
+PACKED_BYTES = BLOCK_VOXELS // 8
+"""Bytes of one bit per voxel of a block."""
 BLOCK_DEPTH = KEY_BITS - BLOCK_BITS
 """Depth of the tree node that a block is."""
 

@@ -22,9 +22,9 @@ from pydantic import ValidationError
 from mapper.core.config import drop_unknown
 from mapper.core.errors import MapFileError
 from mapper.octree.attributes import AttributeLayer
-from mapper.octree.blocks import BLOCK_BYTES, BlockStore, check_memory, find_slots
+from mapper.octree.blocks import BLOCK_BYTES, BLOCKS_AT_ONCE, BlockStore, check_memory, find_slots
 from mapper.octree.config import OctreeConfig
-from mapper.octree.keys import BLOCK_VOXELS
+from mapper.octree.keys import BLOCK_VOXELS, PACKED_BYTES
 from mapper.runtime.atomic import writing
 from mapper.runtime.checked_file import CheckedFormat
 
@@ -34,10 +34,6 @@ if TYPE_CHECKING:
 MAGIC = b"\x89mapper-octree\r\n"
 
 _FORMAT = CheckedFormat(MAGIC, version=1, remedy="update mapper", error=MapFileError)
-_LEVEL = 3  # Zstandard's default
-_MASK_BYTES = BLOCK_VOXELS // 8
-_CHUNK = 1 << 14
-"""Blocks that are copied at once: 32 MB."""
 _COUNTS = ("blocks", "voxels", "attribute_blocks", "attribute_voxels")
 _ATTRIBUTE_BYTES = BLOCK_VOXELS * 28
 """Memory of a block's attributes: three sums of colour, their weight, hits and a stamp per voxel."""
@@ -50,7 +46,7 @@ def write_map(path: Path, octree: "OctreeMap") -> None:
     """
     values = octree.blocks.table.values
     slots = octree.blocks.sorted_slots()
-    chunks = [slots[first : first + _CHUNK] for first in range(0, len(slots), _CHUNK)]
+    chunks = [slots[first : first + BLOCKS_AT_ONCE] for first in range(0, len(slots), BLOCKS_AT_ONCE)]
     bits = [_bits(~np.isnan(values[some])) for some in chunks]
     counts = [len(slots), int(sum(np.bitwise_count(some).sum(dtype=np.int64) for some in bits)), 0, 0]
     attributes: list[NDArray[Any]] = []
@@ -72,7 +68,7 @@ def write_map(path: Path, octree: "OctreeMap") -> None:
         stack.enter_context(writing(path))
         path.parent.mkdir(parents=True, exist_ok=True)
         body = stack.enter_context(TemporaryFile(dir=path.parent))
-        compressor = zstandard.ZstdCompressor(level=_LEVEL)
+        compressor = zstandard.ZstdCompressor()
         with compressor.stream_writer(body, size=sum(_sizes(counts)), closefd=False) as stream:
             for column in columns():
                 stream.write(column.astype(column.dtype.newbyteorder("<"), copy=False).data)
@@ -106,8 +102,8 @@ def _columns(counts: Sequence[int]) -> list[tuple[int, str]]:
     """Return the length and type of the arrays that a body holds."""
     blocks, voxels, attribute_blocks, attribute_voxels = counts
     return [
-        *((blocks, "<i8"), (blocks * _MASK_BYTES, "u1"), (voxels, "<f4")),
-        *((attribute_blocks, "<i8"), (attribute_blocks * _MASK_BYTES, "u1")),
+        *((blocks, "<i8"), (blocks * PACKED_BYTES, "u1"), (voxels, "<f4")),
+        *((attribute_blocks, "<i8"), (attribute_blocks * PACKED_BYTES, "u1")),
         *[(attribute_voxels, "<u4")] * 5,
         (attribute_voxels, "<i8"),
     ]
@@ -171,7 +167,7 @@ def _decompressed(path: Path, body: memoryview, size: int) -> bytes:
 
 
 def _held(path: Path, steps: NDArray[np.int64], bits: NDArray[np.uint8], count: int) -> NDArray[np.bool_]:
-    held = np.unpackbits(bits.reshape(len(steps), _MASK_BYTES), axis=1, bitorder="little").view(np.bool_)
+    held = np.unpackbits(bits.reshape(len(steps), PACKED_BYTES), axis=1, bitorder="little").view(np.bool_)
     if np.count_nonzero(held) != count or (steps[1:] <= 0).any():
         raise MapFileError(f"{path}: its voxels are not {count} in rising blocks; it is damaged")
     return held

@@ -15,7 +15,7 @@ from numba import njit
 from numpy import float32, int64, uint8, uint16
 from numpy.typing import NDArray
 
-from mapper.octree.blocks import BlockStore
+from mapper.octree.blocks import BLOCKS_AT_ONCE, BlockStore
 from mapper.octree.keys import BLOCK_DEPTH, BLOCK_VOXELS
 
 NODE = np.dtype([("value", "<f4"), ("mask", "u1")])
@@ -26,9 +26,7 @@ _VOXELS, _PAIRS, _QUADS, _TOP = 0, 512, 576, 584
 _PYRAMID = _TOP + 1
 _WORDS = _PYRAMID - BLOCK_VOXELS
 _STACK = 8 * (BLOCK_DEPTH + 1)
-_FREE, _OCCUPIED, _INNER = 1, 2, 3
-_CHUNK = 1 << 14
-"""Blocks whose nodes are in memory at once: 48 MB at most."""
+_FREE, _OCCUPIED, _INNER = range(1, 4)
 
 
 class UpperNodes(NamedTuple):
@@ -69,15 +67,15 @@ class Preorder:
         """Yield the nodes, (N,) NODE at a time."""
         ends = self._ends()
         for chunk, (begin, end) in enumerate(zip([0, *ends[:-1]], ends, strict=True)):
-            first = chunk * _CHUNK
-            parts, starts = _block_nodes(self.store, self.slots[first : first + _CHUNK])
+            first = chunk * BLOCKS_AT_ONCE
+            parts, starts = _block_nodes(self.store, self.slots[first : first + BLOCKS_AT_ONCE])
             piece = np.empty(starts[-1] + end - begin, NODE)
             yield piece[: _assemble_nodes(self.upper, self.order[begin:end], first, parts, starts, piece)]
 
     def _ends(self) -> list[int]:
         """Return where in the order the blocks of each chunk but the first begin, and the order's end."""
         at = np.flatnonzero(self.order < len(self.slots))
-        nexts = np.arange(_CHUNK, len(self.slots), _CHUNK)
+        nexts = np.arange(BLOCKS_AT_ONCE, len(self.slots), BLOCKS_AT_ONCE)
         following = np.searchsorted(self.order[at], nexts)
         return [*np.append(at, len(self.order))[following].tolist(), len(self.order)]
 
@@ -91,9 +89,12 @@ def preorder_of(store: BlockStore, *, root_depth: int = 0) -> Preorder:
     """
     slots = store.sorted_slots()
     tops, sizes = np.empty(len(slots), NODE), np.empty(len(slots), np.int64)
-    for first in range(0, len(slots), _CHUNK):
-        parts, starts = _block_nodes(store, slots[first : first + _CHUNK])
-        tops[first : first + _CHUNK], sizes[first : first + _CHUNK] = parts[starts[:-1]], np.diff(starts)
+    for first in range(0, len(slots), BLOCKS_AT_ONCE):
+        parts, starts = _block_nodes(store, slots[first : first + BLOCKS_AT_ONCE])
+        tops[first : first + BLOCKS_AT_ONCE], sizes[first : first + BLOCKS_AT_ONCE] = (
+            parts[starts[:-1]],
+            np.diff(starts),
+        )
     starts = np.concatenate([[0], np.cumsum(sizes)])
     upper = upper_nodes(store.codes[slots], tops, starts, levels=BLOCK_DEPTH - root_depth)
     order = preorder(upper)

@@ -1,5 +1,6 @@
 """Queries of an occupancy map: points, voxels, rays, nearest obstacles, and nodes of coarser levels."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,14 +11,11 @@ from mapper.core.expect import expect_shape
 from mapper.core.frames import Points32
 from mapper.core.geometry import Array, Points, point_rows
 from mapper.octree import query_kernels as kernels
-from mapper.octree.blocks import BlockStore, count_known, log_odds
+from mapper.octree.blocks import BLOCKS_AT_ONCE, BlockStore, count_known, log_odds
 from mapper.octree.casting import origin_key
 from mapper.octree.config import OctreeConfig, Parent
 from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from mapper.octree.keys import BLOCK_BITS, BLOCK_DEPTH, KEY_BITS, KEY_ZERO, codes_of, keys_of
-
-_CHUNK = 1 << 12
-"""Blocks whose voxels are listed at once: 70 MB at most."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -193,6 +191,16 @@ class MapView:
         codes, values = self._nodes(depth, parent)
         return Leaves(keys_of(codes).astype(np.uint16), values, self.resolution_m, depth)
 
+    def leaves_by_part(self, slots: NDArray[np.int64] | None = None) -> Iterator[Leaves]:
+        """Yield the known voxels some blocks at a time, so that their list need not fit into memory.
+
+        Args:
+            slots: (B,) slots of the blocks; None: all, in Morton order.
+        """
+        slots = self.blocks.sorted_slots() if slots is None else slots
+        for first in range(0, len(slots), BLOCKS_AT_ONCE):
+            yield self._known_in(slots[first : first + BLOCKS_AT_ONCE])
+
     def slice(self, z_min: float, z_max: float | None = None) -> OccupancyGrid:
         """Return the 2D map of the voxels with centres between two heights; occupied beats free.
 
@@ -229,7 +237,7 @@ class MapView:
             raise DataError("octree: every ray needs a finite direction other than zero")
         for corner in (origins.min(axis=0, initial=0.0), origins.max(axis=0, initial=0.0)):
             origin_key(corner, self.resolution_m)
-        keys, outcomes = kernels.cast_rays(
+        keys, hits = kernels.cast_rays(
             self.blocks.table,
             origins,
             directions,
@@ -240,7 +248,7 @@ class MapView:
         )
         centres_world = self._centres_of(keys)
         distances_m = np.linalg.norm(centres_world - origins_world, axis=1)
-        return RayEnds(centres_world, distances_m, outcomes == kernels.HIT)
+        return RayEnds(centres_world, distances_m, hits)
 
     def nearest_obstacles(self, points_world: Points | Points32, *, max_range_m: float) -> Nearest:
         """Return the occupied voxel whose centre is nearest to each point, without a distance field.
@@ -278,9 +286,8 @@ class MapView:
         return Leaves(keys, values, self.resolution_m)
 
     def _centres(self, *, occupied: bool) -> Points:
-        slots, parts = self.blocks.sorted_slots(), [np.empty((0, 3))]
-        for first in range(0, len(slots), _CHUNK):
-            known = self._known_in(slots[first : first + _CHUNK])
+        parts = [np.empty((0, 3))]
+        for known in self.leaves_by_part():
             kept = (known.log_odds >= self.occupied_log_odds) == occupied
             parts.append(known.centres_world[kept])
         return np.concatenate(parts)

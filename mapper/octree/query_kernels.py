@@ -23,11 +23,7 @@ from mapper.octree.keys import (
     morton,
 )
 
-HIT, STOPPED_UNKNOWN, STOPPED_RANGE = 1, 2, 3
-"""Outcomes of a ray: it ended in an occupied voxel, in an unknown one, or at the range or map's border."""
-
 _CHUNK = 256  # points worked on at a time: their codes stay in the first-level cache
-_NOWHERE = int64(1) << 60  # a Morton code that no voxel has
 _NOT_LISTED = -1
 _OFFSETS: NDArray[np.int64] = keys_of(np.arange(BLOCK_VOXELS))
 """(512, 3) keys of a block's voxels relative to its first, in Morton order."""
@@ -58,7 +54,7 @@ def values_at(table, points_world, resolution_m):
             x = np.floor(inverse_resolution * x_m[j]) + KEY_ZERO
             y = np.floor(inverse_resolution * y_m[j]) + KEY_ZERO
             z = np.floor(inverse_resolution * z_m[j]) + KEY_ZERO
-            codes[j] = morton(int64(x), int64(y), int64(z)) if have_keys(x, y, z) else _NOWHERE
+            codes[j] = morton(int64(x), int64(y), int64(z)) if have_keys(x, y, z) else int64(-1)
         for j in range(size):
             found[start + j] = _value_at(table, codes[j])
     return found
@@ -78,11 +74,12 @@ def cast_rays(table, origins, directions, resolution_m, max_range_m, threshold, 
         through_unknown: Whether rays pass unknown voxels.
 
     Returns:
-        (N, 3) int64 key of the last voxel and (N,) uint8 outcome of the ray.
+        (N, 3) int64 key of the last voxel, and (N,) whether it is occupied: the others are unknown, or at the
+        end of the range or of the keys.
     """
     n = len(origins)
     last = np.empty((n, 3), int64)
-    outcome = np.empty(n, np.uint8)
+    hits = np.zeros(n, np.bool_)
     step, key = np.empty(3, int64), np.empty(3, int64)
     t_max, t_delta = np.empty(3), np.empty(3)
     for i in range(n):
@@ -100,15 +97,13 @@ def cast_rays(table, origins, directions, resolution_m, max_range_m, threshold, 
         while True:
             value = _value_at(table, morton(key[0], key[1], key[2]))
             if value >= threshold:
-                outcome[i] = HIT
+                hits[i] = True
                 break
             if value != value and not through_unknown:
-                outcome[i] = STOPPED_UNKNOWN
                 break
             axis = 0 if t_max[0] < t_max[1] else 1
             axis = axis if t_max[axis] < t_max[2] else 2
             if key[axis] + step[axis] < 0 or key[axis] + step[axis] >= KEY_COUNT:
-                outcome[i] = STOPPED_RANGE
                 break
             key[axis] += step[axis]
             t_max[axis] += t_delta[axis]
@@ -117,11 +112,10 @@ def cast_rays(table, origins, directions, resolution_m, max_range_m, threshold, 
                 offset = float32(centre_of(key[j], resolution_m)) - origins[i, j]
                 square += float64(offset * offset)
             if square > max_range_m * max_range_m:
-                outcome[i] = STOPPED_RANGE
                 break
         for j in range(3):
             last[i, j] = key[j]
-    return last, outcome
+    return last, hits
 
 
 @njit(cache=True, nogil=True)

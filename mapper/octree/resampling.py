@@ -19,6 +19,7 @@ from mapper.octree.config import OctreeConfig
 from mapper.octree.keys import (
     BLOCK_BITS,
     BLOCK_DEPTH,
+    BLOCK_EDGE,
     BLOCK_VOXELS,
     KEY_COUNT,
     KEY_ZERO,
@@ -29,8 +30,6 @@ from mapper.octree.keys import (
     morton,
 )
 from mapper.octree.map import OctreeMap
-
-_EDGE = 1 << BLOCK_BITS
 
 
 def blocks_reached(octree: OctreeMap, T_map_world: Transform) -> NDArray[np.int64]:
@@ -43,10 +42,10 @@ def blocks_reached(octree: OctreeMap, T_map_world: Transform) -> NDArray[np.int6
     Raises:
         MapSizeError: The run's map would reach beyond the range of keys.
     """
-    middles = block_keys(octree.blocks.codes) - KEY_ZERO + _EDGE // 2
+    middles = block_keys(octree.blocks.codes) - KEY_ZERO + BLOCK_EDGE // 2
     moved = middles @ T_map_world[:3, :3].T + T_map_world[:3, 3] / octree.resolution_m
-    reach = _EDGE // 2 * np.abs(T_map_world[:3, :3]).sum(axis=1)
-    lowest, highest = (np.floor((moved + side * reach) / _EDGE).astype(np.int64) for side in (-1, 1))
+    reach = BLOCK_EDGE // 2 * np.abs(T_map_world[:3, :3]).sum(axis=1)
+    lowest, highest = (np.floor((moved + side * reach) / BLOCK_EDGE).astype(np.int64) for side in (-1, 1))
     limit = 1 << (BLOCK_DEPTH - 1)
     if len(moved) and (lowest.min() < -limit or highest.max() >= limit):
         raise MapSizeError(
@@ -60,7 +59,7 @@ def blocks_reached(octree: OctreeMap, T_map_world: Transform) -> NDArray[np.int6
     return np.unique(np.concatenate(found))
 
 
-def resampled(
+def resample(
     octree: OctreeMap, T_world_map: Transform, codes: NDArray[np.int64], config: OctreeConfig
 ) -> OctreeMap:
     """Return another map's voxels resampled into blocks; blocks without a known voxel are left out.

@@ -24,11 +24,8 @@ from mapper.core.geometry import Transform, angle_between
 from mapper.octree.casting import Cast, depth_limit_of
 from mapper.octree.casting_kernels import FREE, OCCUPIED, UNTOUCHED
 from mapper.octree.config import OctreeConfig
-from mapper.octree.keys import BLOCK_VOXELS
+from mapper.octree.keys import BLOCK_VOXELS, PACKED_BYTES
 from mapper.runtime.atomic import writing
-
-PACKED_BYTES = BLOCK_VOXELS // 8
-"""Bytes of one bit per voxel of a block."""
 
 _LEVEL = 1  # of compression: cells are mostly runs, which higher levels shrink little further
 _FORMAT = "mapper sights 1"  # the updates' former name: files with it are still read

@@ -5,8 +5,6 @@ from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
-from numba import njit
-from numpy import uint8
 from numpy.typing import NDArray
 
 from mapper.core.errors import DataError
@@ -14,7 +12,7 @@ from mapper.core.geometry import Array
 from mapper.octree.columns import DrivenGround, block_extent, ground_heights, known_floor, nearest_heights
 from mapper.octree.config import SliceConfig
 from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
-from mapper.octree.keys import BLOCK_BITS, BLOCK_VOXELS, KEY_ZERO, block_keys, gather
+from mapper.octree.keys import BLOCK_EDGE, KEY_ZERO, block_keys
 
 if TYPE_CHECKING:
     from mapper.octree.queries import MapView
@@ -56,18 +54,21 @@ class Band:
             DataError: The band has no voxels.
         """
         lowest, highest = self._keys()
-        slots = octree.blocks.sorted_slots()
-        codes = octree.blocks.codes[slots]
-        bases = np.zeros(shape, dtype=np.int64)
+        slots, bases = octree.blocks.sorted_slots(), np.zeros(shape, dtype=np.int64)
         if ground_m is None:
-            z = block_keys(codes)[:, 2]
-            inside = (z + (1 << BLOCK_BITS) > lowest) & (z <= highest)
-            codes, slots = codes[inside], slots[inside]
+            z = block_keys(octree.blocks.codes[slots])[:, 2]
+            slots = slots[(z + BLOCK_EDGE > lowest) & (z <= highest)]
         else:
             bases += np.rint((ground_m - self.floor_z_m) / self.resolution_m).astype(np.int64)
         seen = np.zeros(shape, dtype=np.uint8)
-        values, threshold = octree.blocks.table.values, octree.occupied_log_odds
-        _flatten(codes, slots, values, threshold, first, lowest, highest, bases, seen)
+        for known in octree.leaves_by_part(slots):
+            x, y, z = known.keys.T.astype(np.int64)
+            rows, columns = y - first[1], x - first[0]
+            z -= bases[rows, columns]
+            inside = (z >= lowest) & (z <= highest)
+            occupied = known.log_odds >= octree.occupied_log_odds
+            for flag, some in ((_SEEN_FREE, inside & ~occupied), (_SEEN_OCCUPIED, inside & occupied)):
+                seen[rows[some], columns[some]] |= np.uint8(flag)
         return seen
 
     def free_path(self, seen: NDArray[np.uint8], driven: DrivenGround) -> None:
@@ -183,21 +184,6 @@ def cut_slice(octree: "MapView", config: SliceConfig, *, driven: DrivenGround | 
     if driven is not None:
         band.free_path(seen, driven)
     return band.grid_of(seen, first=first)
-
-
-@njit(cache=True, nogil=True)
-def _flatten(codes, slots, values, threshold, first, lowest, highest, bases, seen):
-    """Add the flags of the band's voxels to their columns of ``seen`` (H, W) uint8."""
-    for b in range(len(codes)):
-        for voxel in range(BLOCK_VOXELS):
-            value = values[slots[b], voxel]
-            if value != value:
-                continue
-            code = (codes[b] << (3 * BLOCK_BITS)) | voxel
-            row, column = gather(code >> 1) - first[1], gather(code) - first[0]
-            z = gather(code >> 2) - bases[row, column]
-            if z >= lowest and z <= highest:
-                seen[row, column] |= uint8(_SEEN_OCCUPIED if value >= threshold else _SEEN_FREE)
 
 
 def _without_speckles(seen: NDArray[np.uint8], *, min_cells: int) -> NDArray[np.uint8]:

@@ -16,7 +16,7 @@ from mapper.merging.merged_map import open_map
 from mapper.merging.placing import Placed, as_built, by_poses, by_truth, warnings_about
 from mapper.octree.map import OctreeMap
 from mapper.octree.octomap_file import write_bt, write_ot
-from mapper.octree.resampling import blocks_reached, resampled
+from mapper.octree.resampling import blocks_reached, resample
 from mapper.run.files import SUMMARY
 from mapper.run.folder import open_run
 from mapper.run.manifest import Verdict
@@ -203,7 +203,7 @@ def test_runs_are_brought_together_by_their_truths(maps, tmp_path):
     assert placed[0].stays
     np.testing.assert_allclose(placed[1].T_map_world, T_map_second, atol=1e-9)
     found = merged_map_of(placed, tmp_path / "map").map
-    moved = resampled(
+    moved = resample(
         maps[1], inverse(placed[1].T_map_world), blocks_reached(maps[1], placed[1].T_map_world), COLORED
     )
     octree, _ = total([maps[0], moved], config=COLORED)

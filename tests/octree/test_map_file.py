@@ -37,8 +37,8 @@ def path(tmp_path):
 def test_a_map_written_some_blocks_at_a_time_is_the_same(attributes, tmp_path, monkeypatch):
     octree = mapped(attributes=attributes)
     write_map(tmp_path / "at once.octree", octree)
-    monkeypatch.setattr("mapper.octree.map_file._CHUNK", 5)
-    monkeypatch.setattr("mapper.octree.queries._CHUNK", 5)
+    monkeypatch.setattr("mapper.octree.map_file.BLOCKS_AT_ONCE", 5)
+    monkeypatch.setattr("mapper.octree.queries.BLOCKS_AT_ONCE", 5)
 
     write_map(tmp_path / "map.octree", octree)
 

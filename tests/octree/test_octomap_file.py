@@ -56,7 +56,7 @@ def test_files_equal_the_cpp_library_s_byte_for_byte(octree, their_tree, tmp_pat
 @pytest.mark.parametrize("blocks_at_once", [1, 3, 8])
 def test_files_written_some_blocks_at_a_time_are_the_same(octree, blocks_at_once, tmp_path, monkeypatch):
     write_ot(tmp_path / "at once.ot", octree)
-    monkeypatch.setattr("mapper.octree.octomap_tree._CHUNK", blocks_at_once)
+    monkeypatch.setattr("mapper.octree.octomap_tree.BLOCKS_AT_ONCE", blocks_at_once)
 
     write_ot(tmp_path / "map.ot", octree)
 
@@ -73,7 +73,7 @@ def test_nodes_pruned_above_blocks_are_written_some_blocks_at_a_time(
     codes = np.array([number << 3 * (KEY_BITS - 11) for number in range(len(depths))])
     octree.restore(TreeLeaves(codes, np.array(depths, np.uint8), np.full(len(depths), OCCUPIED)))
     write_ot(tmp_path / "at once.ot", octree)
-    monkeypatch.setattr("mapper.octree.octomap_tree._CHUNK", blocks_at_once)
+    monkeypatch.setattr("mapper.octree.octomap_tree.BLOCKS_AT_ONCE", blocks_at_once)
 
     write_ot(tmp_path / "map.ot", octree)
 

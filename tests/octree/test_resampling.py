@@ -1,4 +1,4 @@
-"""Maps resampled into another frame: the value at each voxel's centre, and nothing lost."""
+"""Maps resample into another frame: the value at each voxel's centre, and nothing lost."""
 
 import numpy as np
 import pytest
@@ -6,13 +6,13 @@ import pytest
 from mapper.core.errors import MapSizeError
 from mapper.core.geometry import apply, exp, inverse
 from mapper.octree.map import OctreeMap
-from mapper.octree.resampling import blocks_reached, resampled
+from mapper.octree.resampling import blocks_reached, resample
 from tests.support.octree_maps import COLORED, CONFIG, as_dict, mapped
 
 
 def moved(octree, T_map_world, *, config=CONFIG):
     codes = blocks_reached(octree, T_map_world)
-    return resampled(octree, inverse(T_map_world), codes, config)
+    return resample(octree, inverse(T_map_world), codes, config)
 
 
 def some_motion(seed):
