@@ -22,9 +22,6 @@ from mapper.run.edits_file import edits_text, parse_edits
 from mapper.run.folder import Run
 from mapper.runtime.regular_files import read_text
 
-_LEVER_M = 1.0
-"""Length of the body's axes in the fit: a straight path alone leaves a turn about itself open."""
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class InMap:
@@ -221,8 +218,11 @@ def fit_poses(T_a_body: Array, T_b_body: Array) -> Transform:
 
 
 def _with_axes(T_a_body: Array) -> Array:
-    """Return (4 N, 3) positions, followed by the ends of the body's axes."""
-    ends = T_a_body[:, :3, 3, np.newaxis] + _LEVER_M * T_a_body[:, :3, :3]
+    """Return (4 N, 3) positions, followed by the ends of the body's axes, a metre long.
+
+    A straight path alone leaves a turn about itself open.
+    """
+    ends = T_a_body[:, :3, 3, np.newaxis] + T_a_body[:, :3, :3]
     return np.concatenate([T_a_body[:, :3, 3], ends.transpose(0, 2, 1).reshape(-1, 3)])
 
 

@@ -21,8 +21,8 @@ from mapper.octree.keys import BLOCK_DEPTH, BLOCK_VOXELS
 NODE = np.dtype([("value", "<f4"), ("mask", "u1")])
 """A node as in an ``.ot`` file: log-odds, and a bit for each child that exists."""
 
-_VOXELS, _PAIRS, _QUADS, _TOP = 0, 512, 576, 584
-"""Index in the pyramid of a block at which the nodes of edge 1, 2, 4 and 8 voxels begin."""
+_PAIRS, _QUADS, _TOP = BLOCK_VOXELS, BLOCK_VOXELS + 64, BLOCK_VOXELS + 64 + 8
+"""Index in the pyramid of a block at which the nodes of edge 2, 4 and 8 voxels begin, after its voxels."""
 _PYRAMID = _TOP + 1
 _WORDS = _PYRAMID - BLOCK_VOXELS
 _STACK = 8 * (BLOCK_DEPTH + 1)
@@ -207,7 +207,7 @@ def _join(values, masks, first):
 def _raise_pyramid(values, masks):
     """Fill the pyramid above the 512 voxels that ``values`` begins with; their masks are 0."""
     for i in range(_PAIRS, _QUADS):
-        values[i], masks[i] = _join(values, masks, _VOXELS + 8 * (i - _PAIRS))
+        values[i], masks[i] = _join(values, masks, 8 * (i - _PAIRS))
     for i in range(_QUADS, _TOP):
         values[i], masks[i] = _join(values, masks, _PAIRS + 8 * (i - _QUADS))
     values[_TOP], masks[_TOP] = _join(values, masks, _QUADS)
@@ -262,7 +262,7 @@ def _write_words(stored, slots, threshold, parts, starts, tops):
                     at = _write_word(parts, at, values, masks, _PAIRS + 8 * quad)
                     for pair in range(8 * quad, 8 * quad + 8):
                         if masks[_PAIRS + pair]:
-                            at = _write_word(parts, at, values, masks, _VOXELS + 8 * pair)
+                            at = _write_word(parts, at, values, masks, 8 * pair)
         starts[b + 1] = at
 
 

@@ -48,11 +48,6 @@ def test_unknown_stays_unknown_unless_the_robot_would_touch():
     assert got.tolist() == [LETHAL, INSCRIBED, INSCRIBED] + [NO_INFORMATION] * 7
 
 
-def test_without_obstacles_everything_is_free():
-    got = inflate(grid_of([[FREE, FREE]]), robot_radius_m=0.1, inflation_radius_m=0.5, cost_scaling=1.0)
-    assert got.tolist() == [[FREE_SPACE, FREE_SPACE]]
-
-
 @pytest.mark.parametrize(
     ("settings", "complaint"),
     [

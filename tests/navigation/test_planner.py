@@ -60,13 +60,6 @@ def test_the_search_is_as_short_as_dijkstra_s_in_every_direction(shape, seed):
                 assert path_length(found.cells) == pytest.approx(expected[goal], abs=1e-9)
 
 
-def test_no_diagonal_squeezes_between_two_obstacles():
-    free = np.array([[[True, False], [False, True]]])
-    assert not shortest_path(free, (0, 0, 0), (0, 1, 1)).reached
-    free[0, 0, 1] = True
-    assert path_length(shortest_path(free, (0, 0, 0), (0, 1, 1)).cells) == 2.0
-
-
 def room_with_a_wall(*, gap_cells=8):
     """Make 4 m × 3 m of free floor with a wall across it, open at the top."""
     cells = np.full((60, 80), FREE, np.int8)
@@ -155,15 +148,6 @@ def test_a_bad_start_names_the_remedy(start, complaint):
     with pytest.raises(PlanError, match=complaint) as caught:
         plan_2d(grid, np.array(start), np.array([1.0, 2.0]), config=PlanConfig())
     assert "\n" not in str(caught.value)
-
-
-def test_the_nearest_free_point_really_is_free():
-    grid = room_with_a_wall(gap_cells=16)
-    with pytest.raises(PlanError, match=r"nearest free point is \((-?[\d.]+), (-?[\d.]+)\)") as caught:
-        plan_2d(grid, np.array([-0.05, 2.0]), np.array([1.0, 2.0]), config=PlanConfig())
-    words = str(caught.value).split("nearest free point is (")[1].split(")")[0].split(",")
-    start = np.array([float(word) for word in words])
-    assert plan_2d(grid, start, np.array([1.0, 2.0]), config=PlanConfig()).length_m > 2.5
 
 
 def test_a_robot_too_large_for_the_map_is_refused():

@@ -76,12 +76,6 @@ def test_a_table_blocks_by_its_height_and_a_lamp_does_not():
     assert row_codes(traversable_grid(octree, tall), [0.65, 1.35, 1.8]) == [OCCUPIED, OCCUPIED, FREE]
 
 
-def test_head_room_is_measured_from_the_floor_to_the_lowest_obstacle():
-    octree = octree_of(floor(), ((0.5, 0.0, 0.6), (1.0, 1.0, 0.65)))
-    assert row_codes(traversable_grid(octree, TraversableConfig(head_room_m=0.6)), [0.7]) == [FREE]
-    assert row_codes(traversable_grid(octree, TraversableConfig(head_room_m=0.65)), [0.7]) == [OCCUPIED]
-
-
 @pytest.mark.parametrize(("height_m", "code"), [(0.05, FREE), (0.1, FREE), (0.15, OCCUPIED)])
 def test_steps_up_and_down_are_climbed_to_a_limit(height_m, code):
     up = octree_of(floor(0.0, 1.0), floor(1.0, 2.0, z=height_m))

@@ -82,12 +82,6 @@ def test_a_map_that_was_read_goes_on_as_if_it_had_not_been_written(path):
     assert path.with_name("again.octree").read_bytes() == path.with_name("octree.octree").read_bytes()
 
 
-def test_bytes_do_not_depend_on_how_blocks_came_about(path):
-    write_map(path.with_name("again.octree"), read_octree(path))
-
-    assert path.with_name("again.octree").read_bytes() == path.read_bytes()
-
-
 def test_an_empty_map_comes_back(tmp_path):
     write_map(tmp_path / "map.octree", OctreeMap(OctreeConfig(resolution_m=0.2, attributes=True)))
 
@@ -148,13 +142,6 @@ def test_damage_is_one_line(path, damage, complaint):
         read_octree(path)
     assert str(caught.value).startswith(f"{path}: ")
     assert "\n" not in str(caught.value)
-
-
-def test_a_map_larger_than_memory_is_refused_before_it_is_unpacked(path, monkeypatch):
-    monkeypatch.setattr(blocks.os, "sysconf", lambda _name: 10)
-
-    with pytest.raises(MapSizeError, match="GiB"):
-        read_octree(path)
 
 
 def test_everything_that_a_header_announces_has_to_fit_into_memory(path, monkeypatch):

@@ -176,16 +176,6 @@ def test_what_is_beside_a_voxel_that_was_seen_through_leaves_with_it():
     assert moving[owner == 0].mean() < 0.001
 
 
-def test_space_where_a_thing_stood_is_free_and_the_floor_below_it_stays(street):
-    octree, updates = fused(street)
-    assert octree.log_odds_at(np.array([[4.3, -2.0, 1.1]]))[0] > 0.0
-
-    remove_moving_objects(octree, lambda: updates)
-
-    chest, floor = octree.log_odds_at(np.array([[4.3, -2.0, 1.1], [4.3, -2.0, 0.1]]))
-    assert chest < 0.0 < floor
-
-
 def test_ground_that_octomap_erases_at_a_slant_is_kept():
     sparse = rays(ring_step_rad=0.03)
     scans = [scan_of([], x_m=-0.61 * i, directions=sparse, reach_m=25.0) for i in range(12)]

@@ -11,7 +11,7 @@ from mapper.octree.config import OctreeConfig
 from mapper.octree.keys import KEY_BITS
 from mapper.octree.map import OctreeMap, read_octree
 from mapper.octree.octomap_file import TreeLeaves, write_bt, write_ot
-from tests.support.octomap_oracle import fr1_xyz_scans, fuse, voxels
+from tests.support.octomap_oracle import fr1_xyz_scans, fuse
 from tests.support.octree_maps import octree_of
 from tests.support.paths import DATA, FR1_XYZ
 
@@ -94,22 +94,6 @@ def test_files_of_real_frames_equal_the_cpp_library_s(tmp_path):
     assert (tmp_path / "map.bt").read_bytes() == tree.writeBinary()
 
 
-def test_the_cpp_library_reads_our_files(octree, tmp_path):
-    write_ot(tmp_path / "map.ot", octree)
-
-    tree = pyoctomap.OcTree(0.05).read(str(tmp_path / "map.ot"))
-
-    leaves = octree.leaves()
-    ours = {tuple(key): value for key, value in zip(leaves.keys.tolist(), leaves.log_odds, strict=True)}
-    assert voxels(tree, resolution_m=0.05) == ours
-
-
-def test_ot_keeps_every_log_odds(octree, tmp_path):
-    write_ot(tmp_path / "map.ot", octree)
-
-    assert_equal_leaves(read_octree(tmp_path / "map.ot"), octree)
-
-
 def test_bt_keeps_free_occupied_and_unknown(octree, tmp_path):
     write_bt(tmp_path / "map.bt", octree)
 
@@ -169,17 +153,6 @@ def test_a_color_octree_gives_its_log_odds(tmp_path):
     centres = np.array([[0.1 * i, -0.3 * i, 0.05] for i in range(20)])
     assert len(octree) == 20
     assert octree.log_odds_at(centres + 1e-6).tolist() == [log_odds(0.7), log_odds(0.4)] * 10
-
-
-def test_what_is_inserted_after_reading_goes_on_from_there(octree, tmp_path):
-    write_ot(tmp_path / "map.ot", octree)
-    again, leaves = read_octree(tmp_path / "map.ot"), octree.leaves()
-    first = leaves.centres_world[:1]
-
-    again.insert_points(first.astype(np.float32), first[0])
-
-    assert again.log_odds_at(first)[0] == min(leaves.log_odds[0] + log_odds(0.7), OCCUPIED)
-    assert len(again) == len(octree)
 
 
 HEADER = b"# Octomap OcTree file\n# comment\nid OcTree\nsize 1\nres 0.1\ndata\n"
@@ -289,21 +262,3 @@ def test_a_leaf_too_large_for_memory_is_refused(tmp_path):
 
     with pytest.raises(MapSizeError, match="pruned leaves expanded needs 131072"):
         read_octree(tmp_path / "map.ot")
-
-
-def test_a_missing_file_is_one_clear_line(tmp_path):
-    with pytest.raises(MapFileError, match=r"nothing\.bt: cannot be read: No such file"):
-        read_octree(tmp_path / "nothing.bt")
-
-
-@BOTH_KINDS
-def test_a_failed_write_leaves_the_old_file(write, octree, tmp_path, monkeypatch):
-    path = tmp_path / "map"
-    write(path, octree)
-    before = path.read_bytes()
-    monkeypatch.setattr("mapper.octree.octomap_file._header_bytes", lambda *_: "text where bytes belong")
-    with pytest.raises(TypeError):
-        write(path, octree)
-
-    assert path.read_bytes() == before
-    assert list(tmp_path.iterdir()) == [path]

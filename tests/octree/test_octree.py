@@ -9,7 +9,6 @@ from mapper.core.frames import Scan
 from mapper.core.geometry import exp
 from mapper.octree import blocks
 from mapper.octree import casting_kernels as kernels
-from mapper.octree.blocks import log_odds
 from mapper.octree.config import OctreeConfig
 from mapper.octree.map import OctreeMap
 from mapper.octree.octomap_file import write_ot
@@ -124,14 +123,6 @@ def test_a_scan_is_its_points_at_the_pose(discretize):
     assert as_dict(octree) == as_dict(octree_of([(points_world, origin_world)], discretize=discretize))
 
 
-def test_a_voxel_changes_once_per_scan_and_a_hit_wins():
-    near, far = [0.525, 0.025, 0.025], [1.025, 0.025, 0.025]  # the far ray crosses the near end
-    octree = octree_of([(np.array([far, near, near, far], np.float32), np.full(3, 0.025))])
-
-    assert octree.log_odds_at(np.array([near, far])).tolist() == [log_odds(0.7)] * 2
-    assert octree.log_odds_at(np.array([[0.325, 0.025, 0.025]])).tolist() == [log_odds(0.4)]
-
-
 def test_log_odds_of_exactly_zero_are_known():
     config = OctreeConfig(hit_probability=0.75, miss_probability=0.25)
     octree = OctreeMap(config)
@@ -141,30 +132,6 @@ def test_log_odds_of_exactly_zero_are_known():
 
     assert octree.log_odds_at(ahead.astype(np.float64)).tolist() == [0.0]
     assert len(octree) == len(octree.leaves().keys) == 21
-
-
-def test_the_order_of_scans_does_not_show_in_the_leaves_of_an_unclamped_map():
-    scans = random_scans(1, scans=3)
-    forward, backward = octree_of(scans).leaves(), octree_of(scans[::-1]).leaves()
-
-    np.testing.assert_array_equal(forward.keys, backward.keys)
-    np.testing.assert_allclose(forward.log_odds, backward.log_odds, atol=1e-6)
-
-
-def test_leaves_agree_with_queries():
-    octree = octree_of(random_scans(2))
-    leaves = octree.leaves()
-
-    np.testing.assert_array_equal(octree.log_odds_at(leaves.centres_world), leaves.log_odds)
-    assert octree.memory_bytes >= 4 * len(octree)
-
-
-def test_voxels_that_no_ray_crossed_are_unknown():
-    octree = octree_of(random_scans(2))
-    strange = np.array([[1e4, 0, 0], [-1e4, 0, 0], [np.nan, 0, 0], [0, np.inf, 0], [500.0, 500.0, 500.0]])
-
-    assert np.isnan(octree.log_odds_at(strange)).all()
-    assert np.isnan(OctreeMap(OctreeConfig()).log_odds_at(strange)).all()
 
 
 @pytest.mark.parametrize("through_unknown", [True, False])
@@ -226,11 +193,6 @@ def test_an_origin_without_a_key_is_refused(bad, discretize):
         octree.insert_points(np.zeros((4, 3), np.float32), np.array([0.0, bad, 0.0]))
 
 
-def test_shapes_other_than_n_by_3_are_refused():
-    with pytest.raises(DataError, match=r"\(3, 4\), want \(N, 3\)"):
-        octree_of([(np.zeros((3, 4), np.float32), np.zeros(3))])
-
-
 def test_an_empty_scan_changes_nothing():
     octree = octree_of([(np.zeros((0, 3), np.float32), np.zeros(3))])
 
@@ -269,10 +231,3 @@ def test_a_map_too_large_for_memory_is_refused_and_stays_as_it_was(monkeypatch):
     assert as_dict(octree) == before
     octree.insert_points(np.full((1, 3), 0.025, np.float32), np.full(3, 0.025))
     assert len(octree) == len(before) + 1  # nothing of the refused scan is left in the window
-
-
-def test_clamps_hold():
-    ahead, origin = np.array([[0.525, 0.025, 0.025]], np.float32), np.full(3, 0.025)
-    leaves = octree_of([(ahead, origin)] * 30).leaves()
-
-    assert set(leaves.log_odds.tolist()) == {log_odds(0.1192), log_odds(0.971)}

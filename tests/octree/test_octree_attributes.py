@@ -6,8 +6,6 @@ from mapper.core.errors import MapSizeError
 from mapper.core.frames import Scan
 from mapper.core.geometry import exp
 from mapper.octree import attributes as layer_module
-from mapper.octree.attributes import NEVER_SEEN
-from mapper.octree.blocks import log_odds
 from mapper.octree.config import OctreeConfig
 from mapper.octree.map import OctreeMap, read_octree
 from mapper.octree.octomap_file import write_bt, write_ot
@@ -63,17 +61,6 @@ def test_every_hit_voxel_has_the_mean_colour_of_its_points(discretize):
         assert (found.hits[i], found.last_seen_ns[i]) == (count, stamp_ns)
 
 
-def test_what_no_ray_ended_in_has_no_attributes():
-    octree = mapped()
-    found = attributes_of_leaves(octree)
-    free = found.hits == 0
-
-    assert free.any()
-    assert not found.colored[free].any()
-    assert (found.colors[free] == 255).all()
-    assert (found.last_seen_ns[free] == NEVER_SEEN).all()
-
-
 def test_queries_agree_with_leaves_and_find_nothing_elsewhere():
     octree = mapped()
     centres, found = octree.leaves().centres_world, attributes_of_leaves(octree)
@@ -88,16 +75,6 @@ def test_queries_agree_with_leaves_and_find_nothing_elsewhere():
     assert octree.attributes.at(nowhere).hits.tolist() == [0, 0, 0]
 
 
-def test_log_odds_do_not_depend_on_the_layer():
-    octree, bare = mapped(), OctreeMap(OctreeConfig(resolution_m=0.1, max_range_m=1.5))
-    for seed in range(4):
-        bare.insert(coloured_scan(seed), pose(seed))
-
-    assert bare.attributes is None
-    np.testing.assert_array_equal(octree.leaves().log_odds, bare.leaves().log_odds)
-    assert octree.memory_bytes > bare.memory_bytes
-
-
 def test_scans_without_colour_leave_the_mean_alone():
     octree = mapped()
     before = attributes_of_leaves(octree)
@@ -109,15 +86,6 @@ def test_scans_without_colour_leave_the_mean_alone():
     np.testing.assert_array_equal(after.colors, before.colors)
     np.testing.assert_array_equal(after.hits, 2 * before.hits)
     assert set(after.last_seen_ns[after.hits > 0]) == {5_000}
-
-
-def test_points_without_a_stamp_count_as_hits():
-    octree = OctreeMap(OctreeConfig(attributes=True))
-    octree.insert_points(np.full((3, 3), 0.51, np.float32), np.zeros(3))
-
-    found = octree.attributes.at(np.full((1, 3), 0.51))
-    assert found.hits.tolist() == [3]
-    assert found.last_seen_ns.tolist() == [NEVER_SEEN]
 
 
 def test_sums_never_overflow():
@@ -204,16 +172,6 @@ def test_colours_come_back_from_a_file(tmp_path):
     assert (found.hits == 0).all()  # a ColorOcTree has no place for them
     write_ot(tmp_path / "again.ot", again)
     assert (tmp_path / "again.ot").read_bytes() == (tmp_path / "map.ot").read_bytes()
-
-
-def test_a_pruned_leaf_s_colour_comes_back_for_all_its_voxels(tmp_path):
-    write_ot(tmp_path / "map.ot", saturated(1, holes=0.0))
-
-    again = read_octree(tmp_path / "map.ot")
-
-    write_ot(tmp_path / "again.ot", again)
-    assert (tmp_path / "again.ot").read_bytes() == (tmp_path / "map.ot").read_bytes()
-    assert again.leaves().log_odds.max() == log_odds(0.971)
 
 
 def test_a_map_without_colours_stays_an_octree(tmp_path):

@@ -3,8 +3,10 @@ import pytest
 from scipy.spatial import cKDTree
 
 from mapper.core.errors import DataError
-from mapper.octree.config import OctreeConfig
+from mapper.octree.config import OctreeConfig, SliceConfig
+from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN
 from mapper.octree.map import OctreeMap
+from mapper.octree.slice import cut_slice
 from tests.support.octomap_oracle import fuse
 from tests.support.octree_maps import octree_of
 
@@ -70,16 +72,6 @@ def test_coarse_leaves_join_their_children(octree, depth, parent):
     )
 
 
-@ALL_DEPTHS
-def test_coarse_leaves_agree_with_coarse_queries(octree, depth):
-    leaves = octree.leaves(depth=depth, parent="mean")
-
-    found = octree.log_odds_at(leaves.centres_world, depth=depth, parent="mean")
-
-    np.testing.assert_array_equal(found, leaves.log_odds)
-    assert leaves.edge_m == pytest.approx(0.05 * 2 ** (16 - depth))
-
-
 @pytest.mark.parametrize("levels", [0, 1, 3, 6])
 @pytest.mark.parametrize("parent", ["max", "mean"])
 def test_a_coarser_map_answers_as_the_level_does(octree, points, levels, parent):
@@ -88,18 +80,6 @@ def test_a_coarser_map_answers_as_the_level_does(octree, points, levels, parent)
     assert len(coarse) == len(octree.leaves(depth=16 - levels).log_odds)
     wanted = octree.log_odds_at(points, depth=16 - levels, parent=parent)
     np.testing.assert_array_equal(coarse.log_odds_at(points), wanted)
-
-
-def test_a_coarse_query_outside_the_key_range_is_unknown(octree):
-    outside = np.array([[1e9, 0.0, 0.0], [-1e9, 0.0, 0.0], [np.nan, 0.0, 0.0], [1638.5, 0.0, 0.0]])
-
-    assert np.isnan(octree.log_odds_at(outside, depth=3)).all()
-    assert np.isnan(octree.log_odds_at(outside, depth=0)).all()
-
-
-def test_an_empty_map_has_no_nodes():
-    assert len(OctreeMap(OctreeConfig()).leaves(depth=4).keys) == 0
-    assert np.isnan(OctreeMap(OctreeConfig()).log_odds_at(np.zeros((2, 3)), depth=4)).all()
 
 
 @pytest.mark.parametrize(("depth", "parent"), [(-1, "max"), (17, "max"), (3, "min")])
@@ -174,3 +154,77 @@ def test_an_empty_map_has_no_obstacles():
 def test_nearest_obstacles_of_nothing_are_refused(octree, points, max_range_m):
     with pytest.raises(DataError, match=r"^octree: nearest obstacles "):
         octree.nearest_obstacles(points, max_range_m=max_range_m)
+
+
+@pytest.fixture(scope="module")
+def ball():
+    """A map of noise around the origin."""
+    rng = np.random.default_rng(0)
+    return octree_of([(rng.normal(0.0, 1.0, (400, 3)).astype(np.float32), np.zeros(3)) for _ in range(4)])
+
+
+def test_states_agree_with_the_leaves(ball):
+    leaves = ball.leaves()
+    expected = np.where(leaves.log_odds >= ball.occupied_log_odds, OCCUPIED, FREE)
+    np.testing.assert_array_equal(ball.query(leaves.centres_world), expected)
+    assert ball.query([50.0, 0.0, 0.0]) == UNKNOWN
+    assert ball.query([[1e9, 0.0, np.nan]]).tolist() == [UNKNOWN]
+
+
+def test_centres_are_those_of_the_states(ball):
+    occupied, free = ball.occupied(), ball.free()
+    assert len(occupied) + len(free) == len(ball)
+    assert len(occupied) > 100
+    assert len(free) > 100
+    assert (ball.query(occupied) == OCCUPIED).all()
+    assert (ball.query(free) == FREE).all()
+
+
+def test_probabilities_are_those_of_the_log_odds(ball):
+    leaves = ball.leaves()
+    np.testing.assert_allclose(
+        ball.probability(leaves.centres_world), 1.0 / (1.0 + np.exp(-leaves.log_odds)), rtol=1e-6
+    )
+    assert np.isnan(ball.probability([50.0, 0.0, 0.0]))
+
+
+def test_points_have_any_shape_whose_last_axis_is_3(ball):
+    grid = ball.occupied()[:24].reshape(2, 3, 4, 3)
+    assert ball.query(grid).shape == ball.log_odds_at(grid).shape == (2, 3, 4)
+    assert ball.query(np.empty((0, 3))).shape == (0,)
+    assert ball.query(grid[0, 0, 0].tolist()).shape == ()
+
+
+@pytest.mark.parametrize("wrong", [np.zeros((4, 2)), np.zeros((3, 5)), 1.0, [[1, 2], [3]], "abc"])
+def test_other_shapes_are_refused_in_one_line(ball, wrong):
+    with pytest.raises(DataError, match=r"octree: points") as caught:
+        ball.query(wrong)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_slice_is_the_band_between_two_heights(ball):
+    grid = ball.slice(-0.2, 0.4)
+    expected = cut_slice(ball, SliceConfig(min_height_m=-0.2, max_height_m=0.4))
+    np.testing.assert_array_equal(grid.cells, expected.cells)
+    centres = ball.occupied()
+    centres = centres[(centres[:, 2] > -0.2) & (centres[:, 2] < 0.4)]
+    columns = np.floor((centres[:, :2] - grid.origin_world_m) / grid.resolution_m).astype(int)
+    assert (grid.cells[columns[:, 1], columns[:, 0]] == OCCUPIED).all()
+    assert np.unique(columns, axis=0).shape[0] == (grid.cells == OCCUPIED).sum()
+    with pytest.raises(DataError, match="nothing is known"):
+        ball.slice(50.0, 51.0)
+
+
+@pytest.mark.parametrize("height_m", [-0.35, 0.0, 0.15, 0.3, 0.5, 0.6])
+def test_a_height_on_a_border_is_in_the_voxels_above_it_as_in_a_query(ball, height_m):
+    """0.5 // 0.05 is 9."""
+    at, within = ball.slice(height_m), ball.slice(height_m + 0.02)
+    np.testing.assert_array_equal(at.cells, within.cells)
+    x, y = at.origin_world_m + at.resolution_m * (np.argwhere((at.cells == OCCUPIED).T)[0] + 0.5)
+    assert ball.query([x, y, height_m]) == OCCUPIED
+
+
+@pytest.mark.parametrize("heights_m", [(1.2, 0.1), (0.3, 0.3), (np.nan,), (0.0, np.inf)])
+def test_heights_that_are_no_band_are_refused_in_one_line(ball, heights_m):
+    with pytest.raises(DataError, match=r"^slice: from .*; want finite heights, the lower one first$"):
+        ball.slice(*heights_m)

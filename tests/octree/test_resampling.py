@@ -5,7 +5,6 @@ import pytest
 
 from mapper.core.errors import MapSizeError
 from mapper.core.geometry import apply, exp, inverse
-from mapper.octree.map import OctreeMap
 from mapper.octree.resampling import blocks_reached, resample
 from tests.support.octree_maps import COLORED, CONFIG, as_dict, mapped
 
@@ -48,21 +47,6 @@ def test_a_shift_by_whole_voxels_loses_nothing():
 
     shifted = {(x + 3, y - 20, z + 7): value for (x, y, z), value in as_dict(octree).items()}
     assert found == shifted
-
-
-def test_a_wall_of_one_voxel_stays_closed_however_it_is_turned():
-    octree = OctreeMap(CONFIG)
-    y, z = np.meshgrid(np.arange(-3.95, 4.0, 0.1), np.arange(-3.95, 4.0, 0.1))
-    wall = np.column_stack([np.full(y.size, 2.05), y.ravel(), z.ravel()]).astype(np.float32)
-    octree.insert_points(wall, np.zeros(3))
-    T_map_world = exp(np.array([0.3, -0.5, 0.7]), np.zeros(3))
-
-    turned = moved(octree, T_map_world)
-
-    directions = apply(T_map_world, wall[np.abs(wall[:, 1:]).max(axis=1) < 1.4].astype(float))
-    ends = turned.cast_rays(np.zeros_like(directions), directions, max_range_m=np.inf, through_unknown=True)
-    assert len(directions) > 500
-    assert ends.hits.all()
 
 
 def test_attributes_come_along():

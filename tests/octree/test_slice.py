@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 
 from mapper.core.errors import DataError
-from mapper.octree.columns import block_extent
+from mapper.core.frames import Scan
+from mapper.octree.columns import NOWHERE, DrivenGround, block_extent, ground_heights
 from mapper.octree.config import OctreeConfig, SliceConfig
 from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, overlap_of, shrunk
+from mapper.octree.keys import KEY_ZERO
 from mapper.octree.map import OctreeMap
 from mapper.octree.slice import Band, cut_slice
 from tests.support.grids import state_at
@@ -60,17 +62,6 @@ def test_occupied_beats_free_beats_unknown():
     assert grid.cells.tolist() == [[FREE] * 20 + [OCCUPIED] + [FREE] * 19 + [OCCUPIED]]
 
 
-def test_unknown_is_kept_apart_from_free():
-    octree = scanned([[1.025, 0.025, 0.525], [0.025, 1.025, 0.525]])
-
-    grid = cut_slice(octree, SliceConfig())
-
-    assert grid.cells.shape == (21, 21)
-    assert (grid.cells[1:, 1:] == UNKNOWN).all()
-    assert (grid.cells[0, :20] == FREE).all()
-    assert (grid.cells[:20, 0] == FREE).all()
-
-
 @pytest.mark.parametrize(
     ("height_m", "inside"), [(0.075, False), (0.125, True), (0.475, True), (0.525, False), (-0.475, False)]
 )
@@ -100,14 +91,6 @@ def test_without_speckles_their_columns_other_voxels_count():
     assert state_at(clean, 1.525, 1.525) == UNKNOWN
     assert state_at(clean, 1.025, 0.025) == OCCUPIED
     assert (clean.cells == OCCUPIED).sum() == (every.cells == OCCUPIED).sum() - 2
-
-
-def test_groups_are_8_connected():
-    diagonal = [[0.025 + CELL * n, 0.025 + CELL * n, 0.525] for n in range(20, 25)]
-    octree = scanned(diagonal, (3.025, 0.025, 0.525))
-
-    assert (cut_slice(octree, SliceConfig(min_cluster_cells=5)).cells == OCCUPIED).sum() == 5
-    assert (cut_slice(octree, SliceConfig(min_cluster_cells=6)).cells == OCCUPIED).sum() == 0
 
 
 @pytest.mark.parametrize(
@@ -160,3 +143,68 @@ def test_a_window_and_an_array_share_the_cells_where_they_overlap(corner):
     padded = np.zeros((40, 40))
     padded[20 + corner[0] : 22 + corner[0], 20 + corner[1] : 23 + corner[1]] = window
     np.testing.assert_array_equal(array, padded[20:24, 20:25])
+
+
+SLOPE = 0.1
+
+
+@pytest.fixture(scope="module")
+def hill():
+    """A road that rises by a tenth, seen from above the road, with a wall beside it."""
+    octree = OctreeMap(OctreeConfig(resolution_m=0.2, max_range_m=80.0))
+    x, y = np.meshgrid(np.arange(-20.0, 20.0, 0.15), np.arange(-8.0, 8.0, 0.15))
+    road = np.column_stack([x.ravel(), y.ravel(), SLOPE * x.ravel()])
+    along, up = np.meshgrid(np.arange(-20.0, 20.0, 0.15), np.arange(0.0, 3.0, 0.15))
+    wall = np.column_stack([along.ravel(), np.full(along.size, 8.0), SLOPE * along.ravel() + up.ravel()])
+    for x_m in np.arange(-18.0, 19.0, 3.0):
+        origin = np.array([x_m, 0.0, SLOPE * x_m + 1.7])
+        points = np.concatenate([road, wall])
+        near = np.abs(points[:, 0] - x_m) < 6.0
+        octree.insert(Scan(0, (points[near] - origin).astype(np.float32)), at(origin))
+    return octree
+
+
+def at(position):
+    pose = np.eye(4)
+    pose[:3, 3] = position
+    return pose
+
+
+def test_the_ground_is_found_under_every_column(hill):
+    first = np.array([KEY_ZERO - 100, KEY_ZERO - 40])
+
+    ground_m = ground_heights(hill, first=first, shape=(80, 200), floor_z_m=0.0)
+
+    columns = (np.arange(200) - 100 + 0.5) * 0.2
+    miss_m = ground_m[40] - SLOPE * columns
+    assert np.abs(miss_m[10:-10]).max() < 0.3
+
+
+def test_a_slice_that_follows_the_ground_shows_the_wall_and_no_road(hill):
+    band = {"min_height_m": 0.5, "max_height_m": 1.5}
+    level = cut_slice(hill, SliceConfig(**band))
+    following = cut_slice(hill, SliceConfig(**band, above="ground"))
+
+    for x_m in (-15.0, -5.0, 5.0, 15.0):
+        assert state_at(following, x_m, 0.0) == FREE
+        assert state_at(following, x_m, 8.1) == OCCUPIED
+    assert state_at(level, 10.0, 0.0) == OCCUPIED  # the road itself is a metre above the floor there
+
+
+def test_where_no_floor_is_seen_the_band_is_level(hill):
+    ground_m = ground_heights(hill, first=np.array([KEY_ZERO + 500, KEY_ZERO]), shape=(20, 20), floor_z_m=0.7)
+
+    np.testing.assert_array_equal(ground_m, np.full((20, 20), 0.7))
+
+
+def test_floor_of_a_few_columns_alone_is_no_ground_to_follow_from(hill):
+    first, shape = np.array([KEY_ZERO - 100, KEY_ZERO - 40]), (80, 200)
+    heights = np.full(shape, NOWHERE, np.int32)
+    heights[40, 100] = 0
+    driven = DrivenGround(heights, np.zeros(shape, np.bool_), first)
+
+    ground_m = ground_heights(hill, first=first, shape=shape, floor_z_m=0.0, driven=driven)
+
+    expected_m = ground_heights(hill, first=first, shape=shape, floor_z_m=0.0)
+    assert ground_m[40, 100] == 0.0
+    np.testing.assert_array_equal(ground_m[:, 120:], expected_m[:, 120:])

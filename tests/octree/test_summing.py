@@ -6,7 +6,7 @@ import pytest
 
 from mapper.octree.attributes import NEVER_SEEN
 from mapper.octree.blocks import Overlap
-from mapper.octree.map import OctreeMap, read_octree
+from mapper.octree.map import read_octree
 from mapper.octree.map_file import write_map
 from tests.support.octomap_oracle import voxels
 from tests.support.octree_maps import COLORED, CONFIG, as_dict, mapped, total
@@ -42,16 +42,6 @@ def test_the_overlap_counts_voxels_known_in_both_maps():
     either = sum(a[key] >= 0 or b[key] >= 0 for key in shared)
     assert overlaps == [Overlap(0, 0, 0), Overlap(len(shared), both, either)]
     assert 0 < both < either < len(shared)
-
-
-def test_only_the_chosen_blocks_are_added():
-    whole, part = mapped(3), OctreeMap(CONFIG)
-    slots = whole.blocks.sorted_slots()[2:5]
-
-    part.add(whole, slots=slots)
-
-    np.testing.assert_array_equal(np.sort(part.blocks.codes), np.sort(whole.blocks.codes[slots]))
-    assert as_dict(part).items() <= as_dict(whole).items()
 
 
 def test_attributes_add_up():
