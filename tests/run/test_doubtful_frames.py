@@ -28,7 +28,7 @@ def path_of(count):
     ]
 
 
-def tracks_of(count, doubted, *, sigma=0.5, period=10):
+def tracks_of(count, doubted, *, sigma=0.5, period=10, repeats=False):
     """Frames of a walk, a keyframe in every period; the doubted ones are 0.6 m off."""
     poses = path_of(count)
     tracks = []
@@ -44,7 +44,7 @@ def tracks_of(count, doubted, *, sigma=0.5, period=10):
                 T,
                 k % period == 0,
                 DIAGNOSTICS,
-                doubts=(Doubt("jump", "jump"),) if is_doubted else (),
+                doubts=(Doubt("repeated image" if repeats else "jump", "0.6 m"),) if is_doubted else (),
                 covariance=None if sigma is None else np.eye(6) * (sigma if is_doubted else 1e-3) ** 2,
             )
         )
@@ -75,6 +75,13 @@ def test_a_wrong_frame_is_placed_where_its_neighbours_lead():
     others = [k for k in range(100) if k not in (34, 35, 36)]
     np.testing.assert_array_equal(trajectory.T_world_body[others], own.T_world_body[others])
     assert len(without_doubtful(trajectory, records)) == 97
+
+
+def test_through_a_long_gap_frames_of_one_image_follow_the_velocities_at_its_ends():
+    tracks, graph, poses = tracks_of(400, set(range(190, 235)), sigma=10.0, period=400, repeats=True)
+    trajectory, _, _ = placed(tracks, graph)
+    off_line_m = np.linalg.norm(0.5 * (poses[189] + poses[235])[:3, 3] - poses[212][:3, 3])
+    assert max(miss_m(trajectory, poses, k) for k in range(190, 235)) < 0.5 * off_line_m
 
 
 def test_what_is_known_better_weighs_more():
