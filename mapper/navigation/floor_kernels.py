@@ -6,9 +6,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from mapper.core.geometry import Array
 from mapper.navigation.config import TraversableConfig
-from mapper.octree.columns import NOWHERE, Columns, Tops
+from mapper.octree.columns import NOWHERE
 
 ALLOWANCE = 1e-6  # of a voxel: 0.1 m is two voxels of 5 cm, whatever the rounding of the division
 OFF_PLANE = 0.75
@@ -59,7 +58,7 @@ def limits_of(config: TraversableConfig, cell_m: float) -> Limits:
 
 
 @njit(cache=True, nogil=True)
-def find_surfaces(columns: Columns, room: int) -> Mask:
+def find_surfaces(columns, room):
     """Return the (N,) mask of the voxels with at least ``room`` free voxels above."""
     starts, tops = columns.starts, columns.tops
     found = np.zeros(len(tops), np.bool_)
@@ -71,9 +70,7 @@ def find_surfaces(columns: Columns, room: int) -> Mask:
 
 
 @njit(cache=True, nogil=True)
-def flood(
-    columns: Columns, column_of: NDArray[np.int32], limits: Limits, seeds: Indices, open_: Mask
-) -> Mask:
+def flood(columns, column_of, limits, seeds, open_):
     """Return the mask of the open surfaces that steps connect to the seeds, over gaps without a neighbour.
 
     Args:
@@ -113,15 +110,7 @@ def flood(
 
 
 @njit(cache=True, nogil=True)
-def _enter_neighbours(
-    columns: Columns,
-    column: int,
-    here: int,
-    limits: Limits,
-    open_: Mask,
-    reached: Mask,
-    entered: NDArray[np.int32],
-) -> tuple[int, bool]:
+def _enter_neighbours(columns, column, here, limits, open_, reached, entered):
     """Enter the surfaces a step away in the eight columns around.
 
     Returns:
@@ -148,15 +137,7 @@ def _enter_neighbours(
 
 
 @njit(cache=True, nogil=True)
-def _cross_gaps(
-    columns: Columns,
-    column: int,
-    here: int,
-    limits: Limits,
-    open_: Mask,
-    reached: Mask,
-    entered: NDArray[np.int32],
-) -> int:
+def _cross_gaps(columns, column, here, limits, open_, reached, entered):
     """Enter the surfaces a step away beyond a gap in which nothing is known; return their number."""
     starts, tops, width = columns.starts, columns.tops, columns.shape[1]
     low_y, high_y, low_x, high_x = around(column, limits.gap + 1, columns.shape)
@@ -173,7 +154,7 @@ def _cross_gaps(
 
 
 @njit(cache=True, nogil=True)
-def around(column: int, reach: int, shape: tuple[int, int]) -> tuple[int, int, int, int]:
+def around(column, reach, shape):
     """Return the ranges, as first and end, of the rows and of the columns within a reach of a column."""
     height, width = shape
     y, x = column // width, column % width
@@ -181,7 +162,7 @@ def around(column: int, reach: int, shape: tuple[int, int]) -> tuple[int, int, i
 
 
 @njit(cache=True, nogil=True)
-def _within_step(starts: Indices, tops: Tops, column: int, top: int, step: int, open_: Mask) -> int:
+def _within_step(starts, tops, column, top, step, open_):
     """Return the open surface of a column that is nearest to a height and within a step of it, or −1.
 
     This is called so often that it takes arrays: numba counts references to those it takes from a tuple.
@@ -195,7 +176,7 @@ def _within_step(starts: Indices, tops: Tops, column: int, top: int, step: int, 
 
 
 @njit(cache=True, nogil=True)
-def _nothing_between(columns: Columns, begin: int, end: int, top: int, limits: Limits) -> bool:
+def _nothing_between(columns, begin, end, top, limits):
     """Return whether the columns on the line between two hold neither an obstacle nor a drop."""
     width = columns.shape[1]
     y, x = begin // width, begin % width
@@ -210,7 +191,7 @@ def _nothing_between(columns: Columns, begin: int, end: int, top: int, limits: L
 
 
 @njit(cache=True, nogil=True)
-def _is_blocked(columns: Columns, column: int, top: int, limits: Limits) -> bool:
+def _is_blocked(columns, column, top, limits):
     """Return whether a column holds an obstacle above a floor's height, or lies more than a step below."""
     for n in range(columns.starts[column], columns.starts[column + 1]):
         rise = columns.tops[n] - top
@@ -220,9 +201,7 @@ def _is_blocked(columns: Columns, column: int, top: int, limits: Limits) -> bool
 
 
 @njit(cache=True, nogil=True)
-def _plane(
-    columns: Columns, column: int, top: int, window: int, limits: Limits, used: Mask
-) -> tuple[float, float, float]:
+def _plane(columns, column, top, window, limits, used):
     """Return the least-squares plane through the floor around: height above ``top``, rises along x and y.
 
     Floor that is too much higher or lower for any slope that the robot can take is left out: it is another
@@ -262,7 +241,7 @@ def _plane(
 
 
 @njit(cache=True, nogil=True)
-def find_steep(columns: Columns, column_of: NDArray[np.int32], limits: Limits, candidates: Mask) -> Mask:
+def find_steep(columns, column_of, limits, candidates):
     """Return the mask of the candidates around which their plane is too steep, in either window."""
     found = np.zeros(len(candidates), np.bool_)
     for n in range(len(candidates)):
@@ -274,15 +253,7 @@ def find_steep(columns: Columns, column_of: NDArray[np.int32], limits: Limits, c
 
 
 @njit(cache=True, nogil=True)
-def find_on_plane(
-    columns: Columns,
-    column_of: NDArray[np.int32],
-    limits: Limits,
-    candidates: Mask,
-    floor: Mask,
-    slopes: tuple[float, float],
-    tolerance: float,
-) -> Mask:
+def find_on_plane(columns, column_of, limits, candidates, floor, slopes, tolerance):
     """Return the mask of the candidates that lie in the plane of the floor next to them.
 
     Args:
@@ -305,7 +276,7 @@ def find_on_plane(
 
 
 @njit(cache=True, nogil=True)
-def _is_at_floor(columns: Columns, column: int, top: int, limits: Limits, floor: Mask) -> bool:
+def _is_at_floor(columns, column, top, limits, floor):
     """Return whether floor lies within a step of a height in any column of the slope's window."""
     low_y, high_y, low_x, high_x = around(column, limits.window, columns.shape)
     starts, tops, width = columns.starts, columns.tops, columns.shape[1]
@@ -317,15 +288,7 @@ def _is_at_floor(columns: Columns, column: int, top: int, limits: Limits, floor:
 
 
 @njit(cache=True, nogil=True)
-def find_swept(
-    columns: Columns,
-    places: Array,
-    heights: Array,
-    rooms: Indices,
-    radius: float,
-    step: int,
-    near: int,
-) -> tuple[Indices, Indices]:
+def find_swept(columns, places, heights, rooms, radius, step, near):
     """Return the columns within a radius of the path and the ground in each, as often as passed.
 
     Args:
@@ -359,9 +322,7 @@ def find_swept(
 
 
 @njit(cache=True, nogil=True)
-def _ground_in(
-    columns: Columns, column: int, height: float, limits: tuple[int, int, int], crosses_drops: bool
-) -> int:
+def _ground_in(columns, column, height, limits, crosses_drops):
     """Return the top of the path's ground in a column, seen or not; NOWHERE if it is blocked."""
     tops, begin, end = columns.tops, columns.starts[column], columns.starts[column + 1]
     best = NOWHERE
@@ -381,7 +342,7 @@ def _ground_in(
 
 
 @njit(cache=True, nogil=True)
-def mask_tops(columns: Columns, wanted: Indices, tops: Tops) -> Mask:
+def mask_tops(columns, wanted, tops):
     """Return the mask of the voxels with some tops, each in its column."""
     found = np.zeros(len(columns.tops), np.bool_)
     for i in range(len(wanted)):

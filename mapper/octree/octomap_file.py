@@ -61,8 +61,7 @@ def write_ot(path: Path, octree: "OctreeMap") -> None:
         nodes = color_nodes(nodes_in_preorder(octree.blocks), octree.blocks, octree.attributes)
         pieces, count, tree_name = [nodes], len(nodes), "ColorOcTree"
     elif len(octree.blocks):
-        tree = preorder_of(octree.blocks)
-        pieces, count = tree.pieces(), tree.count
+        count, pieces = preorder_of(octree.blocks)
     write_tree(
         path,
         pieces,
