@@ -97,7 +97,7 @@ def solve_worlds(shared: Sequence[SharedPlace], gate: GateConfig) -> SolvedWorld
     contradicting = [pair for pair in tied if pair not in tree.pairs and not tree.agrees(pair, ties, gate)]
     used = [place for pair, places in tied.items() if pair not in contradicting for place in places]
     T_map_worlds = _solve(tree.T_map_worlds, used, gate) if used else tree.T_map_worlds
-    worlds = {number: _with_residuals(number, T_map_worlds, used) for number in sorted(T_map_worlds)}
+    worlds = {number: _measure_residuals(number, T_map_worlds, used) for number in sorted(T_map_worlds)}
     return SolvedWorlds(worlds, refused, contradicting, used)
 
 
@@ -229,7 +229,7 @@ def _solve(
     return solution.T_world_node | {0: np.eye(4)}  # held but for rounding
 
 
-def _with_residuals(
+def _measure_residuals(
     number: int, T_map_worlds: Mapping[int, Transform], places: Sequence[SharedPlace]
 ) -> WorldByPlaces:
     """Return the pose of a run's world with the residuals of the places that it shares with any other."""
@@ -363,7 +363,7 @@ def solve_jointly(
         )
     ]
     found = JointGraph(whole, first_nodes, [*solved, *refused], own - sum(kept[:own]))
-    return _connected(found)
+    return _drop_unconnected(found)
 
 
 def _between(place: SharedPlace, first_nodes: Mapping[int, int]) -> LoopClosure:
@@ -372,7 +372,7 @@ def _between(place: SharedPlace, first_nodes: Mapping[int, int]) -> LoopClosure:
     return replace(loop, i=first_nodes[place.first] + loop.i, j=first_nodes[place.second] + loop.j)
 
 
-def _connected(joint: JointGraph) -> JointGraph:
+def _drop_unconnected(joint: JointGraph) -> JointGraph:
     """Return the graph without the runs of which a node is not connected to the first run."""
     first, *others = components(joint.graph)
     if not others:

@@ -108,7 +108,7 @@ def slice_map(
     if workspace.follows_ground:
         _save_ground(raster, columns.values(), manifest, driven)
     band = Band(manifest.slice, manifest.octree.resolution_m, manifest.floor_z_m)
-    done = _sliced_columns(workspace, stages, columns.values(), band)
+    done = _slice_columns(workspace, stages, columns.values(), band)
     if not _is_level(placed):
         return Sliced(done, None, None, None, no_floor)
     seen = np.zeros(raster.shape, np.uint8)
@@ -161,7 +161,7 @@ def _floor(
     )
 
 
-def _sliced_columns(
+def _slice_columns(
     workspace: Workspace, stages: Stages, columns: Collection[Sequence[int]], band: Band
 ) -> list[SlicedColumn]:
     """Slice every column of tiles, several at once."""

@@ -171,18 +171,18 @@ def path_ground(
         floor_z_m: Height of the floor in the world.
     """
     cell_m = columns.resolution_m
-    points, breaks = _sampled(positions_world, cell_m)
+    points, breaks = _sample(positions_world, cell_m)
     highest = int(np.ceil(_MAX_HEIGHT_M / cell_m))
     low = (points[:, :2] / cell_m - (columns.first - KEY_ZERO)).astype(np.float64)
     votes = _vote_heights(columns, low, points[:, 2] / cell_m, radius_m / cell_m, room_m / cell_m, highest)
     height = _find_steadiest(votes, _CHANGE_PER_M * cell_m)
     seen = votes[np.arange(len(points)), height] > 0.0
     ground = points - np.column_stack([np.zeros((len(points), 2)), height * cell_m])
-    kept = _driven(ground, height * cell_m, seen, breaks, floor_z_m)
+    kept = _mask_driven(ground, height * cell_m, seen, breaks, floor_z_m)
     return PathGround(ground[kept], height[kept] * cell_m)
 
 
-def _sampled(positions_world: Points, spacing_m: float) -> tuple[Points, NDArray[np.int64]]:
+def _sample(positions_world: Points, spacing_m: float) -> tuple[Points, NDArray[np.int64]]:
     """Return points along the path, a spacing apart at most, and the first point after each break of it."""
     if len(positions_world) < 2:
         return positions_world.copy(), np.empty(0, np.int64)
@@ -206,7 +206,7 @@ def _sampled(positions_world: Points, spacing_m: float) -> tuple[Points, NDArray
     return np.concatenate(pieces), np.array(breaks, np.int64)
 
 
-def _driven(
+def _mask_driven(
     ground: Points, sensor_m: Array, seen: NDArray[np.bool_], breaks: NDArray[np.int64], floor_z_m: float
 ) -> NDArray[np.bool_]:
     """Return a mask of the points whose stretch of the path was driven or walked along."""

@@ -213,8 +213,8 @@ def shorten(field: DistanceField, path: Array, *, radius_m: float) -> Array:
     best = _corners(field, path, radius_m)
     while True:
         length = path_length(best)
-        forth = _corners(field, _sampled(best), radius_m)
-        back = _corners(field, _sampled(forth)[::-1], radius_m)[::-1]
+        forth = _corners(field, _sample(best), radius_m)
+        back = _corners(field, _sample(forth)[::-1], radius_m)[::-1]
         best = min(best, forth, back, key=path_length)
         if path_length(best) >= (1.0 - _GAIN) * length:
             return best
@@ -232,7 +232,7 @@ def in_sight(field: DistanceField, begin: Array, end: Array, *, radius_m: float)
     return bool(_visible(field.distances_m, field.resolution_m, radius_m, begin, end))
 
 
-def _sampled(path: Array) -> Array:
+def _sample(path: Array) -> Array:
     """Return points about a cell apart along a path, its corners included."""
     spacing = max(1.0, path_length(path) / _MOST_POINTS)
     parts = []

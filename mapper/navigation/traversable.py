@@ -109,7 +109,7 @@ def _storey(floor: Floor, heights: Heights, config: TraversableConfig) -> Storey
         is_near = distances * columns.resolution_m <= NEAR_FLOOR_M
         blocked = _find_obstacles(columns, limits, floor.steep, level, ~reached, is_near)
         riser = max(limits.step, round(_RISER_M / columns.resolution_m))
-        _add_edges(heights, _driven(floor, heights), limits.step, riser, blocked)
+        _add_edges(heights, _mask_driven(floor, heights), limits.step, riser, blocked)
         closed = _close_gaps(reached, limits.gap)
         cells[closed] = FREE
         blocked |= closed & ~reached & _is_edge(heights, limits)
@@ -157,7 +157,7 @@ def _find_obstacles(
     return blocked
 
 
-def _driven(floor: Floor, heights: Heights) -> Mask:
+def _mask_driven(floor: Floor, heights: Heights) -> Mask:
     """Return the (H, W) mask of the columns in which the floor of a storey is ground under the path."""
     columns = floor.columns.column_of[floor.driven]
     of_storey = heights.ravel()[columns] == floor.columns.tops[floor.driven]
@@ -255,7 +255,7 @@ def storeys_of(floor: Floor, *, with_links: bool = False) -> tuple[list[Heights]
     kept.sort(key=lambda number: float(np.median(tops[storey == number])))
     reach = round(_OVERLAP_M / cell_m)
 
-    def extended(own: Mask) -> Heights:
+    def extend(own: Mask) -> Heights:
         _extend(columns, column_of, limits.step, reach, own)
         heights = np.full(columns.shape, NOWHERE, np.int32)
         heights.ravel()[column_of[own]] = tops[own]
@@ -263,8 +263,8 @@ def storeys_of(floor: Floor, *, with_links: bool = False) -> tuple[list[Heights]
 
     pairs = combinations(kept, 2) if with_links else ()
     borders = [_border(columns, column_of, limits, storey, pair) for pair in pairs]
-    links = [extended(border) for border in borders if border.any()]
-    return [extended(storey == number) for number in kept], links
+    links = [extend(border) for border in borders if border.any()]
+    return [extend(storey == number) for number in kept], links
 
 
 @njit(cache=True, nogil=True)

@@ -129,7 +129,7 @@ def parse_map(path: Path, data: bytes) -> tuple[OctreeConfig, list[NDArray[Any]]
     counts, config = _parse_header(path, head)
     plain_bytes = sum(_sizes(counts))
     check_memory(counts[0] * BLOCK_BYTES + counts[2] * _ATTRIBUTE_BYTES + plain_bytes, f"the map in {path}")
-    plain = _decompressed(path, body, plain_bytes)
+    plain = _decompress(path, body, plain_bytes)
     columns: list[NDArray[Any]] = []
     at = 0
     for count, kind in _columns(counts):
@@ -157,7 +157,7 @@ def _parse_header(path: Path, head: bytes) -> tuple[list[int], OctreeConfig]:
     return counts, config
 
 
-def _decompressed(path: Path, body: memoryview, size: int) -> bytes:
+def _decompress(path: Path, body: memoryview, size: int) -> bytes:
     try:
         if zstandard.frame_content_size(body) != size:
             raise MapFileError(f"{path}: its body is not the {size} bytes that its header describes")
@@ -166,7 +166,7 @@ def _decompressed(path: Path, body: memoryview, size: int) -> bytes:
         raise MapFileError(f"{path}: cannot be decompressed: {error}; it is damaged") from None
 
 
-def _held(path: Path, steps: NDArray[np.int64], bits: NDArray[np.uint8], count: int) -> NDArray[np.bool_]:
+def _unpack(path: Path, steps: NDArray[np.int64], bits: NDArray[np.uint8], count: int) -> NDArray[np.bool_]:
     held = np.unpackbits(bits.reshape(len(steps), PACKED_BYTES), axis=1, bitorder="little").view(np.bool_)
     if np.count_nonzero(held) != count or (steps[1:] <= 0).any():
         raise MapFileError(f"{path}: its voxels are not {count} in rising blocks; it is damaged")
@@ -186,7 +186,7 @@ def voxels_of(
         MapFileError: The arrays contradict each other.
     """
     steps, bits, values = columns[:3]
-    return np.cumsum(steps), _held(path, steps, bits, len(values)), values
+    return np.cumsum(steps), _unpack(path, steps, bits, len(values)), values
 
 
 def restore_attributes(
@@ -204,7 +204,7 @@ def restore_attributes(
         MapFileError: The arrays contradict each other or the map.
     """
     steps, bits, red, green, blue, weights, hits, last_seen_ns = columns[3:]
-    held = _held(path, steps, bits, len(hits))
+    held = _unpack(path, steps, bits, len(hits))
     slots = np.empty(len(steps), np.int64)
     if find_slots(blocks.table, np.cumsum(steps), slots):
         raise MapFileError(f"{path}: has attributes of blocks that it does not have; it is damaged")

@@ -150,13 +150,6 @@ def test_a_bad_start_names_the_remedy(start, complaint):
     assert "\n" not in str(caught.value)
 
 
-def test_a_robot_too_large_for_the_map_is_refused():
-    with pytest.raises(PlanError, match="nowhere in the map is there room for a radius of 3 m"):
-        plan_2d(
-            room_with_a_wall(), np.array([-1.0, 2.0]), np.array([1.0, 2.0]), config=PlanConfig(radius_m=3.0)
-        )
-
-
 def test_unknown_space_is_crossed_only_if_it_counts_as_free():
     cells = np.full((20, 40), FREE, np.int8)
     cells[:, 18:22] = UNKNOWN

@@ -178,33 +178,28 @@ def test_headers_may_differ(header, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("data", "message"),
+    "data",
     [
-        (b"", "not an OctoMap file: it is empty"),
-        (b"ply\nformat ascii 1.0\n", "not an OctoMap file: it starts with b'ply'"),
-        (b"\x89PNG\r\n\x1a\n" * 9, "not an OctoMap file"),
-        (HEADER[:40], "no line 'data'; the file is truncated"),
-        (HEADER.replace(b"size 1\n", b""), "no line 'size'"),
-        (HEADER.replace(b"res 0.1\n", b""), "no line 'res'"),
-        (HEADER.replace(b"id OcTree\n", b""), "no line 'id'"),
-        (HEADER.replace(b"id OcTree", b"id CountingOcTree"), "'CountingOcTree'; only OcTree and ColorOcTree"),
-        (HEADER.replace(b"size 1", b"size -1"), "size '-1' must be a count"),
-        (HEADER.replace(b"size 1", b"size many"), "size 'many' must be a count"),
-        (HEADER.replace(b"res 0.1", b"res 0"), "res '0' a length > 0 m"),
-        (HEADER.replace(b"res 0.1", b"res nan"), "res 'nan' a length > 0 m"),
-        (HEADER.replace(b"size 1", b"size 0") + b"x", "size 0, but 1 bytes follow"),
-        (HEADER.replace(b"size 1", b"size 16") + DEEP, "promises 16 nodes of 5 bytes, but 85 bytes follow"),
-        (HEADER.replace(b"size 1", b"size 999999999999") + DEEP, "promises 999999999999 nodes"),
-        (HEADER.replace(b"size 1", b"size 18") + DEEP[:5] + DEEP, "deeper than 16 levels"),
-        (HEADER.replace(b"size 1", b"size 16") + DEEP[:80], "ends before its tree does"),
-        (HEADER.replace(b"size 1", b"size 18") + DEEP + DEEP[-5:], "goes on after its tree has ended"),
-        (HEADER.replace(b"size 1", b"size 17") + DEEP[:80] + struct.pack("<fB", np.nan, 0), "not finite"),
+        b"",
+        b"ply\nformat ascii 1.0\n",
+        HEADER[:40],
+        *(HEADER.replace(line, b"") for line in (b"size 1\n", b"res 0.1\n", b"id OcTree\n")),
+        HEADER.replace(b"id OcTree", b"id CountingOcTree"),
+        *(HEADER.replace(b"size 1", size) for size in (b"size -1", b"size many")),
+        *(HEADER.replace(b"res 0.1", resolution) for resolution in (b"res 0", b"res nan")),
+        HEADER.replace(b"size 1", b"size 0") + b"x",
+        HEADER.replace(b"size 1", b"size 16") + DEEP,
+        HEADER.replace(b"size 1", b"size 999999999999") + DEEP,
+        HEADER.replace(b"size 1", b"size 18") + DEEP[:5] + DEEP,
+        HEADER.replace(b"size 1", b"size 16") + DEEP[:80],
+        HEADER.replace(b"size 1", b"size 18") + DEEP + DEEP[-5:],
+        HEADER.replace(b"size 1", b"size 17") + DEEP[:80] + struct.pack("<fB", np.nan, 0),
     ],
 )
-def test_files_that_are_no_maps_are_refused(data, message, tmp_path):
+def test_files_that_are_no_maps_are_refused_in_one_line(data, tmp_path):
     (tmp_path / "map.ot").write_bytes(data)
 
-    with pytest.raises(MapFileError, match=message) as caught:
+    with pytest.raises(MapFileError) as caught:
         read_octree(tmp_path / "map.ot")
     assert "\n" not in str(caught.value)
     assert str(tmp_path / "map.ot") in str(caught.value)
