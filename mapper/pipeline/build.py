@@ -20,7 +20,7 @@ from mapper.pipeline.checkpoint_identity import identity_of, kept_from_before
 from mapper.pipeline.checkpoints import (
     EVERY_S,
     Checkpoints,
-    kept_result,
+    Step,
     open_checkpoints,
     remove_checkpoints,
 )
@@ -92,15 +92,16 @@ def build(
         open_checkpoints(writer, identity, progress, every_s=checkpoint_s) as checkpoints,
     ):
         writer.warn(warnings)
-        if poses is not None:
-            write_tum(writer.folder / files.ODOMETRY, poses)
         steps = _Steps(source, config, writer, progress, observer, checkpoints)
-        solved = kept_result(checkpoints, "solved", lambda: steps.solve(steps.track(odometry)))
+        solved: _Solved | None = steps.resume("solved")
+        if solved is None:
+            tracking: TrackingResult | None = steps.resume("tracked")
+            if tracking is None:
+                tracking = steps.track(odometry)
+            solved = steps.solve(steps.accept(tracking))
         observer.on_levelled(solved.level.T_level_world)
-        steps.save(solved)
-        from mapper.pipeline.fuse import fuse_into  # takes long to load: the first frame does not wait
-
-        fuse_into(writer, source, config, progress, observer=observer, checkpoints=checkpoints)
+        steps.save(solved, poses)
+        steps.fuse()
     remove_checkpoints(out)
     return open_run(out)
 
@@ -116,7 +117,7 @@ class _Solved:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Steps:
-    """The steps of one build from the log to the solved graph, with what they share."""
+    """The steps of one build, with what they share."""
 
     source: Log
     config: BuildConfig
@@ -125,15 +126,12 @@ class _Steps:
     observer: Observer
     checkpoints: Checkpoints | None
 
-    def track(self, odometry: Odometry[Any] | Trajectory | None) -> TrackingResult:
-        """Track every frame; keep the largest component of the path."""
-        tracking = kept_result(self.checkpoints, "tracked", lambda: self._track_log(odometry))
-        self.writer.warn(tracking.warnings)
-        save_tracking(self.writer, from_tracking(tracking, self.source.truth))
-        refuse_a_fragment(tracking, self.config, sensor=self.source.sensor)
-        return tracking
+    def resume(self, step: Step) -> Any | None:
+        """Return the result of a step as an earlier process left it; None if there is none."""
+        return None if self.checkpoints is None else self.checkpoints.load(step)
 
-    def _track_log(self, odometry: Odometry[Any] | Trajectory | None) -> TrackingResult:
+    def track(self, odometry: Odometry[Any] | Trajectory | None) -> TrackingResult:
+        """Track every frame, and join the parts of a broken path."""
         with self.writer.clock.stage("track"):
             tracking = track_log(
                 self.source,
@@ -144,21 +142,34 @@ class _Steps:
                 checkpoints=None if self.checkpoints is None else TrackingCheckpoints(self.checkpoints),
             )
             tracking = joined(self.source, tracking, self.config, progress=self.progress)
-            return largest_component(tracking, progress=self.progress)
+            tracking = largest_component(tracking, progress=self.progress)
+        if self.checkpoints is not None:
+            self.checkpoints.store("tracked", tracking)
+        return tracking
+
+    def accept(self, tracking: TrackingResult) -> TrackingResult:
+        """Write the result of tracking, unless too little was tracked for a map."""
+        self.writer.warn(tracking.warnings)
+        save_tracking(self.writer, from_tracking(tracking, self.source.truth))
+        refuse_a_fragment(tracking, self.config, sensor=self.source.sensor)
+        return tracking
 
     def solve(self, tracking: TrackingResult) -> _Solved:
-        """Solve the graph, and level the world."""
+        """Solve the graph, keep its largest component, and level the world."""
         with self.writer.clock.stage("solve"):
-            solved = solve(tracking.graph, tracking.loops, self.config.graph)
-        tracking = replace(tracking, graph=solved.graph, loops=solved.loops)
+            graph = solve(tracking.graph, tracking.loops, self.config.graph)
+        tracking = replace(tracking, graph=graph.graph, loops=graph.loops)
         tracking = largest_component(tracking, progress=self.progress)
         with self.writer.clock.stage("level"):
             level = level_of(self.source, tracking, self.config)
         tracking = replace(tracking, graph=tracking.graph.moved(level.T_level_world))
-        return _Solved(tracking, solved.report, level)
+        solved = _Solved(tracking, graph.report, level)
+        if self.checkpoints is not None:
+            self.checkpoints.store("solved", solved)
+        return solved
 
-    def save(self, solved: _Solved) -> None:
-        """Write the solved poses, the graph and the places."""
+    def save(self, solved: _Solved, poses: Trajectory | None) -> None:
+        """Write the solved poses, the graph, the places, and the poses that were given."""
         tracking, level = solved.tracking, solved.level
         if implausible := _height_warning(self.source, tracking.tracked_trajectory()):
             self.progress.note(implausible)
@@ -166,9 +177,24 @@ class _Steps:
         with self.writer.clock.stage("solve"):
             save_solved(self.writer, from_tracking(tracking, self.source.truth))
             save_places(self.writer, tracking)
+        if poses is not None:
+            write_tum(self.writer.folder / files.ODOMETRY, poses)
         self.writer.update(
             solve=solved.report,
             levelling=Levelling(method=level.method, detail=level.detail, has_floor=level.has_floor),
+        )
+
+    def fuse(self) -> None:
+        """Fuse every frame at its final pose."""
+        from mapper.pipeline.fuse import fuse_into  # takes long to load: the first frame does not wait
+
+        fuse_into(
+            self.writer,
+            self.source,
+            self.config,
+            self.progress,
+            observer=self.observer,
+            checkpoints=self.checkpoints,
         )
 
 

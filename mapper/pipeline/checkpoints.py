@@ -20,7 +20,7 @@ from contextlib import AbstractContextManager, nullcontext, suppress
 from functools import partial
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Literal, Self, TypeVar
+from typing import Any, Literal, Self
 
 from pydantic import ValidationError
 
@@ -44,7 +44,8 @@ _SHARE, _LONGEST_S = 0.015, 9.0
 _TIMES = "resumed.json"
 _JOURNAL = "tracking.journal"
 
-Result = TypeVar("Result")
+Step = Literal["tracked", "solved"]
+"""Steps of a build whose results are kept whole."""
 
 
 class _Schedule:
@@ -127,10 +128,10 @@ class Checkpoints:
         if isinstance(error, MapperError) and not isinstance(error, WriteError):
             shutil.rmtree(self.folder, ignore_errors=True)  # it would fail again
 
-    def result(self, step: Literal["tracked", "solved"], work: Callable[[], Result]) -> Result:
-        """Return the result of a step: as an earlier process left it, or computed and stored.
+    def load(self, step: Step) -> Any | None:
+        """Return the result of a step as an earlier process left it; None if it is to be computed.
 
-        The manifest and the times so far are stored with it.
+        The manifest and the times until then are restored with it.
         """
         versions, damaged = StateFile(self.folder, step).versions()
         for path in versions.values():
@@ -143,15 +144,16 @@ class Checkpoints:
             self.is_solved = step == "solved"
             if not self.is_solved:
                 self.resumed_at("solve", 0)
-            known: Result = state["result"]
-            return known
+            return state["result"]
         if damaged:
             self.progress.note(f"what an earlier process has {step} is damaged; it is computed again")
-        result = work()
+        return None
+
+    def store(self, step: Step, result: object) -> None:
+        """Keep the result of a step, with the manifest and the times so far, instead of what led to it."""
         self._wait()
         if not self.is_off:
             self._try(partial(self._replace_by, step, result))
-        return result
 
     def _replace_by(self, step: str, result: object) -> None:
         """Write a result, and delete the checkpoints that led to it, but for the journal it refers to."""
@@ -297,13 +299,6 @@ def open_checkpoints(
 ) -> AbstractContextManager[Checkpoints | None]:
     """Return the checkpoints of a build as a context; None makes none."""
     return nullcontext() if every_s is None else Checkpoints(writer, identity, progress, every_s=every_s)
-
-
-def kept_result(
-    checkpoints: Checkpoints | None, step: Literal["tracked", "solved"], work: Callable[[], Result]
-) -> Result:
-    """Return the result of a step, kept where there are checkpoints."""
-    return work() if checkpoints is None else checkpoints.result(step, work)
 
 
 def remove_checkpoints(run: Path) -> None:
