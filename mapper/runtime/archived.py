@@ -51,10 +51,6 @@ class Archived(Generic[Data]):
         """Leave the data to a reader, which has it from now on."""
         self._data, self._reader = None, reader
 
-    def __reduce__(self) -> Any:
-        """Return what makes a copy that needs no archive."""
-        return Archived, (self.data,)
-
 
 def archived(data: Data) -> Archived[Data]:
     """Return the reference to data, the same one every time for data of a class that can be archived."""

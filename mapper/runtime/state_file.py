@@ -1,11 +1,11 @@
 """State of a computation as arrays, numbers and text, from which a copy continues it to the same bits.
 
 A state is a tree in JSON and the bytes of its arrays. Objects are written as the name of their class and
-their attributes; what is read makes objects of this package's classes alone, without calling these, so that a
-file of somebody else can do nothing but fail. Arrays keep their memory layout, as sums in another order
-would round otherwise, and objects that were one are one again. What cannot or need not be written is referred
-to: parts that exist before the computation begins, by name, and data that never changes, by where a journal
-has it.
+their attributes; what is read makes objects of this package's classes alone, and calls nothing but their own
+``__setstate__``, so that a file of somebody else can do nothing but fail. Arrays keep their memory layout, as
+sums in another order would round otherwise, and objects that were one are one again. What cannot or need not
+be written is referred to: parts that exist before the computation begins, by name, and data that never
+changes, by where a journal has it.
 """
 
 import io

@@ -82,14 +82,21 @@ class ImageObservation(Archivable):
         """(N,) which features have depth."""
         return ~np.isnan(self.depth_m)
 
-    def __reduce_ex__(self, protocol: Any) -> Any:
-        """Return what is written of it: the rest follows from that, to the bit."""
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what a state file holds of it: the rest follows from that, to the bit."""
         if self.unswept is not None:
-            return _swept, (self.unswept, self.sweep_camera)
+            return {"unswept": self.unswept, "sweep_camera": self.sweep_camera}
         measured = {
             field.name: getattr(self, field.name) for field in fields(self) if field.name not in _DERIVED
         }
-        return _unswept, (measured, not np.isnan(self.measured[:, 2]).all())
+        return {"measured": measured, "has_disparity": not np.isnan(self.measured[:, 2]).all()}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Make it again of that."""
+        if "unswept" in state:
+            _copy_fields(state["unswept"].swept(state["sweep_camera"]), self)
+        else:
+            _copy_fields(_unswept(state["measured"], state["has_disparity"]), self)
 
     def weights_among(self, moved: NDArray[np.bool_]) -> Array:
         """Return the (N, 3) inverse variances that tell which features agree on a motion.
@@ -152,9 +159,13 @@ class ObservedView(ImageView):
 
     observation: ImageObservation
 
-    def __reduce_ex__(self, protocol: Any) -> Any:
+    def __getstate__(self) -> ImageObservation:
         """Return the observation alone: a keyframe's is in the archive already."""
-        return _view_of, (self.observation,)
+        return self.observation
+
+    def __setstate__(self, state: ImageObservation) -> None:
+        """Make it again of that."""
+        _copy_fields(state.view(), self)
 
 
 def observe_image(
@@ -227,12 +238,10 @@ def _unswept(measured: Mapping[str, Any], has_disparity: bool) -> ImageObservati
     )
 
 
-def _view_of(observation: ImageObservation) -> ImageView:
-    return observation.view()
-
-
-def _swept(unswept: ImageObservation, sweep_camera: Array) -> ImageObservation:
-    return unswept.swept(sweep_camera)
+def _copy_fields(made: Any, instance: Any) -> None:
+    """Give a frozen object that has no fields yet those of another of its class."""
+    for field in fields(made):
+        object.__setattr__(instance, field.name, getattr(made, field.name))
 
 
 def back_projected(pixels: Array, depth_m: Array, intrinsics: Array) -> Points:
