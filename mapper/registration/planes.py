@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from mapper.core.frames import Scan
 from mapper.core.geometry import Array, Points, Transform, apply
 from mapper.core.subsampling import stride_for
-from mapper.registration.surfaces import Prepared
 
 _POINTS_PER_SCAN = 4000
 """Evenly chosen points of a scan: more hardly change the planes and take longer."""
@@ -32,10 +31,7 @@ _WIDENINGS = (4.0, 3.0, 2.0, 1.5, 1.0, 1.0, 1.0)
 _MIN_CONSTRAINT_RATIO = 0.02
 _MIN_LEVEL_PATCHES = 5
 _MIN_LEVEL_RATIO = 0.03
-_LEVEL_VOXELS = 0.25
-"""Standard deviation of a level surface's height in one scan, in voxels."""
 _MIN_AGREEING_RATIO = 0.3
-_Z = np.array([0.0, 0.0, 1.0])
 
 # Weights of patches: a random normal lies within 8° of an axis in 0.5 % of all cases, and within 8° of the
 # plane across it in 14 %; the ratio of the logarithms is about 2.5. Surfaces that face down are measured less
@@ -141,20 +137,6 @@ def vertical_of(patches: Patches, *, up_guess_world: Array, tolerance_m: float) 
         upright_ratio=float((np.abs(cosine) < np.sin(_REFINED_TOLERANCE_RAD)).mean()),
         determined=determined,
     )
-
-
-def up_of(cloud: Prepared) -> Array | None:
-    """Return (3,) up of one scan by its normals, within 60° of z; None if these leave it open.
-
-    Args:
-        cloud: The scan in its body frame, z roughly up.
-    """
-    has_normal = cloud.normals.any(axis=1)
-    if not has_normal.any():
-        return None
-    patches = Patches(cloud.points[has_normal], cloud.normals[has_normal])
-    vertical = vertical_of(patches, up_guess_world=_Z, tolerance_m=_LEVEL_VOXELS * cloud.voxel_m)
-    return vertical.up_world if vertical.determined and vertical.is_agreed else None
 
 
 def levels_of(heights_m: Array, *, tolerance_m: float, least: int) -> list[NDArray[np.intp]]:

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 import small_gicp
-from scipy.spatial import cKDTree
 
 from mapper.core.errors import DataError
 from mapper.registration.surfaces import prepared
@@ -58,32 +57,3 @@ def test_an_empty_cloud_is_near_nothing():
 def test_points_beyond_exact_voxels_are_refused():
     with pytest.raises(DataError, match=r"900000 m is beyond 209715 m"):
         prepared(np.full((30, 3), 9e5, np.float32), voxel_m=0.2)
-
-
-def test_the_spacing_is_the_distance_of_the_third_nearest_other_point():
-    rng = np.random.default_rng(3)
-    cloud = prepared(rng.uniform(-5.0, 5.0, (400, 3)), voxel_m=VOXEL_M)
-    distances_m, _ = cKDTree(cloud.points).query(cloud.points, 4)
-    assert np.allclose(cloud.spacing_m, distances_m[:, 3])
-    assert np.isinf(prepared(np.eye(3), voxel_m=VOXEL_M).spacing_m).all()
-
-
-def test_a_plane_is_broad_and_lines_far_apart_are_not():
-    rng = np.random.default_rng(4)
-    plane = np.column_stack([rng.uniform(-5.0, 5.0, (4000, 2)), rng.normal(0.0, 0.01, 4000)])
-    rows = np.column_stack([np.arange(-30.0, 30.0, 0.4), np.zeros((150, 2))])
-    lines = np.concatenate([rows + np.array([0.0, y, 0.0]) for y in (-12.0, 0.0, 12.0)])
-    lines += rng.normal(0.0, 0.01, lines.shape)
-
-    broad, narrow = prepared(plane, voxel_m=VOXEL_M).breadth, prepared(lines, voxel_m=VOXEL_M).breadth
-    assert np.quantile(broad, 0.05) > 30.0
-    assert np.median(narrow) < 7.0
-    assert narrow.min() >= 1.0
-    assert (prepared(np.eye(3), voxel_m=VOXEL_M).breadth == 1.0).all()
-
-
-def test_the_breadth_is_the_ratio_of_the_eigenvalues():
-    cloud = prepared(yard(np.random.default_rng(5)), voxel_m=VOXEL_M)
-    _, about = cKDTree(cloud.points).query(cloud.points[:50], 10)
-    values = np.linalg.eigvalsh([np.cov(cloud.points[i].T) for i in about])
-    assert np.allclose(cloud.breadth[:50], values[:, 1] / values[:, 0], rtol=1e-5)

@@ -67,7 +67,6 @@ class DepthAlignment:
     Attributes:
         T_camera_world: (4, 4).
         information: (6, 6) of the camera's tangent (rotation, translation), from planes and the prediction.
-        landmark_information: (6, 6) likewise from the landmarks; halved, as they were measured no better.
         is_landmark_inlier: (L,) which landmarks agree with the pose.
         points: Number of points of the depth image that lie on surfaces of the keyframes, or in front.
         agreeing: (K,) how many of them agree with each keyframe.
@@ -84,7 +83,6 @@ class DepthAlignment:
 
     T_camera_world: Transform
     information: Array
-    landmark_information: Array
     is_landmark_inlier: NDArray[np.bool_]
     points: int
     agreeing: NDArray[np.int64]
@@ -204,7 +202,6 @@ def align_depth(
     return DepthAlignment(
         T_found,
         projected(information / scale, degeneracy) + prior,
-        known,
         is_inlier,
         seen,
         agreeing[:keyframes],
