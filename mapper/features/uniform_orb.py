@@ -39,7 +39,7 @@ class UniformOrb:
         parts: list[Features] = []
         for octave in reversed(range(len(levels))):
             wanted += self._config.max_features * shares[octave] / shares.sum()
-            part = self._features_of(levels[octave], octave, round(wanted))
+            part = self._features_of(levels[octave], octave, round(wanted), gray.shape)
             wanted -= len(part)
             parts.append(part)
         return _joined(parts[::-1])
@@ -57,16 +57,18 @@ class UniformOrb:
                 level = cv2.resize(level, size, interpolation=cv2.INTER_LINEAR_EXACT)
             yield level
 
-    def _features_of(self, level: Image, octave: int, wanted: int) -> Features:
-        """Return the features of a level of the pyramid."""
+    def _features_of(self, level: Image, octave: int, wanted: int, shape: tuple[int, ...]) -> Features:
+        """Return the features of a level of an image of that shape."""
         config = self._config
         scores = fast_scores(level, config.min_threshold, _MARGIN_PX)
         pixels, strength = corners(scores, config.threshold, config.cell_px, _MARGIN_PX)
         kept = spread(pixels, strength, level.shape[1], level.shape[0], wanted)
         pixels, strength = pixels[kept], strength[kept]
         angle_rad = orientations(level, pixels)
+        # A level has whole pixels, so its size is not the image's by the scale factor: 0.4 px in its middle.
+        pixel_px = np.array([shape[1] / level.shape[1], shape[0] / level.shape[0]])
         return Features(
-            pixels=((pixels + 0.5) * ORB_SCALE_FACTOR**octave - 0.5).astype(np.float32),
+            pixels=((pixels + 0.5) * pixel_px - 0.5).astype(np.float32),
             octave=np.full(len(pixels), octave, np.int32),
             angle_rad=angle_rad,
             response=strength.astype(np.float32),

@@ -106,19 +106,6 @@ def test_uniform_orb_finds_mirrored_features_at_mirrored_pixels_in_every_octave(
         assert (np.abs(np.median(differences, axis=0)) < 0.1).all()
 
 
-def test_uniform_orb_finds_corners_to_a_part_of_a_pixel():
-    fine = cv2.resize(texture(6), (1280, 960), interpolation=cv2.INTER_CUBIC)
-    detector = build_detector(UniformOrbConfig(levels=1))
-
-    still = detector.detect(cv2.resize(fine, (320, 240), interpolation=cv2.INTER_AREA))
-    moved = detector.detect(cv2.resize(np.roll(fine, 2, axis=1), (320, 240), interpolation=cv2.INTER_AREA))
-
-    differences = nearest(still.pixels, moved.pixels, within_px=1.5) - [0.5, 0.0]  # whole pixels miss by 0.5
-    assert len(differences) > 300
-    assert np.median(np.abs(differences[:, 0])) < 0.2
-    assert np.median(np.abs(differences[:, 1])) < 0.1
-
-
 @pytest.mark.parametrize("kind", ["surf", "sift", "orb", "akaze"])
 def test_threshold_falls_until_a_faint_image_gives_enough(kind):
     config = next(c for c in EVERY_DETECTOR if c.kind == kind)
