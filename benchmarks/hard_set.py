@@ -33,7 +33,6 @@ from mapper.evaluators.metrics.loops import wrong_loops
 from mapper.evaluators.metrics.silent_failures import check_doubts
 from mapper.evaluators.metrics.trajectory import align, associate, ate
 from mapper.loops.closure import accepted_loops
-from mapper.pipeline.build import levelled
 from mapper.pipeline.components import largest_component
 from mapper.pipeline.joined_components import joined
 from mapper.pipeline.solve import solve
@@ -154,7 +153,6 @@ def mapped(log: Log, name: str, overrides: Sequence[str] = ()) -> Row:
         solved = solve(tracking.graph, tracking.loops, config.graph)
         tracking = replace(tracking, graph=solved.graph, loops=solved.loops)
         tracking = largest_component(tracking, progress=SILENT)
-        tracking, *_ = levelled(log, tracking, config)
         seconds = time.perf_counter() - began
         trajectory, records = tracking.trajectory(), records_of(tracking.tracks, tracking.skipped)
         matched = associate(placed_by_neighbours(trajectory, tracking.graph, records), log.truth)
