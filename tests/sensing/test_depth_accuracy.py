@@ -277,7 +277,7 @@ def test_a_log_without_planes_is_refused():
 
 @pytest.mark.skipif(not FR1_XYZ.is_dir(), reason=f"no {FR1_XYZ}")
 def test_a_real_kinect_is_as_noisy_as_was_published():
-    log = open_source(FR1_XYZ, SourceConfig(first_frame=20, last_frame=400, stride=60, undistort_depth=False))
+    log = open_source(FR1_XYZ, SourceConfig(first_frame=20, last_frame=400, stride=60))
     levels, picture = depth_of_planes(log)
     z = np.array([level.typical.distance_m for level in levels])
     assert len(z) >= 3

@@ -22,9 +22,9 @@ def log_or_skip(name):
 @pytest.mark.parametrize("kind", ["mcap", "bag"])
 def test_fr1_xyz_gives_the_identical_trajectory(tmp_path, kind):
     config = load_config(None, ["loops.kind=none"])
-    source = open_source(log_or_skip("tum_fr1_xyz"), SourceConfig(last_frame=60, undistort_depth=False))
+    source = open_source(log_or_skip("tum_fr1_xyz"), SourceConfig(last_frame=60))
     assert write_log(source, tmp_path / f"xyz.{kind}", kind=kind) == []
-    again = open_source(tmp_path / f"xyz.{kind}", SourceConfig(undistort_depth=False))
+    again = open_source(tmp_path / f"xyz.{kind}", SourceConfig())
     expected, found = (track_log(log, config, progress=SILENT).trajectory() for log in (source, again))
     assert len(expected) == 61
     np.testing.assert_array_equal(found.stamps_ns, expected.stamps_ns)
