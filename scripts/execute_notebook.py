@@ -26,8 +26,10 @@ def executed(notebook: dict[str, Any]) -> dict[str, Any]:
         Exception: Whatever a cell raises.
     """
     import matplotlib as mpl
+    import matplotlib.pyplot as plt
 
     mpl.use("Agg")
+    plt.close("all")  # what was drawn before is not the notebook's
     names: dict[str, Any] = {"__name__": "__main__"}
     cells, count = [], 0
     for cell in notebook["cells"]:

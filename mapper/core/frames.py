@@ -152,6 +152,7 @@ class Scan:
         colors: (N, 3) uint8 RGB of each point, where the sensor has colour.
         times_s: (N,) float32 seconds after ``stamp_ns`` of each point, where the file has them.
         far_returns: Number of returns that were left out as farther than any sensor reaches.
+        untimed_returns: Number of returns that were left out because their time cannot be right.
     """
 
     stamp_ns: int
@@ -160,6 +161,7 @@ class Scan:
     colors: NDArray[np.uint8] | None = None
     times_s: NDArray[np.float32] | None = None
     far_returns: int = 0
+    untimed_returns: int = 0
 
     def __post_init__(self) -> None:
         shape = self.points_body.shape

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from mapper.core.errors import RunError
+from mapper.core.errors import GraphError, RunError
 from mapper.core.trajectory import trajectory_from
 from mapper.export.graph_picture import write_graph_views
 from mapper.graph.components import components
@@ -40,7 +40,7 @@ class SolvedGraph:
 
     @property
     def solved(self) -> PoseGraph:
-        """The graph with its nodes at the solution; rejected loops are still in it."""
+        """The graph with its nodes at the solution, and all of its factors."""
         return self.graph.with_poses(self.solution.T_world_node)
 
     @property
@@ -56,8 +56,12 @@ class SolvedGraph:
     @property
     def rejected(self) -> list[tuple[int, int]]:
         """Nodes i, j of every loop that the solver rejected."""
-        pairs = zip(self.graph.factors, self.solution.weights, strict=True)
-        return [(factor.i, factor.j) for factor, weight in pairs if weight < MIN_WEIGHT]
+        return [(self.graph.factors[k].i, self.graph.factors[k].j) for k in self.rejected_factors]
+
+    @property
+    def rejected_factors(self) -> list[int]:
+        """Indices of the factors that the solver rejected."""
+        return [k for k, weight in enumerate(self.solution.weights) if weight < MIN_WEIGHT]
 
 
 def write_solved_graph(out: Path, solved: SolvedGraph) -> None:
@@ -65,13 +69,23 @@ def write_solved_graph(out: Path, solved: SolvedGraph) -> None:
 
     Raises:
         RunError: The file or folder exists already, or cannot be made.
+        GraphError: The rejected loops were all that connected some nodes.
     """
     refuse_existing_result(out)
+    rejected = frozenset(solved.rejected_factors)
+    held = [factor for k, factor in enumerate(solved.graph.factors) if k not in rejected]
+    parts, given_parts = len(components(solved.graph.with_factors(held))), len(solved.component_sizes)
+    if parts > given_parts:
+        raise GraphError(
+            f"{solved.path}: without its {len(rejected)} rejected loops the graph falls apart into {parts} "
+            f"components, not {given_parts}, so the solution holds for none; --robust none keeps every edge, "
+            f"or number the vertices in the order of the odometry"
+        )
     if out.suffix == ".g2o":
-        write_g2o(out, solved.solved)
+        write_g2o(out, solved.solved, rejected=rejected)
         return
     with atomic_folder(out, _FOLDER) as folder:
-        write_g2o(folder / GRAPH, solved.solved)
+        write_g2o(folder / GRAPH, solved.solved, rejected=rejected)
         by_time = sorted((stamp, node) for node, stamp in solved.graph.stamps_ns.items())
         poses = ((stamp, solved.solution.T_world_node[node]) for stamp, node in by_time)
         write_tum(folder / KEYFRAMES, trajectory_from(poses))

@@ -1,6 +1,6 @@
 """Pose graphs as g2o text (Kümmerle et al. 2011), as GTSAM, g2o and SE-Sync read it."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Container
 from dataclasses import dataclass, field
 from itertools import chain
 from pathlib import Path
@@ -25,12 +25,17 @@ _SHORTEST = 1e-9
 """A quaternion shorter than this has no direction."""
 
 
-def write_g2o(path: Path, graph: PoseGraph) -> None:
+def write_g2o(path: Path, graph: PoseGraph, *, rejected: Container[int] = ()) -> None:
     """Write ``VERTEX_SE3:QUAT``, ``FIX`` (the first node unless others are fixed), ``EDGE_SE3:QUAT``.
 
     Data without a g2o tag stand behind a ``#`` at the line's end, which other readers ignore:
     ``# stamp_ns 1305031102175304000`` of a node, ``# origin loop`` of a factor. The information is that of
     the rotation vector (rad⁻²), as GTSAM takes it; the g2o library itself means half-angles.
+
+    Args:
+        path: File to write.
+        graph: Nodes and factors.
+        rejected: Indices of factors that do not hold; their lines are comments.
 
     Raises:
         GraphError: The graph has no nodes.
@@ -49,8 +54,9 @@ def write_g2o(path: Path, graph: PoseGraph) -> None:
         upper = swapped(information)[:, *np.triu_indices(6)]
         motions = _pose_texts(np.array([factor.T_i_j for factor in graph.factors]))
         lines += [
-            f"EDGE_SE3:QUAT {factor.i} {factor.j} {motion} {_numbers_text(row)} # origin {factor.origin}"
-            for factor, motion, row in zip(graph.factors, motions, upper, strict=True)
+            f"{'# rejected ' if k in rejected else ''}EDGE_SE3:QUAT {factor.i} {factor.j} {motion} "
+            f"{_numbers_text(row)} # origin {factor.origin}"
+            for k, (factor, motion, row) in enumerate(zip(graph.factors, motions, upper, strict=True))
         ]
     write_text(path, "\n".join(lines) + "\n")
 
@@ -64,16 +70,17 @@ def read_g2o(path: Path, *, guess_loops: bool = False, progress: Progress = SILE
 
     Args:
         path: The file.
-        guess_loops: An edge without an origin is a loop if its ids do not follow each other;
-            otherwise it counts as odometry.
-        progress: Receives a note of how many edges have such information.
+        guess_loops: An edge without an origin is a loop unless it joins a vertex to the one with the next
+            id; otherwise it counts as odometry.
+        progress: Receives a note of how many edges have such information or none, and of priors, which are
+            left out.
 
     Raises:
         GraphError: The file cannot be read, has no vertices, or a line has an unknown tag, a wrong
             number of columns, a number that is not finite, an id that is unknown or taken, or
             information whose diagonal is not positive; the message names file and line.
     """
-    tables = _tables(path)
+    tables = _tables(path, progress)
     graph = PoseGraph()
     for line, (node,), note, T_world_node in _in_order(path, tables, _VERTICES):
         try:
@@ -84,9 +91,11 @@ def read_g2o(path: Path, *, guess_loops: bool = False, progress: Progress = SILE
         raise GraphError(f"{path}: no vertices; want g2o text with {' or '.join(_VERTICES)} lines")
     graph.fixed = _fixed(path, tables.get(_FIX, _Table()), graph)
     informations = _informations(path, tables, progress)
+    rank = {node: k for k, node in enumerate(sorted(graph.T_world_node))}
     for line, (i, j), note, T_i_j in _in_order(path, tables, _EDGES):
-        unnamed: Origin = "loop" if guess_loops and abs(i - j) != 1 else "odometry"
         try:
+            are_neighbours = abs(rank.get(i, 0) - rank.get(j, 0)) == 1
+            unnamed: Origin = "loop" if guess_loops and not are_neighbours else "odometry"
             graph.add_factors([BetweenFactor(i, j, T_i_j, informations[line], _origin(note, unnamed))])
         except MapperError as error:
             raise GraphError(f"{path}:{line}: {error}") from None
@@ -146,21 +155,31 @@ _VERTICES = {"VERTEX_SE3:QUAT": _Form(1, 7, pose_of_row), "VERTEX_SE2": _Form(1,
 _EDGES = {"EDGE_SE3:QUAT": _Form(2, 7, pose_of_row, 6), "EDGE_SE2": _Form(2, 3, _poses_2d, 3)}
 _FORMS = _VERTICES | _EDGES
 _FIX = "FIX"
+_PRIORS = frozenset({"EDGE_SE3_PRIOR", "EDGE_PRIOR_SE2", "EDGE_PRIOR_SE2_XY", "EDGE_SE2_PRIOR"})
+_IDENTITY_INFORMATION = {n: ["1" if i == j else "0" for i in range(n) for j in range(i, n)] for n in (3, 6)}
+"""Words of the upper triangle of an identity matrix, by its rows."""
 
 
-def _tables(path: Path) -> dict[str, _Table]:
+def _tables(path: Path, progress: Progress) -> dict[str, _Table]:
     """Sort the lines by their tags; numbers are checked in bulk afterwards."""
     tables: dict[str, _Table] = {}
+    priors = uninformed = 0
     lines = read_text(path, error=GraphError, encoding="ascii").splitlines()
     for line, text in enumerate(lines, start=1):
         body, _, note = text.partition("#")
         tag, *words = body.split() or [""]
         if tag == "" or tag.startswith(_PARAMETERS):
             continue
+        if tag in _PRIORS:
+            priors += 1
+            continue
         form = _Form(len(words), 0, _no_poses) if tag == _FIX else _FORMS.get(tag)
         if form is None:
             known = ", ".join((*_FORMS, _FIX))
             raise GraphError(f"{path}:{line}: unknown tag {tag!r}; want one of {known}")
+        if len(words) == form.ids + form.pose_numbers and form.information_rows:
+            words += _IDENTITY_INFORMATION[form.information_rows]
+            uninformed += 1
         if len(words) != form.columns:
             raise GraphError(f"{path}:{line}: {len(words)} columns after the tag, want {form.columns}")
         table = tables.setdefault(tag, _Table())
@@ -168,9 +187,14 @@ def _tables(path: Path) -> dict[str, _Table]:
             table.ids.append([int(word) for word in words[: form.ids]])
             table.numbers.append([float(word) for word in words[form.ids :]])
         except ValueError as error:
-            raise GraphError(f"{path}:{line}: {error}") from None
+            remedy = "; numbers need a decimal point, not a comma" if "," in body else ""
+            raise GraphError(f"{path}:{line}: {error}{remedy}") from None
         table.lines.append(line)
         table.notes.append(note)
+    if priors:
+        progress.note(f"{path}: {priors} priors on single poses are left out; edges alone are solved")
+    if uninformed:
+        progress.note(f"{path}: {uninformed} edges have no information; it is taken as identity")
     for table in tables.values():
         table.refuse(path, np.array([min(ids, default=0) < 0 for ids in table.ids]), "an id is negative")
     return tables

@@ -32,7 +32,7 @@ _DRIFT_SLACK = 3.0
 _UNUSED_LOOP_RATIO = 4.0
 """Factor on the limit of an unused loop: the path has not been optimised with it."""
 _CLUSTER_NODES = 10
-"""Loops whose ends are at most so many nodes apart form a cluster, which is tried as one."""
+"""Loops whose ends are at most so many nodes apart, in the order of ids, form a cluster, tried as one."""
 _MAX_CLUSTERS_TRIED = 8
 
 
@@ -117,7 +117,7 @@ def _refine_inliers(
     added. False loops that agree with each other can outweigh the true ones, if these are fewer: clusters are
     removed, first those farthest from the odometry's prediction.
     """
-    clusters = sorted(_clusters(part.loops), key=lambda cluster: -float(apart[cluster].max()))
+    clusters = sorted(_clusters(part), key=lambda cluster: -float(apart[cluster].max()))
     cost = _cost(part, now, limit)
     for cluster in (None, *clusters[:_MAX_CLUSTERS_TRIED]):
         inliers = now.chi2 <= limit
@@ -137,8 +137,9 @@ def _cost(part: Part, now: Graduated, limit: float) -> float:
     return 2.0 * sum(term.error(now.poses) for term in part.held) + float(np.minimum(now.chi2, limit).sum())
 
 
-def _clusters(loops: Sequence[BetweenFactor]) -> list[NDArray[np.bool_]]:
+def _clusters(part: Part) -> list[NDArray[np.bool_]]:
     """Return clusters of loops as masks: loops are connected where both ends are close."""
-    ends = np.sort([(loop.i, loop.j) for loop in loops], axis=1)
+    place = {node: k for k, node in enumerate(part.start.keys())}
+    ends = np.sort([(place[loop.i], place[loop.j]) for loop in part.loops], axis=1)
     numbers = cluster_numbers(ends, _CLUSTER_NODES, norm=np.inf)
     return [numbers == number for number in range(numbers.max() + 1)]

@@ -22,6 +22,9 @@ _NEAR_M, _FAR_M = 0.1, 8.0
 _USUALLY_NEAR_M = 0.3
 """Least depth of most cameras and ways to hold them: where nothing states the units, nearer values may be
 millimetres taken for TUM's fifths of these."""
+_DESK_M = 1.5
+"""Depth of most of a desk or an object; nearer than that a whole room is not."""
+_MM_PER_M = 1000.0
 
 _PAIR_WITHIN_NS = NS_PER_S // 2
 _MAX_POSE_GAP_NS = NS_PER_S // 5
@@ -91,6 +94,8 @@ def _range_warning(log: Log, frames: Collection[RgbdFrame]) -> list[str]:
         found = f"half of it is within {median_m:.2g} m"
     elif log.are_units_assumed and near_m < _USUALLY_NEAR_M:
         found, least_m = f"a twentieth of it is within {near_m:.2g} m", _USUALLY_NEAR_M
+    elif log.are_units_assumed and far_m < _DESK_M and not _are_whole_millimetres(log, frames):
+        found = f"nine tenths of it is within {far_m:.2g} m and it is no whole millimetres"
     elif far_m > _FAR_M:
         found = f"a tenth of it is beyond {far_m:.2g} m"
     else:
@@ -98,6 +103,13 @@ def _range_warning(log: Log, frames: Collection[RgbdFrame]) -> list[str]:
     units_per_m = _units_per_m(log)
     setting = "source.camera.depth_factor" + ("" if units_per_m is None else f"={units_per_m:g}")
     return [f"depth: {found}, but cameras measure {least_m:g} to {_FAR_M:g} m; is {setting} right?"]
+
+
+def _are_whole_millimetres(log: Log, frames: Collection[RgbdFrame]) -> bool:
+    """Return whether depth was recorded in whole millimetres, as cameras deliver it, and scaled since."""
+    units_per_mm = (_units_per_m(log) or _MM_PER_M) / _MM_PER_M
+    units = np.concatenate([np.rint(frame.depth_m * units_per_mm * _MM_PER_M) for frame in frames])
+    return bool((np.remainder(units, units_per_mm) == 0.0).all())
 
 
 def _scale_of_log(log: Log, frames: Mapping[int, RgbdFrame]) -> float | None:

@@ -21,6 +21,7 @@ from mapper.sources.ros.index import Series
 from mapper.sources.ros.reader import RecordingReader
 from mapper.sources.ros.source import recording_log
 from mapper.sources.selection import selected
+from mapper.sources.valid_returns import FARTHEST_M
 from mapper.sources.vehicle_box import Box, vehicle_box
 
 _GAP_PERIODS = 3.0
@@ -188,9 +189,18 @@ def _first_frame(source: Log) -> tuple[Frame | None, str]:
     reason = "there is none"
     for entry in source.entries():
         try:
-            return entry.load(), ""
+            frame = entry.load()
         except FrameError as error:
             reason = str(error)
+            continue
+        if not isinstance(frame, Scan) or len(frame.points_body):
+            return frame, ""
+        reason = "it has no returns"
+        if frame.far_returns:
+            reason = (
+                f"all {frame.far_returns} returns are farther than {FARTHEST_M:g} m from the origin of their "
+                "frame; are they in coordinates of a map (UTM) and not around the sensor?"
+            )
     return None, f"no frame can be read: {reason}"
 
 

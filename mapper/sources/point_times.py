@@ -1,10 +1,12 @@
 """Times of a sweep's points, in whatever unit and on whatever clock the sensor's driver wrote them."""
 
 from collections.abc import Iterable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mapper.core.frames import Scan
 from mapper.core.geometry import Array
 from mapper.core.timebase import NS_PER_S
 
@@ -26,6 +28,10 @@ MAX_SWEEP_S = 2.0
 """No sensor turns slower; points farther apart in time were put together from several sweeps."""
 
 _UNITS_PER_S = (1, 1_000, 1_000_000, NS_PER_S)
+_MAX_WRONG_SHARE = 0.05
+"""Share of the points whose times may be damaged; with more of them nothing tells which times are right."""
+_SAMPLED = 1000
+_HALF_COUNTER = 1 << 31
 
 _SAME_STEP_RAD, _NEXT_STEP_RAD = 1e-6, 0.1
 """Azimuths of consecutive points of a spinning LiDAR's file: of one column, or of two columns nearby."""
@@ -47,36 +53,101 @@ def relative_times_s(values: NDArray[np.number], stamp_ns: int) -> NDArray[np.fl
     ``MAX_SWEEP_S`` of zero are offsets from the stamp already; others within as much of the stamp are times
     on its clock; all others are on a clock of the sensor's own, and the first point is taken at the stamp.
 
+    A few values that are not within ``MAX_SWEEP_S`` of the others are damaged: the driver wrote zero or NaN,
+    or its 32-bit counter began anew, which costs nothing, for it is counted on.
+
     Args:
         values: (N,) of any integer or floating type, of the points that measured something.
         stamp_ns: Time of the scan, nanoseconds.
 
     Returns:
-        (N,) float32 seconds, negative before the stamp; None where the values are no times: none, all the
-        same, not finite, or further apart than a sweep lasts.
+        (N,) float32 seconds, negative before the stamp, NaN where damaged; None where the values are no
+        times: none, all the same, not finite, or further apart than a sweep lasts.
     """
     if len(values) == 0:
         return None
-    values = np.ascontiguousarray(values)  # faster, for they are read three times
+    values = _counted_on(np.ascontiguousarray(values))  # contiguous ones are read faster, and three times
+    middle, units_per_s = _middle_and_unit(values)
+    if units_per_s is None:
+        return None
     first, last = values.min(), values.max()  # NaN is the least and the largest of all
-    if not (np.isfinite(first) and np.isfinite(last)):
+    if not (np.isfinite(first) and np.isfinite(last) and _less(last, first) <= MAX_SWEEP_S * units_per_s):
+        return _without_damage(values, middle, units_per_s, stamp_ns)
+    return None if first == last else _after_stamp_s(values, first, units_per_s, stamp_ns)
+
+
+def without_untimed(scan: Scan) -> Scan:
+    """Return a scan without the returns whose time is NaN, which are counted."""
+    if scan.times_s is None or not np.isnan(scan.times_s.sum()):
+        return scan
+    timed = ~np.isnan(scan.times_s)
+    return replace(
+        scan,
+        points_body=scan.points_body[timed],
+        colors=None if scan.colors is None else scan.colors[timed],
+        times_s=scan.times_s[timed],
+        untimed_returns=int((~timed).sum()),
+    )
+
+
+def _counted_on(values: NDArray[np.number]) -> NDArray[np.number]:
+    """Return the values of a 32-bit counter as if it had not begun anew during the sweep."""
+    if values.dtype != np.uint32 or np.ptp(values) <= _HALF_COUNTER:
+        return values
+    middle = int(values[len(values) // 2])
+    return (values.astype(np.int64) - middle + _HALF_COUNTER) % (2 * _HALF_COUNTER) - _HALF_COUNTER + middle
+
+
+def _middle_and_unit(values: NDArray[np.number]) -> tuple[np.number, int | None]:
+    """Return a time in the middle of the sweep and how many units a second has, by most of the values."""
+    ordered = np.sort(values[:: -(-len(values) // _SAMPLED)])
+    damaged = int(_MAX_WRONG_SHARE * len(ordered))
+    middle = ordered[len(ordered) // 2]
+    most = ordered[damaged : len(ordered) - damaged]
+    if not (np.isfinite(most[0]) and np.isfinite(most[-1])):
+        return middle, None
+    span = float(_less(most[-1], most[0]))
+    return middle, next((unit for unit in _UNITS_PER_S if span <= MAX_SWEEP_S * unit), None)
+
+
+def _without_damage(
+    values: NDArray[np.number], middle: np.number, units_per_s: int, stamp_ns: int
+) -> NDArray[np.float32] | None:
+    """Return the same times with NaN for those far from the middle; None where they are too many."""
+    after_middle = _signed_less(values, middle)
+    with np.errstate(invalid="ignore"):
+        sound = np.abs(after_middle) <= MAX_SWEEP_S * units_per_s
+    if (~sound).mean() > _MAX_WRONG_SHARE:
         return None
-    span = float(_less(last, first))
-    units_per_s = next((unit for unit in _UNITS_PER_S if span <= MAX_SWEEP_S * unit), None)
-    if span == 0.0 or units_per_s is None:
+    first, last = float(after_middle[sound].min()), float(after_middle[sound].max())
+    if first == last:
         return None
-    first_ns = round(first.item() * (NS_PER_S // units_per_s))
-    limit_ns = MAX_SWEEP_S * NS_PER_S
-    if abs(first_ns) <= limit_ns:
-        first_after_stamp_ns = first_ns
-    elif abs(first_ns - stamp_ns) <= limit_ns:
-        first_after_stamp_ns = first_ns - stamp_ns
-    else:
-        first_after_stamp_ns = 0
+    first_ns = _ns(middle, units_per_s) + round(first * (NS_PER_S // units_per_s))
+    after_first_s = np.where(sound, after_middle - first, np.nan) / units_per_s
+    return (after_first_s + _first_after_stamp_ns(first_ns, stamp_ns) / NS_PER_S).astype(np.float32)
+
+
+def _after_stamp_s(
+    values: NDArray[np.number], first: np.number, units_per_s: int, stamp_ns: int
+) -> NDArray[np.float32]:
+    """Return times after the stamp of values of a known unit, the least of which is ``first``."""
     after_stamp_s = _less(values, first)
     after_stamp_s /= units_per_s
-    after_stamp_s += first_after_stamp_ns / NS_PER_S
+    after_stamp_s += _first_after_stamp_ns(_ns(first, units_per_s), stamp_ns) / NS_PER_S
     return after_stamp_s.astype(np.float32)
+
+
+def _ns(value: np.number, units_per_s: int) -> int:
+    number: float = value.item()  # type: ignore[assignment]
+    return round(number * (NS_PER_S // units_per_s))
+
+
+def _first_after_stamp_ns(first_ns: int, stamp_ns: int) -> int:
+    """Return how long after the stamp the first point was measured, by the clock that its time is on."""
+    limit_ns = MAX_SWEEP_S * NS_PER_S
+    if abs(first_ns) <= limit_ns:
+        return first_ns
+    return first_ns - stamp_ns if abs(first_ns - stamp_ns) <= limit_ns else 0
 
 
 def azimuth_times_s(
@@ -109,3 +180,11 @@ def _less(values: NDArray[np.number] | np.number, first: np.number) -> Array:
     """Subtract before rounding: nanoseconds of the epoch do not fit into a float64."""
     wide = values if values.dtype == np.uint64 else values.astype(np.result_type(values, np.int64))
     return np.subtract(wide, first, dtype=wide.dtype).astype(np.float64)
+
+
+def _signed_less(values: NDArray[np.number], middle: np.number) -> Array:
+    """As ``_less``, where values may be smaller than what is subtracted."""
+    if values.dtype != np.uint64:
+        return _less(values, middle)
+    after: Array = np.subtract(values, middle).view(np.int64).astype(np.float64)
+    return after

@@ -9,6 +9,7 @@ from mapper.core.doubts import Doubt
 from mapper.core.frames import Frame, Scan
 from mapper.core.timebase import NS_PER_S
 from mapper.sources.base import Log, WrappedEntry
+from mapper.sources.point_times import MAX_SWEEP_S
 from mapper.sources.valid_returns import FARTHEST_M
 
 FROZEN_FRAMES = 10
@@ -32,12 +33,13 @@ _FEWEST_FRAMES, _LONG_NS = 3, NS_PER_S
 
 @dataclass(frozen=True, slots=True)
 class _Reading:
-    """Data of a frame that the checks keep: checksums of its images or of its points, and its far returns."""
+    """Checksums of a frame's images or of its points, and its numbers of returns that were left out."""
 
     image: int | None = None
     depth: int | None = None
     scan: int | None = None
     far_returns: int = 0
+    untimed_returns: int = 0
 
 
 class ReadingChecks:
@@ -87,7 +89,7 @@ class ReadingChecks:
 
     def notes(self) -> list[str]:
         """Return what is suspicious about the frames loaded so far, a sentence each."""
-        return [*self.frozen(), *self.far_returns()]
+        return [*self.frozen(), *self.far_returns(), *self.untimed_returns()]
 
     def frozen(self) -> list[str]:
         """Return where a sensor seems to have been frozen, a sentence each."""
@@ -120,6 +122,15 @@ class ReadingChecks:
                 f"{FARTHEST_M:g} m, which no sensor reaches; left out"
             )
 
+    def untimed_returns(self) -> Iterator[str]:
+        """Yield a sentence about the returns whose time cannot be right, if there were any."""
+        counts = [reading.untimed_returns for reading in self._readings.values() if reading.untimed_returns]
+        if counts:
+            yield (
+                f"{sum(counts)} returns in {len(counts)} of {len(self._readings)} scans have times more than "
+                f"{MAX_SWEEP_S:g} s from those of their scan; left out"
+            )
+
 
 @dataclass(frozen=True, slots=True)
 class _CheckedEntry(WrappedEntry):
@@ -136,5 +147,7 @@ class _CheckedEntry(WrappedEntry):
 
 def _reading_of(frame: Frame) -> _Reading:
     if isinstance(frame, Scan):
-        return _Reading(scan=frame.checksum, far_returns=frame.far_returns)
+        return _Reading(
+            scan=frame.checksum, far_returns=frame.far_returns, untimed_returns=frame.untimed_returns
+        )
     return _Reading(image=frame.image_checksum, depth=frame.depth_checksum)

@@ -21,6 +21,7 @@ _WHOLE = re.compile(r"(?<!\d)\d+$")
 _NUMBER = re.compile(r"\d+(?=\D*$)")
 _EPOCH_S = range(10**9, 10**10)  # the years 2001 to 2286
 _UNITS_PER_S = (1, 1_000, 1_000_000, NS_PER_S)
+_NANOSECOND_DIGITS = 9
 
 
 def in_order(paths: Iterable[Path]) -> list[Path]:
@@ -63,7 +64,9 @@ def scan_stamps(
     """
     named = None if chosen else _stamps_of(files)
     if named is not None:
-        return named, []
+        is_unpadded = _unpadded_stamps([path.stem for path in files]) is not None
+        note = "fractions of the stamps in the names are taken as nanoseconds without leading zeros"
+        return named, [note] if is_unpadded else []
     if listed := chosen or beside:
         return _listed(listed, files, wording), []
     rate_hz = rate_hz or RATE_HZ
@@ -117,11 +120,38 @@ def _stamps_of(files: Sequence[Path]) -> Stamps | None:
 
 
 def stamps_in(stems: Sequence[str]) -> Stamps | None:
-    """Return the stamps that names without their endings end with, nanoseconds; None if one has none."""
+    """Return the stamps that names without their endings end with, nanoseconds; None if one has none.
+
+    pcl_ros once wrote SECONDS.NANOSECONDS without leading zeros; such fractions are whole numbers.
+    """
+    unpadded_ns = _unpadded_stamps(stems)
+    if unpadded_ns is not None:
+        return unpadded_ns
     stamps_ns = [_stamp_in(stem) for stem in stems]
     if any(stamp_ns is None for stamp_ns in stamps_ns):
         return None
     return np.array(stamps_ns, dtype=np.int64)
+
+
+def _unpadded_stamps(stems: Sequence[str]) -> Stamps | None:
+    """Return stamps whose fractions are nanoseconds without leading zeros; None where they are decimals.
+
+    Such fractions differ in length and none begins with a zero. So may decimals that lost the zeros at their
+    ends, but as those the stamps are less even.
+    """
+    parts = [found[0].split(".") for stem in stems if (found := _DECIMAL.search(stem))]
+    fractions = [fraction for _, fraction in parts]
+    lengths = {len(fraction) for fraction in fractions}
+    starts_with_zero = any(fraction != "0" and fraction.startswith("0") for fraction in fractions)
+    if len(parts) < len(stems) or len(lengths) < 2 or max(lengths) != _NANOSECOND_DIGITS or starts_with_zero:
+        return None
+    whole_ns = np.array([int(seconds) * NS_PER_S + int(ns) for seconds, ns in parts], dtype=np.int64)
+    decimal_ns = np.array([ns_from_seconds_text(".".join(part)) for part in parts], dtype=np.int64)
+    return whole_ns if _unevenness_ns(whole_ns) < _unevenness_ns(decimal_ns) else None
+
+
+def _unevenness_ns(stamps_ns: Stamps) -> float:
+    return float(np.diff(np.sort(stamps_ns)).std())
 
 
 def _stamp_in(stem: str) -> int | None:

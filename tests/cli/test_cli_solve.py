@@ -61,7 +61,8 @@ def test_a_folder_holds_graph_path_picture_and_report(tmp_path):
     assert 0.0 < report["error_after"] < report["error_before"]
     assert "4 of 5 accepted" in shown
     again = read_g2o(tmp_path / "out/graph.g2o")
-    assert [factor.origin for factor in again.factors].count("loop") == 5
+    assert [(factor.i, factor.j) for factor in again.factors if factor.origin == "loop"].count((5, 12)) == 0
+    assert len(again.factors) == 23, "the line of the rejected edge is a comment"
     assert np.linalg.norm(again.T_world_node[19][:3, 3] - truth[19][:3, 3]) < 0.05
     path = read_tum(tmp_path / "out/keyframes.tum")
     assert path.stamps_ns.tolist() == list(graph.stamps_ns.values())

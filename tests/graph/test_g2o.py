@@ -178,7 +178,8 @@ def test_files_of_others_need_no_notes(tmp_path):
 @pytest.mark.parametrize(
     ("text", "line", "message"),
     [
-        (VERTICES + "EDGE_SE3_PRIOR 0 1 2\n", 3, "unknown tag 'EDGE_SE3_PRIOR'"),
+        (VERTICES + "EDGE_SE3_XYZ 0 1 2\n", 3, "unknown tag 'EDGE_SE3_XYZ'"),
+        (VERTICES + EDGE.replace(" 0 1 1 ", " 0 1 1,0 "), 3, "not a comma"),
         (VERTICES + EDGE.replace(" 0 1 1 ", " 0 9 1 "), 3, "node 9 is not in the graph"),
         (VERTICES + EDGE.replace(" 0 1 1 ", " 1 1 1 "), 3, "cannot be measured against itself"),
         (VERTICES + VERTICES, 3, "node 0 is in the graph already"),

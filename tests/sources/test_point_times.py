@@ -60,3 +60,26 @@ def test_values_that_tell_nothing_give_no_times(values):
 def test_the_field_is_found_in_any_case():
     assert time_field(["x", "y", "z", "GPS_Time", "t"]) == "GPS_Time"
     assert time_field(["x", "y", "z", "intensity"]) is None
+
+
+@pytest.mark.parametrize("damaged", [0.0, np.nan, 5.0, 1e12])
+def test_a_few_damaged_times_cost_their_points_alone(damaged):
+    times = np.linspace(0.0, 0.1, 1000) + 1.7e9
+    times[10:20] = damaged
+    found = relative_times_s(times, stamp_ns=int(1.7e18))
+    assert np.isnan(found).sum() == 10
+    sound = np.r_[0:10, 20:1000]
+    np.testing.assert_allclose(found[sound], np.linspace(0.0, 0.1, 1000)[sound], atol=1e-6)
+
+
+def test_a_32_bit_counter_that_begins_anew_is_counted_on():
+    ns = (np.arange(1000) * 100_000 + (2**32 - 30_000_000)) % 2**32
+    found = relative_times_s(ns.astype(np.uint32), stamp_ns=0)
+    assert not np.isnan(found).any()
+    np.testing.assert_allclose(np.diff(found), 1e-4, atol=1e-6)
+
+
+def test_times_of_which_many_are_damaged_are_none():
+    times = np.linspace(0.0, 1e8, 1000) + 1.7e18
+    times[:100] = 0.0
+    assert relative_times_s(times, stamp_ns=int(1.7e18)) is None

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from mapper.core.errors import DataError, FrameError
 from mapper.core.frames import Scan
 from mapper.core.geometry import Transform, apply
-from mapper.sources.point_times import relative_times_s, time_field
+from mapper.sources.point_times import relative_times_s, time_field, without_untimed
 from mapper.sources.ros.messages import CloudMessage
 from mapper.sources.valid_returns import valid_returns
 
@@ -47,6 +47,8 @@ def structured(
             names.append(name)
             offsets.append(offset)
             formats.append(kind if count <= 1 else f"{count}{kind}")
+    if len(data) == rows * columns * point_bytes:
+        row_bytes = None  # whatever the message says: without padding there is one way to read it
     try:
         point = np.dtype({"names": names, "offsets": offsets, "formats": formats, "itemsize": point_bytes})
         strides = (row_bytes or columns * point_bytes, point_bytes)
@@ -84,7 +86,7 @@ def scan_from(message: CloudMessage, *, T_body_frame: Transform, with_colours: b
     if not np.array_equal(T_body_points, np.eye(4)):
         points_body = apply(T_body_points, points_body.astype(np.float64)).astype(np.float32)
     times = time_field(names)
-    return Scan(
+    scan = Scan(
         message.stamp_ns,
         points_body,
         origin_body=T_body_points[:3, 3],
@@ -92,6 +94,7 @@ def scan_from(message: CloudMessage, *, T_body_frame: Transform, with_colours: b
         times_s=None if times is None else relative_times_s(points[times][kept], message.stamp_ns),
         far_returns=far,
     )
+    return without_untimed(scan)
 
 
 def _coordinates(points: NDArray[np.void]) -> NDArray[np.float32]:

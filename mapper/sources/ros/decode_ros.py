@@ -17,11 +17,13 @@ from mapper.sources.ros.messages import (
     Message,
     PixelsMessage,
     PoseMessage,
+    Window,
 )
 from mapper.sources.ros.recording import Topic
 from mapper.sources.ros.typestore import typestore
 
-_POINT_FIELD_TYPES = ("", "i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")  # PointField's constants
+_POINT_FIELD_TYPES = dict(enumerate(("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8"), start=1))
+"""Numpy's names of PointField's constants."""
 
 
 def decode_ros(topic: Topic, data: memoryview) -> Message:
@@ -63,14 +65,26 @@ def _camera(m: Any) -> CameraMessage:
     D, K, P = (
         np.asarray(getattr(m, name.lower(), getattr(m, name, None)), dtype=np.float64) for name in "DKP"
     )
-    return CameraMessage(m.header.frame_id, m.width, m.height, m.distortion_model, D, K, P)
+    roi = m.roi
+    window = Window(roi.x_offset, roi.y_offset, roi.width, roi.height, m.binning_x or 1, m.binning_y or 1)
+    return CameraMessage(m.header.frame_id, m.width, m.height, m.distortion_model, D, K, P, window)
 
 
 def _cloud(m: Any) -> CloudMessage:
     order = ">" if m.is_bigendian else "<"
     fields: list[Field] = [
-        (f.name, f.offset, order + _POINT_FIELD_TYPES[f.datatype], max(f.count, 1)) for f in m.fields
+        (f.name, f.offset, order + _POINT_FIELD_TYPES[f.datatype], max(f.count, 1))
+        for f in m.fields
+        if f.datatype in _POINT_FIELD_TYPES
     ]
+    notes = [
+        f"field {f.name} is left out: its datatype {f.datatype} is none of PointField's"
+        for f in m.fields
+        if f.datatype not in _POINT_FIELD_TYPES
+    ]
+    packed_bytes = m.width * m.point_step
+    if m.height > 1 and m.row_step not in (0, packed_bytes) and len(m.data) == m.height * packed_bytes:
+        notes.append(f"row_step is {m.row_step}, but the rows follow each other every {packed_bytes} bytes")
     points = structured(
         memoryview(m.data),
         fields,
@@ -78,7 +92,7 @@ def _cloud(m: Any) -> CloudMessage:
         shape=(m.height, m.width),
         row_bytes=m.row_step,
     )
-    return CloudMessage(_ns(m.header.stamp), m.header.frame_id, points)
+    return CloudMessage(_ns(m.header.stamp), m.header.frame_id, points, notes=notes)
 
 
 def _imu(m: Any) -> ImuMessage:

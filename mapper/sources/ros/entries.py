@@ -1,18 +1,18 @@
 """Frames of a recording that have not been read yet; see :class:`mapper.sources.base.Entry`."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from mapper.core.errors import DataError, FrameError
 from mapper.core.frames import DepthImage, Scan
-from mapper.core.geometry import Transform
 from mapper.sources.base import ImageFiles
 from mapper.sources.image_files.image_sizes import RecordedCamera
 from mapper.sources.image_files.reading import encode_colour, encode_depth
 from mapper.sources.image_folders.rgbd import RgbdEntry
 from mapper.sources.ros.cloud_messages import scan_from
 from mapper.sources.ros.decode import decode
+from mapper.sources.ros.frame_tree import FrameTree
 from mapper.sources.ros.image_messages import depth_file_of, depth_m_of, image_of
-from mapper.sources.ros.messages import CloudMessage, FileMessage, ImageMessage, Message
+from mapper.sources.ros.messages import CloudMessage, FileMessage, ImageMessage, Message, frame_of
 from mapper.sources.ros.recording import Place, Recording, Topic
 
 
@@ -93,10 +93,17 @@ def rgbd_entry(
 
 @dataclass(frozen=True, slots=True)
 class CloudEntry:
-    """Point cloud message, not read yet."""
+    """Point cloud message, not read yet.
+
+    Attributes:
+        cloud: The message.
+        body: Coordinate frame of the scan.
+        tree: Coordinate frames that tie each message's own frame to the body's.
+    """
 
     cloud: Located
-    T_body_frame: Transform
+    body: str
+    tree: FrameTree
     files: ImageFiles | None = None
 
     @property
@@ -108,12 +115,20 @@ class CloudEntry:
         """Read the cloud, with the time of each point where the message has it.
 
         Raises:
-            FrameError: The message is damaged, or its points have no x, y and z.
+            FrameError: The message is damaged, its points have no x, y and z, or tf does not tie their frame
+                to the body's.
         """
         message = self.cloud.read()
         if not isinstance(message, CloudMessage):
             raise FrameError(f"{self.cloud}: {self.cloud.topic.type} is no point cloud")
-        return scan_from(message, T_body_frame=self.T_body_frame, with_colours=colour, where=f"{self.cloud}")
+        message = replace(message, stamp_ns=self.cloud.stamp_ns)
+        frame = frame_of(message)
+        T_body_frame = self.tree.find(self.body, frame)
+        if T_body_frame is None:
+            raise FrameError(
+                f"{self.cloud}: its points are in frame {frame}, which tf does not connect to {self.body}"
+            )
+        return scan_from(message, T_body_frame=T_body_frame, with_colours=colour, where=f"{self.cloud}")
 
     def scan(self) -> Scan:
         """Read the cloud without its colours.

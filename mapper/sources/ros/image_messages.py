@@ -45,14 +45,18 @@ _COLOUR = {
 }
 _DEPTH = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
 _FARTHEST_M = 1000.0  # no depth camera reaches as far: a damaged message, or a simulator's sky
+_PNG_KIND, _SIXTEEN_BIT_GREY = slice(24, 26), b"\x10\x00"
+"""Place of the bit depth and colour type in a PNG, and their values of one channel of 16 bits (RFC 2083)."""
+_IMAGE_STARTS = (b"\xff\xd8", b"\x89PNG", b"BM", b"II*\x00", b"MM\x00*", b"RIFF", b"P")
 _DEPTH_HEADER = struct.Struct("<iff")  # compressedDepth's: how it is stored, and two parameters of that
 
 
 def is_depth(message: ImageMessage) -> bool:
-    """Return whether an image is of depth, by its encoding."""
+    """Return whether an image is of depth: by its encoding, or as a PNG of one channel of 16 bits."""
     if isinstance(message, PixelsMessage):
         return message.encoding in _DEPTH
-    return "compressedDepth" in message.format or message.format.startswith(tuple(_DEPTH))
+    is_called_depth = "compressedDepth" in message.format or message.format.startswith(tuple(_DEPTH))
+    return is_called_depth or bytes(message.data[_PNG_KIND]) == _SIXTEEN_BIT_GREY
 
 
 def size_of(message: ImageMessage, *, where: str) -> tuple[int, int]:
@@ -66,7 +70,7 @@ def size_of(message: ImageMessage, *, where: str) -> tuple[int, int]:
     if is_depth(message):
         height_px, width_px = depth_m_of(message, units_per_m=MILLIMETRES_PER_M, where=where).shape
     else:
-        height_px, width_px = decode_grey(bytes(message.data), where).shape
+        height_px, width_px = image_of(message, colour=False, where=where).shape
     return width_px, height_px
 
 
@@ -77,6 +81,7 @@ def image_of(message: ImageMessage, *, colour: bool, where: str) -> Image:
         FrameError: The image is damaged, or in an encoding that is not read; ``where`` is what it names.
     """
     if isinstance(message, FileMessage):
+        _refuse_video(message, where=where)
         data = bytes(message.data)
         return decode_colour(data, where) if colour else decode_grey(data, where)
     encoding = _COLOUR.get(message.encoding)
@@ -114,7 +119,7 @@ def depth_m_of(
     order = ">" if message.is_big_endian else "<"
     pixels = _pixels(message, order + kind, 1, where=where)
     if kind == "f4":
-        return _valid_depth(pixels, float_units_per_m)
+        return _valid_depth(pixels, float_units_per_m, where=where)
     return depth_m_from(np.ascontiguousarray(pixels, dtype=np.uint16), units_per_m)
 
 
@@ -153,14 +158,35 @@ def _depth_m_of_file(
         return depth_m_from(units, units_per_m)
     with np.errstate(divide="ignore"):
         depth_m = np.float32(a) / (units.astype(np.float32) - np.float32(b))
-    return _valid_depth(np.where(units > 0, depth_m, np.float32(0.0)), float_units_per_m)
+    return _valid_depth(np.where(units > 0, depth_m, np.float32(0.0)), float_units_per_m, where=where)
 
 
-def _valid_depth(depth: DepthImage, units_per_m: float) -> DepthImage:
-    """Return metres, 0 where depth is not finite, negative, or beyond the reach of every depth camera."""
+def _refuse_video(message: FileMessage, *, where: str) -> None:
+    """Refuse data that is no image file: a frame of a video shows only what changed."""
+    is_image = bytes(message.data[:4]).startswith(_IMAGE_STARTS)
+    if len(message.data) and not is_image:
+        raise FrameError(
+            f"{where}: its format is {message.format!r}, which is no image file; "
+            "video is not read: record raw images, JPEG or PNG"
+        )
+
+
+def _valid_depth(depth: DepthImage, units_per_m: float, *, where: str) -> DepthImage:
+    """Return metres, 0 where depth is not finite, negative, or beyond the reach of every depth camera.
+
+    Raises:
+        FrameError: All of it is beyond that reach.
+    """
     valid: DepthImage = np.array(depth, dtype=np.float32)  # aligned, which a message need not be
     valid /= np.float32(units_per_m)
-    np.copyto(valid, 0.0, where=~((valid >= 0.0) & (valid < _FARTHEST_M)))
+    is_measured = valid > 0.0
+    is_near = is_measured & (valid < _FARTHEST_M)
+    if not is_near.any() and (is_far := is_measured & np.isfinite(valid)).any():
+        raise FrameError(
+            f"{where}: the median depth is {np.median(valid[is_far]):.0f} m, at most {_FARTHEST_M:.0f} m can "
+            "be measured; millimetres? --set source.camera.depth_factor=1000 reads them"
+        )
+    np.copyto(valid, 0.0, where=~is_near)
     return valid
 
 

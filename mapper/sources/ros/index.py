@@ -32,6 +32,7 @@ class Series:
         log_ns: (N,) when they were recorded.
         places: (N, 3) block, offset and length of each.
         undated: Number of others without a header that can be read; they are left out.
+        are_stamps_recorded: ``stamps_ns`` is ``log_ns``, because every header has the same stamp.
         kept: Bytes of small messages by their number: to read them again would unpack the whole file again.
     """
 
@@ -40,6 +41,7 @@ class Series:
     log_ns: Stamps
     places: NDArray[np.int64]
     undated: int
+    are_stamps_recorded: bool = False
     kept: Mapping[int, bytes] = field(default_factory=dict)
 
     def __len__(self) -> int:
@@ -83,17 +85,24 @@ def index_of(recording: Recording) -> Mapping[str, Series]:
         series.log_ns.append(log_ns)
         series.places.extend(place)
     return {
-        topic.name: Series(
-            topic,
-            stamps_ns=np.array(series.stamps_ns, np.int64),
-            log_ns=np.array(series.log_ns, np.int64),
-            places=np.array(series.places, np.int64).reshape(-1, 3),
-            undated=series.undated,
-            kept=series.kept,
-        )
+        topic.name: _finished(topic, series)
         for topic, series in sorted(builders.items(), key=lambda item: item[0].name)
         if series.stamps_ns
     }
+
+
+def _finished(topic: Topic, series: _SeriesBuilder) -> Series:
+    stamps_ns, log_ns = np.array(series.stamps_ns, np.int64), np.array(series.log_ns, np.int64)
+    are_all_the_same = len(stamps_ns) > 1 and bool((stamps_ns == stamps_ns[0]).all())
+    return Series(
+        topic,
+        stamps_ns=log_ns if are_all_the_same else stamps_ns,
+        log_ns=log_ns,
+        places=np.array(series.places, np.int64).reshape(-1, 3),
+        undated=series.undated,
+        are_stamps_recorded=are_all_the_same and not np.array_equal(stamps_ns, log_ns),
+        kept=series.kept,
+    )
 
 
 def first_messages(recording: Recording, series: Iterable[Series]) -> dict[str, Message]:

@@ -51,6 +51,27 @@ class FileMessage:
     data: memoryview
 
 
+@dataclass(frozen=True, slots=True)
+class Window:
+    """Part of the sensor that an image shows (CameraInfo's roi and binning), in pixels of the full sensor.
+
+    Attributes:
+        x_px: First column.
+        y_px: First row.
+        width_px: Columns; 0 for all.
+        height_px: Rows; 0 for all.
+        binning_x: Columns that one pixel of the image sums up.
+        binning_y: As ``binning_x``, of rows.
+    """
+
+    x_px: int = 0
+    y_px: int = 0
+    width_px: int = 0
+    height_px: int = 0
+    binning_x: int = 1
+    binning_y: int = 1
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraMessage:
     """A camera's calibration (sensor_msgs/CameraInfo, foxglove.CameraCalibration).
@@ -63,6 +84,7 @@ class CameraMessage:
         D: Its coefficients.
         K: (9,) intrinsics of the raw image, row by row.
         P: (12,) intrinsics of the rectified image, row by row.
+        window: Part of the sensor that the images show; size, K and P are the full sensor's.
     """
 
     frame: str
@@ -72,6 +94,7 @@ class CameraMessage:
     D: Array
     K: Array
     P: Array
+    window: Window = Window()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,12 +106,14 @@ class CloudMessage:
         frame: Coordinate frame of the points.
         points: (N,) structured view of the message's own bytes; organised rows follow each other.
         T_frame_points: Pose of the points in ``frame``; only Foxglove's clouds have another than identity.
+        notes: What was left out or corrected to read it, a sentence each.
     """
 
     stamp_ns: int
     frame: str
     points: NDArray[np.void]
     T_frame_points: Transform = field(default_factory=lambda: np.eye(4))
+    notes: Sequence[str] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -123,8 +148,27 @@ class ImuMessage:
     acceleration_mps2: Array
 
 
+GRAVITY_MPS2 = 9.80665
+
+
+def unit_mps2(acceleration: Array) -> float | None:
+    """Return the unit in which a (3,) acceleration is as long as gravity: 1 m/s² or g; None where neither is.
+
+    ROS says m/s²; drivers of Livox and Hesai write g.
+    """
+    length = float(np.linalg.norm(acceleration))
+    units = (unit for unit in (1.0, GRAVITY_MPS2) if 0.5 < length * unit / GRAVITY_MPS2 < 2.0)
+    return next(units, None)
+
+
 ImageMessage = PixelsMessage | FileMessage
 Message = ImageMessage | CameraMessage | CloudMessage | ImuMessage | list[PoseMessage]
+
+
+def frame_of(message: Message | None) -> str:
+    """Return the coordinate frame that a message names, without the slash that ROS 1 once put before it."""
+    return "" if message is None or isinstance(message, list) else message.frame.lstrip("/")
+
 
 PIXELS = frozenset({"sensor_msgs/msg/Image", "foxglove.RawImage"})
 FILES = frozenset({"sensor_msgs/msg/CompressedImage", "foxglove.CompressedImage"})

@@ -18,9 +18,16 @@ from mapper.sources.ros.entries import Located
 from mapper.sources.ros.frame_tree import FrameTree
 from mapper.sources.ros.index import Series, first_messages, index_of
 from mapper.sources.ros.message_order import ordered
-from mapper.sources.ros.messages import TRANSFORMS, ImuMessage, Message, PoseMessage
+from mapper.sources.ros.messages import (
+    GRAVITY_MPS2,
+    TRANSFORMS,
+    ImuMessage,
+    Message,
+    PoseMessage,
+    frame_of,
+    unit_mps2,
+)
 from mapper.sources.ros.recording import Recording
-from mapper.sources.ros.topics import frame_of
 from mapper.sources.wheel_files import mounting
 
 _MAX_READINGS = 20_000  # levelling asks for fewer, and an hour of a fast unit would take minutes to read
@@ -102,6 +109,10 @@ class RecordingReader:
             return None, [*notes, f"{series.topic.name}: no readings"]
         stamps_ns = np.array([reading.stamp_ns for reading in readings], dtype=np.int64)
         acceleration_imu = np.array([reading.acceleration_mps2 for reading in readings])
+        unit = unit_mps2(np.median(np.linalg.norm(acceleration_imu, axis=1)) * np.eye(3)[0])
+        if unit == GRAVITY_MPS2:
+            acceleration_imu *= unit
+            notes.append(f"{series.topic.name}: accelerations are as long as 1 at rest: taken as g")
         T_body_imu = self.tree.find(body, frame_of(readings[0]))
         R_body_imu = np.eye(3) if T_body_imu is None else T_body_imu[:3, :3]
         return Accelerations(stamps_ns, acceleration_imu @ R_body_imu.T), notes

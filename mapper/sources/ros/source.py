@@ -18,13 +18,23 @@ from mapper.sources.ros.entries import CloudEntry, rgbd_entry
 from mapper.sources.ros.image_messages import MILLIMETRES_PER_M, has_float_depth, size_of
 from mapper.sources.ros.index import Series, why_unread
 from mapper.sources.ros.message_order import ordered, paired
-from mapper.sources.ros.messages import IMAGES, CameraMessage, FileMessage, ImageMessage
+from mapper.sources.ros.messages import (
+    IMAGES,
+    CameraMessage,
+    CloudMessage,
+    FileMessage,
+    ImageMessage,
+    Window,
+    frame_of,
+)
 from mapper.sources.ros.reader import RecordingReader
-from mapper.sources.ros.topics import CameraTopics, choose, frame_of, is_called_registered
+from mapper.sources.ros.topics import CameraTopics, choose, is_called_registered
 
 _SAME_LENS_RATIO = 0.01
 _SAME_PLACE_M = 0.005
 """Colour cameras lie farther beside the depth camera, 15 mm at least; frames of one lens may be turned."""
+_FIXED_FRAMES = frozenset({"map", "odom", "world", "earth", "utm", "camera_init", "global", "local_origin"})
+"""Names of frames that do not move with the robot (REP 105; camera_init is LOAM's, Zhang & Singh 2014)."""
 _JPEG_START = b"\xff\xd8"
 _BROWN_CONRADY = ("plumb_bob", "brown_conrady", "rational_polynomial")
 
@@ -119,10 +129,18 @@ def _rgbd(reader: RecordingReader, topics: CameraTopics, config: SourceConfig) -
 
 def _lidar(reader: RecordingReader, clouds: Series, config: SourceConfig) -> _Frames:
     i, notes = ordered(clouds)
-    frame = frame_of(reader.firsts.get(clouds.topic.name))
+    first = reader.firsts.get(clouds.topic.name)
+    if isinstance(first, CloudMessage):
+        notes += [f"{clouds.topic.name}: {note}" for note in first.notes]
+    frame = frame_of(first)
     body = config.body_frame or frame
-    T_body_frame = reader.tree.find(body, frame)
-    if T_body_frame is None:
+    if config.body_frame is None and frame in _FIXED_FRAMES:
+        raise SourceError(
+            f"{reader.recording.path}: the points of {clouds.topic.name} are in frame {frame}, which stays "
+            "where it is while the sensor moves; build from the driver's own topic (source.topics.points), "
+            f"or if they are around the sensor all the same, --set source.body_frame={frame}"
+        )
+    if reader.tree.find(body, frame) is None:
         raise SourceError(
             f"{reader.recording.path}: source.body_frame={body}: tf does not connect it to the clouds' "
             f"frame {frame}; its frames: {', '.join(reader.tree.frames) or 'no frames'}"
@@ -131,7 +149,7 @@ def _lidar(reader: RecordingReader, clouds: Series, config: SourceConfig) -> _Fr
         notes.append(f"points are in {body}, whose z looks forward; source.body_frame can take another")
 
     def entry_at(index: int) -> FrameRef:
-        return CloudEntry(reader.located(clouds, int(i[index])), T_body_frame)
+        return CloudEntry(reader.located(clouds, int(i[index])), body, reader.tree)
 
     return _Frames("lidar", body, clouds.stamps_ns[i], entry_at, notes)
 
@@ -155,7 +173,8 @@ def _first_image(reader: RecordingReader, series: Series) -> ImageMessage:
     first = reader.firsts.get(series.topic.name)
     if not isinstance(first, ImageMessage):
         raise SourceError(
-            f"{reader.recording.path}: {series.topic.name}: none of its first images can be read"
+            f"{reader.recording.path}: {series.topic.name}: none of its first images can be read: "
+            f"{why_unread(reader.recording, series)}"
         )
     return first
 
@@ -171,6 +190,7 @@ def _camera(reader: RecordingReader, topics: CameraTopics, config: SourceConfig)
                 f"{reader.recording.path}: no camera info for {name}; choose one with "
                 "source.topics.camera_info=… or --set source.camera.fx_px=… and so on"
             )
+        info = _windowed(info, _size(reader, topics.color))
         calibration = _calibration(info, is_rectified="rect" in name, name=topics.info.topic.name)
     return recorded_camera(
         calibration,
@@ -182,6 +202,33 @@ def _camera(reader: RecordingReader, topics: CameraTopics, config: SourceConfig)
 
 def _size(reader: RecordingReader, images: Series) -> Size:
     return size_of(_first_image(reader, images), where=f"{reader.recording.path}: {images.topic.name}")
+
+
+def _windowed(info: CameraMessage, image_px: Size) -> CameraMessage:
+    """Return the calibration of the part of the sensor that images of this size show, binned as they are."""
+    window = info.window
+    shown_px = (
+        (window.width_px or info.width_px) // window.binning_x,
+        (window.height_px or info.height_px) // window.binning_y,
+    )
+    if image_px != shown_px or image_px == (info.width_px, info.height_px):
+        return info
+    # The centre of pixel (0, 0) is at 0, so that of the first bin of n is at (n - 1) / 2.
+    to_image = np.array(
+        [
+            [1.0 / window.binning_x, 0.0, (0.5 - window.x_px) / window.binning_x - 0.5],
+            [0.0, 1.0 / window.binning_y, (0.5 - window.y_px) / window.binning_y - 0.5],
+            [0.0, 0.0, 1.0],
+        ]
+    )
+    return replace(
+        info,
+        width_px=image_px[0],
+        height_px=image_px[1],
+        K=(to_image @ info.K.reshape(3, 3)).ravel() if info.K.size == 9 else info.K,
+        P=(to_image @ info.P.reshape(3, 4)).ravel() if info.P.size == 12 else info.P,
+        window=Window(),
+    )
 
 
 def _calibration(info: CameraMessage, *, is_rectified: bool, name: str) -> Calibration:
@@ -209,6 +256,7 @@ def _refuse_unregistered(reader: RecordingReader, topics: CameraTopics, recorded
     if not isinstance(info, CameraMessage) or info.K.shape != (9,) or not info.K[0] > 0.0:
         return
     width_px, height_px = recorded.depth_px
+    info = _windowed(info, recorded.depth_px)
     fx_px = recorded.camera.fx_px
     if recorded.depth_px != recorded.colour_px:
         fx_px *= (info.width_px or width_px) / recorded.camera.width_px

@@ -1,6 +1,5 @@
 """Choice of the topics that a map is made from: the user's, or a guess that a note reports."""
 
-import math
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product, takewhile
@@ -20,13 +19,14 @@ from mapper.sources.ros.messages import (
     ImageMessage,
     ImuMessage,
     Message,
+    frame_of,
+    unit_mps2,
 )
 
 TRUTH, WHEELS = "/ground_truth", "/wheel_odometry"
 
 _TRANSPORTS = ("/compressedDepth", "/compressed")  # what image_transport appends to an image's own topic
 _OWN_TYPES = "mapper/msg/"
-_GRAVITY_MPS2 = (5.0, 20.0)  # an accelerometer feels it, a gyroscope's empty accelerations do not
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -235,27 +235,31 @@ def _is_packed(name: str) -> bool:
 
 
 def _beside(image: Series, infos: Sequence[Series]) -> list[Series]:
-    """Return the calibrations in an image topic's own namespace."""
+    """Return the calibrations in an image topic's own namespace, or in the one that it shares most with.
+
+    realsense-viewer has /device_0/sensor_1/Color_0/info/camera_info beside …/Color_0/image/data.
+    """
     name = image.topic.name
     for transport in _TRANSPORTS:
         name = name.removesuffix(transport)
-    return [one for one in infos if one.topic.name.rpartition("/")[0] == name.rpartition("/")[0]]
+    own = [one for one in infos if one.topic.name.rpartition("/")[0] == name.rpartition("/")[0]]
+    if own:
+        return own
+    shared = [_shared_namespaces(name, one.topic.name) for one in infos]
+    most = max(shared, default=0)
+    return [infos[shared.index(most)]] if most and shared.count(most) == 1 else []
 
 
 def _of_frame(image: Series, infos: Sequence[Series], firsts: Mapping[str, Message]) -> list[Series]:
-    """Return the calibrations of an image's coordinate frame."""
+    """Return the calibration of an image's coordinate frame; none where several cameras name the same."""
     frame = frame_of(firsts.get(image.topic.name))
-    return [one for one in infos if frame and frame_of(firsts.get(one.topic.name)) == frame]
-
-
-def frame_of(message: Message | None) -> str:
-    """Return the coordinate frame that a message names, without the slash that ROS 1 once put before it."""
-    return "" if message is None or isinstance(message, list) else message.frame.lstrip("/")
+    found = [one for one in infos if frame and frame_of(firsts.get(one.topic.name)) == frame]
+    return found if len(found) == 1 else []
 
 
 def _feels_gravity(message: Message | None) -> bool:
-    low, high = _GRAVITY_MPS2
-    return isinstance(message, ImuMessage) and low < math.hypot(*message.acceleration_mps2) < high
+    """Return whether an accelerometer feels gravity: a gyroscope's empty accelerations do not."""
+    return isinstance(message, ImuMessage) and unit_mps2(message.acceleration_mps2) is not None
 
 
 def _what_there_is(color: Series | None, depth: Series | None, series: Iterable[Series]) -> str:

@@ -8,7 +8,7 @@ from mapper.core.frames import Scan
 from mapper.sources.base import ImageFiles
 from mapper.sources.cloud_files import read_cloud
 from mapper.sources.cloud_files.parsing import MIN_POINTS
-from mapper.sources.point_times import relative_times_s
+from mapper.sources.point_times import relative_times_s, without_untimed
 from mapper.sources.valid_returns import FARTHEST_M, valid_returns
 
 
@@ -38,13 +38,14 @@ class ScanEntry:
                 "no sensor reaches"
             )
         kept = slice(None) if rows is None else rows
-        return Scan(
+        scan = Scan(
             stamp_ns=self.stamp_ns,
             points_body=points_body,
             colors=cloud.colors[kept] if colour and cloud.colors is not None else None,
             times_s=None if cloud.times is None else relative_times_s(cloud.times[kept], self.stamp_ns),
             far_returns=far,
         )
+        return without_untimed(scan)
 
     def scan(self) -> Scan:
         """Read the cloud.

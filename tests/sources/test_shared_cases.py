@@ -1,0 +1,149 @@
+"""Recordings of public bug reports in ../shared/cases: what each states is used, or refused by its cause."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mapper.core.errors import GraphError, SourceError
+from mapper.core.frames import RgbdFrame, Scan
+from mapper.graph.config import GraphConfig
+from mapper.graph.g2o import read_g2o
+from mapper.graph.optimize import optimize
+from mapper.sources import open_source
+from mapper.sources.config import CameraConfig, SourceConfig
+from mapper.sources.depth_scale import depth_warnings
+from mapper.sources.inspection import inspect_log
+from tests.support.paths import SHARED
+
+
+def case(name: str) -> Path:
+    path = SHARED / "cases" / name
+    if not path.exists():
+        pytest.skip(f"{path} is not here")
+    return path
+
+
+def scans_of(name: str, config: SourceConfig | None = None) -> list[Scan]:
+    return list(open_source(case(name), config or SourceConfig()))
+
+
+@pytest.mark.parametrize("name", ["viewer", "same_frame_ids"])
+def test_each_camera_has_the_calibration_of_its_own_stream(name):
+    with pytest.raises(SourceError, match=r"focal length 63\.0 px\) is not registered to .*78\.8 px"):
+        open_source(case(f"01_realsense_viewer_bag/{name}.bag"), SourceConfig())
+
+
+def test_depth_in_millimetres_that_is_read_as_tum_s_units_is_doubted():
+    log = open_source(case("02_own_dataset_with_associations_in_mm/log"), SourceConfig())
+    assert len(depth_warnings(log)) == 1
+    right = SourceConfig(camera=CameraConfig(depth_factor=1000.0))
+    assert depth_warnings(open_source(log.path, right)) == []
+
+
+@pytest.mark.parametrize("name", ["ros2", "foxglove.mcap"])
+def test_a_sixteen_bit_png_is_depth(name):
+    log = open_source(case(f"03_depth_png_as_compressed_image/{name}"), SourceConfig())
+    frame = log[0]
+    assert len(log) == 12
+    assert isinstance(frame, RgbdFrame)
+    assert 0.5 < np.median(frame.depth_m[frame.depth_m > 0.0]) < 8.0
+
+
+def test_clouds_of_two_lidars_lie_in_one_body_frame():
+    scans = scans_of("04_two_lidars_one_topic/bag", SourceConfig(body_frame="base_link"))
+    origins = np.array([scan.origin_body for scan in scans])
+    assert len(np.unique(origins.round(3), axis=0)) == 2
+    # Twice the lever arm would separate them if each were read in the other's frame.
+    floors_m = [float(np.percentile(scan.points_body[:, 2], 1.0)) for scan in scans]
+    assert np.ptp(floors_m) < 0.1
+
+
+@pytest.mark.parametrize("name", ["05_clouds_in_the_world_frame/bag", "18_utm_clouds_in_a_bag/bag"])
+def test_clouds_in_a_frame_that_stays_are_refused_unless_the_user_says_they_move(name):
+    path = case(name)
+    found = inspect_log(path, SourceConfig())
+    assert found.log is None
+    frame = "utm" if "utm" in name else "camera_init"
+    assert f"frame {frame}," in found.problem
+    assert len(open_source(path, SourceConfig(body_frame=frame))) == 10
+
+
+def test_inspect_refuses_clouds_whose_returns_are_all_out_of_reach():
+    found = inspect_log(case("18_utm_clouds_in_a_bag/bag"), SourceConfig(body_frame="utm"))
+    assert "450 returns" in found.problem
+
+
+def test_edges_between_neighbouring_vertices_are_odometry_whatever_their_ids():
+    folder = case("06_g2o_ids_in_tens")
+    truth_world = np.load(folder / "truth.npy")[:, :3, 3]
+    for name in ("ids_in_tens", "consecutive_ids"):
+        graph = read_g2o(folder / f"{name}.g2o", guess_loops=True)
+        solution = optimize(graph, GraphConfig(robust="gnc"))
+        assert len(graph.loops) == 32
+        assert sum(weight > 0.5 for weight in solution.weights) == 59 + 10
+        found_world = np.array([T[:3, 3] for T in solution.T_world_node.values()])
+        steps_m = [np.linalg.norm(np.diff(path, axis=0), axis=1) for path in (found_world, truth_world)]
+        np.testing.assert_allclose(steps_m[0], steps_m[1], atol=0.1)
+
+
+def test_a_binned_camera_s_intrinsics_are_its_images():
+    camera = open_source(case("07_binning/binning2"), SourceConfig())[0].camera
+    np.testing.assert_allclose(camera.intrinsics, [131.263, 131.263, 79.5, 59.5], atol=0.001)
+
+
+@pytest.mark.parametrize("name", ["half", "whole"])
+def test_rows_that_follow_each_other_are_read_whatever_row_step_says(name):
+    log = open_source(case(f"10_row_step_wrong/{name}"), SourceConfig())
+    assert all(len(scan.points_body) == 672 for scan in log)
+    assert sum("row_step" in note for note in log.notes) == 1
+
+
+def test_headers_that_all_have_stamp_0_leave_the_times_of_recording():
+    log = open_source(case("11_header_stamps_zero/bag"), SourceConfig())
+    np.testing.assert_allclose(np.diff(log.stamps_ns), 1e8, atol=2e7)
+    assert [scan.stamp_ns for scan in log] == log.stamps_ns.tolist()
+
+
+def test_video_is_named():
+    with pytest.raises(SourceError, match="h264"):
+        open_source(case("12_h264_colour/bag"), SourceConfig())
+
+
+def test_float_depth_in_millimetres_is_refused_and_the_setting_reads_it():
+    path = case("14_32FC1_in_millimetres/bag")
+    assert "depth_factor=1000" in inspect_log(path, SourceConfig()).problem
+    right = SourceConfig(camera=CameraConfig(depth_factor=1000.0))
+    assert inspect_log(path, right).problem is None
+
+
+def test_a_counter_that_wraps_costs_no_point():
+    scans = scans_of("15_point_times_partly_wrong/wrapped")
+    assert all(scan.untimed_returns == 0 for scan in scans)
+    assert all(np.ptp(scan.times_s) < 0.11 for scan in scans)
+
+
+def test_nanoseconds_without_leading_zeros_are_whole_numbers():
+    log = open_source(case("16_unpadded_nanoseconds/scans"), SourceConfig())
+    np.testing.assert_array_equal(np.diff(log.stamps_ns), 100_000_000)
+
+
+def test_a_field_of_an_unknown_type_is_left_out_and_named():
+    log = open_source(case("17_field_of_unknown_datatype/bag"), SourceConfig())
+    assert len(log[0].points_body) == 675
+    assert sum("intensity" in note for note in log.notes) == 1
+
+
+def test_other_programs_graphs_are_read_or_refused_by_their_cause():
+    folder = case("19_g2o_of_other_programs")
+    for name in ("priors", "noinfo"):
+        graph = read_g2o(folder / f"{name}.g2o")
+        assert (len(graph.T_world_node), len(graph.factors)) == (60, 69)
+    with pytest.raises(GraphError, match="comma"):
+        read_g2o(folder / "comma.g2o")
+
+
+def test_accelerations_in_g_are_converted():
+    log = open_source(case("21_imu_in_g/bag.bag"), SourceConfig())
+    lengths = np.linalg.norm(log.accelerations.acceleration_mps2, axis=1)
+    np.testing.assert_allclose(np.median(lengths), 9.81, atol=0.1)
