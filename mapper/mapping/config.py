@@ -18,6 +18,9 @@ class LevelConfig(Config):
     """Number of frames, spread over the log, in which planes are searched."""
     plane_tolerance_m: PositiveFloat = 0.03
     """Largest standard deviation of a plane's points from it: the noise of the sensor."""
+    up: Literal["auto", "accelerometer", "sensor"] = "auto"
+    """What says which way is up where the accelerometer's axes, as the log states them, contradict the
+    sensor's mounting by more than 60°: auto asks the floor."""
     heading: Literal["walls", "start"] = "walls"
     """Direction of x and y: along most walls if these agree, so that they are straight in a slice; or the
     first pose's heading."""

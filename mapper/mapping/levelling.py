@@ -1,29 +1,27 @@
 """Levelling: up and the floor, which give the world frame of the maps."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import permutations, product
 
 import numpy as np
 
 from mapper.core.errors import DataError
 from mapper.core.frames import Scan, Sensor
-from mapper.core.geometry import Array, Points, Transform, apply, exp, transform
+from mapper.core.geometry import Array, Points, Transform, exp, transform
 from mapper.core.subsampling import stride_for
 from mapper.core.timebase import nearest
 from mapper.core.trajectory import Trajectory
 from mapper.mapping.config import LevelConfig
+from mapper.mapping.floor import floor_below, floor_of, heights_of
 from mapper.mapping.heading import WallHeading, wall_heading
 from mapper.registration.planes import (
     Patches,
     Vertical,
-    least_support,
-    levels_of,
     patches_of,
-    subsampled,
     vertical_of,
 )
-from mapper.sources.base import Accelerations
+from mapper.sources.base import Accelerations, Log
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,11 +33,13 @@ class BodyAxes:
         forward: (3,) unit vector along the body's heading, body frame.
         stands_on_floor: The floor is the surface below the sensor, not the lowest surface around: a street
             may fall away in range, and reflections lie below it.
+        are_stated: The log says how the body is mounted.
     """
 
     up: Array
     forward: Array
     stands_on_floor: bool = False
+    are_stated: bool = False
 
 
 AXES: Mapping[Sensor, BodyAxes] = {
@@ -57,13 +57,6 @@ _SAME_DIRECTION_RAD = np.radians(3.0)
 _CLEAR_SPREAD_RATIO = 1.25
 
 _MIN_PATCHES = 30
-_FLAT_COSINE = np.cos(np.radians(10.0))
-_NEAR_FLOOR_M = 0.15
-_MAX_BELOW_FLOOR_RATIO = 0.01
-_LOWEST_PERCENT = 0.5
-_NEAR_SENSOR_M = 12.0
-_MIN_SENSOR_HEIGHT_M = 0.15
-_MIN_FLOOR_POINTS = 100
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,12 +69,24 @@ class Level:
         method: Source of the vertical: "accelerometer", "planes" or "camera".
         detail: Quality of the vertical, source of the floor and of x; a sentence for the manifest.
         has_floor: The floor was seen; else its height is a guess.
+        conflict: Sentence on an accelerometer or a mounting that contradicts the up taken; else empty.
+        is_decided: A floor below the sensor says which is right; true without a conflict.
     """
 
     T_level_world: Transform
     method: str
     detail: str
     has_floor: bool
+    conflict: str = ""
+    is_decided: bool = True
+
+
+def axes_of(log: Log) -> BodyAxes:
+    """Return the axes of a log's body: by its mounting on the robot if that is stated, else by its sensor."""
+    if log.T_base_body is None:
+        return AXES[log.sensor]
+    forward, _, up = log.T_base_body[:3, :3]
+    return replace(AXES[log.sensor], up=up, forward=forward, are_stated=True)
 
 
 def find_level(
@@ -96,12 +101,13 @@ def find_level(
 
     Up comes from the accelerometer if the log has one that is unambiguous, else from the planes in the scans,
     else from the mean of the body's own up direction. The first two lie within 60° of the last: a camera is
-    held roughly upright.
+    held roughly upright. Of a LiDAR, the mounting and the axes of the accelerometer that the log states are
+    weighed against it.
 
     Args:
         scans: Scans, spread over the log, with their T_world_body.
         trajectory: Poses of the body; at least one.
-        accelerations: Readings in the accelerometer's own axes, which may be a permutation of the body's.
+        accelerations: Readings, if there are any.
         config: Gives the tolerance of planes, and what x lies along.
         axes: Rough attitude of the sensor's body.
 
@@ -110,16 +116,18 @@ def find_level(
     """
     if not len(trajectory):
         raise DataError("levelling: the trajectory has no poses")
-    tolerance_m, up_guess = config.plane_tolerance_m, _mean_up(trajectory, axes.up)
+    tolerance_m = config.plane_tolerance_m
+    rough = _rough_up(scans, trajectory, accelerations, config=config, axes=axes)
+    up_guess = rough.up_world
     patches = patches_of(scans, tolerance_m=tolerance_m)
     up_world, method, up_detail = _up(
         patches, trajectory, accelerations, up_guess=up_guess, tolerance_m=tolerance_m
     )
     if axes.stands_on_floor:
-        floor = _floor_below(scans, up_world, tolerance_m=tolerance_m)
+        floor = floor_below(scans, up_world, tolerance_m=tolerance_m)
     else:
-        heights_m = _heights(scans, up_world)
-        floor = _floor(patches, heights_m, up_world=up_world, tolerance_m=tolerance_m)
+        heights_m = heights_of(scans, up_world)
+        floor = floor_of(patches, heights_m, up_world=up_world, tolerance_m=tolerance_m)
     T_level_world = _frame(trajectory.T_world_body[0], up_world, floor.height_m, axes)
     details = [up_detail, floor.detail]
     if config.heading == "walls":
@@ -127,7 +135,97 @@ def find_level(
         if walls.determined:
             T_level_world = exp(np.array([0.0, 0.0, -walls.angle_rad]), np.zeros(3)) @ T_level_world
         details.append(_heading_text(walls))
-    return Level(T_level_world, method, "; ".join(details), floor.is_seen)
+    return Level(T_level_world, method, "; ".join(details), floor.is_seen, rough.conflict, rough.is_decided)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _RoughUp:
+    """Direction in the world within 60° of which up is; the rest as in ``Level``."""
+
+    up_world: Array
+    conflict: str = ""
+    is_decided: bool = True
+
+
+def _rough_up(
+    scans: Sequence[tuple[Scan, Transform]],
+    trajectory: Trajectory,
+    accelerations: Accelerations | None,
+    *,
+    config: LevelConfig,
+    axes: BodyAxes,
+) -> _RoughUp:
+    """Return up as tf mounts the sensor, as its accelerometer feels it, or along its z axis.
+
+    The first of them that the log states is taken, or, where they contradict each other, the first below
+    which a floor is seen: drivers turn the clouds of an inverted LiDAR, but may leave tf and accelerometer as
+    they are.
+    """
+    up_sensor = _mean_up(trajectory, axes.up)
+    if not axes.stands_on_floor:
+        return _RoughUp(up_sensor)
+    mounted = _Candidate("the mounting in tf" if axes.are_stated else "the sensor's z axis", up_sensor)
+    candidates = [_Candidate("the accelerometer", up) for up in _felt(accelerations, trajectory)]
+    candidates.insert(0 if axes.are_stated else len(candidates), mounted)
+    if axes.are_stated:
+        candidates.append(_Candidate("the sensor's z axis", _mean_up(trajectory, AXES["lidar"].up)))
+    chosen, is_decided = candidates[0], True
+    if any(chosen.contradicts(other) for other in candidates):
+        with_floor = [
+            candidate
+            for candidate in candidates
+            if floor_below(scans, candidate.up_world, tolerance_m=config.plane_tolerance_m).is_seen
+        ]
+        chosen = next(iter(with_floor), chosen)
+        is_decided = bool(with_floor) and not any(chosen.contradicts(other) for other in with_floor)
+    if config.up != "auto" and len(candidates) > 1:
+        wanted = mounted.name if config.up == "sensor" else "the accelerometer"
+        chosen, is_decided = next((c for c in candidates if c.name == wanted), chosen), True
+    stated = [mounted, *(candidate for candidate in candidates if candidate.name == "the accelerometer")]
+    against = next((other for other in stated if chosen.contradicts(other)), None)
+    if against is None:
+        return _RoughUp(chosen.up_world)
+    angle_deg = np.degrees(chosen.angle_to(against))
+    doubt = "" if is_decided else " though no floor decides"
+    conflict = (
+        f"up by {against.name} is {angle_deg:.0f}° from up by {chosen.name}, which is taken{doubt}; "
+        "level.up=sensor or level.up=accelerometer says which is right"
+    )
+    return _RoughUp(chosen.up_world, conflict, is_decided)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Candidate:
+    """A direction in the world that something says is up."""
+
+    name: str
+    up_world: Array
+
+    def angle_to(self, other: "_Candidate") -> float:
+        return float(np.arccos(np.clip(self.up_world @ other.up_world, -1.0, 1.0)))
+
+    def contradicts(self, other: "_Candidate") -> bool:
+        return self.angle_to(other) > float(_MAX_TILT_RAD)
+
+
+def _felt(accelerations: Accelerations | None, trajectory: Trajectory) -> list[Array]:
+    """Return up by an accelerometer in the axes that the log states; nothing where it is not clear."""
+    if accelerations is None or not accelerations.are_axes_stated:
+        return []
+    readings, R_world_body = _matched_readings(accelerations, trajectory)
+    if len(readings) < _MIN_READINGS:
+        return []
+    up_felt, spread_rad = _mean_direction(readings, R_world_body)
+    return [up_felt] if spread_rad <= _MAX_SPREAD_RAD else []
+
+
+def _mean_direction(readings: Array, R_world_body: Array) -> tuple[Array, float]:
+    """Return the mean direction of (N, 3) readings in the world, and their RMS angle from it, rad."""
+    directions_world = np.einsum("nij,nj->ni", R_world_body, readings)
+    mean = directions_world.mean(axis=0)
+    mean /= max(float(np.linalg.norm(mean)), 1e-12)
+    angles = np.arccos(np.clip(directions_world @ mean, -1.0, 1.0))
+    return mean, float(np.sqrt(np.mean(angles**2)))
 
 
 def _up(
@@ -169,12 +267,9 @@ def _up_by_accelerometer(
         return None, f"accelerometer: only {len(readings)} readings near a pose, want {_MIN_READINGS}"
     found = []
     for R_body_sensor in _right_angled_frames():
-        directions_world = np.einsum("nij,nj->ni", R_world_body, readings @ R_body_sensor.T)
-        mean = directions_world.mean(axis=0)
-        mean /= max(float(np.linalg.norm(mean)), 1e-12)
+        mean, spread_rad = _mean_direction(readings @ R_body_sensor.T, R_world_body)
         if mean @ up_guess > np.cos(_MAX_TILT_RAD):
-            angles = np.arccos(np.clip(directions_world @ mean, -1.0, 1.0))
-            found.append((float(np.sqrt(np.mean(angles**2))), mean))
+            found.append((spread_rad, mean))
     if not found:
         return None, "accelerometer: no axes put up within 60° of the camera's"
     found.sort(key=lambda one: one[0])
@@ -186,6 +281,11 @@ def _up_by_accelerometer(
         )
     others = [spread for spread, up in found if up @ up_world < np.cos(_SAME_DIRECTION_RAD)]
     if others and others[0] < _CLEAR_SPREAD_RATIO * spread_rad:
+        stated_up, stated_spread_rad = _mean_direction(readings, R_world_body)
+        is_possible = stated_up @ up_guess > np.cos(_MAX_TILT_RAD)
+        if accelerations.are_axes_stated and is_possible and stated_spread_rad <= _MAX_SPREAD_RAD:
+            detail = f"{len(readings)} accelerometer readings in the axes that the log states"
+            return stated_up, f"{detail}, spread over {np.degrees(stated_spread_rad):.1f}°"
         return None, "accelerometer: its axes are ambiguous because the body hardly turned"
     return up_world, f"{len(readings)} accelerometer readings spread over {np.degrees(spread_rad):.1f}°"
 
@@ -227,72 +327,6 @@ def _mean_up(trajectory: Trajectory, up_body: Array) -> Array:
     length = float(np.linalg.norm(mean))
     first: Array = ups_world[0]
     return mean / length if length > 0.3 else first
-
-
-def _heights(scans: Sequence[tuple[Scan, Transform]], up_world: Array) -> Array:
-    """Return (N,) heights along up of the points, metres."""
-    heights = [apply(T_world_body, subsampled(scan)) @ up_world for scan, T_world_body in scans]
-    return np.concatenate([np.empty(0), *heights])
-
-
-@dataclass(frozen=True, slots=True)
-class _Floor:
-    """The floor.
-
-    Attributes:
-        height_m: Height along up; None is that of the first pose.
-        detail: Source of the height; part of a sentence.
-        is_seen: Whether a surface shows it; else it is a guess.
-    """
-
-    height_m: float | None
-    detail: str
-    is_seen: bool
-
-
-def _floor(patches: Patches, heights_m: Array, *, up_world: Array, tolerance_m: float) -> _Floor:
-    """Return the floor that patches show.
-
-    The floor is the lowest surface that faces up with enough patches. If many points lie deeper, that surface
-    is a table, and the lowest points give the floor.
-    """
-    if not len(heights_m):
-        return _Floor(None, "no points seen: the floor is put at the first pose", is_seen=False)
-    faces_up = patches.normals_world @ up_world > _FLAT_COSINE
-    heights_up_m = patches.centres_world[faces_up] @ up_world
-    surfaces = levels_of(heights_up_m, tolerance_m=tolerance_m, least=least_support(len(heights_up_m)))
-    if surfaces:
-        medians_m = np.array([np.median(heights_up_m[members]) for members in surfaces])
-        # A surface has fringes just above and below it; the best supported of the lowest ones comes first.
-        chosen = int(np.flatnonzero(medians_m <= medians_m.min() + _NEAR_FLOOR_M)[0])
-        floor_m = float(medians_m[chosen])
-        if (heights_m < floor_m - _NEAR_FLOOR_M).mean() <= _MAX_BELOW_FLOOR_RATIO:
-            detail = f"floor seen in {len(surfaces[chosen])} of {len(patches)} patches"
-            return _Floor(floor_m, detail, is_seen=True)
-    lowest_m = float(np.percentile(heights_m, _LOWEST_PERCENT))
-    detail = f"no floor seen: z = 0 is where the lowest {_LOWEST_PERCENT} % of the points end"
-    return _Floor(lowest_m, detail, is_seen=False)
-
-
-def _floor_below(scans: Sequence[tuple[Scan, Transform]], up_world: Array, *, tolerance_m: float) -> _Floor:
-    """Return the floor below the first scan that shows one.
-
-    It is the best supported height below the sensor among the points around it.
-    """
-    for scan, T_world_body in scans:
-        sensor_world = apply(T_world_body, scan.origin_body[np.newaxis])[0]
-        points_world = apply(T_world_body, scan.points_body.astype(np.float64)) - sensor_world
-        heights_m = points_world @ up_world
-        across_m = np.linalg.norm(points_world - heights_m[:, np.newaxis] * up_world, axis=1)
-        below_m = heights_m[(across_m <= _NEAR_SENSOR_M) & (heights_m < -_MIN_SENSOR_HEIGHT_M)]
-        least = max(_MIN_FLOOR_POINTS, len(below_m) // 4)
-        levels = levels_of(below_m, tolerance_m=tolerance_m, least=least)
-        if levels:
-            floor_m = float(np.median(below_m[levels[0]]))
-            height_m = floor_m + float(sensor_world @ up_world)
-            return _Floor(height_m, f"floor {-floor_m:.2f} m below the sensor", is_seen=True)
-    detail = "no floor seen below the sensor: the floor is put at the first pose"
-    return _Floor(None, detail, is_seen=False)
 
 
 def _frame(T_world_first: Transform, up_world: Array, floor_m: float | None, axes: BodyAxes) -> Transform:

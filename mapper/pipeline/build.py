@@ -14,7 +14,7 @@ from mapper.core.errors import FrameError
 from mapper.core.frames import Scan
 from mapper.core.timebase import check_stamps
 from mapper.core.trajectory import Trajectory
-from mapper.mapping.levelling import AXES, Level, find_level
+from mapper.mapping.levelling import Level, axes_of, find_level
 from mapper.odometry.base import Odometry
 from mapper.pipeline.checkpoint_identity import identity_of, kept_from_before
 from mapper.pipeline.checkpoints import (
@@ -32,7 +32,7 @@ from mapper.pipeline.tracking_checkpoints import TrackingCheckpoints
 from mapper.pipeline.tracking_result import TrackingResult, from_tracking, refuse_a_fragment, save_places
 from mapper.run import files
 from mapper.run.folder import Run, open_run
-from mapper.run.manifest import Levelling, RunWarning, Solve
+from mapper.run.manifest import Levelling, RunWarning, Solve, Weight
 from mapper.run.observers import NULL_OBSERVER, Observer
 from mapper.run.stored_tracking import save_solved, save_tracking
 from mapper.run.writer import RunWriter, first_manifest, write_run
@@ -171,6 +171,10 @@ class _Steps:
     def save(self, solved: _Solved, poses: Trajectory | None) -> None:
         """Write the solved poses, the graph, the places, and the poses that were given."""
         tracking, level = solved.tracking, solved.level
+        if level.conflict:
+            self.progress.note(level.conflict)
+            weight: Weight = "note" if level.is_decided else "doubt"
+            self.writer.warn([RunWarning(kind="level", sentence=level.conflict, weight=weight)])
         if implausible := _height_warning(self.source, tracking.tracked_trajectory()):
             self.progress.note(implausible)
             self.writer.warn([RunWarning(kind="depth", sentence=implausible, weight="doubt")])
@@ -219,7 +223,7 @@ def level_of(source: Log, tracking: TrackingResult, config: BuildConfig) -> Leve
         trajectory=trajectory,
         accelerations=source.accelerations,
         config=config.level,
-        axes=AXES[source.sensor],
+        axes=axes_of(source),
     )
 
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mapper.core.errors import DataError, FrameError
 from mapper.core.frames import Frame, RgbdFrame, Scan, Sensor
-from mapper.core.geometry import Array
+from mapper.core.geometry import Array, Transform
 from mapper.core.timebase import Stamps
 from mapper.core.trajectory import Trajectory
 
@@ -117,15 +117,17 @@ class WrappedEntry:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Accelerations:
-    """Accelerometer readings of a log, in the accelerometer's own axes.
+    """Accelerometer readings of a log.
 
     Attributes:
         stamps_ns: (N,) int64 nanoseconds.
         acceleration_mps2: (N, 3) float64; at rest it points up.
+        are_axes_stated: The axes are the body's, as the log says; else they may be a permutation of them.
     """
 
     stamps_ns: Stamps
     acceleration_mps2: Array
+    are_axes_stated: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -141,6 +143,8 @@ class Log:
         entry_at: Returns the entry of frame 0 … N - 1; nothing is decoded yet.
         truth: True T_world_body, if the log has it.
         accelerations: Accelerometer readings, if the log has them.
+        T_base_body: Mounting of the body on the robot, whose base has x forward and z up (REP 103), if the
+            log states it.
         wheels: T_odom_body by wheel odometry, in a frame of its own that drifts, if the log has it.
         are_units_assumed: Nothing says how many units of its depth images a metre has.
         notes: Sentences on what opening it left out or assumed.
@@ -155,6 +159,7 @@ class Log:
     entry_at: Callable[[int], FrameRef]
     truth: Trajectory | None = None
     accelerations: Accelerations | None = None
+    T_base_body: Transform | None = None
     wheels: Trajectory | None = None
     are_units_assumed: bool = False
     notes: Sequence[str] = ()

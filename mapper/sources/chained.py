@@ -79,6 +79,7 @@ def chained(first: Log, second: Log, *, shift_ns: int | None = None) -> Log:
         stamps_ns=np.concatenate([log.stamps_ns for log in logs]),
         entry_at=entry_at,
         truth=truth,
+        T_base_body=logs[0].T_base_body,
         notes=notes,
         sessions=sessions,
     )

@@ -10,7 +10,7 @@ from mapper.core.geometry import apply, exp, inverse, rotation_exp, transform
 from mapper.core.timebase import nearest, ns_from_seconds_text
 from mapper.core.trajectory import Trajectory
 from mapper.mapping.config import LevelConfig
-from mapper.mapping.levelling import AXES, find_level
+from mapper.mapping.levelling import AXES, BodyAxes, find_level
 from mapper.sources.base import Accelerations
 from mapper.sources.trajectory_files import read_tum
 from tests.support.paths import FR1_XYZ
@@ -279,6 +279,59 @@ def test_a_body_may_have_other_axes():
     level = level_of(as_lidar, moved, axes=AXES["lidar"])
     assert tilt_deg(level, T_world_room) < 0.3
     assert (level.T_level_world @ moved.T_world_body[0])[0, 0] > 0.8
+
+
+def street(*, is_inverted, has_ground=True, imu_is_inverted):
+    """Scans of a LiDAR that drives 1.7 m above the ground beside a wall, and stated accelerations."""
+    rng = np.random.default_rng(0)
+    ground = np.column_stack([rng.uniform(-20, 20, (2000, 2)), rng.normal(-1.7, 0.01, 2000)])
+    wall = np.column_stack([rng.uniform(-20, 20, 500), rng.normal(8.0, 0.01, 500), rng.uniform(-1.7, 4, 500)])
+    points = np.concatenate([ground, wall]) if has_ground else wall
+    R_body_robot = np.diag([1.0, -1.0, -1.0]) if is_inverted else np.eye(3)
+    poses = [transform(np.eye(3), [0.1 * k, 0.0, 0.0]) for k in range(100)]
+    trajectory = Trajectory(np.arange(100, dtype=np.int64) * 100 * MS, np.array(poses))
+    scans = [(Scan(0, (points @ R_body_robot.T).astype(np.float32)), poses[0])]
+    felt = [0.0, 0.0, -9.81 if imu_is_inverted else 9.81]
+    return (
+        scans,
+        trajectory,
+        Accelerations(trajectory.stamps_ns, np.tile(felt, (100, 1)), are_axes_stated=True),
+    )
+
+
+STATED = BodyAxes(
+    np.array([0.0, 0.0, -1.0]), np.array([1.0, 0.0, 0.0]), stands_on_floor=True, are_stated=True
+)
+"""Axes of a LiDAR that tf says is mounted upside down."""
+
+
+@pytest.mark.parametrize("axes", [AXES["lidar"], STATED])
+@pytest.mark.parametrize("is_inverted", [True, False])
+def test_the_floor_decides_between_the_accelerometer_and_the_mounting(is_inverted, axes):
+    scans, trajectory, readings = street(is_inverted=is_inverted, imu_is_inverted=True)
+    level = level_of(scans, trajectory, readings, axes=axes)
+    assert level.T_level_world[2, 2] == pytest.approx(-1.0 if is_inverted else 1.0, abs=0.01)
+    assert level.T_level_world[2, 3] == pytest.approx(1.7, abs=0.05)
+    assert bool(level.conflict) == (axes is AXES["lidar"] or not is_inverted)
+    assert level.is_decided
+
+
+@pytest.mark.parametrize(("axes", "z_up"), [(AXES["lidar"], -1.0), (STATED, -1.0)])
+def test_without_a_floor_a_stated_mounting_goes_before_the_accelerometer(axes, z_up):
+    scans, trajectory, readings = street(
+        is_inverted=True, has_ground=False, imu_is_inverted=axes is AXES["lidar"]
+    )
+    level = level_of(scans, trajectory, readings, axes=axes)
+    assert level.T_level_world[2, 2] == pytest.approx(z_up, abs=0.05)
+    assert level.conflict
+    assert not level.is_decided
+
+
+@pytest.mark.parametrize(("up", "z_up"), [("sensor", 1.0), ("accelerometer", -1.0)])
+def test_the_user_can_say_which_way_is_up(up, z_up):
+    scans, trajectory, readings = street(is_inverted=True, imu_is_inverted=True)
+    level = level_of(scans, trajectory, readings, LevelConfig(up=up), axes=AXES["lidar"])
+    assert level.T_level_world[2, 2] == pytest.approx(z_up, abs=0.05)
 
 
 def test_the_same_log_gives_the_same_frame_to_the_bit():

@@ -1,15 +1,18 @@
 """Recordings of public bug reports in ../shared/cases: what each states is used, or refused by its cause."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from mapper.config.loading import load_config
 from mapper.core.errors import GraphError, SourceError
 from mapper.core.frames import RgbdFrame, Scan
 from mapper.graph.config import GraphConfig
 from mapper.graph.g2o import read_g2o
 from mapper.graph.optimize import optimize
+from mapper.pipeline.build import build
 from mapper.sources import open_source
 from mapper.sources.config import CameraConfig, SourceConfig
 from mapper.sources.depth_scale import depth_warnings
@@ -147,3 +150,16 @@ def test_accelerations_in_g_are_converted():
     log = open_source(case("21_imu_in_g/bag.bag"), SourceConfig())
     lengths = np.linalg.norm(log.accelerations.acceleration_mps2, axis=1)
     np.testing.assert_allclose(np.median(lengths), 9.81, atol=0.1)
+
+
+@pytest.mark.parametrize("is_mounting_stated", [True, False])
+def test_an_inverted_lidar_is_levelled_with_its_z_axis_down(tmp_path, is_mounting_stated):
+    log = open_source(case("20_upside_down_lidar/imu_mps2.bag"), SourceConfig())
+    if not is_mounting_stated:
+        log = replace(log, T_base_body=None)
+    run = build(log, load_config(None, sensor=log.sensor), tmp_path / "run")
+    T_world_body = run.trajectory.T_world_body
+    assert (T_world_body[:, 2, 2] < -0.99).all()
+    assert (T_world_body[:, 2, 3] > 1.0).all()
+    warned = [warning.kind for warning in run.manifest.warnings if warning.kind == "level"]
+    assert len(warned) == (0 if is_mounting_stated else 1)

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from mapper.core.errors import DataError, FrameError
 from mapper.core.frames import Sensor
+from mapper.core.geometry import Transform
 from mapper.core.rotations import pose_of_row
 from mapper.core.trajectory import Trajectory
 from mapper.sources.base import Accelerations
@@ -32,6 +33,8 @@ from mapper.sources.wheel_files import mounting
 
 _MAX_READINGS = 20_000  # levelling asks for fewer, and an hour of a fast unit would take minutes to read
 _MAX_TRANSFORMS = 1_000
+_BASES = ("base_link", "base_footprint")
+"""Frames of a robot's base (REP 105, REP 120)."""
 _UNIT_TOLERANCE = 0.01
 _FARTHEST_M = 1e8  # farther than anything drives: a damaged message
 
@@ -115,7 +118,12 @@ class RecordingReader:
             notes.append(f"{series.topic.name}: accelerations are as long as 1 at rest: taken as g")
         T_body_imu = self.tree.find(body, frame_of(readings[0]))
         R_body_imu = np.eye(3) if T_body_imu is None else T_body_imu[:3, :3]
-        return Accelerations(stamps_ns, acceleration_imu @ R_body_imu.T), notes
+        return Accelerations(stamps_ns, acceleration_imu @ R_body_imu.T, T_body_imu is not None), notes
+
+    def mounting(self, body: str) -> Transform | None:
+        """Return T_base_body, the pose of the body on the robot; None where tf names no robot's base."""
+        poses = (self.tree.find(base, body) for base in _BASES if base in self.tree.frames)
+        return next((T_base_body for T_base_body in poses if T_base_body is not None), None)
 
     def _poses_of(self, series: Series) -> tuple[Trajectory | None, str, list[str]]:
         """Return the poses of a topic in time order, the frame that moves, and notes."""

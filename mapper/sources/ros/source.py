@@ -85,6 +85,7 @@ def recording_log(reader: RecordingReader, config: SourceConfig) -> Log:
         entry_at=frames.entry_at,
         truth=truth,
         accelerations=accelerations,
+        T_base_body=reader.mounting(frames.body),
         wheels=wheels,
         notes=[*choice.notes, *recording.notes, *frames.notes, *truth_notes, *wheel_notes, *imu_notes],
     )
