@@ -8,6 +8,7 @@ import numpy as np
 from mapper.core.errors import SourceError
 from mapper.core.frames import NO_DISTORTION, PinholeCamera
 from mapper.sources.config import CameraConfig
+from mapper.sources.undistorted import Lens
 
 _CHECKED = 17
 """Columns and rows of the pixels whose distortion is taken out to check a calibration."""
@@ -28,6 +29,7 @@ class Calibration:
         cx_px: Principal point's column.
         cy_px: Principal point's row.
         distortion: (k1, k2, p1, p2, k3).
+        lens: Distortion of another kind, to be taken out of the images when they are read.
         size_px: (width, height) the numbers hold for, if stated.
         depth_units_per_m: Depth image units per metre, if stated.
     """
@@ -38,6 +40,7 @@ class Calibration:
     cx_px: float
     cy_px: float
     distortion: _Distortion = NO_DISTORTION
+    lens: Lens | None = None
     size_px: tuple[int, int] | None = None
     depth_units_per_m: float | None = None
 

@@ -95,6 +95,14 @@ def test_a_binned_camera_s_intrinsics_are_its_images():
     np.testing.assert_allclose(camera.intrinsics, [131.263, 131.263, 79.5, 59.5], atol=0.001)
 
 
+def test_eight_coefficients_are_taken_out_of_the_images():
+    log = open_source(case("08_rational_polynomial/bag"), SourceConfig())
+    frame = log[0]
+    assert not any(frame.camera.distortion)
+    assert (frame.depth_m > 0.0).mean() > 0.8
+    assert sum("rational_polynomial" in note for note in log.notes) == 1
+
+
 @pytest.mark.parametrize("name", ["half", "whole"])
 def test_rows_that_follow_each_other_are_read_whatever_row_step_says(name):
     log = open_source(case(f"10_row_step_wrong/{name}"), SourceConfig())

@@ -7,6 +7,7 @@ import cv2
 from mapper.core.errors import FrameError, SourceError
 from mapper.core.frames import DepthImage, Image, PinholeCamera
 from mapper.sources.calibration import Calibration
+from mapper.sources.undistorted import Lens
 
 Size = tuple[int, int]
 """Width and height, px."""
@@ -30,11 +31,13 @@ class RecordedCamera:
         camera: Camera of the frames: of both images once they are brought to its size.
         colour_px: Size of the colour images as recorded.
         depth_px: Size of the depth images as recorded.
+        lens: Distortion that is still in the images.
     """
 
     camera: PinholeCamera
     colour_px: Size
     depth_px: Size
+    lens: Lens | None = None
 
     def image(self, recorded: Image, where: str) -> Image:
         """Return a colour or grey image in the camera's size.
@@ -110,7 +113,8 @@ def recorded_camera(
     is_of_depth = calibration.size_px == depth_px
     width_px, height_px = depth_px if is_of_depth else colour_px
     camera = calibration.camera(width_px=width_px, height_px=height_px)
-    return RecordedCamera(camera.resized(*_common_size(colour_px, depth_px)), colour_px, depth_px)
+    resized = camera.resized(*_common_size(colour_px, depth_px))
+    return RecordedCamera(resized, colour_px, depth_px, calibration.lens)
 
 
 def is_same_view(colour_px: Size, depth_px: Size) -> bool:

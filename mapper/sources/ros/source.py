@@ -29,6 +29,7 @@ from mapper.sources.ros.messages import (
 )
 from mapper.sources.ros.reader import RecordingReader
 from mapper.sources.ros.topics import CameraTopics, choose, is_called_registered
+from mapper.sources.undistorted import FISHEYE_MODELS, POLYNOMIAL_MODELS, Lens, UndistortedEntry
 
 _SAME_LENS_RATIO = 0.01
 _SAME_PLACE_M = 0.005
@@ -36,7 +37,6 @@ _SAME_PLACE_M = 0.005
 _FIXED_FRAMES = frozenset({"map", "odom", "world", "earth", "utm", "camera_init", "global", "local_origin"})
 """Names of frames that do not move with the robot (REP 105; camera_init is LOAM's, Zhang & Singh 2014)."""
 _JPEG_START = b"\xff\xd8"
-_BROWN_CONRADY = ("plumb_bob", "brown_conrady", "rational_polynomial")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -114,9 +114,13 @@ def _rgbd(reader: RecordingReader, topics: CameraTopics, config: SourceConfig) -
     float_units_per_m = (factor or 1.0) if has_float_depth(first_depth) else None
     units_per_m = (factor or MILLIMETRES_PER_M) if float_units_per_m is None else FINE_UNITS_PER_M
     is_jpeg = isinstance(first_color, FileMessage) and bytes(first_color.data[:2]) == _JPEG_START
+    maps = None
+    if camera.lens is not None:
+        maps = camera.lens.maps(camera.camera)
+        notes.append(f"the distortion {camera.lens.model} is taken out of the images as they are read")
 
     def entry_at(index: int) -> FrameRef:
-        return rgbd_entry(
+        entry = rgbd_entry(
             reader.located(color, int(i[index])),
             reader.located(depth, int(j[index])),
             camera,
@@ -124,6 +128,7 @@ def _rgbd(reader: RecordingReader, topics: CameraTopics, config: SourceConfig) -
             float_units_per_m=float_units_per_m,
             colour_suffix=".jpg" if is_jpeg else ".png",
         )
+        return entry if maps is None else UndistortedEntry(entry, maps)
 
     return _Frames("rgbd", frame, color.stamps_ns[i], entry_at, notes)
 
@@ -242,11 +247,15 @@ def _calibration(info: CameraMessage, *, is_rectified: bool, name: str) -> Calib
         raise SourceError(
             f"{name}: the camera is not calibrated, K is {K}; --set source.camera.fx_px=… and so on"
         )
-    if any(D[5:]) or (any(D) and info.model not in _BROWN_CONRADY):
-        raise SourceError(
-            f"{name}: {info.model} distortion with {len(D)} coefficients; only plumb_bob is supported: "
-            "rectify the images, or --set source.camera.fx_px=… and so on"
-        )
+    if any(D) and (info.model not in POLYNOMIAL_MODELS or any(D[5:])):
+        lens = Lens(info.model, D)
+        if not lens.is_known:
+            raise SourceError(
+                f"{name}: distortion {info.model} with {len(D)} coefficients is not known; known are "
+                f"{', '.join(sorted(POLYNOMIAL_MODELS | FISHEYE_MODELS))}: rectify the images, or --set "
+                "source.camera.fx_px=… and so on"
+            )
+        return Calibration(name, K[0], K[4], K[2], K[5], lens=lens, size_px=size_px)
     k1, k2, p1, p2, k3 = (*D[:5], *NO_DISTORTION)[:5]
     return Calibration(name, K[0], K[4], K[2], K[5], distortion=(k1, k2, p1, p2, k3), size_px=size_px)
 
