@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
 __all__ = ["open_source"]
 
+RECORDING = "ros.files"
 # The first that recognises a path reads it. Images of ICL-NUIM and Poznań are numbered too, and stamps are
 # numbers, so these come before numbered images; any log's folder may have clouds in it, so clouds come last.
 _FORMATS = (
@@ -25,7 +26,7 @@ _FORMATS = (
     "image_folders.stamped_images",
     "image_folders.numbered",
     "scan_folders.kitti",
-    "ros.files",
+    RECORDING,
     "scan_folders.clouds",
 )
 """Modules, imported one after the other when a log is opened, until one recognises it."""
@@ -54,19 +55,17 @@ def open_source(path: Path, config: SourceConfig = _DEFAULTS) -> "Log":
         raise SourceError(f"{path}: no such file or folder")
     if not (path.is_dir() or path.is_file()):
         raise SourceError(f"{path}: a device or a pipe; want a file or a folder")
-    for name in _FORMATS:
-        log_format = import_module(f"mapper.sources.{name}")
-        if log_format.recognise(path):
-            if config.body_frame is not None and name != "ros.files":
-                raise SourceError(
-                    f"{path}: source.body_frame={config.body_frame}: only a recording's tf has such a frame; "
-                    "leave it out"
-                )
-            log: Log = log_format.read_log(path, config)
-            if log.wheels is None and path.is_dir():
-                wheels, notes = read_wheels(path, config.wheels, sensor=log.sensor)
-                log = replace(log, wheels=wheels, notes=[*log.notes, *notes])
-            return selected(log, config)
+    if name := format_of(path):
+        if config.body_frame is not None and name != RECORDING:
+            raise SourceError(
+                f"{path}: source.body_frame={config.body_frame}: only a recording's tf has such a frame; "
+                "leave it out"
+            )
+        log: Log = import_module(f"mapper.sources.{name}").read_log(path, config)
+        if log.wheels is None and path.is_dir():
+            wheels, notes = read_wheels(path, config.wheels, sensor=log.sensor)
+            log = replace(log, wheels=wheels, notes=[*log.notes, *notes])
+        return selected(log, config)
     if (path / MANIFEST_NAME).is_file():
         raise SourceError(f"{path}: holds what mapper made, not a log; mapper eval {path} judges it")
     hint = "; of clouds it has one, want two or more" if most_clouds(path) == 1 else _inner_hint(path)
@@ -77,12 +76,18 @@ def open_source(path: Path, config: SourceConfig = _DEFAULTS) -> "Log":
     )
 
 
+def format_of(path: Path) -> str | None:
+    """Return the module of the format that recognises a file or folder; None if none does."""
+    recognising = (name for name in _FORMATS if import_module(f"mapper.sources.{name}").recognise(path))
+    return next(recognising, None)
+
+
 def _inner_hint(path: Path) -> str:
-    """Return advice to open a folder in this one that is a log; archives often hold a folder in a folder."""
+    """Return advice to open what is in a folder: a log in a folder of its own, or one of several bags."""
     folders = sorted(inner for inner in path.glob("*") if inner.is_dir())[:_MOST_TRIED]
-    formats = [import_module(f"mapper.sources.{name}") for name in _FORMATS]
     for inner in folders:
         with suppress(SourceError):  # of a file in it that cannot be read
-            if any(form.recognise(inner) for form in formats):
+            if format_of(inner):
                 return f"; {inner.name} in it is one"
-    return ""
+    bags = sorted(bag.name for bag in path.glob("*.bag"))
+    return f"; open one of {', '.join(bags[:_MOST_TRIED])}" if bags else ""

@@ -11,7 +11,7 @@ from mapper.core.frames import Frame, PinholeCamera, RgbdFrame, Scan, Sensor
 from mapper.core.timebase import MAX_TRUTH_GAP_NS, NS_PER_S, Stamps, check_stamps, nearest
 from mapper.core.trajectory import Trajectory
 from mapper.runtime.ordered_map import ordered_map
-from mapper.sources import open_source
+from mapper.sources import RECORDING, format_of, open_source
 from mapper.sources.base import Log
 from mapper.sources.config import SourceConfig
 from mapper.sources.depth_scale import depth_warnings
@@ -122,7 +122,7 @@ def inspect_log(path: Path, config: SourceConfig) -> Inspection:
     Raises:
         SourceError: It is no log of a known format, or is damaged beyond reading.
     """
-    if not (path.exists() and recordings.recognise(path)):
+    if not (path.exists() and format_of(path) == RECORDING):
         return _inspected(path, [], open_source(path, config))
     reader = RecordingReader(recordings.open_recording(path))
     topics = [_topic(series) for series in reader.series.values()]

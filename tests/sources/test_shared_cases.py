@@ -103,6 +103,21 @@ def test_eight_coefficients_are_taken_out_of_the_images():
     assert sum("rational_polynomial" in note for note in log.notes) == 1
 
 
+def test_the_bags_of_a_split_recording_are_joined():
+    folder = case("09_folder_of_split_bags/log")
+    parts = [open_source(path, SourceConfig()) for path in sorted(folder.glob("*.bag"))]
+    log = open_source(folder, SourceConfig())
+    assert log.kind == "rosbag"
+    np.testing.assert_array_equal(log.stamps_ns, np.concatenate([part.stamps_ns for part in parts]))
+
+
+def test_bags_of_other_names_are_no_parts_of_one(tmp_path):
+    for path, name in zip(case("09_folder_of_split_bags/log").glob("*.bag"), ("one", "other"), strict=True):
+        (tmp_path / f"{name}.bag").write_bytes(path.read_bytes())
+    with pytest.raises(SourceError, match="open one of"):
+        open_source(tmp_path, SourceConfig())
+
+
 @pytest.mark.parametrize("name", ["half", "whole"])
 def test_rows_that_follow_each_other_are_read_whatever_row_step_says(name):
     log = open_source(case(f"10_row_step_wrong/{name}"), SourceConfig())

@@ -1,5 +1,6 @@
 """Recordings recognised by their names, and opened by the reader of their format."""
 
+import re
 from pathlib import Path
 
 from mapper.core.errors import SourceError
@@ -11,11 +12,11 @@ from mapper.sources.ros.source import recording_log
 
 _ENDINGS = (".mcap", ".bag", ".db3")
 _PACKED = ".zstd"
-_IN_FOLDERS = (".mcap", ".db3", _PACKED)
+_IN_FOLDERS = (".mcap", ".db3", _PACKED, ".bag")
 
 
 def recognise(path: Path) -> bool:
-    """Return whether a path is named as a recording, or a folder as ROS 2 records it."""
+    """Return whether a path is named as a recording, or is a folder of the parts of one."""
     if path.is_dir():
         return bool(_parts(path))
     return path.suffix in (*_ENDINGS, _PACKED) and path.is_file()
@@ -74,10 +75,16 @@ def _opened(path: Path) -> Recording:
 
 
 def _parts(folder: Path) -> list[Path]:
-    """Return a folder's recordings in sequence, of the first kind that ROS 2 records and that is there."""
+    """Return a folder's recordings in sequence, of the first kind that is there.
+
+    Names of ``rosbag record --split`` differ in their dates and numbers alone; other bags lie side by side by
+    chance, and are no parts.
+    """
     from mapper.sources.ros.ros2_bag import in_sequence
 
     for ending in _IN_FOLDERS:
-        if parts := [path for path in folder.glob(f"*{ending}") if path.is_file()]:
+        parts = [path for path in folder.glob(f"*{ending}") if path.is_file()]
+        names = {re.sub(r"\d+", "", path.stem) for path in parts}
+        if parts and (ending != ".bag" or len(names) == 1):
             return in_sequence(parts)
     return []

@@ -1,4 +1,4 @@
-"""ROS 2 bags read as recordings: .db3 files (SQLite), and folders of .db3 or .mcap files in sequence."""
+"""ROS 2 bags read as recordings: .db3 files (SQLite), and folders of files in sequence."""
 
 import re
 import sqlite3
@@ -79,8 +79,6 @@ class DatabaseRecording:
 class JoinedRecording:
     """Recording of one session that was split into files. See :class:`Recording`."""
 
-    kind = "rosbag2"
-
     def __init__(self, path: Path, parts: Sequence[Recording], *, lost: Sequence[str]) -> None:
         """Join the files of a folder.
 
@@ -92,6 +90,11 @@ class JoinedRecording:
         self.path = path
         self._parts = parts
         self._lost = lost
+
+    @property
+    def kind(self) -> str:
+        """Return the kind of ROS 2's folders, or of ROS 1's files."""
+        return "rosbag" if self._parts[0].kind == "rosbag" else "rosbag2"
 
     @property
     def notes(self) -> Sequence[str]:
