@@ -19,6 +19,7 @@ from mapper.cli.terminal import print_text
 from mapper.core.errors import MapperError, UntrustedError
 from mapper.runtime.atomic import MANIFEST_NAME
 from mapper.runtime.progress import SILENT, Progress
+from mapper.runtime.result_paths import result_path
 
 if TYPE_CHECKING:
     from mapper.run.manifest import Verdict
@@ -98,6 +99,9 @@ def verb(function: Callable[..., Answer]) -> Callable[..., None]:
     def command(*, json: bool, verbose: bool, quiet: bool, **given: Any) -> None:
         refuse_several({"--verbose": verbose, "--quiet": quiet})
         output = Output(json=json, quiet=quiet, verbose=verbose)
+        given |= {
+            name: result_path(given[name]) for name in _RESULTS & given.keys() if given[name] is not None
+        }
         answer = function(**given, output=output)
         _show(answer, output)
         if answer.error is not None:
@@ -115,6 +119,8 @@ def verb(function: Callable[..., Answer]) -> Callable[..., None]:
     return command
 
 
+_RESULTS = frozenset({"out", "plot"})
+"""Parameters of verbs that name what they write."""
 _COMMON = {
     "json": Annotated[bool, typer.Option("--json", help="Print one JSON document.")],
     "verbose": Annotated[bool, typer.Option("--verbose", help="Print every row and every note.")],

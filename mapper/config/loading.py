@@ -2,7 +2,6 @@
 
 import json
 import os
-import tomllib
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -17,7 +16,7 @@ from mapper.core.config import Config, drop_unknown, kind_of, members_of
 from mapper.core.errors import ConfigError, MapperWarning
 from mapper.core.paths import AnyPath
 from mapper.runtime.atomic import MANIFEST_NAME
-from mapper.runtime.regular_files import read_text
+from mapper.runtime.regular_files import parse_toml, read_text
 from mapper.sources.config import SourceConfig
 
 if TYPE_CHECKING:
@@ -126,7 +125,7 @@ def _read(path: Path) -> dict[str, Any]:
 def _parsed(text: str, path: Path) -> dict[str, Any]:
     is_json = path.suffix == ".json"
     try:
-        tree: dict[str, Any] = json.loads(text) if is_json else tomllib.loads(text)
+        tree: dict[str, Any] = json.loads(text) if is_json else parse_toml(text)
     except (ValueError, RecursionError) as error:
         raise ConfigError(f"{path}: not valid {'JSON' if is_json else 'TOML'}: {error}") from None
     return tree

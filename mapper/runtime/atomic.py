@@ -18,6 +18,8 @@ MANIFEST_NAME = "manifest.json"
 """File that identifies a folder of ours."""
 
 _TEMPORARY = ".*.part*"
+_MARK = ".mapper.part"
+"""File that says of a folder without a manifest that it is ours and not whole."""
 _DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO}
 _NO_FOLLOW = getattr(os, "O_NOFOLLOW", 0)
 _FOLDER = getattr(os, "O_DIRECTORY", None)
@@ -156,7 +158,13 @@ def flush_to_disk(path: Path) -> None:
 
 
 def partial_of(out: Path) -> Path:
-    """Return where a folder is built before it is whole: a sibling, so that one rename finishes it."""
+    """Return where a folder is built before it is whole: a sibling, so that one rename finishes it.
+
+    Raises:
+        RunError: The path has no name, as the root folder has none.
+    """
+    if not out.name:
+        raise RunError(f"{out}: has no name of its own; choose another --out")
     return out.with_name(f"{out.name}.partial")
 
 
@@ -186,16 +194,36 @@ def atomic_folder(
     out = out.resolve()
     _refuse_to_lose(out, kind, overwrite=overwrite, takes_over=takes_over)
     partial = partial_of(out)
-    if (partial.exists() or partial.is_symlink()) and not kind.wrote(partial):
+    if (partial.exists() or partial.is_symlink()) and not (_is_marked(partial) or kind.wrote(partial)):
         raise RunError(f"{partial}: is in the way and not {kind.name}; move it or choose another --out")
+    with _filled(partial, named=partial, keeps=keeps):
+        yield partial
+        _swap(partial, out)
+        (out / _MARK).unlink(missing_ok=True)
+
+
+@contextmanager
+def _filled(
+    partial: Path, *, named: Path, keeps: Callable[[Path], Collection[str]] = lambda _: ()
+) -> Iterator[None]:
+    """Hold a folder that is to be filled, marked as ours, without what an earlier process left in it.
+
+    Raises:
+        RunError: It cannot be made, or another process is filling it.
+        WriteError: It cannot be written.
+    """
     try:
         partial.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise RunError(f"{partial}: cannot be created: {error.strerror}") from None
-    with locked(partial), writing(partial):
+    with locked(partial), writing(named, partial):
         _empty(partial, except_for=keeps(partial))
-        yield partial
-        _swap(partial, out)
+        (partial / _MARK).touch()
+        yield
+
+
+def _is_marked(partial: Path) -> bool:
+    return partial.is_dir() and not partial.is_symlink() and (partial / _MARK).is_file()
 
 
 @contextmanager
@@ -331,19 +359,23 @@ def _exchange(partial: Path, out: Path) -> None:
 def new_folder(out: Path) -> Iterator[Path]:
     """Yield a folder to fill; it takes ``out``'s place when it is complete, and is gone if it never is.
 
+    What a process that was killed left of it is replaced.
+
     Raises:
-        SourceError: ``out`` is there and not empty.
+        SourceError: ``out`` is there and not empty, or something else is where it is filled.
+        RunError: Another process is filling it.
         WriteError: It cannot be written, as when the disk is full.
     """
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise SourceError(f"{out}: exists already; give a folder that does not, or remove it")
     out = out.resolve()
-    partial = out.with_name(f"{out.name}.{secrets.token_hex(8)}.partial")
-    with writing(out, partial):
-        out.parent.mkdir(parents=True, exist_ok=True)
-        partial.mkdir()
+    partial = partial_of(out)
+    if (partial.exists() or partial.is_symlink()) and not _is_marked(partial):
+        raise SourceError(f"{partial}: is in the way; move it or choose another folder")
+    with _filled(partial, named=out):
         try:
             yield partial
             partial.rename(out)
+            (out / _MARK).unlink()
         finally:
             shutil.rmtree(partial, ignore_errors=True)

@@ -1,14 +1,21 @@
 """Regular files of a bounded size, as bytes and as text; devices and pipes may never end, or never begin."""
 
 import os
+import re
 import stat
+import tomllib
 from pathlib import Path
+from typing import Any
 
 from mapper.core.errors import DataError, MapperError
 
 MOST_TEXT_BYTES = 256 << 20
 """Size of a text file, beyond which it is taken for something else: the true poses of ten hours at 100 Hz
 fill it, and as lines it takes a few gigabytes of memory."""
+
+
+_MOST_TOML_CHARACTERS = 1 << 20
+_MOST_KEY_PARTS = 32
 
 
 def read_regular(path: Path, *, most_bytes: int, may_be_pipe: bool = False) -> bytes:
@@ -36,6 +43,22 @@ def read_regular(path: Path, *, most_bytes: int, may_be_pipe: bool = False) -> b
         if len(data) > most_bytes:
             raise DataError(f"more than {most_bytes} bytes")
         return data
+
+
+def parse_toml(text: str) -> dict[str, Any]:
+    """Return the tree of a TOML document.
+
+    A key of thousands of parts, which is a thing of kilobytes, would take gigabytes to parse.
+
+    Raises:
+        ValueError: It is no TOML, or larger or deeper than any that people write.
+    """
+    if len(text) > _MOST_TOML_CHARACTERS:
+        raise ValueError(f"{len(text)} characters, at most {_MOST_TOML_CHARACTERS} are read")
+    words = re.split(r"[=,\[\]{}#\r\n]", text.replace(" ", "").replace("\t", ""))
+    if (deepest := max((word.count(".") for word in words), default=0)) > _MOST_KEY_PARTS:
+        raise ValueError(f"a key of {deepest + 1} parts, at most {_MOST_KEY_PARTS} are read")
+    return tomllib.loads(text)
 
 
 def read_text(

@@ -1,5 +1,6 @@
 """Paths of results that a caller does not name: after the log or run, with a number if that is taken."""
 
+import os
 from collections.abc import Sequence
 from itertools import count
 from pathlib import Path
@@ -9,6 +10,9 @@ from mapper.runtime.atomic import locked, partial_of
 
 RUNS, LOGS, MAPS, DIFFS = Path("runs"), Path("logs"), Path("maps"), Path("diffs")
 _MOST_NAMED = 3
+_LONGEST_NAME_BYTES = 255 - len(".partial")
+"""Longest name on Linux's file systems, less what is added to it while a folder is filled."""
+_SHOWN = 40
 
 
 def place_of(out: Path | None, usual: Path, *, overwrite: bool = False) -> Path:
@@ -22,6 +26,24 @@ def place_of(out: Path | None, usual: Path, *, overwrite: bool = False) -> Path:
         return usual
     numbered = (usual.with_name(f"{usual.stem}-{number}{usual.suffix}") for number in count(2))
     return next(path for path in numbered if not _is_taken(path))
+
+
+def result_path(path: Path) -> Path:
+    """Return a path that something may be written to, without ``..`` and with a name of its own.
+
+    Raises:
+        RunError: It is the root folder, or one of its names is too long for a file system.
+    """
+    if not path.name or ".." in path.parts:
+        path = path.resolve()
+    if not path.name:
+        raise RunError(f"{path}: has no name of its own; name a file or folder in it")
+    if longest := next((part for part in path.parts if len(os.fsencode(part)) > _LONGEST_NAME_BYTES), None):
+        raise RunError(
+            f"{longest[:_SHOWN]}…: a name of {len(os.fsencode(longest))} bytes, at most "
+            f"{_LONGEST_NAME_BYTES} can be written; choose a shorter one"
+        )
+    return path
 
 
 def name_of(path: Path) -> str:

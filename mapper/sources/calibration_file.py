@@ -3,7 +3,6 @@
 import json
 import math
 import re
-import tomllib
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -14,7 +13,7 @@ import numpy as np
 from mapper.core.errors import DataError, SourceError
 from mapper.core.frames import NO_DISTORTION, PinholeCamera
 from mapper.core.toml_text import toml_text
-from mapper.runtime.regular_files import read_text
+from mapper.runtime.regular_files import parse_toml, read_text
 from mapper.sources.calibration import Calibration
 
 _FILE_NAMES = (
@@ -64,7 +63,7 @@ def read_calibration(path: Path) -> Calibration:
     numbers: _Numbers
     try:
         if path.suffix == ".toml":
-            numbers = _toml_numbers(tomllib.loads(text))
+            numbers = _toml_numbers(parse_toml(text))
             unknown = sorted(set(numbers) - _KEYS)
             if unknown:
                 raise DataError(f"{unknown[0]}: unknown key; known are {', '.join(sorted(_KEYS))}")

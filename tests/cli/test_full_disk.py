@@ -47,7 +47,8 @@ def test_every_verb_tells_the_file_in_one_line_and_leaves_no_half(verb, desk_run
     assert re.match(f"mapper: {tmp_path}.*: cannot be written: (File too large|\\d+ requested)", lines[-1])
     left = [path for path in out.rglob("*") if path.is_file() and ".partial" not in str(path)]
     assert all(path.stat().st_size < 600 for path in left), "only files that are whole"
-    assert not list(tmp_path.rglob(".*")), "no temporary files"
+    temporary = [path for path in tmp_path.rglob(".*") if path.name != ".mapper.part"]
+    assert not temporary, "only the mark of a folder that is not whole"
     assert digest_of(run) == before
 
 
@@ -62,4 +63,4 @@ def test_a_full_disk_leaves_no_file_and_one_line(desk_log, tmp_path):
     assert build.stderr.count(b"\n") == 1, build.stderr
     assert b"File too large; raise the limit (ulimit -f)" in build.stderr
     assert not (tmp_path / "run").exists()
-    assert not list((tmp_path / "run.partial").glob(".*"))
+    assert [path.name for path in (tmp_path / "run.partial").glob(".*")] in ([], [".mapper.part"])

@@ -1,5 +1,7 @@
 import errno
 import json
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -104,6 +106,37 @@ def test_a_new_folder_on_a_full_disk_is_gone(tmp_path):
     (tmp_path / "log/mine").touch()
     with pytest.raises(SourceError, match="exists already"), new_folder(tmp_path / "log"):
         pytest.fail("the body must not run")
+
+
+KILLED = """
+import os, sys
+from pathlib import Path
+from mapper.runtime.atomic import FolderKind, atomic_folder, new_folder
+out = Path(sys.argv[2])
+kind = FolderKind("a map", manifest_keys=frozenset({"voxels"}), files=frozenset({"map.bt"}))
+with atomic_folder(out, kind) if sys.argv[1] == "atomic" else new_folder(out) as folder:
+    (folder / "cloud.ply").write_text("half")
+    os._exit(9)
+"""
+
+
+@pytest.mark.parametrize("way", ["atomic", "new"])
+def test_what_a_killed_process_left_is_replaced(tmp_path, way):
+    out = tmp_path / "out"
+    assert subprocess.run([sys.executable, "-c", KILLED, way, out], check=False).returncode == 9
+    assert names_in(tmp_path) == ["out.partial"]
+    with atomic_folder(out, MAP) if way == "atomic" else new_folder(out) as folder:
+        (folder / "map.bt").write_text("whole")
+    assert names_in(tmp_path) == ["out"]
+    assert names_in(out) == ["map.bt"]
+
+
+def test_a_folder_of_others_where_a_log_is_filled_is_left_alone(tmp_path):
+    (tmp_path / "log.partial").mkdir()
+    (tmp_path / "log.partial/mine").touch()
+    with pytest.raises(SourceError, match="in the way"), new_folder(tmp_path / "log"):
+        pytest.fail("the body must not run")
+    assert names_in(tmp_path / "log.partial") == ["mine"]
 
 
 def names_in(folder):

@@ -4,8 +4,9 @@ from pathlib import Path
 
 import pytest
 
+from mapper.core.errors import RunError
 from mapper.runtime.atomic import locked
-from mapper.runtime.result_paths import joined_names, name_of, place_of
+from mapper.runtime.result_paths import joined_names, name_of, place_of, result_path
 from tests.support.command_line import mapper
 
 
@@ -28,6 +29,35 @@ def test_a_place_is_numbered_while_it_is_taken(here):
         assert place_of(None, usual) == Path("runs/xyz-3"), "what another process fills is not"
     Path("log.mcap").touch()
     assert place_of(None, Path("log.mcap")) == Path("log-2.mcap")
+
+
+@pytest.mark.parametrize(
+    ("given", "found"), [("a/../../b", "../b"), (".", "."), ("", "."), ("runs/x", "runs/x")]
+)
+def test_a_result_has_a_name_of_its_own(here, given, found):
+    assert result_path(Path(given)).resolve() == (here / found).resolve()
+    assert result_path(Path(given)).name
+
+
+@pytest.mark.parametrize("given", ["/", "/..", "a" * 300, "ä" * 130 + "/run"])
+def test_what_cannot_be_a_name_is_refused(given):
+    with pytest.raises(RunError, match="name of"):
+        result_path(Path(given))
+
+
+WITH_RESULTS = {
+    "build": ["LOG"], "convert": ["LOG"], "solve": ["graph.g2o"], "diff": ["RUN", "RUN"],
+    "export": ["RUN", "--as", "native"],
+    "localise": ["LOG", "--in", "RUN"], "merge": ["RUN", "RUN"], "report": ["RUN"], "compare": ["LOG"],
+    "sweep": ["sweep.toml"], "vocabulary train": ["LOG"], "demo": [],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("verb", WITH_RESULTS)
+@pytest.mark.parametrize("out", ["/", "a" * 300])
+def test_every_verb_refuses_a_result_without_a_name_in_one_line(verb, out):
+    told = mapper(*verb.split(), *WITH_RESULTS[verb], "--out", out, status=1)
+    assert [line.startswith("mapper: ") for line in told.stderr.splitlines()] == [True]
 
 
 def test_names_are_those_of_the_logs(here):

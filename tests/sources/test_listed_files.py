@@ -4,6 +4,7 @@ import os
 import shutil
 import signal
 
+import numpy as np
 import pytest
 
 from mapper.core.errors import FrameError, SourceError
@@ -63,6 +64,19 @@ def test_an_image_that_is_a_link_out_of_the_log_is_refused(tiny_tum_log, tmp_pat
             SourceError, match=rf"{image.name}: a link to /etc/passwd, out of the log; copy the f"
         ):
             open_source(log if image.name == "link.png" else folder)
+
+
+@pytest.mark.parametrize("ending", [".pcd", ".npy", ".las", ".txt", ".bag", ".db3", ".mcap"])
+def test_clouds_and_recordings_in_a_folder_are_no_links_out_of_it(tmp_path, ending):
+    (tmp_path / "log").mkdir()
+    np.savetxt(tmp_path / "log/1.xyz", np.random.default_rng(0).normal(0, 5, (50, 3)))
+    text = (tmp_path / "log/1.xyz").read_bytes()
+    for name in ("1", "2"):
+        (tmp_path / f"secret{name}{ending}").write_bytes(text)
+        (tmp_path / f"log/{name}{ending}").symlink_to(tmp_path / f"secret{name}{ending}")
+    (tmp_path / "log/1.xyz").unlink()
+    with pytest.raises(SourceError, match=r"out of the log|not a log of a known"):
+        open_source(tmp_path / "log")
 
 
 def test_links_that_stay_inside_and_linked_folders_are_fine(tiny_tum_log, tmp_path):

@@ -3,6 +3,7 @@
 import re
 from io import StringIO
 from pathlib import Path
+from threading import Lock
 
 import numpy as np
 
@@ -15,6 +16,9 @@ _HEAD_BYTES = 1 << 16
 _NUMBER_BYTES = 4
 _MAX_CLASS = 1000
 _QUOTED = 60
+_ONE_HEADER = Lock()
+"""NumPy parses an array's header with ``ast``, which counts its recursion for all threads together in Python
+3.11 and may find it wrong."""
 EMPTY = "the file is empty"
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*([eE][-+]?\d+)?|\.\d+([eE][-+]?\d+)?|nan|inf)", re.IGNORECASE)
 
@@ -59,7 +63,7 @@ def read_npy(path: Path) -> Columns:
     Raises:
         FrameError: It is neither, or not an array's file.
     """
-    with path.open("rb") as stream, refusing_damage(path, what="npy"):
+    with path.open("rb") as stream, refusing_damage(path, what="npy"), _ONE_HEADER:
         array = np.lib.format.read_array(stream, allow_pickle=False)
     if array.dtype.names:
         return {name: array[name].ravel() for name in array.dtype.names if array[name].shape == array.shape}
@@ -102,6 +106,7 @@ def why_no_points(path: Path) -> str | None:
     except OSError as error:
         return f"cannot be read: {error.strerror}"
     text = head.decode("utf-8-sig", errors="replace").replace(",", " ").replace(";", " ")
+    text = text.replace("\r\n", "\n").replace("\r", "\n")  # as text files are read
     lines = text.split("\n")[: -1 if is_cut else None]
     names, skipped = _header(text)
     if skipped is None:

@@ -6,6 +6,7 @@ from pathlib import Path
 from mapper.core.errors import SourceError
 from mapper.sources.base import Log
 from mapper.sources.config import SourceConfig
+from mapper.sources.listed_files import refuse_links_out
 from mapper.sources.ros.reader import RecordingReader
 from mapper.sources.ros.recording import Recording
 from mapper.sources.ros.source import recording_log
@@ -41,6 +42,7 @@ def open_recording(path: Path) -> Recording:
         return _opened(path)
     from mapper.sources.ros.ros2_bag import JoinedRecording
 
+    refuse_links_out(_parts(path), log=path)
     parts: list[Recording] = []
     lost: list[str] = []
     for part in _parts(path):

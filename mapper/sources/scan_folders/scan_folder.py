@@ -15,6 +15,7 @@ from mapper.sources.base import Log
 from mapper.sources.cloud_files import EMPTY, ENDINGS, why_no_points
 from mapper.sources.config import SourceConfig
 from mapper.sources.image_folders.tum import read_truth
+from mapper.sources.listed_files import refuse_links_out
 from mapper.sources.scan_folders.scans import ScanEntry
 from mapper.sources.scan_stamps import in_order, line_of_each, scan_stamps
 from mapper.sources.text import rows, time_order, truth_from
@@ -96,9 +97,11 @@ def scan_log(
         notes: Sentences on what finding the clouds left out or assumed.
 
     Raises:
-        SourceError: A text file is missing or malformed, or has not one stamp for every cloud.
+        SourceError: A text file is missing or malformed, or has not one stamp for every cloud, or a file is a
+            link out of the log.
         DataError: A line of KITTI's poses is malformed.
     """
+    refuse_links_out(filter(None, [*files, stamps_file, truth_file]), log=path)
     stamps_ns, stamp_notes = scan_stamps(
         files, chosen=_chosen(path, config.stamps_file), beside=stamps_file, rate_hz=config.rate_hz
     )
