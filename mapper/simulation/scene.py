@@ -8,10 +8,9 @@ import numpy as np
 
 from mapper.core.frames import Image
 from mapper.core.geometry import Array
-from mapper.simulation import surfaces
-from mapper.simulation.atlas import Atlas, Faces, build_atlas
+from mapper.simulation import textures
 from mapper.simulation.boxes import Boxes
-from mapper.simulation.builder import DAYLIGHT, ORIGIN, Builder, Light, Place, Skin
+from mapper.simulation.builder import DAYLIGHT, ORIGIN, Atlas, Builder, Faces, Light, Place, Skin, build_atlas
 from mapper.simulation.config import SynthConfig
 from mapper.simulation.furniture import PIECES, Studio, desk
 from mapper.simulation.plan import (
@@ -27,7 +26,6 @@ from mapper.simulation.plan import (
     route_points,
 )
 from mapper.simulation.streams import Stream, rng_of
-from mapper.simulation.workshop import Workshop
 
 _SLAB_M = 0.2
 _WHITE = np.array([232.0, 230.0, 226.0])
@@ -76,7 +74,7 @@ def make_scene(config: SynthConfig) -> Scene:
     builder = Builder()
     rng = rng_of(config.seed, Stream.FURNITURE)
     another_day = rng_of(config.seed, Stream.DAY, config.day) if config.day > 0 else None
-    studio = Studio(builder, Workshop(builder, rng, px_per_m=config.texture_px_per_m), rng, another_day)
+    studio = Studio(builder, rng, another_day, px_per_m=config.texture_px_per_m)
     match config.scene:
         case "flat":
             _flat(config, studio, plan)
@@ -152,13 +150,13 @@ def _close_doors(studio: Studio, room: Room) -> list[_Footprint]:
         while at_m < length_m / 2 - 1.2:
             place = Place(*wall.world(at_m, -back_m / 2 + 0.03), yaw_rad)
             footprints.append(_footprint(place, (size[0] + 0.9, 0.4, size[2])))
-            front = {3: studio.shop.front((size[0], size[2]), columns=1, rows=2)}
+            front = {3: studio.front((size[0], size[2]), columns=1, rows=2)}
             low = (-size[0] / 2, -size[1] / 2, 0.0)
-            studio.builder.box("door", place, low=low, size=size, skin=studio.shop.wood(), faces=front)
+            studio.builder.box("door", place, low=low, size=size, skin=studio.wood(), faces=front)
             sign = (0.2, 0.02, 0.14)
-            faces = {3: studio.shop.document((sign[0], sign[2]))}
+            faces = {3: studio.print(textures.document, (sign[0], sign[2]))}
             low = (size[0] / 2 + 0.1, -0.03, 1.5)
-            studio.builder.box("sign", place, low=low, size=sign, skin=studio.shop.paint(), faces=faces)
+            studio.builder.box("sign", place, low=low, size=sign, skin=studio.paint(), faces=faces)
             at_m += studio.rng.uniform(3.0, 6.0)
     return footprints
 
@@ -198,15 +196,15 @@ def _room_surfaces(
     x0, y0 = room.x0_m - WALL_M / 2, room.y0_m - WALL_M / 2
     width, depth = room.x1_m - room.x0_m + WALL_M, room.y1_m - room.y0_m + WALL_M
     shape = (round(depth * px_per_m), round(width * px_per_m))
-    pave = surfaces.linoleum if plain else surfaces.FLOORS[(number + config.seed) % len(surfaces.FLOORS)]
+    pave = textures.linoleum if plain else textures.FLOORS[(number + config.seed) % len(textures.FLOORS)]
     floor = pave(rng, shape, px_per_m)
-    ceiling = (surfaces.painted if plain else surfaces.plaster)(rng, shape, px_per_m)
+    ceiling = (textures.painted if plain else textures.plaster)(rng, shape, px_per_m)
     for name, low, image in (("floor", -_SLAB_M, floor), ("ceiling", config.room_height_m, ceiling)):
         skin = Skin(builder.texture(image))
         builder.box(name, ORIGIN, low=(x0, y0, low), size=(width, depth, _SLAB_M), skin=skin)
     around = 2 * (room.x1_m - room.x0_m + room.y1_m - room.y0_m)
     strip = (round(config.room_height_m * px_per_m), round(around * px_per_m))
-    covering = surfaces.painted if plain else surfaces.WALLS[(number + config.seed) % len(surfaces.WALLS)]
+    covering = textures.painted if plain else textures.WALLS[(number + config.seed) % len(textures.WALLS)]
     return Skin(builder.texture(covering(rng, strip, px_per_m)), px_per_m)
 
 
@@ -217,7 +215,7 @@ def _build_wall(config: SynthConfig, studio: Studio, wall: Wall, *, plan: Plan, 
     if wall.door_m is not None:
         left, right = wall.door_m - DOOR_WIDTH_M / 2, wall.door_m + DOOR_WIDTH_M / 2
         parts = [(wall.low_m, left, 0.0), (left, right, DOOR_HEIGHT_M), (right, wall.high_m, 0.0)]
-    paint = studio.shop.paint()
+    paint = studio.paint()
     for begin, end, bottom in parts:
         faces = {}
         for side, number in ((0, wall.room_below), (1, wall.room_above)):
@@ -251,10 +249,10 @@ def _hang_door(studio: Studio, wall: Wall, door_m: float) -> _Footprint:
     past_rad = studio.rng.uniform(0.1, 0.4)
     yaw_rad = np.pi / 2 - past_rad if wall.axis == 0 else past_rad
     place = Place(hinge[0], hinge[1], float(yaw_rad))
-    front = studio.shop.front((leaf[0], leaf[2]), columns=1, rows=2)
+    front = studio.front((leaf[0], leaf[2]), columns=1, rows=2)
     faces = {2: front, 3: front}
     low_y = -leaf[1] if wall.axis == 0 else 0.0
-    studio.builder.box("door", place, low=(0, low_y, 0.01), size=leaf, skin=studio.shop.wood(), faces=faces)
+    studio.builder.box("door", place, low=(0, low_y, 0.01), size=leaf, skin=studio.wood(), faces=faces)
     x, y = place.world(leaf[0] / 2, low_y + leaf[1] / 2)
     return _footprint(Place(x, y, place.yaw_rad), leaf)
 
@@ -345,8 +343,8 @@ def _hang_pictures(
                 continue
             taken.append(footprint)
             low = (-size[0] / 2, -size[1] / 2 - 0.01, float(rng.uniform(1.25, 1.3)))
-            faces = {3: studio.shop.poster((size[0], size[2]))}
-            studio.builder.box("picture", place, low=low, size=size, skin=studio.shop.wood(), faces=faces)
+            faces = {3: studio.print(textures.poster, (size[0], size[2]))}
+            studio.builder.box("picture", place, low=low, size=size, skin=studio.wood(), faces=faces)
             break
 
 

@@ -5,8 +5,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from mapper.core.geometry import Array
-from mapper.simulation.atlas import LEVELS, Atlas, Faces
 from mapper.simulation.boxes import BoxView
+from mapper.simulation.builder import LEVELS, Atlas, Faces
 
 _TAPS_APART = 0.1
 """Taps closer than this share of a filtered texel are one."""

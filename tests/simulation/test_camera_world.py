@@ -17,8 +17,7 @@ from mapper.simulation import (
     read_scene,
     render,
 )
-from mapper.simulation.atlas import build_atlas
-from mapper.simulation.builder import ORIGIN, Builder, Skin
+from mapper.simulation.builder import ORIGIN, Builder, Skin, build_atlas
 from mapper.simulation.config import SynthConfig
 from mapper.simulation.path import START_NS, make_motion, seconds_of
 from tests.support.ideal_sensors import IDEAL_SENSOR

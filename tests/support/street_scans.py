@@ -9,7 +9,7 @@ from mapper.core.geometry import Transform, rotation_exp, transform
 from mapper.features.frame_view import ScanView
 from mapper.simulation.config import STREET, LidarSensorConfig
 from mapper.simulation.lidar import OutdoorScene, make_outdoor_scene
-from mapper.simulation.lidar.sensor import measure
+from mapper.simulation.lidar.source import measure
 
 MOUNT_M = 1.7
 SENSOR = LidarSensorConfig(rings=32, azimuth_steps=360)

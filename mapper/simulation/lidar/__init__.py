@@ -1,8 +1,7 @@
 """Simulated LiDAR logs: streets and yards, a route through them, and what a LiDAR sees, with exact truth."""
 
-from mapper.simulation.lidar.log import write_lidar_log
 from mapper.simulation.lidar.scene import OutdoorScene, make_outdoor_scene
-from mapper.simulation.lidar.source import LidarSimulator
+from mapper.simulation.lidar.source import LidarSimulator, write_lidar_log
 
 __all__ = [
     "LidarSimulator",

@@ -13,11 +13,14 @@ from numba import njit
 from numpy.typing import NDArray
 
 from mapper.core.geometry import Array
-from mapper.simulation.lidar.solids import Shape, Solids
-from mapper.simulation.lidar.terrain import Ground, Vector, ground_range_m
+from mapper.simulation.lidar.solids import Ground, Shape, Solids
 
 _CELL_M = 2.0
+_TOUCH_M = 1e-6
+_STEPS = 100
 _CYLINDER, _ELLIPSOID = float(Shape.CYLINDER), float(Shape.ELLIPSOID)
+
+Vector = tuple[float, float, float]
 
 
 class World(NamedTuple):
@@ -97,7 +100,7 @@ def cast(world: World, origins: Array, directions: Array, max_range_m: float, me
             )
             if meets_ground:
                 limit_m = min(nearest, max_range_m)
-                nearest = min(nearest, ground_range_m(slope, waves, origin, direction, limit_m))
+                nearest = min(nearest, _ground_range_m(slope, waves, origin, direction, limit_m))
             ranges[a, e] = nearest
             ray += 1
     return ranges
@@ -215,3 +218,33 @@ def _between_roots(a: float, half_b: float, c: float) -> tuple[float, float]:
         return np.inf, -np.inf
     root = math.sqrt(discriminant)
     return (-half_b - root) / a, (-half_b + root) / a
+
+
+@njit(cache=True, nogil=True)
+def _ground_range_m(slope: Array, waves: Array, origin: Vector, direction: Vector, limit_m: float) -> float:
+    """Return how far along a ray the ground is, metres; inf where it is not within the limit.
+
+    No step is longer than where the ray could be at the soonest if the ground rose towards it as fast as
+    the waves' curvature lets it: the root of gap + rate·s − bend·s²/2. So none passes through, as in sphere
+    tracing (Hart 1996), and the last steps converge like Newton's.
+    """
+    dx, dy, dz = direction
+    bend = 1e-12
+    for k in range(len(waves)):
+        bend += abs(waves[k, 0]) * (waves[k, 1] * dx + waves[k, 2] * dy) ** 2
+    t = 0.0
+    for _ in range(_STEPS):
+        x, y = origin[0] + t * dx, origin[1] + t * dy
+        gap = origin[2] + t * dz - slope[0] * x - slope[1] * y
+        rate = dz - slope[0] * dx - slope[1] * dy
+        for k in range(len(waves)):
+            angle = waves[k, 1] * x + waves[k, 2] * y + waves[k, 3]
+            gap -= waves[k, 0] * math.sin(angle)
+            rate -= waves[k, 0] * math.cos(angle) * (waves[k, 1] * dx + waves[k, 2] * dy)
+        if gap < _TOUCH_M:
+            return t
+        root = math.sqrt(rate * rate + 2.0 * bend * gap)
+        t += (rate + root) / bend if rate > 0.0 else 2.0 * gap / (root - rate)
+        if t > limit_m:
+            return np.inf
+    return np.inf

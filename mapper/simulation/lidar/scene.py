@@ -13,11 +13,9 @@ from mapper.simulation.builder import ORIGIN, Place
 from mapper.simulation.config import LidarSynthConfig
 from mapper.simulation.lidar import things
 from mapper.simulation.lidar.cast import World, sort_into_cells
-from mapper.simulation.lidar.facades import row
 from mapper.simulation.lidar.route import Route, flat_of, make_route
-from mapper.simulation.lidar.solids import Shape, Site, Solids
+from mapper.simulation.lidar.solids import Ground, Shape, Site, Solids, make_ground
 from mapper.simulation.lidar.staircase import build_staircase, storeys_of
-from mapper.simulation.lidar.terrain import Ground, make_ground
 from mapper.simulation.scene import make_scene
 from mapper.simulation.streams import Stream, rng_of
 
@@ -97,7 +95,7 @@ def _street(
     width, depth = route.size_m
     for side in _sides(width + 2 * _FACADE_M, depth + 2 * _FACADE_M):
         house_rng = rng.spawn(1)[0]
-        row(site, side.outwards(), side.length_m, depth_m=_HOUSE_M, behind_m=20.0, rng=house_rng)
+        things.row(site, side.outwards(), side.length_m, depth_m=_HOUSE_M, behind_m=20.0, rng=house_rng)
     block = (width - 2 * _FACADE_M, depth - 2 * _FACADE_M)
     if min(block) >= _SMALLEST_BLOCK_M:
         _block(site, block, rng)
@@ -114,7 +112,7 @@ def _block(site: Site, size_m: tuple[float, float], rng: np.random.Generator) ->
         inset_m = deep_m if number % 2 else 0.0
         start = Place(*side.start.world(inset_m, 0.0), side.start.yaw_rad)
         length_m = side.length_m - 2 * inset_m
-        row(site, start, length_m, depth_m=deep_m, behind_m=0.0, rng=rng.spawn(1)[0])
+        things.row(site, start, length_m, depth_m=deep_m, behind_m=0.0, rng=rng.spawn(1)[0])
 
 
 def _courtyard(site: Site, route: Route, rng: np.random.Generator) -> None:

@@ -1,5 +1,9 @@
-"""Solids of the outdoor world: each fills a turned box, as a cuboid, an upright cylinder or an ellipsoid."""
+"""The outdoor world: ground that slopes and undulates, and solids that stand on it.
 
+A solid fills a turned box, as a cuboid, an upright cylinder or an ellipsoid.
+"""
+
+import math
 from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Any
@@ -11,7 +15,55 @@ from mapper.core.errors import DataError
 from mapper.core.geometry import Array
 from mapper.simulation.boxes import Boxes
 from mapper.simulation.builder import Place
-from mapper.simulation.lidar.terrain import Ground
+
+_WAVES = 3
+_SHORTEST_WAVE_M, _LONGEST_WAVE_M = 25.0, 70.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Ground:
+    """z = slope · (x, y) + Σ amplitude · sin(wave · (x, y) + phase).
+
+    Attributes:
+        slope: (2,) rise per metre along x and y.
+        waves: (K, 4) amplitude in metres, wave vector x and y in radians per metre, phase in radians.
+    """
+
+    slope: Array
+    waves: Array
+
+    def height_m(self, points_xy: Array) -> Array:
+        """Return (N,) heights above z = 0 at (N, 2) places."""
+        return points_xy @ self.slope + np.sin(self._angles(points_xy)) @ self.waves[:, 0]
+
+    def normals(self, points_xy: Array) -> Array:
+        """Return (N, 3) unit normals, upwards, at (N, 2) places."""
+        swing = np.cos(self._angles(points_xy)) * self.waves[:, 0]
+        rise = self.slope + swing @ self.waves[:, 1:3]
+        normals = np.column_stack([-rise, np.ones(len(rise))])
+        unit: Array = normals / np.linalg.norm(normals, axis=1, keepdims=True)
+        return unit
+
+    def as_json(self) -> dict[str, list[Any]]:
+        """Return both attributes, with every digit."""
+        return {"slope": self.slope.tolist(), "waves": self.waves.tolist()}
+
+    def _angles(self, points_xy: Array) -> Array:
+        return points_xy @ self.waves[:, 1:3].T + self.waves[:, 3]
+
+
+def make_ground(rng: np.random.Generator, *, slope_rad: float, undulation_m: float) -> Ground:
+    """Return ground that rises by an angle in any direction and swings by at most ``undulation_m``."""
+    uphill_rad = rng.uniform(0.0, 2.0 * np.pi)
+    amplitudes_m = undulation_m * rng.dirichlet(np.ones(_WAVES))
+    directions_rad, phases_rad = rng.uniform(0.0, 2.0 * np.pi, (2, _WAVES))
+    rates = 2.0 * np.pi / rng.uniform(_SHORTEST_WAVE_M, _LONGEST_WAVE_M, _WAVES)
+    return Ground(
+        slope=math.tan(slope_rad) * np.array([np.cos(uphill_rad), np.sin(uphill_rad)]),
+        waves=np.column_stack(
+            [amplitudes_m, rates * np.cos(directions_rad), rates * np.sin(directions_rad), phases_rad]
+        ),
+    )
 
 
 class Shape(IntEnum):

@@ -11,8 +11,7 @@ from mapper.simulation.config import LidarSynthConfig
 from mapper.simulation.lidar import things
 from mapper.simulation.lidar.cast import cast, sort_into_cells
 from mapper.simulation.lidar.route import Route
-from mapper.simulation.lidar.solids import Shape, Site, Solids
-from mapper.simulation.lidar.terrain import Ground
+from mapper.simulation.lidar.solids import Ground, Shape, Site, Solids
 from mapper.simulation.streams import Stream, rng_of
 
 _LANE_M = 1.75
