@@ -68,7 +68,8 @@ def measure(tree: Tree, log: Path, settings: Sequence[str], out: Path) -> Measur
     """Build a log by a tree."""
     paths = [str(tree.folder), tree.packages]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, paths))}
-    command = [sys.executable, "-c", "from mapper.cli.main import main; main()", "build", str(log)]
+    package = "mapper.cli" if (tree.folder / "mapper" / "cli").exists() else "cli"  # until 22 November
+    command = [sys.executable, "-c", f"from {package}.main import main; main()", "build", str(log)]
     command += ["--out", str(out), *(word for setting in settings for word in ("--set", setting))]
     before, began_s = resource.getrusage(resource.RUSAGE_CHILDREN), time.monotonic()
     ended = subprocess.run(
