@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from mapper.core.errors import DataError, FrameError
 from mapper.core.frames import DepthImage, Scan
 from mapper.sources.base import ImageFiles
@@ -10,7 +12,7 @@ from mapper.sources.image_files.reading import encode_colour, encode_depth
 from mapper.sources.image_folders.rgbd import RgbdEntry
 from mapper.sources.ros.cloud_messages import scan_from
 from mapper.sources.ros.decode import decode
-from mapper.sources.ros.frame_tree import FrameTree
+from mapper.sources.ros.frame_tree import FrameTree, is_fixed
 from mapper.sources.ros.image_messages import depth_file_of, depth_m_of, image_of
 from mapper.sources.ros.messages import CloudMessage, FileMessage, ImageMessage, Message, frame_of
 from mapper.sources.ros.recording import Place, Recording, Topic
@@ -123,12 +125,18 @@ class CloudEntry:
             raise FrameError(f"{self.cloud}: {self.cloud.topic.type} is no point cloud")
         message = replace(message, stamp_ns=self.cloud.stamp_ns)
         frame = frame_of(message)
-        T_body_frame = self.tree.find(self.body, frame)
+        T_body_frame = self.tree.find(self.body, frame, stamp_ns=self.stamp_ns)
         if T_body_frame is None:
+            when = "" if self.tree.find(self.body, frame) is None else " at that time"
             raise FrameError(
-                f"{self.cloud}: its points are in frame {frame}, which tf does not connect to {self.body}"
+                f"{self.cloud}: its points are in frame {frame}, which tf does not connect to "
+                f"{self.body}{when}"
             )
-        return scan_from(message, T_body_frame=T_body_frame, with_colours=colour, where=f"{self.cloud}")
+        scan = scan_from(message, T_body_frame=T_body_frame, with_colours=colour, where=f"{self.cloud}")
+        if frame != self.body and is_fixed(frame):
+            # Where the sensor was is not stated; what turned its points into that frame has deskewed them.
+            scan = replace(scan, origin_body=np.zeros(3), times_s=None)
+        return scan
 
     def scan(self) -> Scan:
         """Read the cloud without its colours.

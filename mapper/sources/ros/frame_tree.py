@@ -1,49 +1,116 @@
 """Tree of the coordinate frames in tf."""
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
-from mapper.core.geometry import Transform, inverse
+from mapper.core.geometry import Array, Transform, inverse
+from mapper.core.timebase import NS_PER_S, Stamps
+from mapper.core.trajectory import Trajectory, trajectory_from
+from mapper.sensing.wheel_kinematics import pose_at
 from mapper.sources.ros.messages import PoseMessage
-from mapper.sources.text import pose_from_numbers
+from mapper.sources.text import poses_from_numbers
+
+_FIXED_FRAMES = frozenset(
+    {"map", "odom", "world", "earth", "utm", "enu", "global", "combined", "init", "origin"}
+)
+"""Last words of frames that do not move with the robot: REP 105's, odom_combined of robot_pose_ekf,
+camera_init of LOAM (Zhang & Singh 2014), local_origin of mavros."""
+_MAX_GAP_NS = NS_PER_S
+"""Longer than any publisher of a moving frame pauses; tf2 keeps 10 s and interpolates over any gap."""
+_SAME_POSE = 1e-6
+_LATEST_NS = 1 << 62
+
+
+def is_fixed(frame: str) -> bool:
+    """Return whether a frame's name says that it does not move with the robot."""
+    return re.split("[/_]", frame.lower())[-1] in _FIXED_FRAMES
 
 
 class FrameTree:
-    """Tree of coordinate frames, each at its first pose, for what is mounted on a robot does not move."""
+    """Tree of coordinate frames; those that move in their parent keep their poses over time."""
 
     def __init__(self, poses: Iterable[PoseMessage]) -> None:
-        """Keep the first pose of every frame in its parent."""
-        self._parents: dict[str, tuple[str, Transform]] = {}
+        """Keep the poses of every frame in its first parent; of several with one stamp the first."""
+        links: dict[tuple[str, str], dict[int, Sequence[float]]] = {}
         for pose in poses:
-            child, parent = pose.child.lstrip("/"), pose.parent.lstrip("/")
-            if child not in self._parents:
-                T_parent_child = pose_from_numbers(np.array(pose.numbers))
-                if T_parent_child is not None:
-                    self._parents[child] = (parent, T_parent_child)
+            link = links.setdefault((pose.child.lstrip("/"), pose.parent.lstrip("/")), {})
+            link.setdefault(min(max(pose.stamp_ns, 0), _LATEST_NS), pose.numbers)
+        self._parents: dict[str, tuple[str, Trajectory]] = {}
+        for (child, parent), numbers in links.items():
+            found = zip(numbers, poses_from_numbers(np.array(list(numbers.values()))), strict=True)
+            path = [(stamp_ns, T) for stamp_ns, T in found if T is not None]
+            if path and child not in self._parents:
+                stays = np.ptp([T for _, T in path], axis=0).max() < _SAME_POSE
+                self._parents[child] = (
+                    parent,
+                    trajectory_from(path[:1] if stays else sorted(path, key=_stamp)),
+                )
 
     @property
     def frames(self) -> Sequence[str]:
         """Every frame, in order of name."""
         return sorted(self._parents.keys() | {parent for parent, _ in self._parents.values()})
 
-    def find(self, to: str, from_: str) -> Transform | None:
-        """Return T_to_from, the pose of one frame in another; None where nothing connects them."""
-        T_ancestor_to, T_ancestor_from = self._ancestors(to), self._ancestors(from_)
+    def find(self, to: str, from_: str, *, stamp_ns: int | None = None) -> Transform | None:
+        """Return T_to_from, the pose of one frame in another.
+
+        Args:
+            to: The frame in which the pose is given.
+            from_: The frame whose pose it is.
+            stamp_ns: Time for which poses of frames that move are interpolated; None takes their first.
+
+        Returns:
+            None where nothing connects the two, or where one moves and its pose at that time is unknown.
+        """
+        T_ancestor_to, T_ancestor_from = self._ancestors(to, stamp_ns), self._ancestors(from_, stamp_ns)
         for ancestor, T_a_from in T_ancestor_from.items():
             if ancestor in T_ancestor_to:
                 return inverse(T_ancestor_to[ancestor]) @ T_a_from
         return None
 
-    def _ancestors(self, frame: str) -> Mapping[str, Transform]:
+    def find_each(self, to: str, from_: str, stamps_ns: Stamps) -> tuple[NDArray[np.bool_], Array]:
+        """Return at which of some times T_to_from is known, and (N, 4, 4) T_to_from at these."""
+        times: list[int | None] = stamps_ns.tolist() if self.moves(to, from_) else [None]
+        found = [self.find(to, from_, stamp_ns=time) for time in times]
+        known = np.broadcast_to([T is not None for T in found], stamps_ns.shape)
+        T_to_from = np.array([T for T in found if T is not None]).reshape(-1, 4, 4)
+        return known, np.broadcast_to(T_to_from, (int(known.sum()), 4, 4))
+
+    def moves(self, to: str, from_: str) -> bool:
+        """Return whether one frame moves in another that is connected to it."""
+        between = self._ancestors(to).keys() ^ self._ancestors(from_).keys()
+        return self.find(to, from_) is not None and any(map(self._moves_in_parent, between))
+
+    def carried_by(self, fixed: str) -> str | None:
+        """Return the frame nearest below a fixed one that moves in it; None without one."""
+        moving = filter(self._moves_in_parent, self._parents)
+        below = [
+            (len(chain), child) for child in moving if fixed.lstrip("/") in (chain := self._ancestors(child))
+        ]
+        return min(below)[1] if below else None
+
+    def _moves_in_parent(self, frame: str) -> bool:
+        return frame in self._parents and len(self._parents[frame][1]) > 1
+
+    def _ancestors(self, frame: str, stamp_ns: int | None = None) -> Mapping[str, Transform]:
         """Return the pose of a frame in itself, its parent, its parent's parent and so on."""
         frame = frame.lstrip("/")
         T = np.eye(4)
         found = {frame: T}
         while frame in self._parents:
-            frame, T_parent_frame = self._parents[frame]
-            if frame in found:
+            frame, path = self._parents[frame]
+            T_parent_frame: Transform | None = path[0]
+            if len(path) > 1 and stamp_ns is not None:
+                T_parent_frame = pose_at(path, stamp_ns, max_gap_ns=_MAX_GAP_NS)
+            if frame in found or T_parent_frame is None:
                 break
             T = T_parent_frame @ T
             found[frame] = T
         return found
+
+
+def _stamp(moment: tuple[int, Transform]) -> int:
+    return moment[0]

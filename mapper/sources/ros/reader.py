@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,7 +55,16 @@ class RecordingReader:
         self.recording = recording
         self.series: Mapping[str, Series] = index_of(recording)
         self.firsts: Mapping[str, Message] = first_messages(recording, self.series.values())
-        self.tree = FrameTree(self._transforms())
+        self.tree = FrameTree(self._transforms(most=_MAX_TRANSFORMS))
+
+    @cached_property
+    def whole_tree(self) -> FrameTree:
+        """The coordinate frames with every pose of those that move."""
+        return FrameTree(self._transforms(most=None))
+
+    def tree_of(self, to: str, from_: str) -> FrameTree:
+        """Return a tree with every pose of the frames between two."""
+        return self.whole_tree if self.tree.moves(to, from_) else self.tree
 
     def located(self, series: Series, i: int) -> Located:
         """Return message ``i`` of a topic, to be read later."""
@@ -67,11 +77,10 @@ class RecordingReader:
         truth, child, notes = self._poses_of(series)
         if truth is None or child in ("", body):
             return truth, notes
-        T_child_body = self.tree.find(child, body)
-        if T_child_body is None:
+        if self.tree.find(child, body) is None:
             note = f"{series.topic.name}: poses of {child}, which tf does not tie to {body}; taken as its own"
             return truth, [*notes, note]
-        return replace(truth, T_world_body=truth.T_world_body @ T_child_body), notes
+        return self._carried(truth, child, body), notes
 
     def wheels(
         self, series: Series | None, *, body: str, config: WheelsConfig, sensor: Sensor
@@ -88,42 +97,55 @@ class RecordingReader:
         wheels, child, notes = self._poses_of(series)
         if wheels is None or child == body:
             return wheels, notes
-        T_base_body = self.tree.find(child, body) if child and config.body_in_base is None else None
-        if T_base_body is None:
-            T_base_body = mounting(config, sensor)
-            if config.body_in_base is None:
-                notes.append(
-                    f"{series.topic.name}: tf does not tie {child or 'it'} to {body}, which is taken to be "
-                    "at its origin, looking forward; a config file can set source.wheels.body_in_base"
-                )
-        return replace(wheels, T_world_body=wheels.T_world_body @ T_base_body), notes
+        if child and config.body_in_base is None and self.tree.find(child, body) is not None:
+            return self._carried(wheels, child, body), notes
+        if config.body_in_base is None:
+            notes.append(
+                f"{series.topic.name}: tf does not tie {child or 'it'} to {body}, which is taken to be "
+                "at its origin, looking forward; a config file can set source.wheels.body_in_base"
+            )
+        return replace(wheels, T_world_body=wheels.T_world_body @ mounting(config, sensor)), notes
 
     def accelerations(self, series: Series | None, *, body: str) -> tuple[Accelerations | None, list[str]]:
         """Return the readings of a topic, in the body's axes where tf ties the two, and notes."""
         if series is None:
             return None, []
         order, notes = ordered(series)
-        readings = [
-            message
-            for message in self._messages(series, _spread(order, most=_MAX_READINGS))
+        stamped = [
+            (stamp_ns, message)
+            for stamp_ns, message in self._messages(series, _spread(order, most=_MAX_READINGS))
             if isinstance(message, ImuMessage) and np.isfinite(message.acceleration_mps2).all()
         ]
+        readings = [reading for _, reading in stamped]
         if not readings:
             return None, [*notes, f"{series.topic.name}: no readings"]
-        stamps_ns = np.array([reading.stamp_ns for reading in readings], dtype=np.int64)
+        stamps_ns = np.array([stamp_ns for stamp_ns, _ in stamped], dtype=np.int64)
         acceleration_imu = np.array([reading.acceleration_mps2 for reading in readings])
         unit = unit_mps2(np.median(np.linalg.norm(acceleration_imu, axis=1)) * np.eye(3)[0])
         if unit == GRAVITY_MPS2:
             acceleration_imu *= unit
             notes.append(f"{series.topic.name}: accelerations are as long as 1 at rest: taken as g")
-        T_body_imu = self.tree.find(body, frame_of(readings[0]))
-        R_body_imu = np.eye(3) if T_body_imu is None else T_body_imu[:3, :3]
-        return Accelerations(stamps_ns, acceleration_imu @ R_body_imu.T, T_body_imu is not None), notes
+        imu = frame_of(readings[0])
+        known, T_body_imu = self.tree_of(body, imu).find_each(body, imu, stamps_ns)
+        if not known.any():
+            return Accelerations(stamps_ns, acceleration_imu), notes
+        acceleration_body = np.einsum("nij,nj->ni", T_body_imu[:, :3, :3], acceleration_imu[known])
+        return Accelerations(stamps_ns[known], acceleration_body, are_axes_stated=True), notes
+
+    def base_of(self, frame: str) -> str | None:
+        """Return the frame of the robot that carries a frame; None where tf names none."""
+        bases = (base for base in _BASES if base in self.tree.frames)
+        return next((base for base in bases if self.tree.find(base, frame) is not None), None)
 
     def mounting(self, body: str) -> Transform | None:
-        """Return T_base_body, the pose of the body on the robot; None where tf names no robot's base."""
-        poses = (self.tree.find(base, body) for base in _BASES if base in self.tree.frames)
-        return next((T_base_body for T_base_body in poses if T_base_body is not None), None)
+        """Return T_base_body, the pose of the body on the robot; None where tf names none, or it moves."""
+        base = self.base_of(body)
+        return None if base is None or self.tree.moves(base, body) else self.tree.find(base, body)
+
+    def _carried(self, poses: Trajectory, child: str, body: str) -> Trajectory:
+        """Return the poses of the body for those of the frame that carries it."""
+        known, T_child_body = self.tree_of(child, body).find_each(child, body, poses.stamps_ns)
+        return Trajectory(poses.stamps_ns[known], poses.T_world_body[known] @ T_child_body)
 
     def _poses_of(self, series: Series) -> tuple[Trajectory | None, str, list[str]]:
         """Return the poses of a topic in time order, the frame that moves, and notes."""
@@ -133,23 +155,27 @@ class RecordingReader:
         trajectory, pose_notes = _trajectory(poses, what=series.topic.name)
         return trajectory, child, [*order_notes, *pose_notes]
 
-    def _transforms(self) -> Iterator[PoseMessage]:
+    def _transforms(self, *, most: int | None) -> Iterator[PoseMessage]:
         """Yield the transforms of tf, the static first; of many, enough to name every frame."""
         series = [one for one in self.series.values() if one.topic.type in TRANSFORMS]
         for one in sorted(series, key=lambda one: "static" not in one.topic.name):
-            yield from self._poses(one, _spread(np.arange(len(one)), most=_MAX_TRANSFORMS))
+            for recorded_ns, message in self._messages(
+                one, _spread(np.arange(len(one)), most=most or len(one))
+            ):
+                if isinstance(message, list):
+                    yield from (replace(pose, stamp_ns=pose.stamp_ns or recorded_ns) for pose in message)
 
     def _poses(self, series: Series, indices: NDArray[np.intp]) -> Iterator[PoseMessage]:
-        for message in self._messages(series, indices):
+        for stamp_ns, message in self._messages(series, indices):
             if isinstance(message, list):
-                yield from message
+                yield from (replace(pose, stamp_ns=stamp_ns) for pose in message)
 
-    def _messages(self, series: Series, indices: NDArray[np.intp]) -> Iterator[Message]:
-        """Yield some of a topic's messages; damaged ones are left out."""
+    def _messages(self, series: Series, indices: NDArray[np.intp]) -> Iterator[tuple[int, Message]]:
+        """Yield some of a topic's messages with their stamps in the series; damaged ones are left out."""
         for i in indices.tolist():
             with suppress(FrameError, DataError):
                 data = series.kept.get(i) or self.recording.read(series.place(i))
-                yield decode(series.topic, memoryview(data))
+                yield int(series.stamps_ns[i]), decode(series.topic, memoryview(data))
 
 
 def _spread(indices: NDArray[np.intp], *, most: int) -> NDArray[np.intp]:

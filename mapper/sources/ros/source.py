@@ -15,6 +15,7 @@ from mapper.sources.image_files.image_sizes import RecordedCamera, Size, recorde
 from mapper.sources.image_files.reading import FINE_UNITS_PER_M
 from mapper.sources.image_folders.pairing import depth_offset_ns
 from mapper.sources.ros.entries import CloudEntry, rgbd_entry
+from mapper.sources.ros.frame_tree import is_fixed
 from mapper.sources.ros.image_messages import MILLIMETRES_PER_M, has_float_depth, size_of
 from mapper.sources.ros.index import Series, why_unread
 from mapper.sources.ros.message_order import ordered, paired
@@ -34,8 +35,6 @@ from mapper.sources.undistorted import FISHEYE_MODELS, POLYNOMIAL_MODELS, Lens, 
 _SAME_LENS_RATIO = 0.01
 _SAME_PLACE_M = 0.005
 """Colour cameras lie farther beside the depth camera, 15 mm at least; frames of one lens may be turned."""
-_FIXED_FRAMES = frozenset({"map", "odom", "world", "earth", "utm", "camera_init", "global", "local_origin"})
-"""Names of frames that do not move with the robot (REP 105; camera_init is LOAM's, Zhang & Singh 2014)."""
 _JPEG_START = b"\xff\xd8"
 
 
@@ -139,25 +138,53 @@ def _lidar(reader: RecordingReader, clouds: Series, config: SourceConfig) -> _Fr
     if isinstance(first, CloudMessage):
         notes += [f"{clouds.topic.name}: {note}" for note in first.notes]
     frame = frame_of(first)
-    body = config.body_frame or frame
-    if config.body_frame is None and frame in _FIXED_FRAMES:
-        raise SourceError(
-            f"{reader.recording.path}: the points of {clouds.topic.name} are in frame {frame}, which stays "
-            "where it is while the sensor moves; build from the driver's own topic (source.topics.points), "
-            f"or if they are around the sensor all the same, --set source.body_frame={frame}"
-        )
-    if reader.tree.find(body, frame) is None:
-        raise SourceError(
-            f"{reader.recording.path}: source.body_frame={body}: tf does not connect it to the clouds' "
-            f"frame {frame}; its frames: {', '.join(reader.tree.frames) or 'no frames'}"
-        )
+    body, body_notes = _body_of(reader, frame, config, name=clouds.topic.name)
+    notes += body_notes
     if "optical" in body:
         notes.append(f"points are in {body}, whose z looks forward; source.body_frame can take another")
 
     def entry_at(index: int) -> FrameRef:
-        return CloudEntry(reader.located(clouds, int(i[index])), body, reader.tree)
+        return CloudEntry(reader.located(clouds, int(i[index])), body, tree)
 
+    tree = reader.tree_of(body, frame)
     return _Frames("lidar", body, clouds.stamps_ns[i], entry_at, notes)
+
+
+def _body_of(
+    reader: RecordingReader, frame: str, config: SourceConfig, *, name: str
+) -> tuple[str, list[str]]:
+    """Return the frame of the scans of clouds in a frame, and notes: the robot's where theirs moves in it.
+
+    Raises:
+        SourceError: The clouds' frame stays and tf does not say where the robot was, or tf does not connect
+            the clouds' frame to the body's.
+    """
+    path, tree = reader.recording.path, reader.tree
+    body, notes = config.body_frame or frame, []
+    base = reader.base_of(frame) or (tree.carried_by(frame) if is_fixed(frame) else None)
+    if config.body_frame is None and base is not None and tree.moves(base, frame):
+        body = base
+        notes.append(
+            f"{name}: points in frame {frame}, which moves in {base} by tf, are turned into {base}; "
+            "source.body_frame can take another"
+        )
+    elif config.body_frame is None and is_fixed(frame):
+        raise SourceError(
+            f"{path}: the points of {name} are in frame {frame}, which stays where it is while the sensor "
+            "moves; build from the driver's own topic (source.topics.points), or if they are around the "
+            f"sensor all the same, --set source.body_frame={frame}"
+        )
+    if tree.find(body, frame) is None:
+        raise SourceError(
+            f"{path}: source.body_frame={body}: tf does not connect it to the clouds' frame {frame}; its "
+            f"frames: {', '.join(tree.frames) or 'no frames'}"
+        )
+    if is_fixed(body) and body != frame:
+        raise SourceError(
+            f"{path}: source.body_frame={body}: it stays where it is while the sensor moves; want a frame "
+            f"of the robot: {', '.join(one for one in tree.frames if not is_fixed(one))}"
+        )
+    return body, notes
 
 
 def _refuse_apart(reader: RecordingReader, topics: CameraTopics, frame: str, depth_frame: str) -> None:

@@ -2,65 +2,30 @@
 
 import numpy as np
 import pytest
-from rosbags.typesys import Stores, get_typestore
 
 from mapper.core.errors import FrameError, SourceError
 from mapper.core.frames import PinholeCamera, Scan
 from mapper.core.geometry import exp
-from mapper.core.rotations import quaternion_from_rotation
 from mapper.sources import open_source
 from mapper.sources.config import CameraConfig, SourceConfig, TopicsConfig
 from mapper.sources.image_files.reading import decode_depth_units
 from mapper.sources.ros.encode_ros import (
-    SerializedMessage,
     cloud_message,
     compressed_image_message,
     imu_message,
     odometry_message,
 )
 from mapper.sources.writers import write_log
-from tests.support.recordings import CAMERA, COLOR, DEPTH, camera_info, image, shots, write
+from tests.support.recordings import CAMERA, COLOR, DEPTH, camera_info, image, shots, transforms, write
 from tests.support.tum_logs import FIRST_NS, PERIOD_NS, picture
 
 RVL = "16UC1; compressedDepth rvl"
-ROS2 = get_typestore(Stores.ROS2_HUMBLE)
 T_BASE_LIDAR = exp(np.array([0.0, 0.0, 1.5]), np.array([0.2, 0.0, 1.1]))
-
-
-def made(type_, **fields):
-    return ROS2.types[type_](**fields)
 
 
 def cloud(stamp_ns, topic="/velodyne_points", n=20):
     points = np.random.default_rng(stamp_ns % 1000).uniform(-9.0, 9.0, (n, 3)).astype(np.float32)
     return cloud_message(topic, Scan(stamp_ns, points), frame="lidar")
-
-
-def transforms(*told, topic="/tf_static"):
-    """A message of (parent, child, T_parent_child)."""
-    stamped = []
-    for parent, child, T in told:
-        x, y, z = T[:3, 3].tolist()
-        qx, qy, qz, qw = quaternion_from_rotation(T[:3, :3]).tolist()
-        header = made(
-            "std_msgs/msg/Header",
-            stamp=made("builtin_interfaces/msg/Time", sec=0, nanosec=0),
-            frame_id=parent,
-        )
-        transform = made(
-            "geometry_msgs/msg/Transform",
-            translation=made("geometry_msgs/msg/Vector3", x=x, y=y, z=z),
-            rotation=made("geometry_msgs/msg/Quaternion", x=qx, y=qy, z=qz, w=qw),
-        )
-        stamped.append(
-            made(
-                "geometry_msgs/msg/TransformStamped", header=header, child_frame_id=child, transform=transform
-            )
-        )
-    type_ = "tf2_msgs/msg/TFMessage"
-    return SerializedMessage(
-        FIRST_NS, topic, type_, bytes(ROS2.serialize_cdr(made(type_, transforms=stamped), type_))
-    )
 
 
 def odometry(stamp_ns, T, *, child="base_link", topic="/odom"):
