@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 def prepare_environment() -> None:
     """Leave the threads to us, and give compiled code a place where it may be kept."""
     import mapper
-    from mapper.runtime.threads import one_thread_per_library
+    from mapper.runtime.extras import one_thread_per_library
 
     one_thread_per_library()
     os.environ.setdefault("RUST_LOG", "off")  # Rerun would print lines of its own beside our errors

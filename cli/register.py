@@ -54,8 +54,8 @@ def register(
 
     Example: mapper register scan_10.bin scan_00.bin --method hough-gicp --out registered
     """
-    from mapper.api.guess import parse_guess
     from mapper.api.logs import read_frame
+    from mapper.api.register import parse_guess
     from mapper.config.loading import load_source_config, overridden
     from mapper.config.register import check_method, register_config
     from mapper.evaluators.register.files import (

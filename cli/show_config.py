@@ -38,7 +38,7 @@ def show_config(
     loaded = load_config(config, set_ or (), sensor=sensor)
     values = loaded.model_dump(mode="json")
     if key is None and not docs:
-        from mapper.core.toml_text import toml_text
+        from mapper.core.config import toml_text
 
         return Answer(values, toml_text(values))
 

@@ -7,7 +7,6 @@ from html import escape
 
 import numpy as np
 
-from mapper.core.paths import AnyPath
 from mapper.core.timebase import Stamps
 from mapper.core.trajectory import Trajectory
 from mapper.evaluators.metrics.clock_offset import clock_offset
@@ -25,6 +24,7 @@ from mapper.evaluators.metrics.trajectory import (
     rpe,
     start_end_offset,
 )
+from mapper.runtime.regular_files import AnyPath
 
 ALIGNED = {
     "none": "not aligned",

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 
 from mapper.core.errors import DataError, SourceError
-from mapper.core.paths import AnyPath
 from mapper.core.trajectory import Trajectory
 from mapper.run.folder import Run, open_run
+from mapper.runtime.regular_files import AnyPath
 from mapper.sources.text import parse_stamp, rows
 from mapper.sources.trajectory_files import is_mulran, read_kitti, read_mulran, read_tum
 

@@ -14,8 +14,7 @@ from scipy.spatial import cKDTree
 from mapper.core.deskew import deskewed
 from mapper.core.errors import DataError
 from mapper.core.frames import Sensor
-from mapper.core.geometry import Array, Points, apply
-from mapper.core.subsampling import stride_for
+from mapper.core.geometry import Array, Points, apply, stride_for
 from mapper.core.trajectory import Trajectory
 from mapper.core.voxel_grid import thin
 from mapper.evaluators.metrics.metric import Metric

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from mapper.core.toml_text import toml_text
+from mapper.core.config import toml_text
 from mapper.evaluators.depth_camera.accuracy import Accuracy, DepthLevel, ResidualMap
 from mapper.evaluators.depth_camera.noise_fit import NoiseFit
 from mapper.evaluators.depth_camera.study import DepthStudy, records_of

@@ -14,7 +14,7 @@ from mapper.evaluators.tables.table import Record
 from mapper.pipeline.build import build
 from mapper.run.files import CONFIG, MANIFEST, OCTREE_MAP, SUMMARY, TRAJECTORY, TRUTH
 from mapper.run.folder import Run
-from mapper.runtime.timing import forget_peak_memory
+from mapper.runtime.progress import forget_peak_memory
 from mapper.sources import open_source
 
 Keep = Literal["nothing", "trajectory", "run"]

@@ -5,25 +5,69 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from numpy.typing import ArrayLike
 
 from mapper.api.logs import open_log
-from mapper.api.own_poses import poses_of
 from mapper.config.build import BuildConfig
 from mapper.config.loading import Settings, load_config, overridden
 from mapper.core.config import flattened
-from mapper.core.errors import ConfigError
+from mapper.core.errors import ConfigError, DataError, FrameError, TrackingError
 from mapper.core.frames import Frame
-from mapper.core.paths import AnyPath
-from mapper.core.trajectory import Trajectory
+from mapper.core.geometry import Transform, is_rigid
+from mapper.core.trajectory import Trajectory, trajectory_from
 from mapper.odometry.base import Odometry
 from mapper.pipeline.build import build as build_run
 from mapper.run import files
 from mapper.run.folder import Run
 from mapper.run.observers import NULL_OBSERVER, Observer
 from mapper.runtime.progress import SILENT, Progress, Report
+from mapper.runtime.regular_files import AnyPath
 from mapper.runtime.result_paths import RUNS, name_of, place_of
 from mapper.sources.base import Log
+
+
+def poses_of(track: Callable[[Frame], ArrayLike | None], log: Log, *, progress: Progress) -> Trajectory:
+    """Return the poses that a function gives a log's frames, called once for each in time order.
+
+    Args:
+        track: Takes a frame; returns (4, 4) T_world_body, or None where there is none.
+        log: The log; frames that cannot be read are left out.
+        progress: Receives the stage and its counts.
+
+    Raises:
+        DataError: It returns something else.
+        TrackingError: It places fewer than two frames.
+    """
+    poses: list[tuple[int, Transform]] = []
+    with progress.stage("odometry") as report:
+        for done, entry in enumerate(log.entries(), start=1):
+            report(done, len(log))
+            try:
+                frame = entry.load()
+            except FrameError:
+                continue  # tracking reports it
+            found = track(frame)
+            if found is not None:
+                poses.append((entry.stamp_ns, _rigid(found, entry.stamp_ns)))
+    if len(poses) < 2:
+        raise TrackingError(
+            f"odometry: placed {len(poses)} of {len(log)} frames, want at least 2; it returns (4, 4), or None"
+        )
+    return trajectory_from(poses)
+
+
+def _rigid(found: ArrayLike, stamp_ns: int) -> Transform:
+    try:
+        T_world_body = np.array(found, dtype=np.float64)
+    except (TypeError, ValueError):
+        T_world_body = np.empty(0)
+    if T_world_body.shape != (4, 4):
+        raise DataError(f"odometry: frame {stamp_ns}: a pose of shape {np.shape(T_world_body)}, want (4, 4)")
+    if not is_rigid(T_world_body):
+        raise DataError(f"odometry: frame {stamp_ns}: the pose is not a finite rigid motion")
+    return T_world_body
+
 
 OwnOdometry = Odometry[Any] | Callable[[Frame], ArrayLike | None] | Trajectory
 """A caller's odometry: an object, a function of one frame after the other, or poses."""

@@ -5,7 +5,7 @@ from pathlib import Path
 from mapper.config.loading import Settings, load_source_config
 from mapper.core.errors import SourceError
 from mapper.core.frames import Frame, Sensor
-from mapper.core.paths import AnyPath
+from mapper.runtime.regular_files import AnyPath
 from mapper.sources import open_source
 from mapper.sources.base import Log
 from mapper.sources.config import SourceConfig

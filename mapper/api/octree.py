@@ -2,12 +2,12 @@
 
 from pathlib import Path
 
-from mapper.core.paths import AnyPath
 from mapper.octree import map as octree_map
 from mapper.octree.config import OctreeConfig
 from mapper.octree.map import OctreeMap
 from mapper.run import files
 from mapper.run.folder import open_run
+from mapper.runtime.regular_files import AnyPath
 
 
 def read_octree(path: AnyPath, config: OctreeConfig | None = None) -> OctreeMap:

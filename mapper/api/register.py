@@ -1,24 +1,70 @@
-"""Registration of two clouds, of arrays, files or logs' frames."""
+"""Registration of two clouds, of arrays, files or logs' frames, and the first guess of their motion."""
 
 import os
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mapper.api.guess import parse_guess
 from mapper.api.logs import read_frame
 from mapper.config.loading import Settings, load_source_config, overridden
 from mapper.config.register import check_method, register_config
 from mapper.core.errors import ConfigError
 from mapper.core.frames import Frame, RgbdFrame, Scan, Sensor
-from mapper.core.geometry import Transform, is_rigid, point_rows
-from mapper.core.paths import AnyPath
+from mapper.core.geometry import Transform, is_rigid, point_rows, transform
+from mapper.core.rotations import pose_of_row, rotation_from_euler
 from mapper.odometry.config import IsvdOdometryConfig
 from mapper.registration.base import Alignment
 from mapper.registration.factory import build_registration
 from mapper.run.cloud import Cloud
+from mapper.runtime.regular_files import AnyPath
 from mapper.sources.config import SourceConfig
+
+
+def parse_guess(text: str | None) -> Transform:
+    """Return the (4, 4) T_target_source of a guess; identity for None.
+
+    Args:
+        text: Six numbers, x y z in metres and roll pitch yaw in degrees; or a file with a 4×4 or 3×4 matrix,
+            or a line of TUM (stamp x y z qx qy qz qw; the stamp may be absent).
+
+    Raises:
+        ConfigError: It is none of these.
+    """
+    if text is None:
+        return np.eye(4)
+    path = Path(text)
+    is_file = path.is_file()
+    numbers = _numbers(path.read_text(errors="replace") if is_file else text, text)
+    if is_file and len(numbers) in (12, 16):
+        rows = numbers.reshape(-1, 4)
+        T_target_source = transform(rows[:3, :3], rows[:3, 3])
+        if not is_rigid(T_target_source) or (len(rows) == 4 and not np.allclose(rows[3], [0, 0, 0, 1])):
+            raise ConfigError(f"--guess {text}: the matrix is no rigid motion")
+        return T_target_source
+    if is_file and len(numbers) in (7, 8):
+        return pose_of_row(numbers[-7:])
+    if len(numbers) == 6:
+        return transform(rotation_from_euler(*np.radians(numbers[3:])), numbers[:3])
+    raise ConfigError(
+        f'--guess {text}: {len(numbers)} numbers; want "x y z roll pitch yaw" in metres and degrees, '
+        "or a file with a 4×4 matrix or a TUM line"
+    )
+
+
+def _numbers(content: str, text: str) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+    lines = [line for line in content.splitlines() if not line.lstrip().startswith("#")]
+    try:
+        numbers = np.array([float(word) for line in lines for word in line.replace(",", " ").split()])
+    except ValueError:
+        raise ConfigError(
+            f'--guess {text}: no such file, and not "x y z roll pitch yaw" in metres and degrees'
+        ) from None
+    if not np.isfinite(numbers).all():
+        raise ConfigError(f"--guess {text}: a number is not finite")
+    return numbers
+
 
 Registrable = ArrayLike | Cloud | Frame | AnyPath
 """(N, 3) points in metres, a cloud, a frame, a cloud's file, or ``LOG@N``."""

@@ -3,24 +3,39 @@
 import json
 import os
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from pydantic import ValidationError
 
 from mapper.config.build import BuildConfig
-from mapper.config.refusals import refusal
-from mapper.config.sensors import DEFAULTS
 from mapper.core.config import Config, drop_unknown, kind_of, members_of
 from mapper.core.errors import ConfigError, MapperWarning
-from mapper.core.paths import AnyPath
 from mapper.runtime.atomic import MANIFEST_NAME
-from mapper.runtime.regular_files import parse_toml, read_text
+from mapper.runtime.regular_files import AnyPath, parse_toml, read_text
 from mapper.sources.config import SourceConfig
 
 if TYPE_CHECKING:
     from mapper.core.frames import Sensor
+
+DEFAULTS: "Mapping[Sensor, Mapping[str, Any]]" = {
+    "rgbd": {},
+    "lidar": {
+        "odometry": {"kind": "gicp"},
+        "loops": {"kind": "scans"},
+        "octree": {"resolution_m": 0.2, "max_range_m": 80.0},
+        "level": {"plane_tolerance_m": 0.1},
+        "slice": {"min_height_m": 0.3, "max_height_m": 2.0, "above": "ground"},
+        "traversable": {"max_step_m": 0.2, "slope_window_m": 2.0, "head_room_m": 2.0, "max_gap_m": 1.0},
+        "costmap": {"robot_radius_m": 0.5, "inflation_radius_m": 2.0, "cost_scaling": 3.0},
+        "cloud": {"voxel_m": 0.1, "frame_stride": 4},
+    },
+}
+"""Default settings per sensor, where they differ from the classes' own. A street is coarser than a room: what
+would be a step indoors is within the noise of the road."""
+
 
 AnyConfig = TypeVar("AnyConfig", bound=Config)
 Settings = Mapping[str, Any]
@@ -257,5 +272,65 @@ def checked_config(tree: Mapping[str, Any], model: type[AnyConfig], where: str |
     try:
         return model.model_validate(tree)
     except ValidationError as error:
-        refused = refusal(model, error.errors()[0])
+        refused = _refusal(model, error.errors()[0])
         raise ConfigError(refused if where is None else f"{where}: {refused}") from None
+
+
+def _refusal(model: type[Config], error: Mapping[str, Any]) -> str:
+    """Return ``name: reason`` of one of pydantic's errors.
+
+    Args:
+        model: The class that refused.
+        error: One of ``ValidationError.errors()``.
+    """
+    loc: Sequence[int | str] = error["loc"]
+    reason = error["msg"]
+    if error["type"] == "extra_forbidden":
+        reason = f"unknown; {_hint(model, loc)}"
+    elif error["type"] == "value_error":  # one of ours, which names the setting where several are concerned
+        reason = str(error["ctx"]["error"])
+        if not loc:
+            return reason
+    elif error["type"] == "missing" and isinstance(loc[-1], int):
+        loc, reason = loc[:-1], f"{loc[-1]} values are too few"
+    elif error["type"] == "tuple_type" and isinstance(error["input"], str):
+        reason = "want a list, as in 1,2,3"
+    elif isinstance(error["input"], (str, int, float)) and error["type"] != "missing":
+        reason = f"{reason}, not {error['input']}"
+    return f"{'.'.join(map(str, loc)) or 'configuration'}: {reason}"
+
+
+def _hint(model: type[Config], loc: Sequence[int | str]) -> str:
+    """Return what was perhaps meant by an unknown name, or else which names are known."""
+    *parents, name = loc
+    alternatives = _members_at(model, parents[:-1])
+    if len(alternatives) > 1 and (kinds := [kind_of(m) for m in alternatives if name in m.model_fields]):
+        return f"{'.'.join(map(str, parents[:-1]))}.kind={' or '.join(kinds)} has it"
+    known = [field for member in _members_at(model, parents)[:1] for field in member.model_fields]
+    if close := get_close_matches(str(name), known, n=1):
+        return f"did you mean {close[0]}?"
+    if elsewhere := [path for path in _setting_names(model) if path.split(".")[-1] == name]:
+        return f"did you mean {' or '.join(elsewhere)}?"
+    return f"known are {', '.join(known)}"
+
+
+def _members_at(model: type[Config], loc: Sequence[int | str]) -> list[type[Config]]:
+    """Return the classes of the settings that a location leads to: several where it ends before a kind."""
+    members = [model]
+    for part in loc:
+        if isinstance(part, int):  # an element of a list
+            continue
+        if len(members) > 1:
+            members = [member for member in members if kind_of(member) == part]
+        elif members and part in members[0].model_fields:
+            members = members_of(members[0].model_fields[part].annotation)
+    return members
+
+
+def _setting_names(model: type[Config]) -> Iterator[str]:
+    """Yield the dotted name of every setting of the default kinds and below."""
+    for name, field in model.model_fields.items():
+        yield name
+        default = field.get_default(call_default_factory=False)
+        if isinstance(default, Config):
+            yield from (f"{name}.{path}" for path in _setting_names(type(default)))

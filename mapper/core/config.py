@@ -1,8 +1,9 @@
 """Base class of all settings, and the types of their fields."""
 
 import json
+import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Annotated, Any, TypeVar, get_args, get_origin
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
@@ -121,3 +122,37 @@ def _delete(tree: Any, loc: Sequence[Any]) -> str:
             parent, node, is_kind_seen = node, node[part], False
     del parent[names[-1]]
     return ".".join(str(name) for name in names)
+
+
+_BARE = re.compile(r"[A-Za-z0-9_-]+")
+
+
+def toml_text(settings: Mapping[str, Any]) -> str:
+    """Return settings as TOML, which has no word for none: such a setting is a comment."""
+    return "\n".join(_toml_section(settings, ())).strip()
+
+
+def _toml_section(table: Mapping[str, Any], path: tuple[str, ...]) -> Iterator[str]:
+    """Yield the lines of a table, plain values first, since they may not follow the tables in it."""
+    values = {key: value for key, value in table.items() if not isinstance(value, Mapping)}
+    if path and (values or not table):
+        yield f"\n[{'.'.join(map(_toml_key, path))}]"
+    for key, value in values.items():
+        yield f"# {_toml_key(key)} = none" if value is None else f"{_toml_key(key)} = {_toml_value(value)}"
+    for key, value in table.items():
+        if isinstance(value, Mapping):
+            yield from _toml_section(value, (*path, key))
+
+
+def _toml_key(key: str) -> str:
+    return key if _BARE.fullmatch(key) else json.dumps(key, ensure_ascii=False)
+
+
+def _toml_value(value: Any) -> str:
+    if isinstance(value, float) and not math.isfinite(value):
+        return str(value)  # inf, -inf and nan are TOML's words, too
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(_toml_value, value))}]"
+    if isinstance(value, Mapping):
+        return f"{{{', '.join(f'{_toml_key(key)} = {_toml_value(one)}' for key, one in value.items())}}}"
+    return json.dumps(value, ensure_ascii=False)

@@ -4,6 +4,10 @@ Library code raises or warns; only ``cli`` turns them into one line and, for an 
 """
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 _LONGEST = 800
 
@@ -101,3 +105,27 @@ class Terminated(KeyboardInterrupt):
 
 class MapperWarning(UserWarning):
     """A warning that a user should read; ``cli`` prints it as one line."""
+
+
+def expect_shape(
+    array: "NDArray[Any]", want: str, name: str, *, error: type[MapperError] = DataError
+) -> dict[str, int]:
+    """Return the lengths of an array's named axes, if it has the shape that is wanted.
+
+    Args:
+        array: The array.
+        want: Its shape: numbers and names of axes, separated by commas, as in "N,3" or "H,W,3".
+        name: What the message calls the array, as "octree: points_world".
+        error: Class of the error.
+
+    Raises:
+        error: The number of axes or a fixed length is another, or two axes of one name differ.
+    """
+    axes = [axis.strip() for axis in want.split(",")]
+    lengths: dict[str, int] = {}
+    if array.ndim == len(axes) and all(
+        length == (int(axis) if axis.isdigit() else lengths.setdefault(axis, length))
+        for axis, length in zip(axes, array.shape, strict=True)
+    ):
+        return lengths
+    raise error(f"{name} {array.shape}, want ({', '.join(axes)})")

@@ -252,3 +252,8 @@ def _is_rigid_rows(rows: list[list[float]], tolerance: float) -> bool:
     proper = a * (e * i - f * h) + b * (f * g - d * i) + c * (d * h - e * g) > 0.0
     affine = all(abs(value) <= tolerance for value in (p, q, r, s - 1.0))
     return orthogonal and proper and affine and all(abs(value) < _FARTHEST_M for value in (x, y, z))
+
+
+def stride_for(count: int, most: int) -> int:
+    """Return the smallest step, from the first row on, at which at most so many of the rows are taken."""
+    return max(1, -(-count // most))

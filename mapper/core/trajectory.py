@@ -9,11 +9,22 @@ from numpy.typing import NDArray
 
 from mapper.core.errors import DataError
 from mapper.core.geometry import Array, Transform, inverse, is_rigid, path_length
-from mapper.core.plan_axes import plan_axes
 from mapper.core.timebase import NS_PER_S, Stamps
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+
+
+def plan_axes(axes: "Axes | None") -> "Axes":
+    """Return axes of x and y in metres, of equal scale: those given, or of a new figure of pyplot's."""
+    if axes is None:
+        import matplotlib.pyplot as plt  # keeps global state, which only a caller without axes needs
+
+        axes = plt.subplots(layout="constrained")[1]
+    axes.set_aspect("equal")
+    axes.set_xlabel("x (m)")
+    axes.set_ylabel("y (m)")
+    return axes
 
 
 @dataclass(frozen=True, slots=True, eq=False)

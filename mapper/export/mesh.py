@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from mapper.config.export import MeshConfig
+from mapper.config.build import MeshConfig
 from mapper.core.errors import DependencyError, RunError
 from mapper.core.frames import Points32
 from mapper.core.geometry import inverse

@@ -11,13 +11,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.core.back_projection import back_project
 from mapper.core.errors import FrameError, RunError
 from mapper.core.frames import (
     NO_DISTORTION,
     DepthImage,
     PinholeCamera,
     RgbdFrame,
+    back_project,
     ray_table,
     undistortion_maps,
 )

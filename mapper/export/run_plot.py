@@ -4,7 +4,7 @@ import base64
 from html import escape
 from typing import TYPE_CHECKING
 
-from mapper.core.plan_axes import plan_axes
+from mapper.core.trajectory import plan_axes
 from mapper.export.html import table
 from mapper.export.picture import draw_summary
 from mapper.run import files

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mapper.core.geometry import Array, Transform, adjoint, inverse, log
-from mapper.core.subsampling import stride_for
+from mapper.core.geometry import Array, Transform, adjoint, inverse, log, stride_for
 from mapper.graph.model import BetweenFactor
 
 _MOST_TRIED = 5

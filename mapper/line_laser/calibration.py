@@ -5,10 +5,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mapper.core.config import toml_text
 from mapper.core.errors import DataError
 from mapper.core.frames import Image
 from mapper.core.geometry import Array
-from mapper.core.toml_text import toml_text
 from mapper.line_laser.config import (
     Covariance,
     LateralLaw,

@@ -19,9 +19,8 @@ from mapper.loops.config import (
 from mapper.loops.factory import build_similarity_proposer, build_verifier
 from mapper.loops.map_constraints import KnownPlaces
 from mapper.loops.place_file import AnyPlace
-from mapper.runtime.executor import IN_PROCESS, Workers, make_executor, run_jobs
+from mapper.runtime.executor import IN_PROCESS, Failure, Workers, make_executor, run_jobs
 from mapper.runtime.progress import SILENT, Progress
-from mapper.runtime.worker_process import Failure
 
 _MOST_SIMILAR = 12
 """Places that are proposed for a keyframe, of all earlier runs."""

@@ -8,8 +8,7 @@ import numpy as np
 
 from mapper.core.errors import DataError
 from mapper.core.frames import Scan, Sensor
-from mapper.core.geometry import Array, Points, Transform, exp, transform
-from mapper.core.subsampling import stride_for
+from mapper.core.geometry import Array, Points, Transform, exp, stride_for, transform
 from mapper.core.timebase import nearest
 from mapper.core.trajectory import Trajectory
 from mapper.mapping.config import LevelConfig

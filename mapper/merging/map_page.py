@@ -4,7 +4,6 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from mapper.core.paths import AnyPath
 from mapper.export.report.data import Seconds, data_uri, drawn_loop, drawn_path
 from mapper.export.report.map_data import map_of_octree, no_map
 from mapper.export.report.map_page import map_page
@@ -12,6 +11,7 @@ from mapper.loops.closure import read_closures
 from mapper.merging.merged_map import MergedMap
 from mapper.run import files
 from mapper.runtime.atomic import write_text
+from mapper.runtime.regular_files import AnyPath
 
 
 def write_merged_map_page(path: AnyPath, merged: MergedMap, names: list[str]) -> None:

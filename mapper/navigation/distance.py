@@ -13,8 +13,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from mapper.core.errors import DataError, MapSizeError
-from mapper.core.expect import expect_shape
+from mapper.core.errors import DataError, MapSizeError, expect_shape
 from mapper.core.geometry import Array, Points
 from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from mapper.octree.keys import BLOCK_EDGE, KEY_ZERO, block_keys

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mapper.core.errors import DataError, MapFileError
 from mapper.core.geometry import Array
-from mapper.core.plan_axes import plan_axes
+from mapper.core.trajectory import plan_axes
 from mapper.runtime.regular_files import read_text
 
 if TYPE_CHECKING:

@@ -9,7 +9,6 @@ from pydantic import ValidationError
 from mapper.core.errors import DataError, MapFileError, MapSizeError
 from mapper.core.frames import Points32, Scan
 from mapper.core.geometry import Array, Transform, apply
-from mapper.core.paths import AnyPath
 from mapper.octree import casting_kernels, map_file, octomap_file
 from mapper.octree.attributes import NEVER_SEEN, UNSET, AttributeLayer, ended_blocks
 from mapper.octree.blocks import BlockStore, Overlap, SensorModel, add_blocks, check_memory, sensor_model
@@ -19,7 +18,7 @@ from mapper.octree.keys import KEY_BITS, codes_of
 from mapper.octree.octomap_file import TreeLeaves, fill
 from mapper.octree.queries import MapView
 from mapper.octree.scan_updates import ScanUpdate
-from mapper.runtime.regular_files import read_regular
+from mapper.runtime.regular_files import AnyPath, read_regular
 
 
 class OctreeMap(MapView):

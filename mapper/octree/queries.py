@@ -6,8 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mapper.core.errors import DataError
-from mapper.core.expect import expect_shape
+from mapper.core.errors import DataError, expect_shape
 from mapper.core.frames import Points32
 from mapper.core.geometry import Array, Points, point_rows
 from mapper.octree import query_kernels as kernels

@@ -33,9 +33,8 @@ from mapper.runtime.archive import Archive
 from mapper.runtime.archived import Archived
 from mapper.runtime.atomic import flush_to_disk, write_text
 from mapper.runtime.journal import Journal, StateFile, opened_state
-from mapper.runtime.progress import Progress
+from mapper.runtime.progress import Progress, peak_memory_mb
 from mapper.runtime.state_file import dump, dumps, load, loads
-from mapper.runtime.timing import peak_memory_mb
 
 EVERY_S = 4.0
 """Seconds between two checkpoints, at least."""

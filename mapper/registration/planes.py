@@ -7,8 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.frames import Scan
-from mapper.core.geometry import Array, Points, Transform, apply
-from mapper.core.subsampling import stride_for
+from mapper.core.geometry import Array, Points, Transform, apply, stride_for
 
 _POINTS_PER_SCAN = 4000
 """Evenly chosen points of a scan: more hardly change the planes and take longer."""

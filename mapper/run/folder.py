@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 from mapper.config.build import BuildConfig
 from mapper.config.loading import load_run_config
 from mapper.core.errors import MapperError, RunError, listed
-from mapper.core.paths import AnyPath
 from mapper.core.timebase import Stamps
 from mapper.core.trajectory import Trajectory
 from mapper.graph.g2o import read_g2o
@@ -34,6 +33,7 @@ from mapper.run.pose_covariances import UncertainPoses, read_poses
 from mapper.run.results import RunResults, aligned_truth
 from mapper.run.warnings import find_warnings, verdict_of
 from mapper.runtime.atomic import partial_of
+from mapper.runtime.regular_files import AnyPath
 from mapper.sources import open_source
 from mapper.sources.base import Log
 from mapper.sources.trajectory_files import read_tum

@@ -20,7 +20,7 @@ from mapper.run.manifest import (
     now_text,
 )
 from mapper.runtime.atomic import FolderKind, atomic_folder, flush_to_disk, write_text
-from mapper.runtime.timing import Stopwatch, peak_memory_mb
+from mapper.runtime.progress import Stopwatch, peak_memory_mb
 from mapper.sources.base import Log, Session
 from mapper.sources.config import SourceConfig
 

@@ -1,5 +1,6 @@
-"""Extras: groups of optional libraries that pip installs on demand, as in ``octree-mapper[viewer]``."""
+"""Libraries: extras that pip installs on demand, as in ``octree-mapper[viewer]``, and one thread for each."""
 
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
@@ -49,3 +50,21 @@ def install_line(name: str) -> str:
 
 def _missing(library: str, name: str, purpose: str) -> DependencyError:
     return DependencyError(f"{purpose} needs {library}, which is not installed: {install_line(name)}")
+
+
+_LIMITS = (
+    "OMP_NUM_THREADS",
+    "OPENBLAS_NUM_THREADS",
+    "MKL_NUM_THREADS",
+    "NUMBA_NUM_THREADS",
+    "OPENCV_FOR_THREADS_NUM",
+)
+
+
+def one_thread_per_library() -> None:
+    """Limit libraries to one thread where the user has set no other number; they read it when loaded.
+
+    Small matrices are slower with several threads.
+    """
+    for name in _LIMITS:
+        os.environ.setdefault(name, "1")

@@ -1,7 +1,7 @@
 """Isolated calls: libraries that abort on damaged input run in a process of their own, in bounded memory.
 
 ``python -m mapper.runtime.isolated`` is that process: it takes pickled jobs on its standard input. Unlike
-:mod:`mapper.runtime.worker_process` it does not import the main module again, which a script that only reads
+:mod:`mapper.runtime.executor` it does not import the main module again, which a script that only reads
 a file need not allow for, and may be started by a worker.
 """
 

@@ -88,3 +88,7 @@ def read_text(
         raise error(f"{path}: not a text file: byte {why.start} is not {encoding.upper()}") from None
     except (DataError, MemoryError) as why:
         raise error(f"{path}: {why or 'does not fit into memory'}") from None
+
+
+AnyPath = str | os.PathLike[str]
+"""Path of a file or folder: text, or a ``pathlib.Path``."""

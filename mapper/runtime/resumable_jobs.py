@@ -15,10 +15,8 @@ from pydantic import BaseModel
 
 from mapper.core.errors import DataError, RunError
 from mapper.runtime.atomic import write_text
-from mapper.runtime.executor import Executor, run_jobs
-from mapper.runtime.progress import SILENT, Progress
-from mapper.runtime.timing import peak_memory_mb
-from mapper.runtime.worker_process import Failure
+from mapper.runtime.executor import Executor, Failure, run_jobs
+from mapper.runtime.progress import SILENT, Progress, peak_memory_mb
 
 Record = Mapping[str, Any]
 """Names with text, finite numbers, None, or lists and mappings of these."""

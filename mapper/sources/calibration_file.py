@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from mapper.core.config import toml_text
 from mapper.core.errors import DataError, SourceError
 from mapper.core.frames import NO_DISTORTION, PinholeCamera
-from mapper.core.toml_text import toml_text
 from mapper.runtime.regular_files import parse_toml, read_text
 from mapper.sources.calibration import Calibration
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mapper.api.guess import parse_guess
+from mapper.api.register import parse_guess
 from mapper.core.errors import ConfigError
 from mapper.core.rotations import rotation_from_euler
 

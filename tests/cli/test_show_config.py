@@ -8,7 +8,7 @@ import pytest
 
 from mapper.config.describe import settings
 from mapper.config.loading import load_config
-from mapper.core.toml_text import toml_text
+from mapper.core.config import toml_text
 from tests.support.command_line import mapper
 
 

@@ -5,6 +5,7 @@ from hypothesis import strategies as st
 
 from mapper.core import geometry as g
 from mapper.core.errors import DataError
+from mapper.core.geometry import stride_for
 
 COORDINATE = st.floats(-10.0, 10.0)
 VECTORS = st.tuples(COORDINATE, COORDINATE, COORDINATE).map(np.array)
@@ -164,3 +165,10 @@ def test_is_rigid_refuses_matrices_that_only_resemble_a_motion():
     bad_pairs = [np.stack([T, bad]) for bad in (scaled, far, huge)]
     for bad in (scaled, mirrored, bent, broken, far, huge, np.eye(3), *bad_pairs):
         assert not g.is_rigid(bad)
+
+
+@pytest.mark.parametrize("count", [0, 1, 9, 10, 11, 20, 21])
+def test_the_smallest_step_that_leaves_few_enough(count):
+    step = stride_for(count, 10)
+    assert len(range(0, count, step)) <= 10
+    assert step == 1 or len(range(0, count, step - 1)) > 10

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from mapper.config.export import MeshConfig
+from mapper.config.build import MeshConfig
 from mapper.core.frames import PinholeCamera, RgbdFrame, Scan, ray_table
 from mapper.core.geometry import apply, inverse, transform
 from mapper.core.rotations import rotation_from_euler

@@ -3,7 +3,7 @@ import pytest
 
 from mapper.cli.answer import Output
 from mapper.cli.build import built, observer_factory
-from mapper.config.export import RerunConfig
+from mapper.config.build import RerunConfig
 from mapper.core.frames import Scan
 from mapper.export.rerun.live import LiveRerun
 from mapper.export.rerun.recording import recorded

@@ -6,8 +6,7 @@ import pytest
 
 from mapper.core.errors import ConfigError, DependencyError
 from mapper.runtime import executor as workers
-from mapper.runtime.executor import Workers, make_executor, run_jobs
-from mapper.runtime.worker_process import Failure
+from mapper.runtime.executor import Failure, Workers, make_executor, run_jobs
 from tests.support.counted_jobs import Work, alive, told, until
 from tests.support.paths import ROOT
 

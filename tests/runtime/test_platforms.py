@@ -13,7 +13,7 @@ from mapper.octree.casting import sparse_zeros
 from mapper.runtime import atomic
 from mapper.runtime.atomic import FolderKind, atomic_folder, flush_to_disk
 from mapper.runtime.file_array import FileArray
-from mapper.runtime.timing import forget_peak_memory, peak_memory_mb
+from mapper.runtime.progress import forget_peak_memory, peak_memory_mb
 from tests.support.paths import ROOT
 
 MAC = """
@@ -109,7 +109,7 @@ def test_processors_are_counted_without_affinity(monkeypatch):
 
 
 def test_memory_is_unknown_where_nothing_tells(monkeypatch):
-    monkeypatch.setattr("mapper.runtime.timing.Path.exists", lambda _path: False)
+    monkeypatch.setattr("mapper.runtime.progress.Path.exists", lambda _path: False)
     assert peak_memory_mb() > 1.0
     monkeypatch.setitem(sys.modules, "resource", None)
     assert peak_memory_mb() == 0.0
@@ -119,7 +119,7 @@ def test_peak_memory_begins_anew_only_where_it_can(monkeypatch):
     def no_handle(_name):
         raise TypeError("LoadLibrary() argument 1 must be str, not None")
 
-    monkeypatch.setattr("mapper.runtime.timing.ctypes.CDLL", no_handle)
+    monkeypatch.setattr("mapper.runtime.progress.ctypes.CDLL", no_handle)
     forget_peak_memory()
 
 

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 import numpy as np
 import rerun as rr
 
-from mapper.config.export import RerunConfig
+from mapper.config.build import RerunConfig
 from mapper.core.errors import FrameError
 from mapper.core.frames import RgbdFrame, Scan, Sensor
 from mapper.core.geometry import Array, Transform, inverse

@@ -15,7 +15,7 @@ from mapper.registration.hough.planar_refinement import PlanarFit, align_grounds
 from mapper.registration.hough.point_refinement import RefinementCloud, refine_on_points, refinement_cloud
 from mapper.registration.hough.voting import Peak, vote
 from mapper.registration.refining import measured
-from mapper.runtime.timing import Stopwatch
+from mapper.runtime.progress import Stopwatch
 
 NEAR_SCORE = 0.3
 """Candidates are refined whose scores are this near to the best."""

@@ -6,8 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.frames import Scan
-from mapper.core.geometry import Array, Points, Transform, apply
-from mapper.core.subsampling import stride_for
+from mapper.core.geometry import Array, Points, Transform, apply, stride_for
 from mapper.registration.free_space import ScanDescription, range_image
 from mapper.registration.hough.config import HoughConfig
 from mapper.registration.hough.ground_removal import Ground, surroundings
