@@ -23,7 +23,7 @@ from mapper.config.loading import load_config
 from mapper.pipeline.build import build
 from mapper.pipeline.tracking_checkpoints import TrackingCheckpoints
 from mapper.run import files
-from mapper.run.observers import NullObserver, Step
+from mapper.run.observers import Observers, Step
 from mapper.runtime.archive import Archive
 from mapper.runtime.atomic import partial_of
 from mapper.runtime.journal import Journal, StateFile
@@ -69,7 +69,7 @@ class Clock:
         return sum(self._spent_s.values())
 
 
-class Meter(NullObserver):
+class Meter(Observers):
     """Prints a row for every so many frames that are tracked."""
 
     def __init__(self, out: Path, frames: int) -> None:

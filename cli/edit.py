@@ -56,7 +56,7 @@ def edit(
 
     Example: mapper edit runs/xyz --erase --box 2.1 0.3 0.1 2.9 1.05 1.5
     """
-    from mapper.pipeline.edit_map import add_region, undo_region
+    from mapper.pipeline.edit import add_region, undo_region
     from mapper.run.folder import moved_log, open_run
 
     given: dict[EditKind, bool] = {"erase": erase, "keep": keep, "keepout": keepout}

@@ -55,7 +55,7 @@ def loops(
     if add or remove:
         from mapper.cli.summary import summary_of
         from mapper.evaluators.metrics.evaluate import evaluate
-        from mapper.pipeline.edit_loops import edit_loops
+        from mapper.pipeline.edit import edit_loops
 
         if log:
             built = moved_log(built, *log)

@@ -105,7 +105,7 @@ def register(
 def _shown(
     rerun: str, registered: "Registered", target: "Scan", source: "Scan", name: str, sensor: "Sensor"
 ) -> None:
-    from mapper.export.rerun.registration import record_registration
+    from mapper.export.rerun.finished import record_registration
 
     stages = [
         (f"{stage.name}: MPD {stage.distance.mpd_m:.3f} m", stage.T_target_source)

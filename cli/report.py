@@ -87,7 +87,7 @@ def _correctness(run: "Run") -> list[tuple[str, str]]:
     """Return names and values of what a run itself says about its errors."""
     import numpy as np
 
-    from mapper.export.path_band import SIGMAS
+    from mapper.export.figures import SIGMAS
 
     counts, poses = run.manifest.counts, run.poses
     rows: list[tuple[str, str]] = [("verdict", run.verdict.state)]

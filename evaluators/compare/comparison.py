@@ -23,7 +23,7 @@ from mapper.evaluators.compare.pairwise import guesses_for, pairs_of, trials_of
 from mapper.evaluators.metrics.odometry import OdometryRun, Step, assess_run, step_for
 from mapper.evaluators.study.engine import run_study
 from mapper.evaluators.study.versions import digest, versions
-from mapper.run.fingerprint import fingerprint
+from mapper.run.input_logs import fingerprint
 from mapper.runtime.progress import SILENT, Progress
 from mapper.runtime.resumable_jobs import Job, Record
 from mapper.sources.base import FrameRef, Log, Skipped

@@ -16,7 +16,7 @@ from mapper.core.frames import Scan
 from mapper.core.geometry import Transform, inverse, transform
 from mapper.core.rotations import rotation_from_euler, rotation_from_quaternion
 from mapper.evaluators.papers.scan_pairs import fewer_rings, merged, moved
-from mapper.run.fingerprint import fingerprint
+from mapper.run.input_logs import fingerprint
 from mapper.sources import open_source
 from mapper.sources.base import FrameRef
 from mapper.sources.cloud_files import ENDINGS

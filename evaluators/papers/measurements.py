@@ -15,7 +15,7 @@ from mapper.evaluators.papers.model import PaperCell, PaperTable
 from mapper.evaluators.papers.published import Figures
 from mapper.evaluators.study.versions import digest, versions
 from mapper.evaluators.tables.table import Record
-from mapper.run.fingerprint import fingerprint
+from mapper.run.input_logs import fingerprint
 from mapper.runtime.resumable_jobs import Job, JobResult
 from mapper.sources import open_source
 from mapper.sources.base import Log

@@ -13,9 +13,7 @@ from mapper.evaluators.metrics.trajectory import associate
 from mapper.evaluators.papers.layout import compares, file_name
 from mapper.evaluators.papers.model import PaperCell, PaperPath, PaperTable, Reproduction
 from mapper.evaluators.pictures.path_errors import add_color_bar, draw_path
-from mapper.export.page import INK, LINE, hex_of, save
-from mapper.export.palette import ESTIMATE, TRUTH
-from mapper.export.panels import caption, draw_boxes, page, panel
+from mapper.export.figures import ESTIMATE, LINE, TEXT, TRUTH, caption, draw_boxes, hex_of, page, panel, save
 from mapper.sources.trajectory_files import read_tum
 
 if TYPE_CHECKING:
@@ -106,7 +104,7 @@ def _write_boxes(path: Path, table: PaperTable) -> None:
         printed = {k: cell.published for k, cell in enumerate(cells, 1) if cell.published is not None}
         axes.plot(list(printed.values()), list(printed), "D", color=hex_of(TRUTH), zorder=3, label="printed")
         ours = [(figure, k) for k, cell in enumerate(cells, 1) for figure in cell.ours]
-        axes.plot(*zip(*ours, strict=True), "o", color=INK, markersize=4, zorder=3, label="ours, each seed")
+        axes.plot(*zip(*ours, strict=True), "o", color=TEXT, markersize=4, zorder=3, label="ours, each seed")
         draw_boxes(axes, {cell.column: np.array(cell.ours) for cell in cells})
         axes.set_xscale("linear")
         axes.set_xlim(left=0.0)

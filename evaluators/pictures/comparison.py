@@ -8,9 +8,24 @@ import numpy as np
 
 from mapper.core.geometry import Array
 from mapper.core.trajectory import Trajectory
-from mapper.export.page import FAINT, LINE, fit_to_window, hex_of, save
-from mapper.export.palette import END, START, TRUTH
-from mapper.export.panels import by_logarithm, caption, color_of, draw_boxes, extent, page, panel, widest_axes
+from mapper.export.figures import (
+    END,
+    FAINT,
+    LINE,
+    START,
+    TRUTH,
+    by_logarithm,
+    caption,
+    color_of,
+    draw_boxes,
+    extent,
+    fit_to_window,
+    hex_of,
+    page,
+    panel,
+    save,
+    widest_axes,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -8,9 +8,8 @@ import numpy as np
 
 from mapper.core.trajectory import Trajectory
 from mapper.evaluators.metrics.odometry import OdometryRun
+from mapper.export.figures import TRUTH, color_of
 from mapper.export.mcap_log import McapLog
-from mapper.export.palette import TRUTH
-from mapper.export.panels import color_of
 
 
 def write_comparison_log(

@@ -13,9 +13,7 @@ from mapper.evaluators.depth_camera.accuracy import Accuracy, DepthLevel, Residu
 from mapper.evaluators.depth_camera.noise_fit import NoiseFit
 from mapper.evaluators.depth_camera.study import DepthStudy, records_of
 from mapper.evaluators.tables.table import csv_text
-from mapper.export.page import FAINT, INK, LINE, hex_of, save
-from mapper.export.palette import Rgb
-from mapper.export.panels import caption, page, panel
+from mapper.export.figures import FAINT, LINE, TEXT, Rgb, caption, hex_of, page, panel, save
 from mapper.runtime.atomic import MANIFEST_NAME, FolderKind, write_json, write_text
 from mapper.sensing.depth_noise import depth_sigma_m
 
@@ -99,7 +97,9 @@ def write_accuracy(path: Path, levels: Sequence[DepthLevel], fit: NoiseFit, *, t
     _finish(axes, "largest error Δd, mm")
     axes = panel(figure, 1, columns=2, rows=1)
     z = np.linspace(fit.low_m, fit.high_m, 200)
-    axes.plot(z, _MM * depth_sigma_m(fit.noise, z), color=INK, linewidth=1.0, label=f"σ = {fit.noise.text} m")
+    axes.plot(
+        z, _MM * depth_sigma_m(fit.noise, z), color=TEXT, linewidth=1.0, label=f"σ = {fit.noise.text} m"
+    )
     for label, color, accuracies in _kinds(levels):
         spread = [_MM * one.std_m for one in accuracies]
         axes.plot(distance_m, spread, "o", color=hex_of(color), markersize=5, label=label)

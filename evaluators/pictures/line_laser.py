@@ -8,8 +8,7 @@ import numpy as np
 
 from mapper.core.frames import Image
 from mapper.core.geometry import Array
-from mapper.export.page import FAINT, INK, LINE, hex_of, new_figure, quiet_frame, save
-from mapper.export.palette import ESTIMATE, TRUTH
+from mapper.export.figures import ESTIMATE, FAINT, LINE, TEXT, TRUTH, hex_of, new_figure, quiet_frame, save
 from mapper.line_laser.calibration import CalibrationShot, Fit, ahead_m, row_px, up_px
 from mapper.line_laser.config import StripeConfig
 from mapper.line_laser.detection import Method, responses, stripe_rows
@@ -47,7 +46,7 @@ def write_detections(
     page_in = 2 * (height_in + _CAPTION_IN) + _HEAD_IN
     figure = new_figure(_COLUMNS * _PANEL_IN, page_in)
     colors = "orange: the row found" + ("" if true_rows is None else "; blue: the true one")
-    figure.text(0.012, 1.0 - 0.1 / page_in, title, fontsize=13, fontweight="bold", color=INK, va="top")
+    figure.text(0.012, 1.0 - 0.1 / page_in, title, fontsize=13, fontweight="bold", color=TEXT, va="top")
     figure.text(0.988, 1.0 - 0.12 / page_in, colors, fontsize=9.5, color=FAINT, va="top", ha="right")
     nothing = np.full(image.shape[1], np.nan)
     panels = [("image", image, nothing)]
@@ -70,7 +69,7 @@ def write_detections(
         axes.set_xlim(0, image.shape[1] - 1)
         axes.set_ylim(image.shape[0] - 1, 0)
         axes.set_axis_off()
-        axes.set_title(name, fontsize=9.5, color=INK, loc="left")
+        axes.set_title(name, fontsize=9.5, color=TEXT, loc="left")
     save(figure, path)
 
 
@@ -84,7 +83,7 @@ def write_calibration_picture(path: Path, fit: Fit, shots: Sequence[CalibrationS
     """
     calibration = fit.calibration
     figure = new_figure(11.0, 4.6)
-    figure.text(0.065, 0.925, "Calibration of a line laser", fontsize=14, fontweight="bold", color=INK)
+    figure.text(0.065, 0.925, "Calibration of a line laser", fontsize=14, fontweight="bold", color=TEXT)
     law, lateral = calibration.range, calibration.lateral
     far_px = row_px(calibration, calibration.reach_m)
     rows = np.linspace(min(shot.board.row_px for shot in shots), far_px, 200)
@@ -95,7 +94,7 @@ def write_calibration_picture(path: Path, fit: Fit, shots: Sequence[CalibrationS
         _shot(axes, percent * shot_px, shot.range_m, f"{1e3 * error_m:+.1f} mm")
     axes.set_xlabel("height of the stripe in the image, p (0 bottom … 100 top)", fontsize=9, color=FAINT)
     axes.set_title(
-        f"range: {law.scale_mm:.0f} · p$^{{{law.exponent:.4f}}}$ mm", fontsize=10.5, color=INK, loc="left"
+        f"range: {law.scale_mm:.0f} · p$^{{{law.exponent:.4f}}}$ mm", fontsize=10.5, color=TEXT, loc="left"
     )
     axes.set_ylabel("range (m)", fontsize=9, color=FAINT)
     wide = [shot for shot in shots if shot.width_m is not None and shot.board.width_px is not None]
@@ -107,7 +106,10 @@ def write_calibration_picture(path: Path, fit: Fit, shots: Sequence[CalibrationS
     axes.set_xlabel("height of the stripe in the image, y (px)", fontsize=9, color=FAINT)
     axes.set_ylabel("px per cm", fontsize=9, color=FAINT)
     axes.set_title(
-        f"lateral: x / ({lateral.slope:.4f} y {lateral.offset:+.4f}) cm", fontsize=10.5, color=INK, loc="left"
+        f"lateral: x / ({lateral.slope:.4f} y {lateral.offset:+.4f}) cm",
+        fontsize=10.5,
+        color=TEXT,
+        loc="left",
     )
     save(figure, path)
 

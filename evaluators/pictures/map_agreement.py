@@ -9,9 +9,18 @@ from numpy.typing import NDArray
 from mapper.core.geometry import Array
 from mapper.evaluators.metrics.occupancy import OccupancyCheck
 from mapper.evaluators.pictures.path_errors import made_folder
-from mapper.export.page import hex_of, save
-from mapper.export.palette import ESTIMATE, OCCUPIED_CELL, TRUTH, UNKNOWN_CELL, Rgb
-from mapper.export.panels import caption, page, panel
+from mapper.export.figures import (
+    ESTIMATE,
+    OCCUPIED_CELL,
+    TRUTH,
+    UNKNOWN_CELL,
+    Rgb,
+    caption,
+    hex_of,
+    page,
+    panel,
+    save,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -10,9 +10,24 @@ from mapper.core.geometry import Array
 from mapper.core.timebase import NS_PER_S
 from mapper.evaluators.metrics.evaluate import Assessment, have_clock
 from mapper.evaluators.metrics.trajectory import Matched
-from mapper.export.page import FAINT, INK, LINE, fit_to_window, hex_of, save
-from mapper.export.palette import END, ESTIMATE, START, TRUTH
-from mapper.export.panels import caption, draw_boxes, extent, page, panel, widest_axes
+from mapper.export.figures import (
+    END,
+    ESTIMATE,
+    FAINT,
+    LINE,
+    START,
+    TEXT,
+    TRUTH,
+    caption,
+    draw_boxes,
+    extent,
+    fit_to_window,
+    hex_of,
+    page,
+    panel,
+    save,
+    widest_axes,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -128,7 +143,7 @@ def _draw_over_time(axes: "Axes", elapsed: Array, values: Array, *, quantity: st
         ("RMSE", float(np.sqrt(np.mean(values**2))), "dashed"),
         ("median", float(np.median(values)), "dotted"),
     ):
-        axes.axhline(value, color=INK, linewidth=0.8, linestyle=style, label=f"{name} {value:.3g}")
+        axes.axhline(value, color=TEXT, linewidth=0.8, linestyle=style, label=f"{name} {value:.3g}")
     axes.set_ylim(bottom=0.0)
     caption(axes, y=quantity)
     axes.grid(color=LINE, linewidth=0.4)

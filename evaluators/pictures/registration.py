@@ -7,8 +7,18 @@ import numpy as np
 
 from mapper.core.frames import Points32, Sensor
 from mapper.core.geometry import Array, Transform, apply
-from mapper.export.page import FAINT, INK, fit_to_window, hex_of, new_figure, quiet_frame, save
-from mapper.export.palette import END, ESTIMATE, TRUTH
+from mapper.export.figures import (
+    END,
+    ESTIMATE,
+    FAINT,
+    TEXT,
+    TRUTH,
+    fit_to_window,
+    hex_of,
+    new_figure,
+    quiet_frame,
+    save,
+)
 from mapper.registration.config import VOXEL_M
 from mapper.registration.kd_tree import kd_tree
 
@@ -74,7 +84,7 @@ def write_before_and_after(
             share = f", {on.mean():.0%} within {near_m:g} m (dark)" if row == 0 else ""
             axes.set_title(f"{name}, {view}{share}", fontsize=9, color=FAINT)
             quiet_frame(axes, label_size=7)
-    figure.suptitle(title, fontsize=11, color=INK)
+    figure.suptitle(title, fontsize=11, color=TEXT)
     figure.tight_layout()
     save(figure, path)
 

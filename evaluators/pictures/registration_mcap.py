@@ -8,9 +8,9 @@ import numpy as np
 from mapper.core.frames import Points32
 from mapper.core.geometry import Transform, apply
 from mapper.core.timebase import NS_PER_S
+from mapper.export.figures import ESTIMATE, TRUTH
 from mapper.export.mcap_log import McapLog
-from mapper.export.palette import ESTIMATE, TRUTH
-from mapper.export.ros_messages import Value
+from mapper.export.mcap_messages import Value
 
 
 def write_registration_log(

@@ -11,8 +11,8 @@ from mapper.core.geometry import apply
 from mapper.evaluators.pictures.registration import write_before_and_after
 from mapper.evaluators.pictures.registration_mcap import write_registration_log
 from mapper.evaluators.register.registration import Registered, xyz_rpy
-from mapper.export.palette import ESTIMATE
-from mapper.export.ply import write_ply
+from mapper.export.figures import ESTIMATE
+from mapper.export.mesh_files import write_ply
 from mapper.runtime.atomic import MANIFEST_NAME, FolderKind, write_json
 
 ALIGNED, PICTURE, RECORDING = "aligned.ply", "registration.png", "registration.mcap"

@@ -20,7 +20,7 @@ from mapper.evaluators.sweep.config import ConfigurationConfig, MethodConfig, Sw
 from mapper.loops.config import PlaceLoopsConfig, ScanLoopsConfig, ThesisLoopsConfig
 from mapper.odometry.config import IsvdOdometryConfig, KeyframeOdometryConfig
 from mapper.odometry.scans.config import ScanOdometryConfig
-from mapper.run.fingerprint import fingerprint
+from mapper.run.input_logs import fingerprint
 from mapper.runtime.atomic import resumable_folder, write_json
 from mapper.runtime.executor import IN_PROCESS, Workers
 from mapper.runtime.extras import require

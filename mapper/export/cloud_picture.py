@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from mapper.core.frames import Points32
 from mapper.core.geometry import Array
 from mapper.core.trajectory import Trajectory
-from mapper.export.page import LINE, hex_of, new_figure, save, scale_bar
-from mapper.export.palette import BACKDROP, END, ESTIMATE, START
+from mapper.export.figures import BACKDROP, END, ESTIMATE, LINE, START, hex_of, new_figure, save, scale_bar
 from mapper.mapping.cloud import height_colors, thinned_to_view
 
 if TYPE_CHECKING:

@@ -1,19 +1,22 @@
 """Exports of a run: the kinds of file, and the function that writes any of them."""
 
+import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mapper.core.errors import ConfigError, RunError
-from mapper.runtime.atomic import refuse_existing
+from mapper.run import files
+from mapper.runtime.atomic import atomic_file, refuse_existing
 from mapper.runtime.progress import SILENT, Progress
 
 if TYPE_CHECKING:
     from mapper.config.build import BuildConfig
-    from mapper.run.map_folder import MapFolder
+    from mapper.run.folder import MapFolder, Run
 
 Write = Callable[[Any, Path, Progress], None]
 """Writes one file of a ``Run``, or of any ``MapFolder``, atomically; long jobs report progress."""
@@ -26,6 +29,7 @@ class Exporter:
     Attributes:
         summary: Description of the file, in a few words.
         function: ``module:name`` of the ``Write``, below :mod:`mapper.export`; imported at the first use.
+            Empty for a copy of the run's own file.
         file_name: Its name inside the run; some are there since the build. Empty for a folder, which is
             never in the run.
         endings: Endings that another name may have.
@@ -45,6 +49,8 @@ class Exporter:
     @property
     def write(self) -> Write:
         """The function that writes it."""
+        if not self.function:
+            return partial(_copy, name=self.file_name)
         module, _, name = self.function.partition(":")
         found: Write = getattr(import_module(f"mapper.export.{module}"), name)
         return found
@@ -55,20 +61,20 @@ _MESH_ENDINGS = (".ply", ".obj", ".glb")
 EXPORTERS = {
     "octomap": Exporter(
         "octree for OctoMap and ROS",
-        "stored_files:octomap",
+        "exporters:octomap",
         "map.bt",
         (".bt", ".ot"),
         settings="octomap",
         of_merged=True,
     ),
-    "native": Exporter("octree with all attributes", "stored_files:native", "map.octree", (".octree",)),
-    "ply": Exporter("coloured cloud", "stored_files:cloud", "cloud.ply", (".ply",)),
+    "native": Exporter("octree with all attributes", "", "map.octree", (".octree",)),
+    "ply": Exporter("coloured cloud", "", "cloud.ply", (".ply",)),
     "voxels": Exporter("occupied voxels' centres", "voxels:centres", "voxels.ply", (".ply",)),
     "voxel-mesh": Exporter("occupied voxels as cubes", "voxels:cubes", "voxel_mesh.ply", _MESH_ENDINGS),
     "mesh": Exporter("coloured surface", "mesh:surface", "mesh.ply", _MESH_ENDINGS, settings="mesh"),
     "grid": Exporter(
         "slice for nav2",
-        "stored_files:grid",
+        "exporters:grid",
         "slice.yaml",
         (".yaml", ".yml"),
         sidecars=(".pgm", ".png"),
@@ -76,7 +82,7 @@ EXPORTERS = {
     ),
     "costmap": Exporter(
         "slice inflated for nav2",
-        "costmap:costmap",
+        "nav2:costmap",
         "costmap.yaml",
         (".yaml", ".yml"),
         sidecars=(".pgm", ".png"),
@@ -86,14 +92,12 @@ EXPORTERS = {
     "nav2": Exporter(
         "folder for nav2: map, masks, parameters", "nav2:nav2", "", (), settings="costmap", of_merged=True
     ),
-    "tum": Exporter("trajectory as TUM text", "stored_files:tum", "trajectory.tum", (".tum", ".txt")),
-    "kitti": Exporter(
-        "trajectory as KITTI text", "stored_files:kitti", "trajectory.kitti", (".kitti", ".txt")
-    ),
+    "tum": Exporter("trajectory as TUM text", "", "trajectory.tum", (".tum", ".txt")),
+    "kitti": Exporter("trajectory as KITTI text", "exporters:kitti", "trajectory.kitti", (".kitti", ".txt")),
     "foxglove-layout": Exporter(
         "how Foxglove is to show run.mcap", "foxglove_layout:layout", "foxglove_layout.json", (".json",)
     ),
-    "g2o": Exporter("pose graph", "stored_files:g2o", "graph.g2o", (".g2o",)),
+    "g2o": Exporter("pose graph", "", "graph.g2o", (".g2o",)),
 }
 
 
@@ -151,10 +155,8 @@ def _refuse_merged(run: "MapFolder", kind: str) -> None:
 @contextmanager
 def _recording(run: "MapFolder", exporter: Exporter, path: Path) -> Iterator[None]:
     """Record in the manifest what an export writes into the run; files of the build stay as they are."""
-    from mapper.run.files import names_of
-
     written = {path.name, *(path.with_suffix(ending).name for ending in exporter.sidecars)}
-    names = written & names_of("poses", "exported maps")
+    names = written & files.names_of("poses", "exported maps")
     inside = path.parent.resolve() == run.path.resolve()
     with run.changing(names) if inside and names else nullcontext():
         yield
@@ -180,3 +182,51 @@ def _refuse_out(path: Path, exporter: Exporter, *, kind: str, overwrite: bool) -
         if file.is_dir():
             raise RunError(f"{file}: is a folder; name a file")
         refuse_existing(file, overwrite=overwrite)
+
+
+def octomap(run: "MapFolder", path: Path, progress: Progress) -> None:
+    """Write the octree: free or occupied as ``.bt``, log-odds as ``.ot``; with wider voxels if so configured.
+
+    Raises:
+        RunError: Wider voxels are to replace the run's own octree.
+    """
+    level, full = run.config.octomap.level, path.suffix.lower() == ".ot"
+    name = files.OCTREE_OT if full else files.OCTREE_BT
+    if level == 0:
+        _copy(run, path, progress, name=name)
+        return
+    if _is_same(run.path / name, path):
+        raise RunError(f"{path}: is the run's own octree; name another file to write level {level} to")
+    from mapper.octree.octomap_file import write_bt, write_ot
+
+    octree = run.octree.coarser(level, parent=run.config.octomap.parent)
+    (write_ot if full else write_bt)(path, octree)
+
+
+def kitti(run: "Run", path: Path, _progress: Progress) -> None:
+    """Write the trajectory without its stamps, for which KITTI text has no place."""
+    from mapper.sources.trajectory_files import write_kitti
+
+    write_kitti(path, run.trajectory)
+
+
+def grid(run: "MapFolder", path: Path, _progress: Progress) -> None:
+    """Write the slice's YAML with PGM and PNG beside it; the YAML names the PGM, so this is no copy."""
+    slice_world = run.slice
+    if not _is_same(run.path / f"{files.SLICE}.yaml", path):
+        from mapper.export.grid import write_grid
+
+        write_grid(path.parent, path.stem, slice_world)
+
+
+def _copy(run: "MapFolder", path: Path, _progress: Progress, *, name: str) -> None:
+    source = run.file(name)
+    if not source.is_file():
+        raise RunError(f"{source}: is missing from the run; build it again")
+    if not _is_same(source, path):
+        with atomic_file(path) as part:
+            shutil.copyfile(source, part)
+
+
+def _is_same(source: Path, path: Path) -> bool:
+    return path.exists() and source.exists() and source.samefile(path)

@@ -4,9 +4,8 @@ from pathlib import Path
 
 import foxglove.layouts as fl
 
-from mapper.export.foxglove_messages import WORLD
-from mapper.export.page import hex_of
-from mapper.export.palette import ESTIMATE, PLAN, TRUTH, Rgb
+from mapper.export.figures import ESTIMATE, PLAN, TRUTH, Rgb, hex_of
+from mapper.export.mcap_messages import WORLD
 from mapper.export.run_mcap import BODY
 from mapper.run.folder import Run
 from mapper.runtime.atomic import write_text

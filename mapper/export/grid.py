@@ -7,8 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.errors import DataError
-from mapper.export.page import round_length
-from mapper.export.palette import FREE_CELL, INK, OCCUPIED_CELL, PAPER, UNKNOWN_CELL
+from mapper.export.figures import FREE_CELL, INK, OCCUPIED_CELL, PAPER, UNKNOWN_CELL, round_length
 from mapper.octree.grid import (
     FREE,
     FREE_PIXEL,

@@ -5,8 +5,7 @@ from html import escape
 from importlib import resources
 
 from mapper import __version__
-from mapper.export import palette
-from mapper.export.page import hex_of
+from mapper.export import figures
 
 _POLICY = (
     "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline' data:; "
@@ -60,19 +59,19 @@ def document(
 
 def _palette_css() -> str:
     """Return the palette as CSS variables, so that pages and pictures agree."""
-    named: dict[str, palette.Rgb] = {
-        "backdrop": palette.BACKDROP,
-        "estimate": palette.ESTIMATE,
-        "truth": palette.TRUTH,
-        "accepted": palette.ACCEPTED,
-        "rejected": palette.REJECTED,
-        "doubtful": palette.DOUBTFUL,
-        "start": palette.START,
-        "end": palette.END,
-        "end-on-dark": palette.END_ON_DARK,
-        **{f"run{number}": color for number, color in enumerate(palette.RUNS)},
+    named: dict[str, figures.Rgb] = {
+        "backdrop": figures.BACKDROP,
+        "estimate": figures.ESTIMATE,
+        "truth": figures.TRUTH,
+        "accepted": figures.ACCEPTED,
+        "rejected": figures.REJECTED,
+        "doubtful": figures.DOUBTFUL,
+        "start": figures.START,
+        "end": figures.END,
+        "end-on-dark": figures.END_ON_DARK,
+        **{f"run{number}": color for number, color in enumerate(figures.RUNS)},
     }
-    rules = " ".join(f"--{name}: {hex_of(color)};" for name, color in named.items())
+    rules = " ".join(f"--{name}: {figures.hex_of(color)};" for name, color in named.items())
     return f":root {{ {rules} }}"
 
 

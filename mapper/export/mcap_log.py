@@ -61,24 +61,22 @@ from mapper.core.frames import PinholeCamera
 from mapper.core.geometry import Array, Points, Transform
 from mapper.core.timebase import check_stamp
 from mapper.core.trajectory import Trajectory
-from mapper.export.foxglove_messages import (
-    WORLD,
-    lines_of,
-    pose_of,
-    quaternion_of,
-    sample_segments,
-    timestamp_of,
-    vector_of,
-)
-from mapper.export.palette import ESTIMATE, FACTORS, PLAN, Rgb
-from mapper.export.ros_messages import (
+from mapper.export.figures import ESTIMATE, FACTORS, PLAN, Rgb
+from mapper.export.mcap_messages import (
     OCCUPANCY_GRID,
     UNCERTAIN_POSE,
+    WORLD,
     Value,
     encode_occupancy_grid,
     encode_record,
     encode_uncertain_pose,
+    lines_of,
+    pose_of,
+    quaternion_of,
     record_definition,
+    sample_segments,
+    timestamp_of,
+    vector_of,
 )
 from mapper.graph.model import BetweenFactor
 from mapper.octree.grid import OccupancyGrid

@@ -1,4 +1,4 @@
-"""Coloured triangle meshes as PLY, Wavefront OBJ and binary glTF 2.0 (Khronos 2021), by the file's ending."""
+"""Coloured clouds and triangle meshes: PLY (Turk 1994), Wavefront OBJ and binary glTF 2.0 (Khronos 2021)."""
 
 import json
 import struct
@@ -8,10 +8,59 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from mapper.core.errors import DataError
 from mapper.core.frames import Points32
-from mapper.export.ply import write_ply
 from mapper.mapping.cloud import Colors
-from mapper.runtime.atomic import write_bytes, write_text
+from mapper.runtime.atomic import atomic_file, write_bytes, write_text
+
+_PLY_VERTEX = np.dtype([("position", "<f4", 3), ("color", "u1", 3)])
+_CHUNK = 1 << 20  # vertices written at once
+_PLY_TRIANGLE = np.dtype([("corners", "u1"), ("vertices", "<i4", 3)])
+
+
+def write_ply(
+    path: Path,
+    points: Points32,
+    colors: NDArray[np.uint8],
+    *,
+    triangles: NDArray[np.int32] | None = None,
+) -> None:
+    """Write a little-endian binary PLY, atomically.
+
+    Args:
+        path: File to write.
+        points: (N, 3) float32 metres.
+        colors: (N, 3) uint8 RGB.
+        triangles: (T, 3) int32 indices of points, counterclockwise seen from outside; None for a cloud.
+
+    Raises:
+        DataError: Shapes that differ.
+    """
+    if points.ndim != 2 or points.shape[1] != 3 or colors.shape != points.shape:
+        raise DataError(f"{path}: points {points.shape} and colors {colors.shape}, want two of (N, 3)")
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        "comment units: metres",
+        f"element vertex {len(points)}",
+        *(f"property float {axis}" for axis in ("x", "y", "z")),
+        *(f"property uchar {channel}" for channel in ("red", "green", "blue")),
+    ]
+    if triangles is not None:
+        header += [f"element face {len(triangles)}", "property list uchar int vertex_indices"]
+    with atomic_file(path) as part, part.open("wb") as file:
+        file.write("\n".join([*header, "end_header\n"]).encode("ascii"))
+        for first in range(0, len(points), _CHUNK):
+            some = slice(first, first + _CHUNK)
+            vertices = np.empty(len(points[some]), _PLY_VERTEX)
+            vertices["position"] = points[some]
+            vertices["color"] = colors[some]
+            vertices.tofile(file)
+        if triangles is not None:
+            faces = np.full(len(triangles), 3, _PLY_TRIANGLE)
+            faces["vertices"] = triangles
+            faces.tofile(file)
+
 
 Triangles = NDArray[np.int32]
 Write = Callable[[Path, Points32, Colors, Triangles], None]

@@ -1,7 +1,9 @@
 """Pictures over a grid, seen from above: trajectories, planned paths, runs of a merged map, voxels."""
 
+import base64
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,12 +13,23 @@ from numpy.typing import NDArray
 
 from mapper.core.geometry import Array, Points, distances_along
 from mapper.core.timebase import stretches
-from mapper.core.trajectory import Trajectory
-from mapper.export.grid import grid_image
-from mapper.export.page import (
+from mapper.core.trajectory import Trajectory, plan_axes
+from mapper.export.figures import (
+    DOUBTFUL,
+    END,
+    ESTIMATE,
+    FACTORS,
     FAINT,
-    INK,
     LINE,
+    PLAN,
+    SIGMAS,
+    START,
+    TEXT,
+    TRUTH,
+    UNKNOWN_CELL,
+    Rgb,
+    band_image,
+    color_of,
     fit_to_window,
     hex_of,
     new_figure,
@@ -24,14 +37,16 @@ from mapper.export.page import (
     save,
     scale_bar,
 )
-from mapper.export.palette import DOUBTFUL, END, ESTIMATE, FACTORS, PLAN, START, TRUTH, UNKNOWN_CELL, Rgb
-from mapper.export.panels import color_of
-from mapper.export.path_band import SIGMAS, band_image
+from mapper.export.grid import grid_image
+from mapper.export.html import table as html_table
 from mapper.octree.grid import FREE, OCCUPIED, OccupancyGrid, shrunk
+from mapper.run import files
 from mapper.run.pose_covariances import UncertainPoses
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+
+    from mapper.run.folder import Run
 
 _MARGIN_M = 0.3
 _MOST_CELLS = 2000  # along an edge of a merged map: more than a page has pixels
@@ -299,7 +314,7 @@ def _over_grid(
     reach = 0.5 * np.array([box.width, box.height]) * float(np.max((high - low) / [box.width, box.height]))
     lowest, highest = 0.5 * (low + high) - reach, 0.5 * (low + high) + reach
     fit_to_window(axes, lowest, highest)
-    scale_bar(axes, low, high, color=INK)
+    scale_bar(axes, low, high, color=TEXT)
     axes.legend(loc="best", fontsize=8, framealpha=0.92, edgecolor=LINE)
 
 
@@ -333,7 +348,7 @@ def _map_page(
     height_in = bottom_in + map_height_in + top_in
     figure = new_figure(width_in, height_in)
     left, bottom = left_in / width_in, bottom_in / height_in
-    figure.text(left, 1 - 0.2 / height_in, title, fontsize=14, fontweight="bold", color=INK, va="top")
+    figure.text(left, 1 - 0.2 / height_in, title, fontsize=14, fontweight="bold", color=TEXT, va="top")
     figure.text(left, 1 - 0.52 / height_in, "\n".join(lines), fontsize=9, color=FAINT, va="top")
     axes = figure.add_axes((left, bottom, map_width_in / width_in, map_height_in / height_in))
     axes.set_facecolor(hex_of(UNKNOWN_CELL))
@@ -351,3 +366,44 @@ def _grid_page(
     """Write a page with a headline, a grid and what the caller draws over it, on axes in metres."""
     with _map_page(path, grid, paths_world, title, lines) as axes, _over_grid(axes, grid, paths_world):
         yield axes
+
+
+def plot_run(run: "Run", axes: "Axes | None") -> "Axes":
+    """Draw a run's path over its slice, seen from above; axes are in metres.
+
+    Args:
+        run: A finished run.
+        axes: Axes to draw on; None makes a figure of pyplot's.
+
+    Returns:
+        The axes.
+    """
+    axes = plan_axes(axes)
+    results = run.results
+    draw_summary(
+        axes,
+        grid=run.slice,
+        trajectory=results.trajectory,
+        truth=results.truth,
+        loops_world=results.graph.loops_world,
+        poses=results.poses,
+    )
+    axes.set_title(run.manifest.input.title)
+    return axes
+
+
+def run_html(run: "Run") -> str:
+    """Return the HTML of a run's verdict, its sizes and its picture, which loads nothing from elsewhere."""
+    counts = run.manifest.counts
+    rows = [
+        ("verdict", ". ".join([run.verdict.state, *run.verdict.sentences])),
+        ("frames", counts.frames_text),
+        ("keyframes", f"{counts.nodes}, {counts.loops} loops"),
+        ("path", f"{run.trajectory.path_length_m:.2f} m"),
+        ("octree", f"{counts.voxels_text} of {run.config.octree.resolution_m:g} m"),
+    ]
+    picture = ""
+    if (run.path / files.SUMMARY).is_file():
+        data = base64.b64encode(run.file(files.SUMMARY).read_bytes()).decode("ascii")
+        picture = f'<img alt="path over the slice" style="max-width:100%" src="data:image/png;base64,{data}">'
+    return f"<b>{escape(str(run.path))}</b>{html_table(('', ''), rows)}{picture}"

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mapper.core.errors import FrameError, WriteError
 from mapper.core.geometry import Array, Transform, apply
-from mapper.export.palette import ESTIMATE, FREE_CELL, OCCUPIED_CELL, START, Rgb
+from mapper.export.figures import ESTIMATE, FREE_CELL, OCCUPIED_CELL, START, Rgb
 from mapper.features.frame_view import ImageView
 from mapper.mapping.levelling import AXES
 from mapper.run.observers import Step

@@ -7,9 +7,9 @@ from dataclasses import asdict
 import numpy as np
 
 from mapper.core.doubts import doubts_text
-from mapper.export.foxglove_messages import WORLD
+from mapper.export.figures import TRUTH
 from mapper.export.mcap_log import McapLog
-from mapper.export.palette import TRUTH
+from mapper.export.mcap_messages import WORLD
 from mapper.loops.closure import Discrepancy, LoopClosure
 from mapper.mapping.cloud import height_colors, thinned_to_view
 from mapper.mapping.fusion import Maps, ScanSnapshot, Snapshot

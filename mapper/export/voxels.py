@@ -6,8 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.errors import RunError
-from mapper.export.mesh_files import Triangles, write_mesh
-from mapper.export.ply import write_ply
+from mapper.export.mesh_files import Triangles, write_mesh, write_ply
 from mapper.mapping.cloud import height_colors
 from mapper.octree.keys import KEY_ZERO
 from mapper.octree.map import read_octree

@@ -7,10 +7,10 @@ import cv2
 import numpy as np
 
 from mapper.core.timebase import seconds_text_from_ns
+from mapper.export.figures import ESTIMATE
 from mapper.export.grid import write_grid
-from mapper.export.palette import ESTIMATE
+from mapper.export.mesh_files import write_ply
 from mapper.export.picture import write_summary
-from mapper.export.ply import write_ply
 from mapper.line_laser.calibration import calibration_text
 from mapper.line_laser.config import LineLaserCalibration, LineLaserConfig
 from mapper.line_laser.ranging import LineScan, local_grid

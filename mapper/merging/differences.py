@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from mapper.core.clusters import cluster_numbers
 from mapper.core.errors import ConfigError
 from mapper.core.geometry import Array, Points, Transform, apply, inverse
-from mapper.export.palette import APPEARED, NOT_SEEN_AGAIN, VANISHED, Rgb
+from mapper.export.figures import APPEARED, NOT_SEEN_AGAIN, VANISHED, Rgb
+from mapper.export.mesh_files import write_ply
 from mapper.export.picture import write_layers
-from mapper.export.ply import write_ply
 from mapper.merging.placing import Placed
 from mapper.octree.blocks import log_odds
 from mapper.octree.map import OctreeMap

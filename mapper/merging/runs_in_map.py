@@ -21,8 +21,8 @@ from mapper.octree.blocks import Overlap
 from mapper.octree.config import OctreeConfig
 from mapper.run import files
 from mapper.run.doubtful_frames import without_doubtful
-from mapper.run.fingerprint import fingerprint
 from mapper.run.folder import Run, open_run
+from mapper.run.input_logs import fingerprint
 from mapper.runtime.atomic import atomic_file
 from mapper.runtime.resumable_jobs import Stages
 from mapper.sources.trajectory_files import read_tum, write_tum

@@ -12,7 +12,7 @@ from mapper.core.config import flattened
 from mapper.core.errors import RunError, listed
 from mapper.core.trajectory import Trajectory
 from mapper.run import files
-from mapper.run.fingerprint import fingerprint
+from mapper.run.input_logs import fingerprint
 from mapper.run.manifest import Manifest, library_versions
 from mapper.runtime.atomic import MANIFEST_NAME, write_json
 from mapper.sources.base import Log

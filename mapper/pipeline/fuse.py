@@ -16,8 +16,8 @@ from mapper.core.trajectory import Trajectory
 from mapper.export.cloud_picture import write_cloud_views
 from mapper.export.grid import write_grid
 from mapper.export.mcap_log import McapLog
+from mapper.export.mesh_files import write_ply
 from mapper.export.picture import write_summary
-from mapper.export.ply import write_ply
 from mapper.export.run_mcap import log_maps, log_results, log_snapshot
 from mapper.mapping.config import Edits
 from mapper.mapping.fusion import Maps, fuse_log

@@ -2,8 +2,8 @@
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import replace
-from itertools import compress
+from dataclasses import dataclass, replace
+from itertools import compress, pairwise, product
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +11,7 @@ import numpy as np
 from mapper.config.build import BuildConfig
 from mapper.core.doubts import Doubt
 from mapper.core.errors import ConfigError, LoopError
-from mapper.core.geometry import distances_along
+from mapper.core.geometry import Transform, distances_along, inverse
 from mapper.core.timebase import NS_PER_S
 from mapper.export.picture import write_localised
 from mapper.graph.components import component_numbers, components
@@ -19,12 +19,12 @@ from mapper.graph.config import GraphConfig
 from mapper.graph.gate import MEDIAN_CHI2
 from mapper.graph.model import PoseGraph
 from mapper.graph.optimize import optimize
-from mapper.loops.closure import SOLVER, Discrepancy, accepted_loops, exceeds, why_none_accepted
-from mapper.loops.config import PlaceLoopsConfig, ScanLoopsConfig
+from mapper.loops.closure import SOLVER, Discrepancy, accepted_loops, discrepancy, exceeds, why_none_accepted
+from mapper.loops.config import GateConfig, PlaceLoopsConfig, ScanLoopsConfig
 from mapper.loops.map_constraints import build_map_constraint_detector
+from mapper.loops.odometry_chain import NodePath, allowed
 from mapper.odometry.node_offset import NodeOffset
-from mapper.pipeline.components import component_of
-from mapper.pipeline.kidnapping import without_jumps
+from mapper.pipeline.components import component_of, disconnected
 from mapper.pipeline.known_map import KnownMap, detector_of, loops_between_days
 from mapper.pipeline.solve import solve
 from mapper.pipeline.track import Start, noted_depth_warnings, session_odometry, track_log
@@ -39,6 +39,108 @@ from mapper.run.warnings import localisation_warnings, verdict_of
 from mapper.run.writer import RunWriter, first_manifest, write_run
 from mapper.runtime.progress import SILENT, Progress
 from mapper.sources.base import Log
+
+_WINDOW, _LEAST = 5, 3
+"""Constraints on either side of a jump that are compared, and how many there must be."""
+_MAX_ACROSS, _MIN_WITHIN = 0.2, 0.6
+"""Shares of the pairs that agree: across a jump few do, on either side of it most."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Constrained:
+    """A node with its pose by the map, its pose by odometry, and the metres and radians of path before it."""
+
+    node: int
+    T_map_node: Transform
+    T_odometry_node: Transform
+    path: NodePath
+
+
+def without_jumps(
+    tracking: TrackingResult, map_node: int, gate: GateConfig, *, progress: Progress
+) -> TrackingResult:
+    """Return the result with the odometry cut where the map shows that the sensor was carried elsewhere.
+
+    Several constraints before a jump agree with each other along the odometry, and so do several after it,
+    but hardly any before agrees with one after. What lies between the last before and the first after is left
+    out.
+
+    Args:
+        tracking: Tracking result with constraints from the map's node.
+        map_node: That node.
+        gate: Drift that the odometry may have.
+        progress: Receives a note on each cut.
+    """
+    graph = tracking.graph
+    for nodes in components(graph.without_loops()):
+        for last, first in _jumps(_constrained(tracking, sorted(nodes)), gate):
+            times_s = [
+                (graph.stamps_ns[node] - tracking.tracks[0].stamp_ns) / NS_PER_S for node in (last, first)
+            ]
+            progress.note(
+                f"between {times_s[0]:.1f} and {times_s[1]:.1f} s the path jumps in the map: the odometry is "
+                "cut there"
+            )
+            tracking = _cut(tracking, last, first, map_node)
+    return tracking
+
+
+def _constrained(tracking: TrackingResult, nodes: Sequence[int]) -> list[_Constrained]:
+    T_odometry = tracking.graph.T_world_node
+    T_map_node = {
+        loop.j: loop.T_i_j for loop in tracking.loops if loop.verdict == "accepted" and loop.T_i_j is not None
+    }
+    found, path_m, turned_rad = [], 0.0, 0.0
+    for before, node in zip([nodes[0], *nodes], nodes, strict=False):
+        step = discrepancy(np.eye(4), T_odometry[before], T_odometry[node])
+        path_m, turned_rad = path_m + step.translation_m, turned_rad + step.rotation_rad
+        if node in T_map_node:
+            path = NodePath(path_m, turned_rad)
+            found.append(_Constrained(node, T_map_node[node], T_odometry[node], path))
+    return found
+
+
+def _jumps(constrained: Sequence[_Constrained], gate: GateConfig) -> list[tuple[int, int]]:
+    """Return the last node before every jump and the first after it."""
+    best, least = None, _MAX_ACROSS
+    for k in range(_LEAST, len(constrained) - _LEAST + 1):
+        before, after = constrained[max(k - _WINDOW, 0) : k], constrained[k : k + _WINDOW]
+        across = float(np.mean([_agree(a, b, gate) for a, b in product(before, after)]))
+        if across < least and min(_within(before, gate), _within(after, gate)) >= _MIN_WITHIN:
+            best, least = k, across
+    if best is None:
+        return []
+    jump = constrained[best - 1].node, constrained[best].node
+    return [*_jumps(constrained[:best], gate), jump, *_jumps(constrained[best:], gate)]
+
+
+def _within(side: Sequence[_Constrained], gate: GateConfig) -> float:
+    return float(np.mean([_agree(a, b, gate) for a, b in pairwise(side)]))
+
+
+def _agree(a: _Constrained, b: _Constrained, gate: GateConfig) -> bool:
+    T_map_b = a.T_map_node @ inverse(a.T_odometry_node) @ b.T_odometry_node
+    path = NodePath(b.path.path_m - a.path.path_m, b.path.turned_rad - a.path.turned_rad)
+    return not exceeds(discrepancy(np.eye(4), T_map_b, b.T_map_node), allowed(gate, path))
+
+
+def _cut(tracking: TrackingResult, last: int, first: int, map_node: int) -> TrackingResult:
+    """Return the result without what connects two nodes along the path."""
+    graph = tracking.graph
+    kept = (
+        factor
+        for factor in graph.factors
+        if factor.i == map_node or max(factor.i, factor.j) <= last or min(factor.i, factor.j) >= first
+    )
+    begin_ns, end_ns = graph.stamps_ns[last], graph.stamps_ns[first]
+    return replace(
+        tracking,
+        graph=graph.with_factors(kept),
+        tracks=tuple(
+            disconnected(track) if begin_ns < track.stamp_ns < end_ns else track for track in tracking.tracks
+        ),
+    )
+
 
 _LEAST_CONSTRAINTS = 3
 """A part of the path that fewer constraints tie to the map is not localised."""

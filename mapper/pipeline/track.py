@@ -18,7 +18,7 @@ from mapper.loops.factory import build_loop_detector, build_verifier
 from mapper.loops.verification_log import VerificationLog
 from mapper.odometry.base import FrameResult, Odometry, SensorCheck
 from mapper.odometry.factory import build_odometry, odometry_for
-from mapper.pipeline.doubtful_keyframes import without_doubtful_ends
+from mapper.pipeline.components import without_doubtful_ends
 from mapper.pipeline.tracking_checkpoints import FrameCheckpoint, TrackingCheckpoints
 from mapper.pipeline.tracking_result import BY_POSES, TrackingResult
 from mapper.run.manifest import RunWarning

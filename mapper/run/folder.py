@@ -1,4 +1,4 @@
-"""Run folder: a finished run, its log, and its files, read on first access."""
+"""Run folder: a finished run, its log and its files, read on first access; what it shares with merged maps."""
 
 from collections.abc import Iterable
 from contextlib import AbstractContextManager, nullcontext
@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from shlex import quote
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol, Self
 
 from mapper.config.build import BuildConfig
 from mapper.config.loading import load_run_config
@@ -44,6 +44,52 @@ if TYPE_CHECKING:  # compiled code, which takes longer to load than most files o
     from mapper.octree.grid import OccupancyGrid
     from mapper.octree.map import OctreeMap
     from mapper.run.cloud import Cloud
+
+
+class MapFolder(Protocol):
+    """Interface of runs and merged maps: maps, and the settings of what is made from them."""
+
+    @property
+    def path(self) -> Path:
+        """Folder of the run or map."""
+        ...
+
+    @property
+    def config(self) -> BuildConfig:
+        """Settings."""
+        ...
+
+    @property
+    def octree(self) -> "OctreeMap":
+        """Occupancy map."""
+        ...
+
+    @property
+    def slice(self) -> "OccupancyGrid":
+        """2D navigation map."""
+        ...
+
+    @property
+    def traversable(self) -> "OccupancyGrid":
+        """Floor that a robot can drive on."""
+        ...
+
+    @property
+    def keepout(self) -> "OccupancyGrid | None":
+        """Keep-out regions in the slice's cells; None if there are none."""
+        ...
+
+    def file(self, name: str, /) -> Path:
+        """Return the path of one of its files."""
+        ...
+
+    def changing(self, names: Iterable[str], /) -> AbstractContextManager[None]:
+        """Return a context in which files of the folder may be written."""
+        ...
+
+    def with_config(self, config: BuildConfig, /) -> Self:
+        """Return the same map with other settings."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -190,12 +236,12 @@ class Run:
         Returns:
             The axes, in metres of the levelled world.
         """
-        from mapper.export.run_plot import plot_run
+        from mapper.export.picture import plot_run
 
         return plot_run(self, axes)
 
     def _repr_html_(self) -> str:
-        from mapper.export.run_plot import run_html
+        from mapper.export.picture import run_html
 
         return run_html(self)
 

@@ -1,15 +1,56 @@
-"""Logs that a run was made from: opened again, and compared with what they were."""
+"""Logs that a run was made from: recognised by a fingerprint, opened again, compared with what they were."""
 
+import hashlib
+import os
+from collections.abc import Iterator
 from itertools import zip_longest
 from pathlib import Path
 
 from mapper.core.errors import RunError
-from mapper.run.fingerprint import fingerprint
 from mapper.run.manifest import Input, InputLog
 from mapper.sources import open_source
 from mapper.sources.base import Log
 from mapper.sources.chained import chained, sessions_of
 from mapper.sources.config import SourceConfig
+
+_TEXT_SUFFIXES = frozenset({".txt", ".csv", ".json", ".toml", ".yaml", ".yml", ".tum", ".log"})
+_SAMPLE_BYTES = 1 << 20
+
+
+def fingerprint(path: Path) -> str:
+    """Return ``sha256:…`` over the names and sizes of a log's files and the content of its lists.
+
+    A single-file log, and the text files of a folder (lists, truth, calibration), count with their first
+    and last MiB; images count with name and size. Modification times do not, so a copy is recognised.
+    """
+    digest = hashlib.sha256()
+    if path.is_file():
+        _hash_file(digest, path, name=path.name, content=True)
+    else:
+        for name, file in _files(path):
+            _hash_file(digest, file, name=name, content=file.suffix in _TEXT_SUFFIXES)
+    return f"sha256:{digest.hexdigest()}"
+
+
+def _hash_file(digest: "hashlib._Hash", file: Path, *, name: str, content: bool) -> None:
+    size = file.stat().st_size
+    digest.update(f"{name}\0{size}\0".encode())
+    if not content:
+        return
+    with file.open("rb") as stream:
+        digest.update(stream.read(_SAMPLE_BYTES))
+        if size > _SAMPLE_BYTES:
+            stream.seek(max(size - _SAMPLE_BYTES, _SAMPLE_BYTES))
+            digest.update(stream.read(_SAMPLE_BYTES))
+
+
+def _files(folder: Path) -> Iterator[tuple[str, Path]]:
+    for parent, folders, names in os.walk(folder):
+        folders.sort()
+        for name in sorted(names):
+            file = Path(parent) / name
+            if file.is_file():  # a dangling link is listed but has no size
+                yield str(file.relative_to(folder)), file
 
 
 def open_inputs(known: Input, config: SourceConfig, *, run: Path) -> Log:

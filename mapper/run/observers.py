@@ -52,7 +52,9 @@ class Observer(Protocol):
 
 
 class Observers:
-    """Observer that passes everything on to several, in their order."""
+    """Observer that passes everything on to several, in their order; without any it ignores everything."""
+
+    _observers: tuple[Observer, ...] = ()
 
     def __init__(self, *observers: Observer) -> None:
         self._observers = observers
@@ -73,17 +75,4 @@ class Observers:
             observer.on_mapped(run, results, maps)
 
 
-class NullObserver:
-    """Observer that ignores everything."""
-
-    def on_frame(self, step: Step, /) -> None:
-        """Ignore the frame."""
-
-    def on_levelled(self, T_level_world: Transform, /) -> None:
-        """Ignore the world."""
-
-    def on_mapped(self, run: "Run", results: "RunResults", maps: "Maps", /) -> None:
-        """Ignore the results."""
-
-
-NULL_OBSERVER = NullObserver()
+NULL_OBSERVER = Observers()

@@ -9,7 +9,7 @@ from mapper.config.build import BuildConfig
 from mapper.core.errors import MapperError, WriteError
 from mapper.run import files
 from mapper.run.digests import digests_of
-from mapper.run.fingerprint import fingerprint
+from mapper.run.input_logs import fingerprint
 from mapper.run.manifest import (
     AppendedLog,
     Input,

@@ -32,7 +32,7 @@ def test_a_run_is_opened_without_what_draws_or_evaluates_it():
     """The two imports against the order of the layers are made when they are used."""
     loaded = modules_after("import mapper; mapper.open_run, mapper.build, mapper.evaluate")
     assert "mapper.run.folder" in loaded
-    assert not {"mapper.export.run_plot", "matplotlib.pyplot", "gtsam", "open3d"} & loaded
+    assert not {"mapper.export.picture", "matplotlib.pyplot", "gtsam", "open3d"} & loaded
     loaded = modules_after("import mapper; mapper.build")
     assert not any(name.startswith("mapper.evaluators") for name in loaded)
 

@@ -12,7 +12,7 @@ from mapper.core.geometry import exp
 from mapper.graph.model import BetweenFactor, PoseGraph
 from mapper.graph.odometry_poses import by_odometry
 from mapper.pipeline.build import build
-from mapper.pipeline.edit_loops import edit_loops
+from mapper.pipeline.edit import edit_loops
 from mapper.run.folder import open_run
 from mapper.sources import open_source
 from tests.support.command_line import mapper

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from mapper.core.errors import DataError
-from mapper.export.costmap import FREE_SPACE, INSCRIBED, LETHAL, NO_INFORMATION, inflate
+from mapper.export.nav2 import FREE_SPACE, INSCRIBED, LETHAL, NO_INFORMATION, inflate
 from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 
 

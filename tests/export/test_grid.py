@@ -3,8 +3,8 @@ import numpy as np
 import pytest
 
 from mapper.core.errors import MapFileError
+from mapper.export.figures import INK
 from mapper.export.grid import write_grid
-from mapper.export.palette import INK
 from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, read_grid
 
 

@@ -15,8 +15,8 @@ from mapper.core.frames import PinholeCamera
 from mapper.core.geometry import exp, inverse
 from mapper.core.rotations import rotation_from_quaternion
 from mapper.core.trajectory import Trajectory
-from mapper.export.foxglove_messages import sample_segments
 from mapper.export.mcap_log import McapLog
+from mapper.export.mcap_messages import sample_segments
 from mapper.graph.model import BetweenFactor, PoseSigmas
 from mapper.mapping.thumbnails import encode_jpeg, shrunk_camera
 from mapper.octree.grid import OccupancyGrid

@@ -5,8 +5,7 @@ from mapper.config.build import MeshConfig
 from mapper.core.frames import PinholeCamera, RgbdFrame, Scan, ray_table
 from mapper.core.geometry import apply, inverse, transform
 from mapper.core.rotations import rotation_from_euler
-from mapper.export.mesh import Volume, in_order
-from mapper.export.mesh_views import as_mapped, rectified
+from mapper.export.mesh import Volume, as_mapped, in_order, rectified
 from mapper.mapping.config import Edits, Region
 from mapper.mapping.edits import MapEditor
 from mapper.octree.config import OctreeConfig

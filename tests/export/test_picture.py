@@ -6,9 +6,7 @@ import pytest
 
 from mapper.core.trajectory import Trajectory
 from mapper.export.cloud_picture import splat, write_cloud_views
-from mapper.export.page import new_figure, save
-from mapper.export.palette import BACKDROP, DOUBTFUL, ESTIMATE, FACTORS, TRUTH
-from mapper.export.path_band import band_image
+from mapper.export.figures import BACKDROP, DOUBTFUL, ESTIMATE, FACTORS, TRUTH, band_image, new_figure, save
 from mapper.export.picture import write_summary
 from mapper.mapping.cloud import height_colors
 from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid

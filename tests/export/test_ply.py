@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from mapper.core.errors import DataError
-from mapper.export.ply import write_ply
+from mapper.export.mesh_files import write_ply
 
 
 def read_ply(path):

@@ -7,7 +7,7 @@ import pytest
 from mapper.config.loading import load_config
 from mapper.core.errors import WriteError
 from mapper.export import preview as module
-from mapper.export.palette import ESTIMATE, OCCUPIED_CELL
+from mapper.export.figures import ESTIMATE, OCCUPIED_CELL
 from mapper.export.preview import PREVIEW, Preview, drawn
 from mapper.pipeline.build import build
 from mapper.run.observers import Observers

@@ -15,7 +15,7 @@ from mapper.octree.map import read_octree
 from mapper.pipeline.append import append
 from mapper.pipeline.fuse import fuse
 from mapper.run.folder import moved_log, open_run
-from mapper.run.observers import NullObserver
+from mapper.run.observers import Observers
 from mapper.sources import open_source
 from mapper.sources.chained import sessions_of
 from mapper.sources.config import SourceConfig
@@ -31,7 +31,7 @@ def joined(first, desk_log):
     return open_run(out)
 
 
-class Counting(NullObserver):
+class Counting(Observers):
     """Notes what it receives."""
 
     def __init__(self):

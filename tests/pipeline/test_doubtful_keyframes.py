@@ -9,7 +9,7 @@ from mapper.core.doubts import Doubt
 from mapper.core.geometry import adjoint, exp, inverse
 from mapper.graph.model import BetweenFactor, PoseGraph, PoseSigmas
 from mapper.odometry.base import Diagnostics, FrameResult
-from mapper.pipeline.doubtful_keyframes import without_doubtful_ends
+from mapper.pipeline.components import without_doubtful_ends
 
 STEP = exp(np.array([0.0, 0.0, 0.2]), np.array([0.5, 0.1, 0.0]))
 SIGMAS = PoseSigmas(0.2, 1.0)

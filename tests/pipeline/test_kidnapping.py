@@ -7,7 +7,7 @@ from mapper.graph.components import components
 from mapper.graph.model import BetweenFactor, PoseGraph, PoseSigmas
 from mapper.loops.closure import LoopClosure
 from mapper.loops.config import GateConfig
-from mapper.pipeline.kidnapping import without_jumps
+from mapper.pipeline.localise import without_jumps
 from mapper.pipeline.tracking_result import TrackingResult
 from mapper.run.frame_outcomes import DISCONNECTED
 from mapper.runtime.progress import SILENT

@@ -11,7 +11,7 @@ from mapper.evaluators.metrics.trajectory import align, associate, ate
 from mapper.loops.closure import discrepancy
 from mapper.pipeline.append import append
 from mapper.pipeline.build import build
-from mapper.pipeline.edit_loops import edit_loops
+from mapper.pipeline.edit import edit_loops
 from mapper.run.folder import open_run
 from mapper.simulation.config import STREET, LidarSensorConfig
 from mapper.simulation.lidar import write_lidar_log

@@ -7,14 +7,14 @@ import pytest
 from mapper.config.build import BuildConfig
 from mapper.core.doubts import Doubt
 from mapper.core.errors import DataError, FrameError, RunError, TrackingError
-from mapper.export.ply import write_ply
+from mapper.export.mesh_files import write_ply
 from mapper.loops.closure import read_closures
 from mapper.odometry.base import Diagnostics
 from mapper.run.cloud import read_cloud
 from mapper.run.files import RUN
-from mapper.run.fingerprint import fingerprint
 from mapper.run.folder import open_run
 from mapper.run.frame_outcomes import FrameRecord, read_frame_ms, read_records, write_frame_ms, write_records
+from mapper.run.input_logs import fingerprint
 from mapper.run.manifest import Input, Manifest, is_merged_map, read_manifest
 from mapper.run.pose_covariances import read_poses
 from mapper.run.writer import write_run

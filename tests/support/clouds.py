@@ -6,7 +6,7 @@ import laspy
 import numpy as np
 from pypcd4 import Encoding, PointCloud
 
-from mapper.export.ply import write_ply
+from mapper.export.mesh_files import write_ply
 
 
 def save_cloud(path: Path, points: np.ndarray) -> None:

@@ -7,7 +7,7 @@ import pytest
 from mapper.config.loading import load_config
 from mapper.pipeline.build import build
 from mapper.run.checks import check_run
-from mapper.run.observers import NullObserver
+from mapper.run.observers import Observers
 from mapper.runtime.atomic import partial_of
 from mapper.runtime.journal import StateFile
 from mapper.runtime.progress import Silent
@@ -23,7 +23,7 @@ class Stopped(KeyboardInterrupt):
     """Ctrl-C at a certain frame."""
 
 
-class StopAt(NullObserver):
+class StopAt(Observers):
     """Stops a build when it has tracked so many frames."""
 
     def __init__(self, frames, stop=None):

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from mapper.core.errors import ConfigError, DataError
 from mapper.core.timebase import MAX_TRUTH_GAP_NS, NS_PER_S, nearest
+from mapper.export.figures import SIGMAS
 from mapper.export.grid import grid_image
-from mapper.export.path_band import SIGMAS
 from mapper.graph.model import PoseGraph
 from mapper.loops.closure import LoopClosure
 from mapper.mapping.thumbnails import encode_jpeg

@@ -15,7 +15,7 @@ from mapper.config.build import RerunConfig
 from mapper.core.errors import FrameError
 from mapper.core.frames import RgbdFrame, Scan, Sensor
 from mapper.core.geometry import Array, Transform, inverse
-from mapper.export.palette import ACCEPTED, ESTIMATE, FACTORS, REJECTED, Rgb
+from mapper.export.figures import ACCEPTED, ESTIMATE, FACTORS, REJECTED, Rgb
 from mapper.export.rerun.finished import about_text, extent, log_run
 from mapper.export.rerun.recording import RerunLog, recorded, transform_of
 from mapper.features.frame_view import ImageView

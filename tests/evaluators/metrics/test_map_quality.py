@@ -12,7 +12,7 @@ from mapper.evaluators.metrics.occupancy import assess_by_points, check_metrics
 from mapper.evaluators.metrics.scenes import outdoor_distance_m, scene_distance
 from mapper.evaluators.metrics.sharpness import Views, sharpness_metrics
 from mapper.evaluators.pictures.map_agreement import write_map_errors
-from mapper.export.ply import write_ply
+from mapper.export.mesh_files import write_ply
 from mapper.octree.config import OctreeConfig
 from mapper.octree.map import OctreeMap
 from mapper.octree.octomap_file import write_bt
