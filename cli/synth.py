@@ -170,7 +170,7 @@ def _line_laser(
 ) -> Answer:
     from mapper.config.loading import overridden
     from mapper.line_laser.config import LineLaserSynthConfig
-    from mapper.line_laser.simulation.log import write_line_laser_log
+    from mapper.line_laser.synthetic_log import write_line_laser_log
 
     usual = LineLaserSynthConfig()
     if noise is not None:

@@ -41,8 +41,8 @@ def train(
 
     from mapper.config.loading import overridden
     from mapper.places.config import VocabularyConfig
+    from mapper.places.training import descriptors_of
     from mapper.places.training import train as train_words
-    from mapper.places.training_images import descriptors_of
     from mapper.sources import open_source
 
     config = overridden(VocabularyConfig(), merged(assignments({"frames_per_log": frames}), set_))

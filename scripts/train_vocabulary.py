@@ -14,8 +14,7 @@ import numpy as np
 
 from mapper.cli.console import progress_for
 from mapper.places.config import VocabularyConfig
-from mapper.places.training import train
-from mapper.places.training_images import descriptors_of
+from mapper.places.training import descriptors_of, train
 from mapper.places.vocabulary import SHIPPED
 from mapper.simulation import CameraSimulator, make_scene
 from mapper.simulation.config import SensorConfig, SynthConfig

@@ -19,9 +19,8 @@ from mapper.line_laser.config import (
 )
 from mapper.line_laser.detection import METHODS, Method
 from mapper.line_laser.ranging import scan_image
-from mapper.line_laser.simulation.log import BOARD_M, calibration_boards, sensor_poses
-from mapper.line_laser.simulation.render import take
-from mapper.line_laser.simulation.room import Room, make_board, make_room
+from mapper.line_laser.rendering import Room, make_board, make_room, take
+from mapper.line_laser.synthetic_log import BOARD_M, calibration_boards, sensor_poses
 from mapper.runtime.progress import SILENT, Progress
 from mapper.simulation.streams import Stream, rng_of
 from mapper.sources.image_files.reading import decode_colour

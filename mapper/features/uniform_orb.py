@@ -9,9 +9,8 @@ from numpy.typing import NDArray
 from mapper.core.frames import Image
 from mapper.features.base import Descriptors, Features
 from mapper.features.config import UniformOrbConfig
-from mapper.features.fast import Pixels, corners, fast_scores, orientations
 from mapper.features.opencv import ORB_SCALE_FACTOR
-from mapper.features.quadtree import spread
+from mapper.features.uniform_orb_kernels import Pixels, corners, fast_scores, orientations, spread
 
 _MARGIN_PX = 19  # reach of the rotated descriptor's tests
 _PATCH_PX = 31

@@ -12,11 +12,65 @@ from numpy.typing import NDArray
 from mapper.core.errors import GraphError, MapperError
 from mapper.core.geometry import Array
 from mapper.core.rotations import pose_of_row, row_of_pose
-from mapper.graph.information import as_gtsam_takes, lifted, swapped, symmetric
 from mapper.graph.model import BetweenFactor, Origin, PoseGraph
 from mapper.runtime.atomic import write_text
 from mapper.runtime.progress import SILENT, Progress
 from mapper.runtime.regular_files import read_text
+
+# g2o orders a pose's tangent (translation, rotation); ours is (rotation, translation).
+_SWAPPED = np.array([3, 4, 5, 0, 1, 2])
+_PLANAR = np.array([3, 4, 2])
+"""Indices of x, y and yaw in the tangent."""
+
+
+def _swap(information: Array) -> Array:
+    """Return (N, 6, 6) matrices from g2o's order of the tangent in ours, or back."""
+    return information[:, _SWAPPED][:, :, _SWAPPED]
+
+
+def _symmetric(upper: Array, rows: int) -> Array:
+    """Return (N, rows, rows) symmetric matrices of their upper triangles, row by row."""
+    where = np.triu_indices(rows)
+    matrices = np.zeros((len(upper), rows, rows))
+    matrices[:, *where] = upper
+    matrices[:, *where[::-1]] = upper
+    return matrices
+
+
+def _lift(planar: Array) -> Array:
+    """Return (N, 6, 6) of (N, 3, 3) over (x, y, yaw): the other motions get an edge's largest information."""
+    largest = planar.diagonal(axis1=1, axis2=2).max(axis=1)
+    information: Array = largest[:, np.newaxis, np.newaxis] * np.eye(6)
+    information[:, _PLANAR[:, np.newaxis], _PLANAR] = planar
+    return information
+
+
+def _as_gtsam_takes(information: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Return positive definite matrices in place of indefinite ones, and which were.
+
+    GTSAM weighs residuals with the Cholesky factor R of the information, information = RᵀR. Eigen's LLT
+    stops at the first pivot that is not positive and leaves the rest of R as the matrix had it;
+    costs published for such graphs rest on that R.
+
+    Args:
+        information: (N, k, k) symmetric, with positive diagonals, in GTSAM's order.
+    """
+    factor = np.tril(information)
+    positive = np.ones(len(factor), dtype=np.bool_)
+    for k in range(factor.shape[1]):
+        done = factor[:, k, :k]
+        pivot = factor[:, k, k] - (done * done).sum(axis=1)
+        positive &= pivot > 0.0
+        root = np.sqrt(pivot[positive])
+        below = factor[positive, k + 1 :, k] - np.einsum(
+            "nij,nj->ni", factor[positive, k + 1 :, :k], done[positive]
+        )
+        factor[positive, k, k] = root
+        factor[positive, k + 1 :, k] = below / root[:, np.newaxis]
+    taken = information.copy()
+    taken[~positive] = factor[~positive] @ np.swapaxes(factor[~positive], 1, 2)
+    return taken, ~positive
+
 
 _ORIGINS: tuple[Origin, ...] = get_args(Origin)
 _PARAMETERS = "PARAMS_"
@@ -51,7 +105,7 @@ def write_g2o(path: Path, graph: PoseGraph, *, rejected: Container[int] = ()) ->
     if graph.factors:
         information = np.array([factor.information for factor in graph.factors])
         information = 0.5 * (information + np.swapaxes(information, 1, 2))
-        upper = swapped(information)[:, *np.triu_indices(6)]
+        upper = _swap(information)[:, *np.triu_indices(6)]
         motions = _pose_texts(np.array([factor.T_i_j for factor in graph.factors]))
         lines += [
             f"{'# rejected ' if k in rejected else ''}EDGE_SE3:QUAT {factor.i} {factor.j} {motion} "
@@ -236,10 +290,10 @@ def _informations(path: Path, tables: dict[str, _Table], progress: Progress) -> 
         if tag not in _EDGES:
             continue
         form = _EDGES[tag]
-        given = symmetric(np.array(table.numbers)[:, form.pose_numbers :], form.information_rows)
+        given = _symmetric(np.array(table.numbers)[:, form.pose_numbers :], form.information_rows)
         is_planar = form.information_rows == 3
         if not is_planar:
-            given = swapped(given)
+            given = _swap(given)
         table.refuse(path, ~np.isfinite(given), "a number is not finite")
         diagonal = given.diagonal(axis1=1, axis2=2)
         table.refuse(
@@ -247,9 +301,9 @@ def _informations(path: Path, tables: dict[str, _Table], progress: Progress) -> 
             diagonal <= 0.0,
             "its information is not positive definite: a diagonal value is not positive",
         )
-        taken, mended = as_gtsam_takes(given)
+        taken, mended = _as_gtsam_takes(given)
         indefinite += int(mended.sum())
-        informations |= zip(table.lines, lifted(taken) if is_planar else taken, strict=True)
+        informations |= zip(table.lines, _lift(taken) if is_planar else taken, strict=True)
     if indefinite:
         progress.note(
             f"{path}: {indefinite} of {len(informations)} edges have indefinite information, "

@@ -11,8 +11,8 @@ from mapper.core.timebase import NS_PER_S
 from mapper.core.trajectory import Trajectory
 from mapper.graph.components import component_numbers
 from mapper.graph.config import WheelFactorsConfig, WheelNoiseConfig
-from mapper.graph.gate import Comparison, compare
 from mapper.graph.model import BetweenFactor, Origin, PoseGraph, PoseSigmas
+from mapper.graph.uncertainty import Comparison, compare
 from mapper.sensing.wheel_kinematics import Odometer, pose_at
 
 

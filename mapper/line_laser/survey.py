@@ -1,22 +1,116 @@
-"""Scans of a folder of images, and one map of them where wheel odometry gives their poses."""
+"""Scans of a folder of images, and one map of log-odds (Moravec & Elfes 1985) at poses by the wheels."""
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise, starmap
 from pathlib import Path
 
-from mapper.core.errors import DataError, FrameError, SourceError
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mapper.core.errors import DataError, FrameError, MapSizeError, SourceError
+from mapper.core.geometry import Array, Points
 from mapper.core.timebase import NS_PER_S, Stamps, seconds_text_from_ns
 from mapper.core.trajectory import Trajectory, trajectory_from
 from mapper.line_laser.config import LineLaserCalibration, LineLaserConfig, LineLaserMapConfig
-from mapper.line_laser.mapping import map_scans
 from mapper.line_laser.ranging import LineScan, scan_image
-from mapper.octree.grid import OccupancyGrid
+from mapper.octree.blocks import log_odds
+from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from mapper.runtime.ordered_map import ordered_map
 from mapper.runtime.progress import SILENT, Progress
 from mapper.sensing.wheel_kinematics import pose_at
 from mapper.sources.config import WheelsConfig
 from mapper.sources.image_files.reading import read_colour
 from mapper.sources.wheel_files import read_wheels_file
+
+_MARGIN_CELLS = 2
+_MAX_CELLS = 200_000_000
+_SUBCELL_BITS = 4
+_SEEN_FREE, _SEEN_OCCUPIED = 1, 2
+
+
+def map_scans(
+    scans: Sequence[LineScan],
+    T_world_sensor: Array,
+    config: LineLaserMapConfig,
+    *,
+    progress: Progress = SILENT,
+) -> OccupancyGrid:
+    """Return the map of all scans: occupied where the stripe was, free between there and the sensor.
+
+    Each scan changes a cell once, and a hit goes before a miss; the log-odds are clamped (Hornung et al.
+    2013, §3.4), so that the map follows what changes. Free is where nothing reaches up to the sheet of light:
+    what is low is seen from afar only, where the sheet is low too.
+
+    Args:
+        scans: The scan of each image, in order.
+        T_world_sensor: (N, 4, 4) where the sensor was, x ahead, y left; only the plane counts.
+        config: Size of a cell and the probabilities.
+        progress: Receives the count of scans.
+
+    Raises:
+        DataError: No scan saw anything.
+        MapSizeError: The poses are so far apart that the grid would not fit.
+    """
+    ends_world = [
+        scan.points_sensor @ T[:2, :2].T + T[:2, 3] for scan, T in zip(scans, T_world_sensor, strict=True)
+    ]
+    if not any(map(len, ends_world)):
+        raise DataError("line laser: no image shows a stripe, so there is nothing to map")
+    seen = np.concatenate([*ends_world, T_world_sensor[:, :2, 3]])
+    low = np.floor(seen.min(axis=0) / config.resolution_m).astype(np.int64) - _MARGIN_CELLS
+    size = np.floor(seen.max(axis=0) / config.resolution_m).astype(np.int64) + _MARGIN_CELLS + 1 - low
+    if math.prod(size.tolist()) > _MAX_CELLS:
+        raise MapSizeError(
+            f"line laser: a map of {size[0]} × {size[1]} cells, want {_MAX_CELLS} at most; "
+            "are the wheels right? else raise map.resolution_m"
+        )
+    odds = np.zeros(size[::-1], np.float32)
+    known = np.zeros(odds.shape, np.bool_)
+    with progress.stage("map") as report:
+        for done, (scan, ends, T) in enumerate(zip(scans, ends_world, T_world_sensor, strict=True), start=1):
+            corners = np.concatenate([T[None, :2, 3], ends]) / config.resolution_m - low
+            _update(odds, known, scan, corners, config)
+            report(done, len(scans))
+    states = np.full(odds.shape, UNKNOWN, np.int8)
+    states[known] = np.where(odds[known] > 0.0, OCCUPIED, FREE)
+    return OccupancyGrid(states, low * config.resolution_m, config.resolution_m)
+
+
+def _update(
+    odds: NDArray[np.float32],
+    known: NDArray[np.bool_],
+    scan: LineScan,
+    corners: Points,
+    config: LineLaserMapConfig,
+) -> None:
+    """Add one scan to the log-odds; ``corners`` are the sensor and then the scan's ends, in cells (x, y)."""
+    first = np.floor(corners.min(axis=0)).astype(np.int64) - 1
+    last = np.floor(corners.max(axis=0)).astype(np.int64) + 2
+    window = (slice(first[1], last[1]), slice(first[0], last[0]))
+    local = corners - first
+    states = np.zeros(last[::-1] - first[::-1], np.uint8)
+    for run in _neighbours(scan.columns):
+        ray = np.concatenate([local[:1], local[1:][run]]) - 0.5
+        fixed = np.rint(ray * (1 << _SUBCELL_BITS)).astype(np.int32)
+        cv2.fillPoly(states, [fixed], _SEEN_FREE, shift=_SUBCELL_BITS)
+    columns, rows = np.floor(local[1:][~scan.is_floor]).astype(np.int64).T
+    states[rows, columns] = _SEEN_OCCUPIED
+    miss, hit = log_odds(config.miss_probability), log_odds(config.hit_probability)
+    lowest, highest = log_odds(config.clamp_min_probability), log_odds(config.clamp_max_probability)
+    change = np.array([0.0, miss, hit], np.float32)
+    odds[window] = np.clip(odds[window] + change[states], lowest, highest)
+    known[window] |= states > 0
+
+
+def _neighbours(columns: NDArray[np.int64]) -> Iterator[slice]:
+    """Yield the runs of columns without a gap: nothing is known of what lies between others."""
+    breaks = np.flatnonzero(np.diff(columns) > 1) + 1
+    bounds = [0, *breaks.tolist(), len(columns)]
+    yield from starmap(slice, pairwise(bounds))
+
 
 _WORKERS = 2
 

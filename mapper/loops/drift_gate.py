@@ -5,7 +5,7 @@ from statistics import median
 import numpy as np
 
 from mapper.core.geometry import inverse
-from mapper.graph.gate import Comparison, compare
+from mapper.graph.uncertainty import Comparison, compare
 from mapper.loops.closure import LoopClosure
 from mapper.loops.config import GateConfig
 from mapper.loops.consistency_check import ConsistencyCheck

@@ -8,14 +8,18 @@ from mapper.core.geometry import Array, Points, Transform, adjoint, apply, inver
 from mapper.features.frame_view import FrameView, ImageView
 from mapper.features.hamming import match_mutual_bits
 from mapper.features.matching import Pairs, homography_inliers, match_mutual
-from mapper.graph.noise import with_model_error
+from mapper.graph.uncertainty import with_model_error
 from mapper.loops.base import Verification
 from mapper.loops.config import ImageVerificationConfig
 from mapper.registration.base import Alignment
 from mapper.registration.isvd import Isvd
-from mapper.registration.p3p import ransac_p3p
-from mapper.registration.reprojection import image_measurements, normal_matrix, refine_pose
-from mapper.registration.variance_factor import residual_statistics
+from mapper.registration.reprojection import (
+    image_measurements,
+    normal_matrix,
+    ransac_p3p,
+    refine_pose,
+    residual_statistics,
+)
 
 MAX_SIGMA_M = 0.05
 """A motion whose translation is less certain in any direction is no loop: far scenes leave it uncertain."""

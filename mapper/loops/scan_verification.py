@@ -8,7 +8,7 @@ import numpy as np
 from mapper.core.errors import ConfigError
 from mapper.core.geometry import Array, Transform, inverse
 from mapper.features.frame_view import FrameView, ScanView
-from mapper.graph.noise import inflated
+from mapper.graph.uncertainty import inflated
 from mapper.loops.base import Verification
 from mapper.loops.closure import Discrepancy, discrepancy, exceeds
 from mapper.loops.config import ScanVerificationConfig
@@ -16,9 +16,8 @@ from mapper.loops.scan_context_proposer import ScanPlace
 from mapper.registration.base import Alignment
 from mapper.registration.degeneracy import degeneracy_of
 from mapper.registration.free_space import FreeSpaceCheck, FreeSpaceCounts, ScanDescription, range_image
+from mapper.registration.hough.ground import find_ground, find_obstacles, level
 from mapper.registration.hough.ground_kernels import thin
-from mapper.registration.hough.ground_plane import level
-from mapper.registration.hough.ground_removal import find_ground, find_obstacles
 from mapper.registration.hough.object_detection import centres_of
 from mapper.registration.hough.voting import vote
 from mapper.registration.refining import refine

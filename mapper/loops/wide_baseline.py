@@ -13,18 +13,18 @@ from mapper.core.frames import RgbdFrame
 from mapper.core.geometry import Array, Transform, adjoint, apply, inverse
 from mapper.features.frame_view import ImageView
 from mapper.features.matching import Pairs, match_mutual
-from mapper.graph.noise import with_model_error
+from mapper.graph.uncertainty import with_model_error
 from mapper.loops.base import Verification
 from mapper.loops.image_verification import rms_residual_px
 from mapper.registration.image_agreement import ImageAgreement, image_agreement
-from mapper.registration.p3p import ransac_p3p
 from mapper.registration.reprojection import (
     disparity_sigmas_px,
     image_measurements,
     normal_matrix,
+    ransac_p3p,
     refine_pose,
+    residual_statistics,
 )
-from mapper.registration.variance_factor import residual_statistics
 from mapper.sensing.config import KINECT_NOISE
 from mapper.sensing.depth_noise import depth_sigma_m
 

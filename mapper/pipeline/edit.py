@@ -6,9 +6,8 @@ from typing import Any
 from mapper.config.build import BuildConfig
 from mapper.core.errors import ConfigError, LoopError
 from mapper.core.frames import Sensor
-from mapper.graph.components import components
+from mapper.graph.components import by_odometry, components
 from mapper.graph.model import PoseGraph
-from mapper.graph.odometry_poses import by_odometry
 from mapper.loops.base import Proposal, Verifier, verify_proposal
 from mapper.loops.closure import LoopClosure, accepted_loops
 from mapper.loops.factory import build_verifier, keyframe_loops

@@ -16,9 +16,9 @@ from mapper.core.timebase import NS_PER_S
 from mapper.export.picture import write_localised
 from mapper.graph.components import component_numbers, components
 from mapper.graph.config import GraphConfig
-from mapper.graph.gate import MEDIAN_CHI2
 from mapper.graph.model import PoseGraph
 from mapper.graph.optimize import optimize
+from mapper.graph.uncertainty import MEDIAN_CHI2
 from mapper.loops.closure import SOLVER, Discrepancy, accepted_loops, discrepancy, exceeds, why_none_accepted
 from mapper.loops.config import GateConfig, PlaceLoopsConfig, ScanLoopsConfig
 from mapper.loops.map_constraints import build_map_constraint_detector

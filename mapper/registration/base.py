@@ -12,7 +12,7 @@ from mapper.core.frames import Scan
 from mapper.core.geometry import Array, Transform, is_rigid
 
 if TYPE_CHECKING:
-    from mapper.registration.variance_factor import ResidualStatistics
+    from mapper.registration.reprojection import ResidualStatistics
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from mapper.core.geometry import Array, Points, Transform, apply, fit_rigid, transform
 from mapper.registration.base import Alignment, failed
 from mapper.registration.config import IsvdConfig
-from mapper.registration.isvd_trimming import trim
+from mapper.registration.isvd_kernels import trim
 
 _MM_PER_M = 1000.0
 _MIN_SPREAD_M = 0.01  # about a common line, points nearer to it than this leave the rotation unobservable

@@ -1,10 +1,15 @@
-"""Camera pose by least reprojection error: compiled Levenberg–Marquardt."""
+"""Camera poses from 3D–2D pairs: P3P without a first guess, least reprojection error, and how sure it is."""
 
+from dataclasses import dataclass
+
+import cv2
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
-from mapper.core.geometry import Array
+from mapper.core.geometry import Array, Points, Transform
 from mapper.core.linear import solve_positive, twist_exp
+from mapper.features.matching import drawing_order
 
 CHI2_2DOF, CHI2_3DOF = 5.991, 7.815
 """95 % quantiles of χ²: of an image point without and with depth."""
@@ -225,3 +230,103 @@ def refine_pose(T_camera_world, points, measured, weights, intrinsics, rounds, i
         if classify(T, points, measured, weights, intrinsics, inlier) < 6:
             break
     return T, inlier, H
+
+
+_CONFIDENCE = 0.999
+
+
+def ransac_p3p(
+    points_world: Points,
+    pixels: Array,
+    intrinsics: Array,
+    *,
+    tolerance_px: float,
+    iterations: int,
+    seed: int = 0,
+) -> tuple[Transform, NDArray[np.intp]] | None:
+    """Return the T_camera_world with most inlier pairs, and their indices; None if no four pairs give a pose.
+
+    Three pairs have up to four solutions (Gao et al. 2003); a fourth pair chooses among them.
+
+    Args:
+        points_world: (N, 3) metres, N ≥ 4.
+        pixels: (N, 2) their undistorted pixels.
+        intrinsics: (≥ 4,) fx, fy, cx, cy.
+        tolerance_px: A pair is an inlier when its point projects this close to its pixel (β in the paper).
+        iterations: Largest number of draws; fewer once a better one has become unlikely.
+        seed: Seed of the draws; see ``drawing_order``.
+    """
+    fx, fy, cx, cy = intrinsics[:4]
+    order = drawing_order(len(pixels), seed)
+    found, rotation, translation, inliers = cv2.solvePnPRansac(
+        points_world[order],
+        pixels[order],
+        np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]),
+        None,
+        iterationsCount=iterations,
+        reprojectionError=tolerance_px,
+        confidence=_CONFIDENCE,
+        flags=cv2.SOLVEPNP_P3P,
+    )
+    if not found or inliers is None:
+        return None
+    T_camera_world = np.eye(4)
+    T_camera_world[:3, :3], _ = cv2.Rodrigues(rotation)
+    T_camera_world[:3, 3] = translation[:, 0]
+    return T_camera_world, np.sort(order[inliers[:, 0]])
+
+
+_COLUMNS, _ROWS = 4, 3
+"""Cells of the image; features of one cell share the errors of lens, depth and shutter."""
+
+
+@dataclass(frozen=True, slots=True)
+class ResidualStatistics:
+    """Size and dependence of a pose's residuals.
+
+    Attributes:
+        variance: Their mean square in standard deviations: features may be found better or worse than their
+            weights say.
+        design_effect: By how much residuals that agree within a cell of the image carry less information than
+            independent ones (Kish 1965, §5.4); about 1 if they are independent.
+    """
+
+    variance: float
+    design_effect: float
+
+    @property
+    def variance_factor(self) -> float:
+        """By how much the inverse of the normal matrix has to be multiplied to be the covariance."""
+        return max(1.0, self.design_effect) * self.variance
+
+
+def residual_statistics(
+    T_camera_world: Transform, points: Points, measured: Array, weights: Array, intrinsics: Array
+) -> ResidualStatistics:
+    """Return the statistics of a pose's residuals.
+
+    The design effect is the cluster-robust covariance of the scores (Liang & Zeger 1986, eq. 8) relative to
+    that of independent ones: one number for all directions, as so few cells do not determine a matrix.
+
+    Args:
+        T_camera_world: (4, 4) at the least squares.
+        points: (N, 3) metres, world; inliers only.
+        measured: (N, 3) u, v, bf/z in pixels; NaN in the third column without depth.
+        weights: (N, 3) inverse variances of the three, px⁻².
+        intrinsics: (5,) fx, fy, cx, cy, bf.
+    """
+    gradients, squares = scores(T_camera_world, points, measured, weights, intrinsics)
+    freedom = int(np.isfinite(measured).sum()) - 6
+    if freedom <= 0:
+        return ResidualStatistics(1.0, 1.0)
+    variance = float(squares.sum()) / freedom
+    share = measured[:, :2] / (2.0 * intrinsics[2:4])
+    cell = np.clip((share * [_COLUMNS, _ROWS]).astype(np.intp), 0, [_COLUMNS - 1, _ROWS - 1])
+    cells, cell_of = np.unique(cell @ [1, _COLUMNS], return_inverse=True)
+    if len(cells) < 2:
+        return ResidualStatistics(variance, 1.0)
+    sums = np.zeros((len(cells), 6))
+    np.add.at(sums, cell_of, gradients)
+    covariance = np.linalg.inv(normal_matrix(T_camera_world, points, measured, weights, intrinsics))
+    together, alone = (float(np.einsum("na,ab,nb->", g, covariance, g)) for g in (sums, gradients))
+    return ResidualStatistics(variance, together * len(cells) / (len(cells) - 1) / alone)

@@ -9,8 +9,8 @@ import pytest
 from mapper.config.loading import load_config
 from mapper.core.errors import ConfigError
 from mapper.core.geometry import exp
+from mapper.graph.components import by_odometry
 from mapper.graph.model import BetweenFactor, PoseGraph
-from mapper.graph.odometry_poses import by_odometry
 from mapper.pipeline.build import build
 from mapper.pipeline.edit import edit_loops
 from mapper.run.folder import open_run

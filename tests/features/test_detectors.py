@@ -11,8 +11,7 @@ from mapper.core.errors import DataError
 from mapper.features.base import Features
 from mapper.features.config import DetectorConfig, OrbConfig, UniformOrbConfig
 from mapper.features.factory import build_detector
-from mapper.features.fast import corners, fast_scores, orientations
-from mapper.features.quadtree import spread
+from mapper.features.uniform_orb_kernels import corners, fast_scores, orientations, spread
 
 EVERY_DETECTOR = [member() for member in get_args(get_args(DetectorConfig)[0])]
 every_detector = pytest.mark.parametrize("config", EVERY_DETECTOR, ids=lambda config: config.kind)

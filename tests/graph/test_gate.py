@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from mapper.core.geometry import exp, transform
-from mapper.graph.gate import compare
+from mapper.graph.uncertainty import compare
 
 NOTHING = np.zeros((6, 6))
 

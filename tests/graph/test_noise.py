@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mapper.graph.noise import with_model_error
+from mapper.graph.uncertainty import with_model_error
 from tests.support.planar import at
 
 

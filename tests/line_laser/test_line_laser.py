@@ -21,9 +21,8 @@ from mapper.line_laser.calibration import (
 )
 from mapper.line_laser.config import THESIS, LineLaserCalibration, LineLaserConfig, VehicleConfig
 from mapper.line_laser.files import find_images, read_shots
-from mapper.line_laser.mapping import map_scans
 from mapper.line_laser.ranging import line_scan, local_grid, scan_image
-from mapper.line_laser.survey import drive, scan_images, sensor_poses
+from mapper.line_laser.survey import drive, map_scans, scan_images, sensor_poses
 from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN
 from tests.support.grids import state_at
 

@@ -13,11 +13,10 @@ from mapper.evaluators.line_laser.scores import TABLE_2_1, count
 from mapper.line_laser.calibration import ahead_m
 from mapper.line_laser.config import THESIS, LineLaserCalibration, LineLaserConfig, LineLaserSynthConfig
 from mapper.line_laser.files import find_images
-from mapper.line_laser.simulation.log import sensor_poses
-from mapper.line_laser.simulation.render import take
-from mapper.line_laser.simulation.room import Patch, Room, make_board, make_room
+from mapper.line_laser.rendering import Patch, Room, make_board, make_room, take
 from mapper.line_laser.survey import drive, scan_images
 from mapper.line_laser.survey import sensor_poses as drive_poses
+from mapper.line_laser.synthetic_log import sensor_poses
 from mapper.octree.grid import OCCUPIED, read_grid
 from mapper.sources.image_files.reading import decode_colour
 from tests.support.command_line import invoke

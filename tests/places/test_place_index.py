@@ -8,10 +8,9 @@ from mapper.features.config import UniformOrbConfig
 from mapper.features.factory import build_detector
 from mapper.features.hamming import match_mutual_bits, pack
 from mapper.places.config import PlacesConfig, VocabularyConfig
-from mapper.places.index import PlaceIndex
+from mapper.places.index import PlaceIndex, match_by_word
 from mapper.places.training import train
 from mapper.places.vocabulary import ONE, WordVector, load_vocabulary
-from mapper.places.word_matching import match_by_word
 from mapper.simulation import CameraSimulator
 from mapper.simulation.config import SynthConfig
 from tests.support.descriptors import noisy, random_bits

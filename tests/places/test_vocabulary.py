@@ -9,10 +9,8 @@ import pytest
 from mapper.core.errors import DataError, VocabularyError
 from mapper.core.frames import Scan
 from mapper.places.config import VocabularyConfig
-from mapper.places.training import grow, train
-from mapper.places.training_images import descriptors_of
-from mapper.places.vocabulary import ONE, Vocabulary, load_vocabulary
-from mapper.places.word_tree import WordTree
+from mapper.places.training import descriptors_of, grow, train
+from mapper.places.vocabulary import ONE, Vocabulary, WordTree, load_vocabulary
 from tests.support.descriptors import noisy, random_bits
 from tests.support.logs import MemoryEntry, log_in_memory
 

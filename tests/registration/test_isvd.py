@@ -6,7 +6,7 @@ import pytest
 from mapper.core.geometry import angle_between, apply, exp, fit_rigid, inverse, log
 from mapper.registration.config import IsvdConfig
 from mapper.registration.isvd import Isvd, rigid_fit_information
-from mapper.registration.isvd_trimming import trim
+from mapper.registration.isvd_kernels import trim
 
 
 def room(rng: np.random.Generator, n: int = 200) -> np.ndarray:

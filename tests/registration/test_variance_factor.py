@@ -2,8 +2,7 @@ import numpy as np
 import pytest
 
 from mapper.core.geometry import apply, exp, log
-from mapper.registration.reprojection import normal_matrix, refine_pose
-from mapper.registration.variance_factor import residual_statistics
+from mapper.registration.reprojection import normal_matrix, refine_pose, residual_statistics
 
 INTRINSICS = np.array([525.0, 525.0, 319.5, 239.5, 40.0])
 

@@ -7,8 +7,7 @@ from mapper.core.frames import Scan
 from mapper.octree.config import OctreeConfig
 from mapper.octree.map import OctreeMap
 from mapper.sensing.config import KINECT_NOISE, DepthNoiseConfig
-from mapper.sensing.depth_limit import DepthLimit
-from mapper.sensing.depth_noise import depth_sigma_m
+from mapper.sensing.depth_noise import DepthLimit, depth_sigma_m
 
 RAY = (0.31, -0.11, 1.0)
 STEREO = DepthNoiseConfig(quadratic_per_m=0.005)

@@ -17,7 +17,7 @@ from mapper.features.base import Detector
 from mapper.features.factory import build_detector
 from mapper.features.frame_view import ImageView
 from mapper.graph.model import BetweenFactor
-from mapper.graph.noise import with_model_error
+from mapper.graph.uncertainty import with_model_error
 from mapper.odometry.base import (
     Diagnostics,
     FeatureMatches,

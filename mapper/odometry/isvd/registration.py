@@ -14,8 +14,7 @@ from mapper.odometry.config import MatchConfig
 from mapper.registration.base import Alignment, failed
 from mapper.registration.config import IsvdConfig
 from mapper.registration.isvd import Isvd
-from mapper.registration.reprojection import classify, normal_matrix, refine_pose
-from mapper.registration.variance_factor import residual_statistics
+from mapper.registration.reprojection import classify, normal_matrix, refine_pose, residual_statistics
 from mapper.runtime.archived import Archivable
 
 _ROUNDS, _ITERATIONS = 3, 10

@@ -13,8 +13,7 @@ from mapper.odometry.keyframes.focal_length import Bundle
 from mapper.odometry.keyframes.growing_table import GrowingTable
 from mapper.odometry.keyframes.keyframe import DepthLink, Keyframe, RecentObservations
 from mapper.odometry.keyframes.landmark_kernels import count_observers, observations_of
-from mapper.registration.reprojection import normal_matrix
-from mapper.registration.variance_factor import ResidualStatistics, residual_statistics
+from mapper.registration.reprojection import ResidualStatistics, normal_matrix, residual_statistics
 from mapper.runtime.archived import archived
 
 Ids = NDArray[np.int32]

@@ -9,14 +9,14 @@ import numpy as np
 from mapper.core.geometry import Array, Transform, inverse
 from mapper.core.running_median import RunningMedian
 from mapper.graph.model import BetweenFactor
-from mapper.graph.noise import inflated, with_model_error
+from mapper.graph.uncertainty import inflated, with_model_error
 from mapper.odometry.config import KeyframeOdometryConfig
 from mapper.odometry.keyframes.focal_length import WINDOW_KEYFRAMES, FocalLengthCheck
 from mapper.odometry.keyframes.frame_doubts import UNDOUBTED, Assessment
 from mapper.odometry.keyframes.landmarks import MIN_SHARED_LANDMARKS, LandmarkMap
 from mapper.odometry.keyframes.pose_tracker import TrackedPose
 from mapper.odometry.keyframes.relocalizer import Relocalizer
-from mapper.registration.variance_factor import ResidualStatistics
+from mapper.registration.reprojection import ResidualStatistics
 
 _FACTORS_PER_KEYFRAME = 4
 """Factors of each keyframe, to the earlier ones that share most landmarks with it."""

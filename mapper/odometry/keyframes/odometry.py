@@ -11,7 +11,7 @@ from mapper.core.geometry import Array, inverse
 from mapper.features.factory import build_detector
 from mapper.features.frame_view import ImageView
 from mapper.graph.model import BetweenFactor
-from mapper.graph.noise import inflated
+from mapper.graph.uncertainty import inflated
 from mapper.odometry.base import (
     Diagnostics,
     FeatureMatches,

@@ -11,10 +11,9 @@ from mapper.odometry.config import KeyframeOdometryConfig
 from mapper.odometry.keyframes.landmarks import Ids, LandmarkMap
 from mapper.odometry.keyframes.local_search import LocalSearch
 from mapper.odometry.keyframes.pose_tracker import MAX_HAMMING, TrackedPose, refined, unmatched
-from mapper.places.index import PlaceIndex
+from mapper.places.index import PlaceIndex, match_by_word
 from mapper.places.vocabulary import Vocabulary
-from mapper.places.word_matching import match_by_word
-from mapper.registration.p3p import ransac_p3p
+from mapper.registration.reprojection import ransac_p3p
 
 _MAX_RATIO = 0.85
 _MATCHING_LEVEL = 2

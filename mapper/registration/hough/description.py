@@ -9,7 +9,7 @@ from mapper.core.frames import Scan
 from mapper.core.geometry import Array, Points, Transform, apply, stride_for
 from mapper.registration.free_space import ScanDescription, range_image
 from mapper.registration.hough.config import HoughConfig
-from mapper.registration.hough.ground_removal import Ground, surroundings
+from mapper.registration.hough.ground import Ground, surroundings
 from mapper.registration.hough.object_detection import centres_of
 from mapper.registration.hough.planar_kernels import draw_volume
 

@@ -3,9 +3,9 @@
 import numpy as np
 
 from mapper.core.geometry import transform
-from mapper.graph.noise import with_model_error
+from mapper.graph.uncertainty import with_model_error
 from mapper.odometry.keyframes.local_mapping import LogResiduals
-from mapper.registration.variance_factor import ResidualStatistics
+from mapper.registration.reprojection import ResidualStatistics
 
 INFORMATION = np.diag([1e7] * 3 + [1e6] * 3)
 T_I_J = transform(np.eye(3), np.array([0.5, 0.0, 0.0]))

@@ -8,7 +8,7 @@ from mapper.core.geometry import angle_between, apply, exp, inverse
 from mapper.core.trajectory import trajectory_from
 from mapper.odometry.config import PnpConfig
 from mapper.odometry.factory import build_frame_odometry
-from mapper.registration.p3p import ransac_p3p
+from mapper.registration.reprojection import ransac_p3p
 from tests.support.desk_frames import ate_rmse_m
 from tests.support.paths import CONFIGS
 

@@ -11,8 +11,7 @@ from mapper.core.timebase import NS_PER_S, Stamps, seconds_text_from_ns
 from mapper.core.trajectory import Trajectory, trajectory_from
 from mapper.line_laser.config import LineLaserSynthConfig
 from mapper.line_laser.files import SHOTS
-from mapper.line_laser.simulation.render import Shot, take
-from mapper.line_laser.simulation.room import Room, curvature_at, lap_m, make_board, make_room
+from mapper.line_laser.rendering import Room, Shot, curvature_at, lap_m, make_board, make_room, take
 from mapper.runtime.atomic import new_folder, write_json
 from mapper.runtime.ordered_map import ordered_map
 from mapper.runtime.progress import SILENT, Progress
