@@ -4,6 +4,9 @@ import os
 import re
 import stat
 import tomllib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +16,21 @@ MOST_TEXT_BYTES = 256 << 20
 """Size of a text file, beyond which it is taken for something else: the true poses of ten hours at 100 Hz
 fill it, and as lines it takes a few gigabytes of memory."""
 
-
 _MOST_TOML_CHARACTERS = 1 << 20
 _MOST_KEY_PARTS = 32
+
+_reads: ContextVar[set[Path] | None] = ContextVar("reads", default=None)
+
+
+@contextmanager
+def reads() -> Iterator[set[Path]]:
+    """Yield a set to which the path of every text file is added that is read meanwhile."""
+    paths: set[Path] = set()
+    token = _reads.set(paths)
+    try:
+        yield paths
+    finally:
+        _reads.reset(token)
 
 
 def read_regular(path: Path, *, most_bytes: int, may_be_pipe: bool = False) -> bytes:
@@ -80,6 +95,8 @@ def read_text(
         MapperError: ``error``: it cannot be read, is no regular file, too large or no text; the message says
             which file.
     """
+    if (paths := _reads.get()) is not None:
+        paths.add(path)
     try:
         return read_regular(path, most_bytes=MOST_TEXT_BYTES, may_be_pipe=may_be_pipe).decode(encoding)
     except OSError as why:

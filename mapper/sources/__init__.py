@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from mapper.core.errors import SourceError
 from mapper.runtime.atomic import MANIFEST_NAME
+from mapper.runtime.regular_files import reads
 from mapper.sources.config import SourceConfig
 
 if TYPE_CHECKING:
@@ -47,6 +48,7 @@ def open_source(path: Path, config: SourceConfig = _DEFAULTS) -> "Log":
         SourceError: Nothing is there, no format fits, the log is malformed, nothing of it is selected, or it
             has no frame such as is to be its body.
     """
+    from mapper.sources.listed_files import unused_note
     from mapper.sources.scan_folders.scan_folder import most_clouds
     from mapper.sources.selection import selected
     from mapper.sources.wheel_files import read_wheels
@@ -61,10 +63,13 @@ def open_source(path: Path, config: SourceConfig = _DEFAULTS) -> "Log":
                 f"{path}: source.body_frame={config.body_frame}: only a recording's tf has such a frame; "
                 "leave it out"
             )
-        log: Log = import_module(f"mapper.sources.{name}").read_log(path, config)
-        if log.wheels is None and path.is_dir():
-            wheels, notes = read_wheels(path, config.wheels, sensor=log.sensor)
-            log = replace(log, wheels=wheels, notes=[*log.notes, *notes])
+        with reads() as read:
+            log: Log = import_module(f"mapper.sources.{name}").read_log(path, config)
+            if log.wheels is None and path.is_dir():
+                wheels, notes = read_wheels(path, config.wheels, sensor=log.sensor)
+                log = replace(log, wheels=wheels, notes=[*log.notes, *notes])
+        if name != RECORDING:
+            log = replace(log, notes=[*log.notes, *unused_note(path, read)])
         return selected(log, config)
     if (path / MANIFEST_NAME).is_file():
         raise SourceError(f"{path}: holds what mapper made, not a log; mapper eval {path} judges it")

@@ -1,10 +1,26 @@
 """Files that a log lists: regular ones, within its folder."""
 
 import os
-from collections.abc import Iterable
+import re
+from collections.abc import Collection, Iterable
 from pathlib import Path, PurePath
 
 from mapper.core.errors import SourceError
+
+_MOST_NAMED = 8
+_SENSOR_FILES = [
+    re.compile(
+        rf"(?:^|[^a-z])(?:{words}).*\.(?:txt|csv|tsv|json|ya?ml|toml|log|np[yz]|tum|bag|mcap|db3)$", re.I
+    )
+    for words in (
+        "ground.?truth|gt(?![a-z])|pose|traj",
+        "imu|accel|gyro",
+        "gnss|gps|oxts|navsat",
+        "odom|wheel|encoder",
+        "calib|intrinsic|cam.?info|camera",
+    )
+]
+"""Names of files of each kind that a sensor or a calibration wrote; one of a kind is enough."""
 
 
 def within(folder: Path, name: str, *, where: str) -> Path:
@@ -67,6 +83,21 @@ def refuse_links_out(paths: Iterable[Path], *, log: Path) -> None:
                         f"{entry.path}: a link to {target}, out of the log; copy the file, or let its folder "
                         "be the link"
                     )
+
+
+def unused_note(folder: Path, read: Collection[Path]) -> list[str]:
+    """Return a note on the sensors' files in a log's folder of whose kind none was read, by their names."""
+    kinds = [kind for kind in _SENSOR_FILES if not any(kind.search(path.name) for path in read)]
+    names = sorted(entry.name for entry in _entries(folder) if folder / entry.name not in read)
+    unused = [name for name in names if any(kind.search(name) for kind in kinds)]
+    if not unused:
+        return []
+    more = f" and {len(unused) - _MOST_NAMED} more" if len(unused) > _MOST_NAMED else ""
+    return [
+        f"files that are not used: {', '.join(unused[:_MOST_NAMED])}{more}; truth is read from the file that "
+        "source.truth_file names (of scans) or groundtruth.txt, accelerations from accelerometer.txt, wheels "
+        "from wheels.txt or encoders.txt, the camera from calibration.toml"
+    ]
 
 
 def _entries(folder: Path) -> list[os.DirEntry[str]]:

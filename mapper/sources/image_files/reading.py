@@ -1,5 +1,6 @@
 """Image files as arrays: whole and of the right kind, or an error that names the file."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import cast
 
@@ -98,8 +99,19 @@ def decode_depth_units(data: bytes, where: str) -> NDArray[np.uint16]:
     Raises:
         FrameError: As :func:`read_depth_m`.
     """
+    return cast(NDArray[np.uint16], decode_depth(data, where, kinds=(np.uint16,)))
+
+
+def decode_depth(
+    data: bytes, where: str, *, kinds: Sequence[type] = (np.uint16, np.float32)
+) -> NDArray[np.uint16] | NDArray[np.float32]:
+    """Return the (H, W) 16-bit units or 32-bit numbers of a depth image's bytes.
+
+    Raises:
+        FrameError: As :func:`read_colour`, or the image is not one channel of one of these kinds.
+    """
     units = _decoded(data, cv2.IMREAD_UNCHANGED, where)
-    if units.dtype != np.uint16 or units.ndim != 2:
+    if units.dtype not in kinds or units.ndim != 2:
         raise FrameError(
             f"{where}: depth image of {units.dtype} {units.shape}, want one channel of 16 bits, as "
             "in a PNG of millimetres"

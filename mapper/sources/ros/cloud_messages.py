@@ -49,6 +49,12 @@ def structured(
             formats.append(kind if count <= 1 else f"{count}{kind}")
     if len(data) == rows * columns * point_bytes:
         row_bytes = None  # whatever the message says: without padding there is one way to read it
+    needed = (rows - 1) * (row_bytes or columns * point_bytes) + columns * point_bytes
+    if len(data) < needed:
+        raise DataError(
+            f"a cloud of {rows}×{columns} points of {point_bytes} bytes needs {needed} bytes, but "
+            f"{len(data)} are there"
+        )
     try:
         point = np.dtype({"names": names, "offsets": offsets, "formats": formats, "itemsize": point_bytes})
         strides = (row_bytes or columns * point_bytes, point_bytes)

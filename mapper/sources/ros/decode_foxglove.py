@@ -95,13 +95,19 @@ def _camera(m: Any) -> CameraMessage:
 
 
 def _cloud(m: Any) -> CloudMessage:
-    fields = [(f.name, f.offset, "<" + _NUMERIC_TYPES[f.type], 1) for f in m.fields]
+    known = [f for f in m.fields if f.type in _NUMERIC_TYPES]
+    fields = [(f.name, f.offset, "<" + _NUMERIC_TYPES[f.type], 1) for f in known]
+    notes = [
+        f"field {f.name} is left out: its type {f.type} is none of PackedElementField's"
+        for f in m.fields
+        if f.type not in _NUMERIC_TYPES
+    ]
     data, stride = _payload(m.data), m.point_stride
     points = structured(data, fields, point_bytes=stride, shape=(1, len(data) // max(stride, 1)))
     T_frame_points = pose_from_numbers(np.array(_numbers(m.pose.position, m.pose.orientation)))
     if T_frame_points is None:  # protobuf leaves zeros out: an empty pose is none
         T_frame_points = np.eye(4)
-    return CloudMessage(_ns(m.timestamp), m.frame_id, points, T_frame_points)
+    return CloudMessage(_ns(m.timestamp), m.frame_id, points, T_frame_points, notes)
 
 
 def _transform(m: Any) -> list[PoseMessage]:

@@ -1,6 +1,7 @@
 """Image messages as arrays: RGB, grey, and depth in metres."""
 
 import struct
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,7 +11,8 @@ from numpy.typing import NDArray
 
 from mapper.core.errors import FrameError
 from mapper.core.frames import DepthImage, Image
-from mapper.sources.image_files.reading import decode_colour, decode_depth_units, decode_grey, depth_m_from
+from mapper.sources.image_files import png
+from mapper.sources.image_files.reading import decode_colour, decode_depth, decode_grey, depth_m_from
 from mapper.sources.ros.messages import FileMessage, ImageMessage, PixelsMessage
 
 MILLIMETRES_PER_M = 1000.0
@@ -47,16 +49,18 @@ _DEPTH = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
 _FARTHEST_M = 1000.0  # no depth camera reaches as far: a damaged message, or a simulator's sky
 _PNG_KIND, _SIXTEEN_BIT_GREY = slice(24, 26), b"\x10\x00"
 """Place of the bit depth and colour type in a PNG, and their values of one channel of 16 bits (RFC 2083)."""
-_IMAGE_STARTS = (b"\xff\xd8", b"\x89PNG", b"BM", b"II*\x00", b"MM\x00*", b"RIFF", b"P")
+_TIFF_STARTS = (b"II*\x00", b"MM\x00*")
+_IMAGE_STARTS = (b"\xff\xd8", b"\x89PNG", b"BM", *_TIFF_STARTS, b"RIFF", b"P")
 _DEPTH_HEADER = struct.Struct("<iff")  # compressedDepth's: how it is stored, and two parameters of that
 
 
 def is_depth(message: ImageMessage) -> bool:
-    """Return whether an image is of depth: by its encoding, or as a PNG of one channel of 16 bits."""
+    """Return whether an image is of depth: by its bytes, else by what its encoding or format says."""
     if isinstance(message, PixelsMessage):
         return message.encoding in _DEPTH
+    data = bytes(_without_header(message)[: _PNG_KIND.stop])
     is_called_depth = "compressedDepth" in message.format or message.format.startswith(tuple(_DEPTH))
-    return is_called_depth or bytes(message.data[_PNG_KIND]) == _SIXTEEN_BIT_GREY
+    return is_called_depth or data[_PNG_KIND] == _SIXTEEN_BIT_GREY or _is_float_tiff(message)
 
 
 def size_of(message: ImageMessage, *, where: str) -> tuple[int, int]:
@@ -125,37 +129,50 @@ def depth_m_of(
 
 def depth_file_of(message: ImageMessage) -> bytes | None:
     """Return the PNG of 16-bit units in a message; None where depth is stored in another way."""
-    if isinstance(message, PixelsMessage) or "rvl" in message.format or message.format.startswith("32FC1"):
+    if isinstance(message, PixelsMessage) or has_float_depth(message):
         return None
-    data = bytes(message.data)
-    return data[_DEPTH_HEADER.size :] if "compressedDepth" in message.format else data
+    data = bytes(_without_header(message))
+    return data if data.startswith(png.SIGNATURE) else None
 
 
 def has_float_depth(message: ImageMessage) -> bool:
     """Return whether depth is stored as 32-bit numbers, or was before it was compressed."""
     if isinstance(message, PixelsMessage):
         return message.encoding == "32FC1"
-    return message.format.startswith("32FC1")
+    return message.format.startswith("32FC1") or _is_float_tiff(message)
+
+
+def _without_header(message: FileMessage) -> memoryview:
+    """Return the image file, which in compressedDepth follows a header."""
+    begins_late = message.data[_DEPTH_HEADER.size :][: len(png.SIGNATURE)] == png.SIGNATURE
+    return message.data[_DEPTH_HEADER.size if begins_late else 0 :]
+
+
+def _is_float_tiff(message: FileMessage) -> bool:
+    with suppress(FrameError):
+        is_tiff = bytes(message.data[:4]) in _TIFF_STARTS
+        return is_tiff and decode_depth(bytes(message.data), "").dtype == np.float32
+    return False
 
 
 def _depth_m_of_file(
     message: FileMessage, *, units_per_m: float, float_units_per_m: float, where: str
 ) -> DepthImage:
-    """Decode a PNG, which in compressedDepth follows a header.
+    """Decode a PNG or a TIFF.
 
-    Its 32-bit depth is stored as A / depth + B in 16 bits, with A and B in the header.
+    compressedDepth stores 32-bit depth as A / depth + B in 16 bits, with A and B in its header.
     """
-    data = bytes(message.data)
-    if "compressedDepth" not in message.format:
-        return depth_m_from(decode_depth_units(data, where), units_per_m)
-    if "rvl" in message.format:
+    if "compressedDepth" in message.format and "rvl" in message.format:
         raise FrameError(f"{where}: depth compressed as RVL is not read; record it as PNG or raw")
-    if len(data) < _DEPTH_HEADER.size:
-        raise FrameError(f"{where}: compressedDepth of {len(data)} bytes")
-    _, a, b = _DEPTH_HEADER.unpack_from(data)
-    units = decode_depth_units(data[_DEPTH_HEADER.size :], where)
-    if not message.format.startswith("32FC1"):
-        return depth_m_from(units, units_per_m)
+    if "compressedDepth" in message.format and len(message.data) < _DEPTH_HEADER.size:
+        raise FrameError(f"{where}: compressedDepth of {len(message.data)} bytes")
+    file = _without_header(message)
+    units = decode_depth(bytes(file), where)
+    if units.dtype == np.float32:
+        return _valid_depth(units.astype(np.float32), float_units_per_m, where=where)
+    if not message.format.startswith("32FC1") or len(file) == len(message.data):
+        return depth_m_from(units.astype(np.uint16, copy=False), units_per_m)
+    _, a, b = _DEPTH_HEADER.unpack_from(message.data)
     with np.errstate(divide="ignore"):
         depth_m = np.float32(a) / (units.astype(np.float32) - np.float32(b))
     return _valid_depth(np.where(units > 0, depth_m, np.float32(0.0)), float_units_per_m, where=where)
@@ -196,6 +213,8 @@ def _pixels(message: PixelsMessage, kind: str, channels: int, *, where: str) -> 
     shape = (message.height_px, message.width_px, channels)
     used_bytes = message.width_px * channels * pixel.itemsize
     row_bytes = message.row_bytes or used_bytes
+    if len(message.data) == message.height_px * used_bytes:
+        row_bytes = used_bytes  # whatever the message says: without padding there is one way to read it
     strides = (row_bytes, channels * pixel.itemsize, pixel.itemsize)
     try:
         if message.height_px > 1 and row_bytes < used_bytes:

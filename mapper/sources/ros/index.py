@@ -119,11 +119,11 @@ def first_messages(recording: Recording, series: Iterable[Series]) -> dict[str, 
 
 
 def why_unread(recording: Recording, series: Series) -> str:
-    """Return why the first message of a topic cannot be read; empty if it can."""
+    """Return why the first message of a topic cannot be read, with its name; empty if it can."""
     try:
         _whole_message(recording, series, 0)
     except (DataError, FrameError) as error:
-        return str(error)
+        return f"{series.topic.name}: {str(error).removeprefix(f'{series.topic.name}: ')}"
     return ""
 
 

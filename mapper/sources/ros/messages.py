@@ -176,10 +176,9 @@ IMAGES = PIXELS | FILES
 CAMERAS = frozenset({"sensor_msgs/msg/CameraInfo", "foxglove.CameraCalibration"})
 CLOUDS = frozenset({"sensor_msgs/msg/PointCloud2", "foxglove.PointCloud"})
 IMUS = frozenset({"sensor_msgs/msg/Imu"})
-ODOMETRY = "nav_msgs/msg/Odometry"
 POSES = frozenset(
     {
-        ODOMETRY,
+        "nav_msgs/msg/Odometry",
         "geometry_msgs/msg/PoseStamped",
         "geometry_msgs/msg/PoseWithCovarianceStamped",
         "geometry_msgs/msg/TransformStamped",

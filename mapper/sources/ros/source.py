@@ -20,7 +20,7 @@ from mapper.sources.ros.image_messages import MILLIMETRES_PER_M, has_float_depth
 from mapper.sources.ros.index import Series, why_unread
 from mapper.sources.ros.message_order import ordered, paired
 from mapper.sources.ros.messages import (
-    IMAGES,
+    READ,
     CameraMessage,
     CloudMessage,
     FileMessage,
@@ -57,15 +57,16 @@ def recording_log(reader: RecordingReader, config: SourceConfig) -> Log:
             pair, or the camera is unknown.
     """
     recording = reader.recording
+    unread = [
+        why_unread(recording, series)
+        for series in reader.series.values()
+        if series.topic.type in READ and series.topic.name not in reader.firsts
+    ]
+    problems = [*filter(None, unread), *recording.notes]
     try:
         choice = choose(reader.series, reader.firsts, config.topics, path=recording.path)
     except SourceError as error:
-        unread = (
-            why_unread(recording, series)
-            for series in reader.series.values()
-            if series.topic.type in IMAGES and series.topic.name not in reader.firsts
-        )
-        raise SourceError("; ".join([str(error), *filter(None, unread), *recording.notes])) from None
+        raise SourceError("; ".join([str(error), *problems])) from None
     if isinstance(choice.frames, CameraTopics):
         frames = _rgbd(reader, choice.frames, config)
     else:
@@ -86,7 +87,7 @@ def recording_log(reader: RecordingReader, config: SourceConfig) -> Log:
         accelerations=accelerations,
         T_base_body=reader.mounting(frames.body),
         wheels=wheels,
-        notes=[*choice.notes, *recording.notes, *frames.notes, *truth_notes, *wheel_notes, *imu_notes],
+        notes=[*choice.notes, *problems, *frames.notes, *truth_notes, *wheel_notes, *imu_notes],
     )
 
 
@@ -206,7 +207,7 @@ def _first_image(reader: RecordingReader, series: Series) -> ImageMessage:
     first = reader.firsts.get(series.topic.name)
     if not isinstance(first, ImageMessage):
         raise SourceError(
-            f"{reader.recording.path}: {series.topic.name}: none of its first images can be read: "
+            f"{reader.recording.path}: none of the first images can be read: "
             f"{why_unread(reader.recording, series)}"
         )
     return first

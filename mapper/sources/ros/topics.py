@@ -1,5 +1,6 @@
 """Choice of the topics that a map is made from: the user's, or a guess that a note reports."""
 
+import re
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product, takewhile
@@ -14,8 +15,8 @@ from mapper.sources.ros.messages import (
     CLOUDS,
     IMAGES,
     IMUS,
-    ODOMETRY,
     POSES,
+    READ,
     ImageMessage,
     ImuMessage,
     Message,
@@ -27,6 +28,13 @@ TRUTH, WHEELS = "/ground_truth", "/wheel_odometry"
 
 _TRANSPORTS = ("/compressedDepth", "/compressed")  # what image_transport appends to an image's own topic
 _OWN_TYPES = "mapper/msg/"
+_BOOKKEEPING = re.compile(
+    r"(?:action|bond|builtin_interfaces|control|diagnostic|dynamic_reconfigure|lifecycle|map|nav|rcl_interfaces"
+    r"|realsense2_camera|rosbag2_interfaces|rosgraph|statistics|std|tf2|visualization)(?:_msgs)?/|actionlib"
+    r"|foxglove\.Log|sensor_msgs/msg/Joy"
+)
+"""Beginnings of types of messages about programs, plans and pictures, which no sensor measured."""
+_MOST_LISTED = 8
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -104,19 +112,20 @@ def choose(
             notes.append(
                 f"there are point clouds too: to map those, source.topics.points={points.topic.name}"
             )
+        used, image_reason = [color, depth, points], "one camera is mapped"
     elif points is not None:
         frames = points
         notes = [_choice_note(f"point clouds {points.topic.name}", config.points, "points")]
-        if others := sorted(one.topic.name for one in clouds if one is not points):
-            notes.append(f"point clouds of other topics are not used: {', '.join(others)}")
+        both = color is not None and depth is not None
+        image_reason = "point clouds are mapped" if both else "colour has no depth, or depth no colour"
+        used = [points]
     else:
         raise SourceError(f"{path}: nothing to map: {_what_there_is(color, depth, series.values())}")
     if wheels is not None:
         notes.append(_choice_note(f"wheel odometry {wheels.topic.name}", config.wheels, "wheels"))
-    elif odometry := [one.topic.name for one in pick.all({ODOMETRY}) if one is not truth]:
-        notes.append(
-            f"odometry {odometry[0]} is not used; if it is wheel odometry, source.topics.wheels={odometry[0]}"
-        )
+    is_chosen = bool(config.points or config.color or config.depth)
+    unused = [one for one in series.values() if one not in (*used, imu, truth, wheels)]
+    notes += _unused_notes(unused, firsts, image_reason=None if is_chosen else image_reason)
     return Choice(frames, imu, truth, wheels, notes)
 
 
@@ -206,12 +215,15 @@ def _choice_note(choice: str, by_user: str | None, option: str) -> str:
 
 def _color_rank(name: str) -> tuple[int, ...]:
     lower = name.lower()
-    is_infrared = any(word in lower for word in ("infra", "/ir", "fisheye"))
-    return int(is_infrared), int("color" not in lower and "rgb" not in lower), int(_is_packed(name))
+    return int(_is_infrared(name)), int("color" not in lower and "rgb" not in lower), int(_is_packed(name))
 
 
 def _depth_rank(name: str) -> tuple[int, ...]:
-    return int(not is_called_registered(name)), int(_is_packed(name))
+    return int(_is_infrared(name)), int(not is_called_registered(name)), int(_is_packed(name))
+
+
+def _is_infrared(name: str) -> bool:
+    return re.search(r"infra|fisheye|[/_]ir(?![a-z])", name.lower()) is not None
 
 
 def is_called_registered(name: str) -> bool:
@@ -255,6 +267,44 @@ def _of_frame(image: Series, infos: Sequence[Series], firsts: Mapping[str, Messa
     frame = frame_of(firsts.get(image.topic.name))
     found = [one for one in infos if frame and frame_of(firsts.get(one.topic.name)) == frame]
     return found if len(found) == 1 else []
+
+
+def _unused_notes(
+    unused: Iterable[Series], firsts: Mapping[str, Message], *, image_reason: str | None
+) -> list[str]:
+    """Return which sensors' topics are not used and why, a sentence for each kind.
+
+    Args:
+        unused: The topics.
+        firsts: The first message of those that can be read.
+        image_reason: Reason why images and clouds are not used; None where the user chose others.
+    """
+    kinds: dict[str, list[str]] = {}
+    for one in unused:
+        name, type_ = one.topic.name, one.topic.type
+        if type_ in IMAGES and name in firsts:
+            kind = image_reason and f"images that are not used, as {image_reason}"
+        elif type_ in CLOUDS and name in firsts:
+            reason = "there is a single one" if len(one) == 1 else "those of one topic are mapped"
+            kind = image_reason and f"point clouds that are not used, as {reason}"
+        elif type_ in IMUS and not _feels_gravity(firsts.get(name)):
+            kind = "accelerations that are not used, as they are not as long as gravity"
+        elif type_ in IMUS:
+            kind = "accelerations that are not used, as one topic is enough (source.topics.imu)"
+        elif type_ in POSES:
+            kind = "poses that are not used; source.topics.wheels reads those of wheels, .truth true ones"
+        elif type_ in READ or _BOOKKEEPING.match(type_):
+            kind = None
+        else:
+            name, kind = f"{name} ({type_})", "topics of types that are not read"
+        if kind is not None:
+            kinds.setdefault(kind, []).append(name)
+    return [f"{kind}: {_listed(names)}" for kind, names in kinds.items()]
+
+
+def _listed(names: Sequence[str]) -> str:
+    more = f" and {len(names) - _MOST_LISTED} more" if len(names) > _MOST_LISTED else ""
+    return f"{', '.join(names[:_MOST_LISTED])}{more}"
 
 
 def _feels_gravity(message: Message | None) -> bool:

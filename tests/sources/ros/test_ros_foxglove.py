@@ -100,6 +100,21 @@ def test_poses_and_transforms():
     assert [t.numbers for t in together] == [NUMBERS, NUMBERS]
 
 
+def test_a_field_of_an_unknown_type_is_left_out_and_named():
+    points = np.arange(12, dtype=np.float32).reshape(4, 3)
+    for type_ in (0, 99):
+        fields = [{"name": name, "offset": 4 * i, "type": 7} for i, name in enumerate("xyz")]
+        message = {
+            "timestamp": JSON_STAMP, "frame_id": "lidar", "point_stride": 12,
+            "pose": {"position": dict.fromkeys("xyz", 0.0), "orientation": dict.fromkeys("xyzw", 0.0)},
+            "fields": [*fields, {"name": "intensity", "offset": 8, "type": type_}],
+            "data": base64.b64encode(points.tobytes()).decode(),
+        }  # fmt: skip
+        found = read("foxglove.PointCloud", json.dumps(message).encode(), "json")
+        assert found.points.dtype.names == ("x", "y", "z")
+        assert sum("intensity" in note for note in found.notes) == 1
+
+
 def test_json_says_the_same():
     fields = {
         "timestamp": JSON_STAMP, "frame_id": "optical", "width": 64, "height": 48, "encoding": "rgb8",

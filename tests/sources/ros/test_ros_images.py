@@ -1,11 +1,19 @@
 import struct
+from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
 
 from mapper.core.errors import FrameError
-from mapper.sources.ros.image_messages import depth_m_of, image_of, is_depth, size_of
+from mapper.sources.ros.image_messages import (
+    depth_file_of,
+    depth_m_of,
+    has_float_depth,
+    image_of,
+    is_depth,
+    size_of,
+)
 from mapper.sources.ros.messages import FileMessage, PixelsMessage
 from tests.support.tum_logs import picture
 
@@ -139,6 +147,41 @@ def test_compressed_depth_of_32_bits_is_inverse_depth():
     got = depth_m_of(message, units_per_m=1000.0, where="m")
     assert got[0, 0] == 0.0
     np.testing.assert_allclose(got.ravel()[1:], depth.ravel()[1:], rtol=5e-4 * 9.0)
+
+
+HEADER = struct.pack("<iff", 0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        file(HEADER + encoded(UNITS, ".png"), "png"),
+        file(HEADER + encoded(UNITS, ".png"), ""),
+        file(encoded(UNITS, ".png"), "16UC1; compressedDepth png"),
+        file(encoded(UNITS, ".png"), "jpeg"),
+        file(encoded(UNITS, ".tiff"), "16UC1; tiff"),
+    ],
+)
+def test_depth_of_16_bits_is_known_by_its_bytes_whatever_its_format_says(message):
+    assert is_depth(message)
+    assert not has_float_depth(message)
+    expected = UNITS.astype(np.float32) / np.float32(1000)
+    np.testing.assert_array_equal(depth_m_of(message, units_per_m=1000.0, where="m"), expected)
+    kept = depth_file_of(message)
+    assert kept is None or kept == encoded(UNITS, ".png")
+
+
+def test_a_tiff_of_32_bits_is_depth_in_metres():
+    depth = np.linspace(0.5, 4.0, 48 * 64, dtype=np.float32).reshape(48, 64)
+    message = file(encoded(depth, ".tiff"), "tiff")
+    assert is_depth(message)
+    assert has_float_depth(message)
+    np.testing.assert_array_equal(depth_m_of(message, units_per_m=1000.0, where="m"), depth)
+
+
+def test_rows_that_follow_each_other_are_read_whatever_step_says():
+    message = replace(pixels(RGB, "rgb8"), row_bytes=64)
+    np.testing.assert_array_equal(image_of(message, colour=True, where="m"), RGB)
 
 
 @pytest.mark.parametrize(

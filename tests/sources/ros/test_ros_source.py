@@ -10,11 +10,13 @@ from mapper.sources import open_source
 from mapper.sources.config import CameraConfig, SourceConfig, TopicsConfig
 from mapper.sources.image_files.reading import decode_depth_units
 from mapper.sources.ros.encode_ros import (
+    SerializedMessage,
     cloud_message,
     compressed_image_message,
     imu_message,
     odometry_message,
 )
+from mapper.sources.ros.typestore import make_header, make_message, serialize
 from mapper.sources.writers import write_log
 from tests.support.recordings import CAMERA, COLOR, DEPTH, camera_info, image, shots, transforms, write
 from tests.support.tum_logs import FIRST_NS, PERIOD_NS, picture
@@ -57,12 +59,56 @@ def test_images_go_before_clouds_unless_clouds_are_asked_for(tmp_path):
 def test_clouds_of_a_second_lidar_are_said_to_be_left_out(tmp_path):
     messages = [cloud(t, topic) for t in stamps(4) for topic in ("/rear/points", "/front/points")]
     source = opened(tmp_path / "a.mcap", messages)
-    assert source.notes == [
-        "point clouds /front/points; choose others with source.topics.points=…",
-        "point clouds of other topics are not used: /rear/points",
-    ]
+    assert len(source.notes) == 2
+    assert source.notes[1].endswith(": /rear/points")
     chosen = open_source(tmp_path / "a.mcap", SourceConfig(topics=TopicsConfig(points="/rear/points")))
     assert chosen.notes == ["point clouds /rear/points"]
+
+
+def test_topics_that_are_not_used_are_named_with_the_reason(tmp_path):
+    fix = make_message(
+        "sensor_msgs/msg/NavSatFix",
+        header=make_header(FIRST_NS, "gps"),
+        status=make_message("sensor_msgs/msg/NavSatStatus", status=0, service=1),
+        latitude=0.0, longitude=0.0, altitude=0.0, position_covariance=np.zeros(9),
+        position_covariance_type=0,
+    )  # fmt: skip
+    text = make_message("std_msgs/msg/String", data="x")
+    rgb, _ = picture(0)
+    messages = [
+        *(cloud(t) for t in stamps(3)),
+        cloud(FIRST_NS, "/map_cloud"),
+        *(image(t, "/fish/image_raw", rgb, "rgb8") for t in stamps(3)),
+        *(imu(t, [0.0, 0.0, 9.8]) for t in stamps(3)),
+        *(imu(t, [0.0, 0.0, 9.8], topic="/imu/other/data") for t in stamps(3)),
+        *(imu(t, [0.0, 0.0, 0.0], topic="/gyro") for t in stamps(3)),
+        *(odometry(t, np.eye(4)) for t in stamps(3)),
+        *(odometry(t, np.eye(4), topic="/vio") for t in stamps(3)),
+        SerializedMessage(FIRST_NS, "/fix", "sensor_msgs/msg/NavSatFix", serialize(fix)),
+        SerializedMessage(FIRST_NS, "/rosout", "std_msgs/msg/String", serialize(text)),
+        transforms(("lidar", "imu", np.eye(4))),
+    ]
+    notes = opened(tmp_path / "a.mcap", messages).notes
+    named = [note.rpartition(": ")[2] for note in notes[1:]]
+    assert sorted(named) == [
+        "/fish/image_raw",
+        "/fix (sensor_msgs/msg/NavSatFix)",
+        "/gyro",
+        "/imu/other/data",
+        "/map_cloud",
+        "/odom, /vio",
+    ]
+    damaged = [m._replace(cdr=m.cdr[:30]) if m.topic == "/fish/image_raw" else m for m in messages]
+    assert any("/fish/image_raw: a damaged" in note for note in opened(tmp_path / "b.mcap", damaged).notes)
+    both = opened(tmp_path / "c.mcap", [*messages, *shots(3)])
+    assert any(note.endswith(": /fish/image_raw") for note in both.notes)
+
+
+def test_infrared_of_16_bits_is_not_taken_for_depth(tmp_path):
+    messages = [message for message in shots(3) if message.topic != DEPTH]
+    for i, t in enumerate(stamps(3)):
+        messages += [image(t, f"/cam/{name}/image", picture(i)[1], "16UC1") for name in ("ir", "z")]
+    assert opened(tmp_path / "a.mcap", messages).notes[0].startswith(f"colour {COLOR}, depth /cam/z/image")
 
 
 def test_the_likeliest_of_several_topics_is_taken_and_another_can_be_chosen(tmp_path):
@@ -297,7 +343,7 @@ def test_depth_in_a_coding_that_is_not_read_is_named_with_the_reason(tmp_path):
 
 def test_a_topic_whose_images_are_all_damaged_is_named(tmp_path):
     messages = [m._replace(cdr=m.cdr[:40]) if m.topic == COLOR else m for m in shots(3)]
-    with pytest.raises(SourceError, match="/cam/color/image_raw: none of its first images can be read"):
+    with pytest.raises(SourceError, match="first images can be read: /cam/color/image_raw: a damaged m"):
         opened(tmp_path / "a.mcap", messages)
 
 
