@@ -91,7 +91,7 @@ def _correctness(run: "Run") -> list[tuple[str, str]]:
 
     counts, poses = run.manifest.counts, run.poses
     rows: list[tuple[str, str]] = [("verdict", run.verdict.state)]
-    if poses is not None and np.isfinite(poses.position_sigmas_m).any():
+    if np.isfinite(poses.position_sigmas_m).any():
         widest_m = SIGMAS * float(np.nanmax(poses.position_sigmas_m))
         rows.append((f"uncertainty of the path, {SIGMAS:g} σ", f"at most {widest_m:.{_DIGITS}g} m"))
     if counts.loop_candidates:

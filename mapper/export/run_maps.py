@@ -16,7 +16,7 @@ from mapper.navigation.floor import reachable_floor
 from mapper.navigation.traversable import TraversableFloor, traversable
 from mapper.octree.grid import OccupancyGrid, stored_grid_if_any
 from mapper.run import files
-from mapper.run.cloud import Cloud, read_cloud
+from mapper.run.cloud import read_cloud
 from mapper.run.folder import Run
 from mapper.sources.ros.decode import decode
 from mapper.sources.ros.frame_tree import FrameTree
@@ -32,9 +32,7 @@ def maps_of(run: Run) -> Maps:
         FrameError: The cloud cannot be read.
         DataError: A grid cannot be read.
     """
-    moved = Cloud(np.empty((0, 3), np.float32), np.empty((0, 3), np.uint8))
-    if (run.path / files.DYNAMIC).exists():  # runs made before 2026-11-22 have none
-        moved = read_cloud(run.file(files.DYNAMIC))
+    moved = read_cloud(run.file(files.DYNAMIC))
     return Maps(
         octree=run.octree,
         cloud_points_world=run.cloud.points,

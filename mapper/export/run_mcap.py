@@ -32,13 +32,10 @@ def log_results(log: McapLog, results: RunResults) -> None:
     log.factors(begin_ns, results.graph.factors, T_world_node=results.graph.T_world_node)
     for stamp_ns, T_world_body in results.trajectory.items():
         log.transform(stamp_ns, T_world_body, parent=WORLD, child=BODY)
-    if results.poses is not None:
-        poses = results.poses
-        for (stamp_ns, T_world_body), covariance in zip(
-            poses.trajectory.items(), poses.covariances, strict=True
-        ):
-            if np.isfinite(covariance).all():
-                log.pose(stamp_ns, T_world_body, covariance)
+    poses = results.poses
+    for (stamp_ns, T_world_body), covariance in zip(poses.trajectory.items(), poses.covariances, strict=True):
+        if np.isfinite(covariance).all():
+            log.pose(stamp_ns, T_world_body, covariance)
     for record in results.records:
         log.diagnostics(record.stamp_ns, _fields(record, results.frame_ms))
     for loop in results.loops:

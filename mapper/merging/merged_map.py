@@ -116,7 +116,7 @@ class MapManifest(Config):
     area_km2: float = 0.0
     """Area of the columns in which anything is known."""
     no_floor: str = ""
-    """Why there is no traversable floor; empty if there is one, and in maps made before 2026-11-26."""
+    """Why there is no traversable floor; empty if there is one."""
     notes: tuple[str, ...] = ()
 
     @property
@@ -235,7 +235,7 @@ class MergedMap:
         """Return the poses in the map of the frames that a run's maps are made from.
 
         Raises:
-            RunError: The map was made before 2026-11-22, or its file is missing.
+            RunError: Its file is missing.
         """
         path = self.path / run.folder / files.TRAJECTORY
         if not path.is_file():

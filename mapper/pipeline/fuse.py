@@ -155,7 +155,7 @@ def _copy_kept_files(run: Run, new: Path) -> None:
     needed = files.names_of("tracking") - files.DISPENSABLE
     for name in needed:
         run.file(name)
-    made_again = files.names_of("maps", "exported maps") | {files.FORMER_SCAN_UPDATES}
+    made_again = files.names_of("maps", "exported maps")
     for child in run.path.iterdir():
         if child.name in made_again or is_temporary(child.name):
             continue

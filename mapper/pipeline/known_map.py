@@ -59,11 +59,11 @@ class KnownMap:
 def load_known_map(path: Path, *, progress: Progress = SILENT) -> KnownMap:
     """Return a run, or a merged map whose runs are still there, with its places.
 
-    A run made before places were stored has them observed again from its log.
+    A run whose stored places a user deleted has them observed again from its log.
 
     Raises:
         RunError: There is no such map, it has no places, its runs have changed or were observed by other
-            settings, or the log of an old run is no longer there.
+            settings, or the log of a run without stored places is no longer there.
     """
     folder = open_map_folder(path)
     members = [(folder, folder.graph.T_world_node)] if isinstance(folder, Run) else _members(folder)
@@ -121,7 +121,7 @@ def detector_of(config: BuildConfig) -> Config | None:
 
 
 def run_places(run: Run, *, progress: Progress = SILENT) -> KnownPlaces[Any]:
-    """Return the places of a run at its solved nodes, in its world; those of an old run from its log."""
+    """Return the places of a run at its solved nodes, in its world; stored or observed again."""
     T_world_node = run.graph.T_world_node
     places = {
         node: place for node, place in places_of(run, progress=progress).items() if node in T_world_node
@@ -130,7 +130,7 @@ def run_places(run: Run, *, progress: Progress = SILENT) -> KnownPlaces[Any]:
 
 
 def places_of(run: Run, *, progress: Progress = SILENT) -> Mapping[int, AnyPlace]:
-    """Return the stored places of a run; those of an old run are observed again from its log."""
+    """Return the stored places of a run; without these they are observed again from its log."""
     if (run.path / files.PLACES).exists():
         return read_places(run.file(files.PLACES))
     log = run.open_log()

@@ -37,8 +37,8 @@ def place_by_shared_places(
     they are, and each run is placed as a rigid body. Places of all runs are held in memory.
 
     Args:
-        runs: Runs, at least one; the first must have places. A run made before places were stored has them
-            observed again from its log.
+        runs: Runs, at least one; the first must have places. A run whose stored places were deleted
+            has them observed again from its log.
         workers: Workers that compare places.
         progress: Receives stages and notes.
 

@@ -4,7 +4,6 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
 
-from mapper.core.errors import MapperError
 from mapper.doctor.machine import Finding
 from mapper.run import files
 from mapper.run.digests import fault_of
@@ -20,8 +19,6 @@ _THREADS = 4
 
 def check_run(folder: Path, *, progress: Progress = SILENT) -> list[Finding]:
     """Compare every file of a run or a localised log with its size and SHA-256 in the manifest.
-
-    The files of a run made before 2026-11-22, which has neither, are read and counted instead.
 
     Args:
         folder: The run, or the localised log.
@@ -39,12 +36,12 @@ def check_run(folder: Path, *, progress: Progress = SILENT) -> list[Finding]:
         run = open_run(folder)
         digests, others = run.manifest.files, _unrecorded(run)
         remedy = partial(files.remedy_for, folder=folder)
-        found = _hashed(folder, digests, remedy) if digests else _counted(run)
+        found = _hashed(folder, digests, remedy)
     findings = []
     with progress.stage("check") as report:
         for done, finding in enumerate(found, start=1):
             findings.append(finding)
-            report(done, len(digests) or done)
+            report(done, len(digests))
     return [*findings, *others]
 
 
@@ -61,41 +58,12 @@ def _hashed(
     return ordered_map(check, sorted(digests), workers=_THREADS)
 
 
-def _counted(run: Run) -> Iterator[Finding]:
-    counts = run.manifest.counts
-    readers: tuple[tuple[str, Callable[[], int], int], ...] = (
-        (files.FRAMES, lambda: len(run.records), counts.listed),
-        (files.TRAJECTORY, lambda: len(run.trajectory), counts.tracked + counts.doubtful),
-        (files.KEYFRAMES, lambda: len(run.keyframes), counts.nodes),
-        (files.GRAPH, lambda: len(run.graph.T_world_node), counts.nodes),
-        (f"{files.GRAPH}: factors", lambda: len(run.graph.factors), counts.factors),
-        (files.LOOPS, lambda: len(run.loops), counts.loop_candidates),
-    )
-    for name, count, wanted in readers:
-        remedy = files.remedy_for(name.split(":")[0], run.path)
-        try:
-            found = count()
-        except MapperError as error:
-            yield Finding(name, "failed", str(error), remedy)
-            continue
-        if found == wanted:
-            yield Finding(name, "well", f"{found}, as in the manifest")
-        else:
-            yield Finding(name, "failed", f"has {found}, the manifest has {wanted}", remedy)
-    yield Finding(
-        files.MANIFEST,
-        "warning",
-        "has no digests: the run is of an older version, and its maps are not checked",
-        f"mapper fuse {run.path} makes the maps again and records digests of all files",
-    )
-
-
 def _unrecorded(run: Run) -> Iterator[Finding]:
     """Yield what lies in the run without a digest, but for a user's own files."""
     for path in run.files():
         if is_temporary(path.name):
             yield Finding(path.name, "warning", "left by a process that was killed", f"delete {path}")
-        elif run.manifest.files and path.name in files.RUN.files - {files.MANIFEST, *run.manifest.files}:
+        elif path.name in files.RUN.files - {files.MANIFEST, *run.manifest.files}:
             remedy = files.remedy_for(path.name, run.path)
             yield Finding(
                 path.name, "warning", "has no digest: its writer was killed, or it is a copy", remedy

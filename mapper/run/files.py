@@ -30,8 +30,6 @@ DYNAMIC = "dynamic.ply"
 MCAP = "run.mcap"
 SUMMARY = "summary.png"
 SCAN_UPDATES = "scan_updates.bin"
-FORMER_SCAN_UPDATES = "sights.bin"
-"""Name of ``scan_updates.bin`` before 2026-11-22, which is still read."""
 EDITS = "edits.toml"
 CONFIG = "config.json"
 MANIFEST = MANIFEST_NAME
@@ -160,8 +158,7 @@ RUN = FolderKind(
     "a run folder",
     manifest_keys=frozenset({"status", "mapper_version", "input"}),
     files=frozenset(name for files in RUN_FILES for name in files.names if files.depends_on != "user")
-    | _STOREY_FILES
-    | {FORMER_SCAN_UPDATES},
+    | _STOREY_FILES,
 )
 LOCALISED_LOG = FolderKind(
     "a localised log",
@@ -209,14 +206,7 @@ _REMEDIES = {
 
 def remedy_for(name: str, folder: Path) -> str:
     """Return how a user gets a file of a run back, or keeps it as it is, for messages."""
-    name = SCAN_UPDATES if name == FORMER_SCAN_UPDATES else name
     remedy = _REMEDIES.get(name, "make it again with mapper fuse RUN")
     if name in EDITABLE:
         remedy = f"{remedy}; if you edited it, mapper doctor RUN --accept {name}"
     return remedy.replace("RUN", quote(str(folder)))
-
-
-def scan_updates_path(folder: Path) -> Path:
-    """Return the path of a run's ``scan_updates.bin``; by its former name if the run has only that."""
-    path, former = folder / SCAN_UPDATES, folder / FORMER_SCAN_UPDATES
-    return former if former.exists() and not path.exists() else path

@@ -1,7 +1,7 @@
-"""Run folder: a finished run, its log and its files, read on first access; what it shares with merged maps."""
+"""Run folder: a finished run, its log and its files, read on first access; its interface with merged maps."""
 
 from collections.abc import Iterable
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -31,7 +31,6 @@ from mapper.run.manifest import (
 )
 from mapper.run.pose_covariances import UncertainPoses, read_poses
 from mapper.run.results import RunResults, aligned_truth
-from mapper.run.warnings import find_warnings, verdict_of
 from mapper.runtime.atomic import partial_of
 from mapper.runtime.regular_files import AnyPath
 from mapper.sources import open_source
@@ -123,7 +122,7 @@ class Run:
 
     def changing(self, names: Iterable[str]) -> AbstractContextManager[None]:
         """Return a context in which files of the run may be written; it records their digests at its end."""
-        return changing(self.path, names) if self.manifest.files else nullcontext()
+        return changing(self.path, names)
 
     @cached_property
     def trajectory(self) -> Trajectory:
@@ -136,10 +135,9 @@ class Run:
         return without_doubtful(self.trajectory, self.records)
 
     @cached_property
-    def poses(self) -> UncertainPoses | None:
-        """The poses of ``trajectory`` with their covariance; None in a run made before 2026-11-22."""
-        path = self.file(files.POSES)
-        return read_poses(path) if path.exists() else None
+    def poses(self) -> UncertainPoses:
+        """The poses of ``trajectory`` with their covariance."""
+        return read_poses(self.file(files.POSES))
 
     @cached_property
     def truth(self) -> Trajectory | None:
@@ -185,12 +183,16 @@ class Run:
             self.trajectory, self.graph, self.records, self.loops, self.frame_ms, truth, self.poses
         )
 
-    @cached_property
+    @property
     def verdict(self) -> Verdict:
-        """Verdict on whether it is to be trusted; that of a run made before 2026-11-22 is found now."""
-        if self.manifest.verdict is not None:
-            return self.manifest.verdict
-        return verdict_of(find_warnings(self.results, self.manifest))
+        """Verdict on whether it is to be trusted.
+
+        Raises:
+            RunError: It is still being built.
+        """
+        if self.manifest.verdict is None:
+            raise RunError(f"{self.path}: has no verdict; make one with mapper fuse {self.path}")
+        return self.manifest.verdict
 
     @cached_property
     def octree(self) -> "OctreeMap":
@@ -257,9 +259,8 @@ class Run:
         return self.config.model_copy(update={"octree": octree})
 
     def scan_updates(self) -> Path | None:
-        """Return the path of the frames' updates, by its former name too; None where a user deleted it."""
-        path = files.scan_updates_path(self.path)
-        return self.file(path.name) if path.exists() else None
+        """Return the path of the frames' updates; None where a user deleted it."""
+        return self.file(files.SCAN_UPDATES) if (self.path / files.SCAN_UPDATES).exists() else None
 
     def open_log(self) -> Log:
         """Return the log that it was built from, with the same frames selected and all that was appended.

@@ -90,8 +90,6 @@ def wheel_warnings(results: RunResults) -> Iterator[RunWarning]:
 def uncertainty_warnings(results: RunResults, suggestion: str) -> Iterator[RunWarning]:
     """Yield a warning, with what to try, if the end of the path is uncertain."""
     poses = results.poses
-    if poses is None:
-        return
     known = np.flatnonzero(np.isfinite(poses.position_sigmas_m) & ~poses.is_doubtful)
     if len(known) < 2:
         return

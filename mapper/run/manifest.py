@@ -93,16 +93,14 @@ class Counts(Config):
     loop_candidates: int = 0
     leaves: int = 0
     """Known voxels of the octree, free and occupied."""
-    occupied: int | None = None
-    """Occupied voxels of the octree; None in runs that were made before they were counted."""
+    occupied: int = 0
+    """Occupied voxels of the octree."""
     cloud_points: int = 0
     dynamic_points: int = 0
 
     @property
     def voxels_text(self) -> str:
         """Numbers of voxels, as text."""
-        if self.occupied is None:
-            return f"{self.leaves} known voxels"
         return f"{self.occupied} occupied and {self.leaves - self.occupied} free voxels"
 
     @property
@@ -254,9 +252,9 @@ class Manifest(Config):
     counts: Counts = Counts()
     skipped: tuple[SkippedFrame, ...] = ()
     warnings: tuple[RunWarning, ...] = ()
-    """All that is suspicious about the run, what weighs most first; older runs have none."""
+    """All that is suspicious about the run, what weighs most first."""
     verdict: Verdict | None = None
-    """None in runs of before 2026-11-22."""
+    """None until the maps are made."""
     solve: Solve | None = None
     levelling: Levelling | None = None
     depth: DepthReach | None = None
@@ -265,7 +263,7 @@ class Manifest(Config):
     """The edits by hand that are in the maps: ``edits.toml`` as it was when they were made."""
     timing: Timing = Timing()
     files: dict[str, FileDigest] = Field(default_factory=dict)
-    """Every file of the run but this; empty while it is being built, and in runs of before 2026-11-22."""
+    """Every file of the run but this; empty while it is being built."""
 
     def save(self, path: Path) -> None:
         """Write the manifest atomically."""

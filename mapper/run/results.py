@@ -26,7 +26,7 @@ class RunResults:
         loops: Every loop candidate with its verdict.
         frame_ms: Milliseconds that each frame took, by stamp; empty leaves them out.
         truth: True body poses, aligned with the trajectory, if known.
-        poses: The trajectory with its covariances, if known.
+        poses: The trajectory with its covariances.
     """
 
     trajectory: Trajectory
@@ -35,7 +35,7 @@ class RunResults:
     loops: Sequence[LoopClosure]
     frame_ms: Mapping[int, float]
     truth: Trajectory | None
-    poses: UncertainPoses | None
+    poses: UncertainPoses
 
     @property
     def tracked(self) -> Trajectory:

@@ -78,10 +78,9 @@ def test_uncertainty_and_doubt_are_the_poses_s(runs):
     assert path["doubtful"] == [False] * 31
     records = list(chapter.results.records)
     records[7] = replace(records[7], outcome="doubtful", doubts=(Doubt("jump", "jump"),))
-    doubted = replace(chapter, results=replace(chapter.results, records=records, poses=None))
+    doubted = replace(chapter, results=replace(chapter.results, records=records))
     path = drawn(doubted)["path"]
     assert [k for k, is_doubtful in enumerate(path["doubtful"]) if is_doubtful] == [7]
-    assert path["band_m"] is None
 
 
 def test_the_errors_are_the_terms_of_the_ate(runs):

@@ -204,23 +204,6 @@ def test_fusing_spares_a_user_s_files_and_learns_where_the_log_is(run, desk_log,
     assert fused.manifest.input == run.manifest.input.model_copy(update={"path": str(moved)})
 
 
-def test_a_run_whose_scan_updates_have_their_former_name_is_fused_without_reading_every_frame(
-    run, desk_log, tmp_path
-):
-    old = open_run(shutil.copytree(run.path, tmp_path / "old"))
-    (old.path / "scan_updates.bin").rename(old.path / "sights.bin")
-    observer = Observer()
-
-    fused = fuse(open_source(desk_log), old, old.config, progress=observer)
-
-    tracked = run.manifest.counts.tracked
-    assert f"fused again: 0 of {tracked} frames, which had moved or were not known" in observer.notes
-    ours, before = files_of(fused.path), files_of(run.path)
-    assert ours.keys() == before.keys()
-    for name in ("map.ot", "scan_updates.bin"):
-        assert ours[name] == before[name], name
-
-
 def test_fusing_refuses_what_it_cannot_change(run, desk_log):
     before = files_of(run.path)
     with pytest.raises(ConfigError, match="odometry: fuse keeps what was tracked"):

@@ -201,16 +201,3 @@ def test_a_process_that_is_killed_leaves_no_digest_of_what_it_was_changing(run):
     with pytest.raises(KeyboardInterrupt):
         kill()
     assert read_manifest(run.path / "manifest.json").files == run.manifest.files
-
-
-def test_a_run_without_digests_is_read_and_counted(run):
-    old = run.manifest.model_copy(update={"files": {}})
-    old.save(run.path / "manifest.json")
-    assert set(verdicts_of(run.path).values()) == {"well", "warning"}
-    export(open_run(run.path), "costmap")
-    assert not read_manifest(run.path / "manifest.json").files
-
-    lines = (run.path / "trajectory.tum").read_text().splitlines(keepends=True)
-    (run.path / "trajectory.tum").write_text("".join(lines[: len(lines) // 2]))
-    assert len(open_run(run.path).trajectory) < len(lines) - 1
-    assert verdicts_of(run.path)["trajectory.tum"] == "failed"

@@ -177,8 +177,8 @@ def _uncertainty(results: RunResults) -> dict[str, Any]:
     poses = results.poses
     return {
         "doubtful": [stamp_ns in doubtful_ns for stamp_ns in stamps_ns],
-        "band_m": None if poses is None else _rounded((SIGMAS * poses.horizontal_sigmas_m).tolist()),
-        "band_3d_m": None if poses is None else _rounded((SIGMAS * poses.position_sigmas_m).tolist()),
+        "band_m": _rounded((SIGMAS * poses.horizontal_sigmas_m).tolist()),
+        "band_3d_m": _rounded((SIGMAS * poses.position_sigmas_m).tolist()),
     }
 
 
