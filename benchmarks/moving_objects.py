@@ -124,6 +124,7 @@ def indoors(name: str, config: SynthConfig) -> Labelled:
     """Return a labelled RGB-D log; its poses err by 5 mm and 0.11° along and about each axis."""
     simulator, octree = CameraSimulator(config), OctreeConfig()
     noise = measure_noise(simulator.log(), workers=1).noise
+    octree = octree.model_copy(update={"depth_noise": noise})
     limit_m = DepthLimit(noise, max_sigma_m=octree.resolution_m).depth_m
     scans, moving = [], []
     for index in range(len(simulator.truth)):
@@ -165,7 +166,9 @@ def ours(log: Labelled) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
     for points, T_world_body in zip(log.scans, log.T_world_body, strict=True):
         updates.append(pack(caster.cast(Scan(0, points), T_world_body)))
         octree.merge(updates[-1])
-    objects = remove_moving_objects(octree, lambda: updates)
+    is_camera = log.octree.depth_noise is not None
+    poses = log.T_world_body if is_camera else None
+    objects = remove_moving_objects(octree, lambda: updates, T_world_camera=poses)
     scans = np.split(points_world, np.cumsum([len(scan) for scan in log.scans])[:-1])
     returns = np.concatenate([objects.returns_of(scan) for scan in scans])
     seconds = (time.process_time() - begin) / len(log.scans)

@@ -283,7 +283,9 @@ def _fuse_scans(
         return octree, None
     with updates.reopen() as written:
         return octree, remove_moving_objects(
-            octree, lambda: ordered_map(CachedUpdate.update, written.entries(), workers=config.workers)
+            octree,
+            lambda: ordered_map(CachedUpdate.update, written.entries(), workers=config.workers),
+            T_world_camera=written.poses_world if source.sensor == "rgbd" else None,
         )
 
 

@@ -8,7 +8,9 @@ the evidence of a ray is weighed by what the same scan saw around it:
   Nothing is observed below the ground or behind a wall, so rays that graze a surface do not erase it. The
   margin of a voxel covers errors of the pose (their d_p = 1).
 - A miss *passes* if none of these 26 voxels was hit in the same scan: noise of the range and errors of the
-  pose move a hit by no more (their d_s). A voxel is *seen through* by a miss that is void and passes.
+  pose move a hit by no more (their d_s). The depth of a camera errs by more, so that one wall has two places:
+  there no voxel within the error of depth may be hit, and what lies so near the limit of depth that a hit
+  may be beyond it is not passed. A voxel is *seen through* by a miss that is void and passes.
 
 What moves is away for a time without a break, while rays that miss a thin thing, such as a pole or a chair's
 leg, lie between rays that hit it. So misses are counted in the longest stretch of scans that do not hit the
@@ -40,7 +42,7 @@ from numpy import float32, int64, uint64
 from numpy.typing import NDArray
 
 from mapper.core.frames import Points32
-from mapper.core.geometry import Points
+from mapper.core.geometry import Array, Points, Transform
 from mapper.octree.bit_planes import (
     ALL_SET,
     NONE_SET,
@@ -52,15 +54,22 @@ from mapper.octree.bit_planes import (
     words_of,
 )
 from mapper.octree.blocks import BlockStore, find_slots
+from mapper.octree.casting import depth_limit_of
+from mapper.octree.config import OctreeConfig
 from mapper.octree.keys import (
     BLOCK_BITS,
+    BLOCK_EDGE,
     KEY_COUNT,
+    KEY_ZERO,
+    block_keys,
     codes_of,
     codes_of_keys,
     keys_of,
 )
 from mapper.octree.map import OctreeMap
 from mapper.octree.scan_updates import ScanUpdate
+from mapper.sensing.config import DepthNoiseConfig
+from mapper.sensing.depth_noise import depth_sigma_m
 
 _LEAST_SEEN_THROUGH, _SEEN_THROUGH_RATIO = 2, 0.5
 _LEAST_PASSES, _PASSES_RATIO = 8, 2.0
@@ -68,6 +77,9 @@ _LEAST_PASSES_NEARBY = 3
 _ATTACHED_RATIO, _ATTACHED_ROUNDS = 0.9, 2
 _ATTACHED_M = 0.4
 _LONGEST, _FIRST, _NOW = range(3)  # stretches of scans without a hit
+_DEPTH_ERROR_SIGMAS = 12.0
+"""Error of depth by the noise of depth. It is that of a pixel of disparity, whose noise is 0.07 to 0.08 px in
+cameras of structured light; both grow with the square of depth (Khoshelham & Oude Elberink 2012)."""
 _BELOW = np.array([(x, y, -z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (1, 2)])
 
 
@@ -124,7 +136,12 @@ class MovingObjects:
         return int(np.unpackbits(self.removed.view(np.uint8)).sum())
 
 
-def remove_moving_objects(octree: OctreeMap, scans: Callable[[], Iterable[ScanUpdate]]) -> MovingObjects:
+def remove_moving_objects(
+    octree: OctreeMap,
+    scans: Callable[[], Iterable[ScanUpdate]],
+    *,
+    T_world_camera: Array | None = None,
+) -> MovingObjects:
     """Free the voxels of an octree in which something moved, and keep those of grazed surfaces.
 
     A voxel that was never passed becomes unknown. Memory: about 40 bytes a voxel that was ever hit, and a few
@@ -133,13 +150,14 @@ def remove_moving_objects(octree: OctreeMap, scans: Callable[[], Iterable[ScanUp
     Args:
         octree: The map of all scans; changed in place.
         scans: Returns the map's scans, in the order of time; it is called more than once.
+        T_world_camera: (S, 4, 4) poses of the depth camera that made them, z forward; None for a LiDAR.
     """
     blocks = octree.blocks
     ever = np.zeros((len(blocks), WORDS), np.uint64)
     for scan in scans():
         _mark(words_of(scan.occupied), _slots_of(blocks, scan), ever)
     starts, count = _number(ever)
-    hits, voids, passes, seen_through = _count_scans(blocks, scans(), ever, starts, count)
+    hits, voids, passes, seen_through = _count_scans(octree, scans(), T_world_camera, ever, starts, count)
     often = (seen_through >= _LEAST_SEEN_THROUGH) & (seen_through > _SEEN_THROUGH_RATIO * hits)
     often |= (passes >= _LEAST_PASSES) & (passes > _PASSES_RATIO * hits)
     inside = _inside(octree)
@@ -172,25 +190,47 @@ def remove_moving_objects(octree: OctreeMap, scans: Callable[[], Iterable[ScanUp
     return MovingObjects(blocks, _scatter(moved, ever), surfaces, octree.resolution_m)
 
 
-def _evidence(scan: ScanUpdate) -> tuple[Words, Words, Words]:
-    """Return where a scan hit, where it is void, and where it passes."""
+def _depth_margins(
+    codes: NDArray[np.int64], T_world_camera: Transform, noise: DepthNoiseConfig, config: OctreeConfig
+) -> NDArray[np.int64]:
+    """Return by how many voxels the hits of a depth camera may be off in (B,) blocks; −1 is unknown."""
+    limit = depth_limit_of(config)
+    centres_world = (block_keys(codes) - KEY_ZERO + BLOCK_EDGE / 2) * config.resolution_m
+    z_m = np.maximum((centres_world - T_world_camera[:3, 3]) @ T_world_camera[:3, 2], 0.0)
+    error_m = _DEPTH_ERROR_SIGMAS * depth_sigma_m(noise, z_m)
+    margins = np.ceil(error_m / config.resolution_m).clip(min=1).astype(np.int64)
+    return np.where(z_m + error_m > (config.range_limit_m if limit is None else limit.depth_m), -1, margins)
+
+
+def _evidence(scan: ScanUpdate, margins: NDArray[np.int64] | None) -> tuple[Words, Words, Words]:
+    """Return where a scan hit, where it is void, and where it passes; margins of None are one voxel."""
     free, hit = words_of(scan.free), words_of(scan.occupied)
     neighbours = neighbours_of(scan.codes)
     void = free & ~dilate(~(free | hit), neighbours, absent=ALL_SET)
-    return hit, void, free & ~dilate(hit, neighbours, absent=NONE_SET)
+    near = grown = dilate(hit, neighbours, absent=NONE_SET)
+    if margins is not None:
+        for voxels in range(2, int(margins.max(initial=1)) + 1):
+            grown = dilate(grown, neighbours, absent=NONE_SET)
+            near = np.where((margins >= voxels)[:, np.newaxis], grown, near)
+        near = np.where((margins < 0)[:, np.newaxis], ALL_SET, near)
+    return hit, void, free & ~near
 
 
 def _count_scans(
-    blocks: BlockStore,
+    octree: OctreeMap,
     scans: Iterable[ScanUpdate],
+    T_world_camera: Array | None,
     ever: Words,
     starts: NDArray[np.int64],
     count: int,
 ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]:
     """Return (count,) hits and voids, and passes and those seen through in the longest stretch."""
     counts, misses = np.zeros((count, 2), np.int32), np.zeros((count, 3, 2), np.int32)
-    for scan in scans:
-        _count(*_evidence(scan), _slots_of(blocks, scan), ever, starts, counts, misses)
+    noise, margins = octree.config.depth_noise, None
+    for i, scan in enumerate(scans):
+        if T_world_camera is not None and noise is not None:
+            margins = _depth_margins(scan.codes, T_world_camera[i], noise, octree.config)
+        _count(*_evidence(scan, margins), _slots_of(octree.blocks, scan), ever, starts, counts, misses)
     around = misses[:, _FIRST] + misses[:, _NOW]
     return *counts.T, *np.maximum(misses[:, _LONGEST], around, out=around).T
 

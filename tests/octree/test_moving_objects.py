@@ -11,6 +11,7 @@ from mapper.octree.keys import codes_of_keys, keys_of
 from mapper.octree.map import OctreeMap
 from mapper.octree.moving_objects import remove_moving_objects
 from mapper.octree.scan_updates import pack
+from mapper.sensing.config import DepthNoiseConfig
 
 CONFIG = OctreeConfig(resolution_m=0.2, max_range_m=30.0)
 EYE_M = 1.62
@@ -243,3 +244,27 @@ def test_neighbours_at_the_ends_of_the_key_range_wrap_to_absent_blocks():
     rows = neighbours_of(np.sort(codes))
 
     assert (rows == -1).all()
+
+
+def test_a_wall_whose_depth_errs_from_view_to_view_does_not_move():
+    config = OctreeConfig(depth_noise=DepthNoiseConfig(quadratic_per_m=0.0017))
+    x, y = np.meshgrid(np.arange(-0.4, 0.4, 0.008), np.arange(-0.4, 0.4, 0.008))
+    directions = np.stack([x, y, np.ones_like(x)], -1).reshape(-1, 3)
+    is_person = (np.abs(directions[:, 0]) < 0.1) & (directions[:, 1] > -0.2)
+    scans, owners = [], []
+    for i in range(12):
+        depth_m = np.full(len(directions), 3.83 if i < 4 else 4.13)
+        owners.append(is_person & (i < 4))
+        depth_m[owners[-1]] = 2.03
+        scans.append(((directions * depth_m[:, None]).astype(np.float32), owners[-1], np.zeros(3)))
+    points, owner = np.concatenate([points for points, _, _ in scans]), np.concatenate(owners)
+
+    octree, updates = fused(scans, config)
+    as_lidar = remove_moving_objects(octree, lambda: updates).contain(points)
+    octree, updates = fused(scans, config)
+    poses = np.broadcast_to(np.eye(4), (len(scans), 4, 4))
+    as_camera = remove_moving_objects(octree, lambda: updates, T_world_camera=poses).contain(points)
+
+    assert as_lidar[~owner].mean() > 0.2
+    assert as_camera[~owner].mean() < 0.001
+    assert as_camera[owner].mean() > 0.95
