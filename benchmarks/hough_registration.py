@@ -20,8 +20,8 @@ import numpy as np
 
 from mapper.core.frames import Scan
 from mapper.core.geometry import Transform, angle_between, inverse
-from mapper.evaluators.metrics.cloud_distance import DistanceTo
-from mapper.evaluators.papers.scan_pairs import fewer_rings, merged, perturbed
+from mapper.evaluators.metrics.map_quality import DistanceTo
+from mapper.evaluators.papers.hough_pairs import fewer_rings, merged, perturbed
 from mapper.registration.base import Registration
 from mapper.registration.config import KissMatcherConfig
 from mapper.registration.factory import build_registration

@@ -13,9 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from mapper.cli.console import progress_for
-from mapper.cli.option_rules import refuse_several
-from mapper.cli.terminal import print_text
+from mapper.cli.console import print_text, progress_for
+from mapper.cli.options import refuse_several
 from mapper.core.errors import MapperError, UntrustedError
 from mapper.runtime.atomic import MANIFEST_NAME
 from mapper.runtime.progress import SILENT, Progress

@@ -1,5 +1,6 @@
-"""``mapper build``: a log becomes a run."""
+"""``mapper build``: a log becomes a run; ``mapper demo``: a synthetic log, made and mapped."""
 
+import json
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
@@ -12,7 +13,6 @@ import typer
 from mapper.cli.answer import Answer, Output, untrusted
 from mapper.cli.completion import run_folders
 from mapper.cli.environment import note_compilation
-from mapper.cli.option_rules import refuse_with, refuse_without
 from mapper.cli.options import (
     ConfigFile,
     First,
@@ -22,21 +22,26 @@ from mapper.cli.options import (
     RequireTruth,
     Stride,
     merged,
+    refuse_with,
+    refuse_without,
     selection,
 )
-from mapper.cli.stepping import Stepping
-from mapper.core.errors import ViewerError
+from mapper.core.errors import ConfigError, ViewerError
 from mapper.runtime.result_paths import RUNS, name_of, place_of
 
 if TYPE_CHECKING:
     from mapper.config.build import BuildConfig
+    from mapper.core.geometry import Transform
     from mapper.evaluators.metrics.metric import Metric
+    from mapper.mapping.fusion import Maps
     from mapper.run.folder import Run
-    from mapper.run.observers import Observer
+    from mapper.run.observers import Observer, Step
+    from mapper.run.results import RunResults
     from mapper.runtime.progress import Progress
     from mapper.sources.base import Log
 
     ObserverFactory = Callable[[Log, BuildConfig], AbstractContextManager[Observer]]
+    from mapper.simulation.config import SynthConfig
 
 
 def build(
@@ -204,3 +209,93 @@ def appended(
     preview = _preview(source, out, progress)
     run = append(source, first, config, out, progress=progress, observer=preview, overwrite=overwrite)
     return run, evaluate(run.trajectory, run.truth).metrics
+
+
+DEMO_LOG = ("path=loop", "width_px=320", "height_px=240")
+
+
+def demo(
+    out: Annotated[Path, typer.Option(help="Folder for the log and the run.")] = Path("demo"),
+    seconds: Annotated[float | None, typer.Option(help="Length of the log; omit for one round.")] = None,
+    set_: Overrides = None,
+    *,
+    output: Output,
+) -> Answer:
+    """Make a synthetic log of a walk through a flat, build a map from it, and print where its pictures are.
+
+    Example: mapper demo --out /tmp/demo --seconds 20
+    """
+    from mapper.cli.options import assignments
+    from mapper.cli.summary import summary_of
+    from mapper.config.loading import load_config, overridden
+    from mapper.run import files
+    from mapper.simulation import write_tum_log
+    from mapper.simulation.config import SynthConfig
+
+    load_config(None, set_ or ())  # what is wrong with it is better known before the log is made
+    log = out / "log"
+    scene = overridden(SynthConfig(), [*DEMO_LOG, *assignments({"duration_s": seconds})])
+    if not _is_made(log, scene):
+        with output.progress().stage("render") as report:
+            write_tum_log(log, scene, on_progress=report)
+    run, metrics = built(log, None, set_ or (), out / "run", overwrite=True, output=output)
+    pictures = [run.path / name for name in (files.SUMMARY, files.CLOUD_VIEWS, f"{files.SLICE}.png")]
+    summary, below = summary_of(run, metrics), "\n".join(map(str, pictures))
+    return Answer(
+        {**summary.document, "pictures": pictures},
+        f"{summary.text}\n{below}",
+        f"{summary.details}\n{below}",
+    )
+
+
+def _is_made(log: Path, scene: "SynthConfig") -> bool:
+    """Return whether an earlier demo left this very log, which takes longer to make than to map."""
+    made_from = log / "scene.json"
+    return made_from.is_file() and json.loads(made_from.read_text())["config"] == scene.model_dump(
+        mode="json"
+    )
+
+
+class Stepping:
+    """Observer that forwards to another and waits for Enter after every frame (Somlyai, PhD thesis, §3.6)."""
+
+    def __init__(self, other: "Observer") -> None:
+        """Refuse to wait for keys where standard input is no terminal.
+
+        Raises:
+            ConfigError: Standard input is no terminal.
+        """
+        if not sys.stdin.isatty():
+            raise ConfigError("--step: waits for Enter after each frame, but standard input is no terminal")
+        self._other = other
+        self._frames = 0
+        self._waits = True
+        _say("stepping: Enter for the next frame, c and Enter to run on")
+
+    def on_frame(self, step: "Step", /) -> None:
+        """Print how the frame went, and wait."""
+        self._other.on_frame(step)
+        self._frames += 1
+        if not self._waits:
+            return
+        how = step.track.diagnostics
+        place = "lost" if step.track.node is None else f"node {step.track.node}, {how.inliers} inliers"
+        kept = ", a keyframe" if step.track.is_keyframe else ""
+        if step.track.doubts:
+            kept += f", doubtful: {', '.join(doubt.text for doubt in step.track.doubts)}"
+        _say(f"frame {self._frames} at {step.track.stamp_ns}: {how.method}, {place}{kept} ", end="")
+        sys.stderr.flush()
+        answer = sys.stdin.readline()
+        self._waits = answer.strip() != "c" and bool(answer)
+
+    def on_levelled(self, T_level_world: "Transform", /) -> None:
+        """Pass on."""
+        self._other.on_levelled(T_level_world)
+
+    def on_mapped(self, run: "Run", results: "RunResults", maps: "Maps", /) -> None:
+        """Pass on."""
+        self._other.on_mapped(run, results, maps)
+
+
+def _say(text: str, *, end: str = "\n") -> None:
+    print(text, end=end, file=sys.stderr)

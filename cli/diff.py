@@ -7,7 +7,7 @@ import typer
 
 from mapper.cli.answer import Answer, Output, record_in
 from mapper.cli.completion import run_folders
-from mapper.cli.placing import Place, PosesFile, placing_of
+from mapper.cli.merge import Place, PosesFile, placing_of
 from mapper.runtime.result_paths import DIFFS, joined_names, place_of
 
 if TYPE_CHECKING:
@@ -80,7 +80,7 @@ def diff(
 
 
 def _table(found: "Differences", resolution_m: float) -> str:
-    from mapper.evaluators.tables.table import Column, Record, text_table
+    from mapper.evaluators.study.table import Column, Record, text_table
 
     records: list[Record] = [
         {

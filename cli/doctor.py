@@ -8,14 +8,14 @@ import typer
 
 from mapper.cli.answer import Answer, Output
 from mapper.cli.completion import run_folders
-from mapper.cli.option_rules import refuse_with
+from mapper.cli.options import refuse_with
 from mapper.core.errors import ConfigError, MapperError
 from mapper.runtime.progress import SILENT
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from mapper.doctor.machine import Finding
+    from mapper.runtime.doctor import Finding
     from mapper.runtime.progress import Progress
 
 _MARKS = {"well": "ok  ", "warning": "warn", "failed": "FAIL"}
@@ -65,7 +65,7 @@ def doctor(
     if warm:
         findings = _warmed(progress)
     elif run is None:
-        from mapper.doctor.libraries import examine
+        from mapper.runtime.doctor import examine
 
         findings = examine(progress=progress)
     else:
@@ -80,8 +80,8 @@ def doctor(
 
 
 def _warmed(progress: "Progress") -> "list[Finding]":
-    from mapper.doctor.machine import check_kernels
     from mapper.pipeline.warm_up import compile_kernels
+    from mapper.runtime.doctor import check_kernels
 
     compile_kernels(progress=progress)
     return [check_kernels()]

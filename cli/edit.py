@@ -5,8 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from mapper.cli.answer import Answer, Output
-from mapper.cli.option_rules import refuse_several, refuse_without
-from mapper.cli.options import MovedLogs, RunFolder
+from mapper.cli.options import MovedLogs, RunFolder, refuse_several, refuse_without
 from mapper.core.errors import ConfigError
 
 if TYPE_CHECKING:

@@ -1,8 +1,14 @@
-"""Environment variables that libraries read when they are loaded."""
+"""What a process needs before a verb runs: variables that libraries read, and handlers of signals."""
 
 import os
+import signal
+import threading
 from pathlib import Path
+from types import FrameType
 from typing import TYPE_CHECKING
+
+from mapper.cli.completion import cache_folder
+from mapper.core.errors import Terminated
 
 if TYPE_CHECKING:
     from mapper.runtime.progress import Progress
@@ -17,14 +23,42 @@ def prepare_environment() -> None:
     os.environ.setdefault("RUST_LOG", "off")  # Rerun would print lines of its own beside our errors
     package = Path(mapper.__file__).parent
     if not os.access(package, os.W_OK):  # numba keeps its code beside ours, and refuses to work if it cannot
-        cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mapper" / "numba"
-        os.environ.setdefault("NUMBA_CACHE_DIR", str(cache))
+        os.environ.setdefault("NUMBA_CACHE_DIR", str(cache_folder() / "numba"))
 
 
 def note_compilation(progress: "Progress") -> None:
     """Say that a verb takes longer this time, if numba has not compiled our kernels before."""
-    import mapper
+    from mapper.runtime.doctor import compiled_kernels
 
-    cache = os.environ.get("NUMBA_CACHE_DIR") or Path(mapper.__file__).parent
-    if next(Path(cache).rglob("*.nbi"), None) is None:
+    if not compiled_kernels():
         progress.note("first run here: the kernels are compiled once, which takes about a minute")
+
+
+_UNSAFE = frozenset({"importlib", "llvmlite", "numba"})
+"""Packages whose frames no exception may leave: in LLVM's callbacks it ends the process, in the import of a
+compiled module it becomes a SystemError."""
+_AGAIN_S = 0.05
+
+
+def handle_interrupts() -> None:
+    """Raise KeyboardInterrupt at Ctrl-C, and Terminated at SIGTERM, in the main thread."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, interrupt)
+
+
+def interrupt(number: int, frame: FrameType | None) -> None:
+    """Raise for a signal; in a module that cannot take an exception it is sent again a little later."""
+    if _is_unsafe(frame):
+        timer = threading.Timer(_AGAIN_S, os.kill, (os.getpid(), number))
+        timer.daemon = True
+        timer.start()
+        return
+    raise Terminated("SIGTERM") if number == signal.SIGTERM else KeyboardInterrupt
+
+
+def _is_unsafe(frame: FrameType | None) -> bool:
+    while frame is not None:
+        if str(frame.f_globals.get("__name__", "")).partition(".")[0] in _UNSAFE:
+            return True
+        frame = frame.f_back
+    return False

@@ -7,7 +7,7 @@ import typer
 
 from mapper.cli.answer import Answer, Output
 from mapper.cli.completion import run_folders
-from mapper.cli.option_rules import refuse_with, refuse_without
+from mapper.cli.options import refuse_with, refuse_without
 from mapper.core.errors import DataError
 
 if TYPE_CHECKING:
@@ -104,7 +104,7 @@ def evaluate(
     Example: mapper eval runs/xyz --align yaw --plot plots, or: mapper eval 00.txt --truth poses/00.txt, or:
     mapper eval runs/flat --map logs/flat --sharpness
     """
-    from mapper.evaluators.metrics.inputs import estimate_and_truth
+    from mapper.evaluators.metrics.evaluate import estimate_and_truth
     from mapper.evaluators.metrics.loops import loop_metrics_of_run
     from mapper.run.manifest import is_merged_map
 
@@ -203,8 +203,7 @@ def _plot(
 ) -> None:
     """Draw the errors of the path, and those of the map if it was compared."""
     from mapper.evaluators.metrics.evaluate import ALIGNED
-    from mapper.evaluators.pictures.map_agreement import write_map_errors
-    from mapper.evaluators.pictures.path_errors import write_trajectory_errors
+    from mapper.evaluators.pictures.errors import write_map_errors, write_trajectory_errors
 
     if quality is None or found.matched is not None:
         write_trajectory_errors(folder, found, title=f"{name}, {ALIGNED[align]}")
@@ -293,7 +292,7 @@ def _every_metric(metrics: "list[Metric]", found: "Assessment") -> "list[Metric]
 def _text(metrics: "list[Metric]", found: "Assessment", format_: Format) -> str:
     from mapper.evaluators.metrics import metric
     from mapper.evaluators.metrics.segments import LENGTH_COLUMNS, length_records
-    from mapper.evaluators.tables import table as tables
+    from mapper.evaluators.study import table as tables
 
     if format_ == "json":
         return metric.json_text(_every_metric(metrics, found))

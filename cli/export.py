@@ -7,8 +7,7 @@ import typer
 
 from mapper.cli.answer import Answer, Output, made
 from mapper.cli.completion import export_kinds
-from mapper.cli.option_rules import refuse_with
-from mapper.cli.options import MovedLogs, Overrides, Overwrite, RunFolder, assignments, merged
+from mapper.cli.options import MovedLogs, Overrides, Overwrite, RunFolder, assignments, merged, refuse_with
 from mapper.export.exporters import EXPORTERS
 
 _KINDS = "; ".join(f"{kind}: {exporter.summary}" for kind, exporter in EXPORTERS.items())

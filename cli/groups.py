@@ -10,7 +10,7 @@ from typing import Any
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from mapper.cli.terminal import escaped, print_help
+from mapper.cli.console import escaped, print_help
 
 HELP = {"help_option_names": ["-h", "--help"], "max_content_width": 110}
 """Settings of every context."""

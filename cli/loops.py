@@ -8,8 +8,7 @@ import typer
 
 from mapper.cli.answer import Answer, Output
 from mapper.cli.groups import Verb
-from mapper.cli.option_rules import refuse_without
-from mapper.cli.options import MovedLogs, RunFolder
+from mapper.cli.options import MovedLogs, RunFolder, refuse_without
 from mapper.core.errors import ConfigError
 
 if TYPE_CHECKING:

@@ -1,19 +1,82 @@
-"""``mapper merge``: many runs as one map."""
+"""``mapper merge``: many runs as one map, and the options for where the worlds of several runs lie."""
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal, assert_never
 
 import typer
 
 from mapper.cli.answer import Answer, Output
 from mapper.cli.completion import run_folders
-from mapper.cli.options import workers_for
-from mapper.cli.placing import Place, PosesFile, placing_of
+from mapper.cli.options import refuse_several, workers_for
 from mapper.runtime.result_paths import MAPS, joined_names
 
 if TYPE_CHECKING:
     from mapper.merging.merge import Merged
-    from mapper.merging.merged_map import RunInMap
+    from mapper.merging.merged_map import MergedMap, RunInMap
+    from mapper.merging.placing import Placing
+    from mapper.run.folder import Run
+    from mapper.runtime.executor import Workers
+    from mapper.runtime.progress import Progress
+
+Place = Literal["built", "truth", "auto"]
+"""Source of the poses of the runs' worlds in the map."""
+
+PosesFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--poses", help="File of the worlds' poses in the map, one line per run: RUN tx ty tz qx qy qz qw."
+    ),
+]
+
+
+def placing_of(
+    runs: "Sequence[Run]",
+    place: Place | None,
+    poses: Path | None,
+    *,
+    default: Place,
+    jointly: bool,
+    known: "MergedMap | None" = None,
+    workers: "Workers",
+    progress: "Progress",
+) -> "Placing":
+    """Return the runs with the poses of their worlds.
+
+    Args:
+        runs: Runs to be placed.
+        place: Source of the poses.
+        poses: File of the poses.
+        default: Source if neither is given.
+        jointly: Whether shared places bend the runs, or place each as a rigid body.
+        known: A map of the first of them, to which the others are added.
+        workers: Workers that compare places.
+        progress: Receives stages and notes.
+
+    Raises:
+        ConfigError: Both are given.
+        MapperError: A pose is missing; see :mod:`mapper.merging.placing` and
+            :mod:`mapper.pipeline.place_runs`.
+    """
+    from mapper.merging.placing import Placing, as_built, by_poses, by_truth
+
+    refuse_several({"--place": place, "--poses": poses})
+    if poses is not None:
+        return Placing(by_poses(runs, poses))
+    match place or default:
+        case "built":
+            return Placing(as_built(runs))
+        case "truth":
+            return Placing(by_truth(runs))
+        case "auto":
+            from mapper.pipeline.place_runs import place_by_shared_places, place_jointly
+
+            if not jointly:
+                return place_by_shared_places(runs, workers=workers, progress=progress)
+            known = known if known is not None and known.graph is not None else None
+            return place_jointly(runs, known=known, workers=workers, progress=progress)
+        case unreachable:
+            assert_never(unreachable)
 
 
 def merge(
@@ -105,7 +168,7 @@ def merge(
 
 def _bent(run: "RunInMap") -> str:
     """Return how far the joint graph has moved a run's map within its world."""
-    from mapper.evaluators.tables.table import MISSING
+    from mapper.evaluators.study.table import MISSING
 
     if run.first_node is None:
         return MISSING
@@ -113,7 +176,7 @@ def _bent(run: "RunInMap") -> str:
 
 
 def _summary(merged: "Merged") -> str:
-    from mapper.evaluators.tables.table import MISSING, Column, text_table
+    from mapper.evaluators.study.table import MISSING, Column, text_table
 
     manifest = merged.map.manifest
     records = [{**run.model_dump(), "name": Path(run.path).name, "bent": _bent(run)} for run in manifest.runs]

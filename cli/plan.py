@@ -10,8 +10,7 @@ import typer
 from mapper.cli.answer import Answer, Output
 from mapper.cli.completion import run_folders
 from mapper.cli.groups import Verb
-from mapper.cli.option_rules import refuse_with
-from mapper.cli.options import assignments
+from mapper.cli.options import assignments, refuse_with
 from mapper.core.errors import ConfigError
 
 if TYPE_CHECKING:

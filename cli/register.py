@@ -13,7 +13,7 @@ from mapper.runtime.atomic import refuse_existing
 
 if TYPE_CHECKING:
     from mapper.core.frames import Scan, Sensor
-    from mapper.evaluators.register.registration import Registered
+    from mapper.evaluators.compare.registration import Registered
 
 _CLOUD = "A cloud (.bin .pcd .ply .xyz .npy .las .laz), or LOG@N: the n-th frame of a log, from 0."
 
@@ -58,13 +58,13 @@ def register(
     from mapper.api.register import parse_guess
     from mapper.config.loading import load_source_config, overridden
     from mapper.config.register import check_method, register_config
-    from mapper.evaluators.register.files import (
+    from mapper.evaluators.compare.registration import (
         FOLDER,
         registration_record,
         registration_text,
         write_registration,
     )
-    from mapper.evaluators.register.registration import register as register_frames
+    from mapper.evaluators.compare.registration import register as register_frames
     from mapper.runtime.atomic import atomic_folder
 
     if rerun is not None:

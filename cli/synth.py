@@ -7,8 +7,7 @@ from typing import Annotated, Literal, TypeVar
 import typer
 
 from mapper.cli.answer import Answer, Output
-from mapper.cli.option_rules import refuse_with
-from mapper.cli.options import assignments, merged
+from mapper.cli.options import assignments, merged, refuse_with
 from mapper.core.errors import ConfigError
 from mapper.runtime.result_paths import LOGS, place_of
 

@@ -8,8 +8,7 @@ from typing import Annotated
 import typer
 
 from mapper.cli.answer import Answer, Output, made
-from mapper.cli.option_rules import refuse_several, refuse_without
-from mapper.cli.options import RunFolders
+from mapper.cli.options import RunFolders, refuse_several, refuse_without
 from mapper.cli.report import distinct_names
 from mapper.core.errors import ConfigError
 from mapper.runtime.atomic import refuse_existing

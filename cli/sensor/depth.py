@@ -9,12 +9,11 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from mapper.cli.answer import Answer, Output
-from mapper.cli.option_rules import refuse_with
-from mapper.cli.options import First, Last, Overrides, Overwrite, Stride, merged, selection
+from mapper.cli.options import First, Last, Overrides, Overwrite, Stride, merged, refuse_with, selection
 from mapper.core.errors import ConfigError
 
 if TYPE_CHECKING:
-    from mapper.evaluators.depth_camera.accuracy import Patch
+    from mapper.evaluators.sensors.depth_accuracy import Patch
 
 _FITTED_FRAMES = 100
 
@@ -64,8 +63,8 @@ def depth(
     --config kinect/sensor.toml
     """
     from mapper.config.loading import load_config
-    from mapper.evaluators.depth_camera.study import depth_text, records_of, study_depth
     from mapper.evaluators.pictures.depth_camera import FOLDER, SENSOR, write_depth_study
+    from mapper.evaluators.sensors.depth_study import depth_text, records_of, study_depth
     from mapper.runtime.atomic import atomic_folder
     from mapper.sources import open_source
 
@@ -112,7 +111,7 @@ def _distances(
 
 
 def _patch(text: str) -> "Patch":
-    from mapper.evaluators.depth_camera.accuracy import Patch
+    from mapper.evaluators.sensors.depth_accuracy import Patch
 
     try:
         column, row, width, height = (int(word) for word in text.split(","))

@@ -61,7 +61,7 @@ def line_laser(
     Example: mapper sensor line-laser drive/images --calibration C.toml --wheels drive/encoders.txt --out seen
     """
     from mapper.config.loading import overridden, read_config
-    from mapper.evaluators.line_laser.labels import read_labels, score
+    from mapper.evaluators.sensors.line_laser import read_labels, score
     from mapper.line_laser.config import THESIS, LineLaserCalibration, LineLaserConfig
     from mapper.line_laser.files import find_images
     from mapper.line_laser.products import FOLDER, write_drive, write_scans
@@ -170,8 +170,8 @@ def accuracy(
     from contextlib import nullcontext
 
     from mapper.config.loading import overridden
-    from mapper.evaluators.line_laser.study import detections, study, table_2_1
-    from mapper.evaluators.tables.table import csv_text
+    from mapper.evaluators.sensors.line_laser_study import detections, study, table_2_1
+    from mapper.evaluators.study.table import csv_text
     from mapper.line_laser.config import LineLaserConfig
     from mapper.line_laser.products import DETECTIONS
     from mapper.runtime.atomic import MANIFEST_NAME, FolderKind, atomic_folder, write_text

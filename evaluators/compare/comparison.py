@@ -17,12 +17,10 @@ from mapper.core.timebase import MAX_TRUTH_GAP_NS, Stamps
 from mapper.core.trajectory import Trajectory, trajectory_from
 from mapper.evaluators.compare.catalogue import methods_for
 from mapper.evaluators.compare.config import CompareConfig, TrialsConfig
-from mapper.evaluators.compare.frames import FrameReader, PreparedFrame
-from mapper.evaluators.compare.methods import Method, Tracker, reason_of
+from mapper.evaluators.compare.methods import FrameReader, Method, PreparedFrame, Tracker, reason_of
 from mapper.evaluators.compare.pairwise import guesses_for, pairs_of, trials_of
 from mapper.evaluators.metrics.odometry import OdometryRun, Step, assess_run, step_for
-from mapper.evaluators.study.engine import run_study
-from mapper.evaluators.study.versions import digest, versions
+from mapper.evaluators.study.engine import digest, run_study, versions
 from mapper.run.input_logs import fingerprint
 from mapper.runtime.progress import SILENT, Progress
 from mapper.runtime.resumable_jobs import Job, Record

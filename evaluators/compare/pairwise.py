@@ -11,9 +11,8 @@ from mapper.core.geometry import Transform, angle_between, inverse, rotation_exp
 from mapper.core.timebase import MAX_TRUTH_GAP_NS, Stamps, nearest
 from mapper.core.trajectory import Trajectory
 from mapper.evaluators.compare.config import GuessConfig, TrialsConfig
-from mapper.evaluators.compare.frames import PreparedFrame
-from mapper.evaluators.compare.methods import Method, reason_of
-from mapper.evaluators.tables.table import Record, Value, column
+from mapper.evaluators.compare.methods import Method, PreparedFrame, reason_of
+from mapper.evaluators.study.table import Record, Value, column
 from mapper.registration.base import Alignment, failed
 
 NO_GUESS = "not used"

@@ -2,23 +2,35 @@
 
 import base64
 import os
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from html import escape
 from pathlib import Path
+from statistics import median
+from typing import TYPE_CHECKING, Any
 
-from mapper.evaluators.papers.layout import (
+import numpy as np
+
+from mapper.core.geometry import Array
+from mapper.evaluators.metrics.trajectory import associate
+from mapper.evaluators.papers.model import (
+    RULE,
+    PaperCell,
+    PaperPath,
+    PaperTable,
+    Reproduction,
     as_printed,
     compared,
     compares,
     counted,
     everything,
     failures,
+    file_name,
     headline,
 )
-from mapper.evaluators.papers.model import RULE, PaperTable, Reproduction
-from mapper.evaluators.papers.plots import write_plots
-from mapper.evaluators.tables.table import (
+from mapper.evaluators.pictures.errors import add_color_bar, draw_path
+from mapper.evaluators.study.table import (
     Table,
     csv_text,
     indented,
@@ -27,8 +39,15 @@ from mapper.evaluators.tables.table import (
     markdown_list,
     shown_cells,
 )
-from mapper.export.html import bullets, document, section, table
+from mapper.export.figures import ESTIMATE, LINE, TEXT, TRUTH, caption, draw_boxes, hex_of, page, panel, save
+from mapper.export.html import bullets, document, section
+from mapper.export.html import table as html_table
 from mapper.runtime.atomic import write_text
+from mapper.sources.trajectory_files import read_tum
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 MARKDOWN, CSV, LATEX, PAGE = "tables.md", "tables.csv", "tables.tex", "index.html"
 _FAILURES_SHOWN = 8
@@ -127,10 +146,170 @@ def _page(folder: Path, reproduction: Reproduction, plots: Mapping[str, Path]) -
 def _section(each: PaperTable, plot: Path | None) -> str:
     shown = _shown(each, _everything_known(each))
     head = [column.title for column in shown.columns]
-    body = table(head, shown_cells(shown.columns, shown.records)) + bullets(shown.notes)
+    body = html_table(head, shown_cells(shown.columns, shown.records)) + bullets(shown.notes)
     return section(shown.title, body + (_image(plot) if plot else ""))
 
 
 def _image(path: Path) -> str:
     data = base64.b64encode(path.read_bytes()).decode()
     return f'<p><img alt="{escape(path.stem)}" src="data:image/png;base64,{data}"></p>'
+
+
+TRAJECTORIES, SCENES = "trajectories.png", "scenes.png"
+_COLUMNS = 3
+_WIDTH_IN, _HEIGHT_IN = 4.6, 3.4
+_PATH_IN = 4.6
+_BOX_IN = 0.3
+_LETTER_IN = 0.062
+_NUMBER = re.compile(r"\d+")
+_LEGEND: dict[str, Any] = {"fontsize": 7, "framealpha": 0.9, "edgecolor": LINE}
+
+
+def write_plots(folder: Path, reproduction: Reproduction) -> dict[str, Path]:
+    """Draw a paper's tables that have curves or boxes, and its paths, a PNG file each.
+
+    Args:
+        folder: Existing folder.
+        reproduction: Measured tables.
+
+    Returns:
+        The files, by the table that they show or by what they are.
+    """
+    drawn: dict[str, Path] = {}
+    for table in reproduction.tables:
+        if not compares(table) or not _by_row(table):
+            continue
+        path = folder / f"{file_name(table.name)}.png"
+        if table.axis:
+            _write_curves(path, table)
+        elif table.unit:
+            _write_boxes(path, table)
+        else:
+            continue
+        drawn[table.name] = path
+    scenes = [table for table in reproduction.tables if table.cells and not compares(table)]
+    alike = [table for table in scenes if _columns(table) == _columns(scenes[0])]
+    if len(alike) > 1:
+        drawn["Scenes"] = folder / SCENES
+        _write_scenes(folder / SCENES, alike, title=reproduction.paper)
+    if reproduction.paths:
+        drawn["Paths"] = folder / TRAJECTORIES
+        _write_paths(folder / TRAJECTORIES, reproduction.paths)
+    return drawn
+
+
+def _write_curves(path: Path, table: PaperTable) -> None:
+    """Draw each row's figures over what the columns count; a column without a number is a level."""
+    rows = _by_row(table)
+    figure, across, down = _sheet(_title(table), len(rows))
+    for number, (row, cells) in enumerate(rows.items()):
+        axes = panel(figure, number, columns=across, rows=down)
+        printed = {cell.column: [cell.published] for cell in cells if cell.published is not None}
+        ours = {cell.column: cell.ours for cell in cells if cell.ours}
+        _draw_curve(axes, printed, color=hex_of(TRUTH), label="printed")
+        _draw_curve(axes, ours, color=hex_of(ESTIMATE), label="ours")
+        caption(axes, title=row, x=table.axis, y=f"{table.metric}, {table.unit}")
+        axes.set_ylim(bottom=0.0)
+        axes.grid(color=LINE, linewidth=0.4)
+        axes.legend(**_LEGEND)
+    save(figure, path)
+
+
+def _draw_curve(axes: "Axes", figures: Mapping[str, Sequence[float]], *, color: str, label: str) -> None:
+    """Draw the medians as a line, and what lies between lowest and highest as a band."""
+    counted = {int(count[0]): some for name, some in figures.items() if (count := _NUMBER.search(name))}
+    low, middle, high = ([of(some) for some in counted.values()] for of in (min, median, max))
+    axes.plot(list(counted), middle, ".-", color=color, linewidth=1.3, label=label)
+    axes.fill_between(list(counted), low, high, color=color, alpha=0.18, linewidth=0.0)
+    for name in figures:
+        if not _NUMBER.search(name):
+            level = median(figures[name])
+            axes.axhline(level, color=color, linewidth=0.9, linestyle="dashed", label=f"{label}, {name}")
+
+
+def _write_boxes(path: Path, table: PaperTable) -> None:
+    """Draw each row's figures over the seeds, a box for each column, with the printed one as a mark."""
+    rows = _by_row(table)
+    most = max(len(cells) for cells in rows.values())
+    figure, across, down = _sheet(_title(table), len(rows), height_in=0.9 + _BOX_IN * most)
+    left_in = _label_in(_columns(table))
+    for number, (row, cells) in enumerate(rows.items()):
+        axes = panel(figure, number, columns=across, rows=down, left_in=left_in)
+        printed = {k: cell.published for k, cell in enumerate(cells, 1) if cell.published is not None}
+        axes.plot(list(printed.values()), list(printed), "D", color=hex_of(TRUTH), zorder=3, label="printed")
+        ours = [(figure, k) for k, cell in enumerate(cells, 1) for figure in cell.ours]
+        axes.plot(*zip(*ours, strict=True), "o", color=TEXT, markersize=4, zorder=3, label="ours, each seed")
+        draw_boxes(axes, {cell.column: np.array(cell.ours) for cell in cells})
+        axes.set_xscale("linear")
+        axes.set_xlim(left=0.0)
+        caption(axes, title=row, x=f"{table.metric}, {table.unit}")
+        axes.legend(**_LEGEND)
+    save(figure, path)
+
+
+def _write_scenes(path: Path, tables: Sequence[PaperTable], *, title: str) -> None:
+    """Draw the figures of each table's rows, a panel for each column and a box for each table."""
+    columns = _columns(tables[0])
+    figure, across, down = _sheet(title, len(columns), height_in=0.9 + _BOX_IN * len(tables))
+    left_in = _label_in([_short(table) for table in tables])
+    for number, column in enumerate(columns):
+        axes = panel(figure, number, columns=across, rows=down, left_in=left_in)
+        draw_boxes(axes, {_short(table): _figures_of(table, column) for table in tables})
+        caption(axes, title=column)
+    save(figure, path)
+
+
+def _figures_of(table: PaperTable, column: str) -> Array:
+    """Return every scene's figure, ours or else the printed one."""
+    cells = [cell for cell in table.cells if cell.column == column]
+    figures = [cell.published if cell.median is None else cell.median for cell in cells]
+    return np.array([figure for figure in figures if figure])  # the scale is logarithmic
+
+
+def _short(table: PaperTable) -> str:
+    return table.name.partition(", ")[2] or "printed"
+
+
+def _write_paths(path: Path, paths: Sequence[PaperPath]) -> None:
+    """Draw every path over its truth, coloured by its error; those of one sequence by one scale."""
+    matched = [associate(read_tum(each.estimate), read_tum(each.truth)) for each in paths]
+    errors_m = [pairs.position_errors_m for pairs in matched]
+    most_m: dict[str, float] = {}
+    for each, errors in zip(paths, errors_m, strict=True):
+        most_m[each.row] = max(most_m.get(each.row, 0.0), float(errors.max()))
+    title = "Paths over the truth, coloured by their error"
+    figure, across, down = _sheet(title, len(paths), height_in=_PATH_IN)
+    for number, (each, pairs, errors) in enumerate(zip(paths, matched, errors_m, strict=True)):
+        axes = panel(figure, number, columns=across, rows=down)
+        add_color_bar(axes, draw_path(axes, pairs, errors, most_m=most_m[each.row]))
+        caption(axes, title=f"{each.row}, {each.method}: ATE {each.ate_m:.4f} m")
+    save(figure, path)
+
+
+def _sheet(title: str, panels: int, *, height_in: float = _HEIGHT_IN) -> tuple["Figure", int, int]:
+    """Return a page for a number of panels, and the numbers of its columns and rows."""
+    across = min(_COLUMNS, panels)
+    down = -(-panels // across)
+    return page(title, columns=across, rows=down, width_in=_WIDTH_IN, height_in=height_in), across, down
+
+
+def _title(table: PaperTable) -> str:
+    """Return a title short enough for a single panel."""
+    return f"{table.name}: {table.metric}, {table.unit}"
+
+
+def _label_in(labels: Sequence[str]) -> float:
+    """Return the width in inches that the longest label needs at a panel's left."""
+    return 0.3 + _LETTER_IN * max(map(len, labels))
+
+
+def _by_row(table: PaperTable) -> dict[str, list[PaperCell]]:
+    """Return the rows that have a figure of ours."""
+    rows: dict[str, list[PaperCell]] = {}
+    for cell in table.cells:
+        rows.setdefault(cell.row, []).append(cell)
+    return {row: cells for row, cells in rows.items() if any(cell.ours for cell in cells)}
+
+
+def _columns(table: PaperTable) -> list[str]:
+    return list(dict.fromkeys(cell.column for cell in table.cells))

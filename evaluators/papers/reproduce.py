@@ -8,12 +8,9 @@ from typing import Any, Literal
 from mapper.core.errors import ConfigError, DataError
 from mapper.evaluators.papers import thesis, zhao
 from mapper.evaluators.papers.files import write_reproduction
-from mapper.evaluators.papers.hough import hough_jobs
-from mapper.evaluators.papers.hough_tables import hough_reproduction
-from mapper.evaluators.papers.measurements import job_for
+from mapper.evaluators.papers.hough import hough_jobs, hough_reproduction
 from mapper.evaluators.papers.model import Reproduction
-from mapper.evaluators.papers.paper import Cut, Paper
-from mapper.evaluators.papers.sequences import Found, find_sequences
+from mapper.evaluators.papers.paper import Cut, Found, Paper, find_sequences, job_for
 from mapper.evaluators.study.engine import CELLS, run_study
 from mapper.runtime.atomic import resumable_folder, write_json
 from mapper.runtime.executor import IN_PROCESS, Workers

@@ -12,9 +12,8 @@ from mapper.config.loading import load_config
 from mapper.core.geometry import inverse, rotation_log
 from mapper.core.trajectory import Trajectory
 from mapper.evaluators.metrics.trajectory import associate, rpe
-from mapper.evaluators.papers.measurements import CONFIGS, ate_rmse_m
 from mapper.evaluators.papers.model import PaperCell, PaperTable
-from mapper.evaluators.papers.published import Figures, figures, published
+from mapper.evaluators.papers.paper import CONFIGS, Figures, ate_rmse_m, figures, published
 
 POZNAN = "Poznań/trajectory1"
 _OWN_LOG = "the thesis's own log"

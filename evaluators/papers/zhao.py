@@ -9,22 +9,24 @@ from tempfile import TemporaryDirectory
 
 from mapper.config.build import BuildConfig
 from mapper.config.loading import load_config
-from mapper.evaluators.papers.measurements import (
+from mapper.evaluators.papers.model import PaperCell, PaperTable
+from mapper.evaluators.papers.paper import (
     CONFIGS,
+    Cut,
+    Paper,
     Place,
     Results,
     ate_rmse_m,
     cells_of,
+    figures,
     filled,
     measured,
     open_with_truth,
+    published,
+    slug,
 )
-from mapper.evaluators.papers.model import PaperCell, PaperTable
-from mapper.evaluators.papers.paper import Cut, Paper
-from mapper.evaluators.papers.published import figures, published
-from mapper.evaluators.papers.sequences import slug
-from mapper.evaluators.study.seeds import seeded
-from mapper.evaluators.tables.table import Record
+from mapper.evaluators.study.engine import seeded
+from mapper.evaluators.study.table import Record
 from mapper.pipeline.build import build
 from mapper.run.files import CLOUD, OCTREE_BT
 

@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mapper.core.config import toml_text
-from mapper.evaluators.depth_camera.accuracy import Accuracy, DepthLevel, ResidualMap
-from mapper.evaluators.depth_camera.noise_fit import NoiseFit
-from mapper.evaluators.depth_camera.study import DepthStudy, records_of
-from mapper.evaluators.tables.table import csv_text
+from mapper.evaluators.sensors.depth_accuracy import Accuracy, DepthLevel, ResidualMap
+from mapper.evaluators.sensors.depth_study import DepthStudy, NoiseFit, records_of
+from mapper.evaluators.study.table import csv_text
 from mapper.export.figures import FAINT, LINE, TEXT, Rgb, caption, hex_of, page, panel, save
 from mapper.runtime.atomic import MANIFEST_NAME, FolderKind, write_json, write_text
 from mapper.sensing.depth_noise import depth_sigma_m

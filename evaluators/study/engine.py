@@ -1,15 +1,21 @@
 """Engine of compare, sweep and reproduce: method × log × settings → rows, a resumable job for each cell."""
 
-from collections.abc import Hashable, Mapping
-from dataclasses import replace
+import hashlib
+import json
+import platform
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
-from mapper.evaluators.study.versions import SameVersions, versions
+import mapper
+from mapper.core.config import AnyConfig, with_changes
+from mapper.core.errors import ConfigError
+from mapper.run.manifest import library_versions
 from mapper.runtime.atomic import locked
 from mapper.runtime.executor import IN_PROCESS, Workers, make_executor
 from mapper.runtime.progress import SILENT, Progress
-from mapper.runtime.resumable_jobs import Job, JobResult, JobRunner
+from mapper.runtime.resumable_jobs import Job, JobResult, JobRunner, Record
 
 CELLS = "cells"
 """Folder of the results beside a study's tables."""
@@ -66,3 +72,49 @@ def run_study(
                         progress.note(f"{result.label}: {result.failure}")
                     report(number, len(left))
     return {place: replace(results[job.key], label=job.label) for place, job in jobs.items()}
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of all that can change a result."""
+    return {"mapper": mapper.__version__, **library_versions()}
+
+
+def digest(*decides: Any, digits: int) -> str:
+    """Return the first hexadecimal digits of the SHA-256 of everything that a result depends on, as JSON."""
+    return hashlib.sha256(json.dumps(decides, sort_keys=True).encode()).hexdigest()[:digits]
+
+
+@dataclass(frozen=True, slots=True)
+class SameVersions:
+    """Work that a machine with other versions of the libraries refuses.
+
+    Attributes:
+        work: The work; can be pickled.
+        planned: The versions where its key was made.
+    """
+
+    work: Callable[[], Sequence[Record]]
+    planned: Mapping[str, str]
+
+    def __call__(self) -> Sequence[Record]:
+        """Return the work's records.
+
+        Raises:
+            ConfigError: This machine has another version of a library, so results would not compare.
+        """
+        for name, version in versions().items():
+            planned = self.planned.get(name)
+            if version != planned:
+                raise ConfigError(
+                    f"worker on {platform.node()}: {name} {version}, where the work was planned with "
+                    f"{planned}; results would not compare, so install the same"
+                )
+        return self.work()
+
+
+_SEEDS = frozenset({"seed", "ransac_seed"})
+
+
+def seeded(config: AnyConfig, seed: int) -> AnyConfig:
+    """Return a configuration with every seed in it set; the same configuration if it has none."""
+    return with_changes(config, lambda name, value: seed if name in _SEEDS else value)

@@ -4,8 +4,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from statistics import median
 
+from mapper.evaluators.study.table import MISSING, Column, Record, Value, decimals, text_table
 from mapper.evaluators.sweep.plan import RUNS, BuildName, Plan
-from mapper.evaluators.tables.table import MISSING, Column, Record, Value, decimals, text_table
 from mapper.runtime.resumable_jobs import JobResult
 
 _WHOLE = 0.995

@@ -8,7 +8,6 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from mapper.config.loading import load_config
-from mapper.doctor.machine import processors
 from mapper.export.exporters import export
 from mapper.export.report.data import chapter_of
 from mapper.export.report.page import write_report
@@ -16,6 +15,7 @@ from mapper.features.hamming import match_mutual_bits, pack
 from mapper.pipeline.build import build
 from mapper.registration.config import IsvdConfig
 from mapper.registration.isvd import Isvd
+from mapper.runtime.doctor import processors
 from mapper.runtime.progress import SILENT, Progress
 from mapper.simulation import write_tum_log
 from mapper.simulation.config import LidarSynthConfig, SynthConfig

@@ -15,7 +15,6 @@ MAY_IMPORT = {"mapper": {"mapper"}, "evaluators": {"evaluators", "mapper"}, "cli
 LAYERS = (
     "core",
     "runtime",
-    "doctor",
     "sensing",
     "features",
     "graph",
@@ -84,7 +83,7 @@ HOMES = {
     "evo": (),
     "rerun": ("mapper/export/rerun/",),
     "distributed": ("mapper/runtime/executor.py",),
-    "pyarrow": ("evaluators/tables/parquet.py",),
+    "pyarrow": ("evaluators/study/table.py",),
 }
 
 

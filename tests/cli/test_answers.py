@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from mapper.cli.answer import plain, rows_text
+from mapper.cli.console import print_help, print_text
 from mapper.cli.groups import PANELS
 from mapper.cli.main import app
-from mapper.cli.terminal import print_help, print_text
 from tests.support.command_line import invoke, mapper
 
 OF_A_RUN = (

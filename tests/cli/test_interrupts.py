@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from mapper.cli import interrupts
+from mapper.cli import environment
 from mapper.core.errors import Terminated
 
 
@@ -21,14 +21,14 @@ def frame_in(*modules):
 )
 def test_an_interrupt_ends_python_code(number, error):
     with pytest.raises(error):
-        interrupts.interrupt(number, frame_in("mapper.pipeline.track", "mapper.cli.build"))
+        environment.interrupt(number, frame_in("mapper.pipeline.track", "mapper.cli.build"))
 
 
 @pytest.mark.parametrize("module", ["llvmlite.binding.ffi", "importlib._bootstrap", "numba.core.dispatcher"])
 def test_an_interrupt_waits_for_compilers_and_imports(module, monkeypatch):
     sent = []
     monkeypatch.setattr("os.kill", lambda _, number: sent.append(number))
-    interrupts.interrupt(signal.SIGTERM, frame_in("ctypes", module, "mapper.cli.build"))
+    environment.interrupt(signal.SIGTERM, frame_in("ctypes", module, "mapper.cli.build"))
     until = time.monotonic() + 5.0
     while not sent and time.monotonic() < until:
         time.sleep(0.01)

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from mapper.cli.option_rules import refuse_several, refuse_with, refuse_without
+from mapper.cli.options import refuse_several, refuse_with, refuse_without
 from mapper.core.errors import ConfigError
 from tests.support.command_line import mapper
 

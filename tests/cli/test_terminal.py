@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-from mapper.cli.terminal import EscapingStream, escaped
+from mapper.cli.console import EscapingStream, escaped
 from mapper.run.manifest import read_manifest
 
 MAPPER = [sys.executable, "-c", "from mapper.cli.main import main; main()"]

@@ -1,6 +1,6 @@
 """Tables as text, Markdown and CSV."""
 
-from mapper.evaluators.tables.table import Column, csv_text, markdown_table, text_table
+from mapper.evaluators.study.table import Column, csv_text, markdown_table, text_table
 
 COLUMNS = (
     Column("name", "name"),

@@ -150,7 +150,7 @@ def test_a_build_that_is_refused_leaves_no_recording(desk_log, desk_run, tmp_pat
 
 def test_stepping_waits_after_each_frame_until_told_to_run_on(desk_log, tmp_path, monkeypatch):
     keys = Log(["\n", "\n", "c\n"])
-    monkeypatch.setattr("mapper.cli.stepping.sys.stdin", keys)
+    monkeypatch.setattr("mapper.cli.build.sys.stdin", keys)
     path = tmp_path / "stepped.rrd"
     built(
         desk_log,

@@ -7,9 +7,8 @@ import pytest
 
 from mapper.config.loading import read_config
 from mapper.core.errors import SourceError
-from mapper.evaluators.line_laser import study as line_laser_study
-from mapper.evaluators.line_laser.labels import range_records, read_labels
-from mapper.evaluators.line_laser.scores import TABLE_2_1, count
+from mapper.evaluators.sensors import line_laser_study
+from mapper.evaluators.sensors.line_laser import TABLE_2_1, count, range_records, read_labels
 from mapper.line_laser.calibration import ahead_m
 from mapper.line_laser.config import THESIS, LineLaserCalibration, LineLaserConfig, LineLaserSynthConfig
 from mapper.line_laser.files import find_images

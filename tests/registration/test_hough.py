@@ -3,7 +3,7 @@ import pytest
 
 from mapper.core.frames import Scan
 from mapper.core.geometry import inverse, rotation_exp, transform
-from mapper.evaluators.papers.scan_pairs import moved
+from mapper.evaluators.papers.hough_pairs import moved
 from mapper.registration.factory import build_registration
 from mapper.registration.hough.aligner import Hough
 from mapper.registration.hough.config import HoughAcceptanceConfig, HoughGicpConfig, HoughNdtConfig

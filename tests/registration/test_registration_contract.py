@@ -7,7 +7,7 @@ import pytest
 
 from mapper.core.frames import Scan
 from mapper.core.geometry import exp, inverse
-from mapper.evaluators.papers.scan_pairs import moved
+from mapper.evaluators.papers.hough_pairs import moved
 from mapper.registration.config import RegistrationConfig
 from mapper.registration.factory import build_registration
 from mapper.simulation.config import STREET, LidarSensorConfig

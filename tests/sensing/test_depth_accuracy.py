@@ -5,11 +5,9 @@ import pytest
 
 from mapper.core.errors import DataError, SourceError
 from mapper.core.frames import PinholeCamera, RgbdFrame, Scan, ray_table
-from mapper.evaluators.depth_camera.accuracy import Patch, accuracy_of, quantisation_step_m
-from mapper.evaluators.depth_camera.noise_fit import fit_noise
-from mapper.evaluators.depth_camera.still import depth_at
-from mapper.evaluators.depth_camera.study import study_depth
-from mapper.evaluators.depth_camera.tiles import depth_of_planes
+from mapper.evaluators.sensors.depth_accuracy import Patch, accuracy_of, quantisation_step_m
+from mapper.evaluators.sensors.depth_planes import depth_at, depth_of_planes
+from mapper.evaluators.sensors.depth_study import fit_noise, study_depth
 from mapper.sensing.depth_noise import depth_sigma_m
 from mapper.sensing.planes import fit_planes
 from mapper.simulation.config import SensorConfig, SynthConfig

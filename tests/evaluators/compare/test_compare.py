@@ -15,10 +15,9 @@ from mapper.evaluators.compare import comparison as compare_module
 from mapper.evaluators.compare.catalogue import methods_for
 from mapper.evaluators.compare.comparison import compare
 from mapper.evaluators.compare.config import CompareConfig, LidarCompareConfig
-from mapper.evaluators.compare.files import compare_into, write_comparison
+from mapper.evaluators.compare.files import compare_into, tables_of, tables_text, write_comparison
 from mapper.evaluators.compare.methods import registration_method
 from mapper.evaluators.compare.pairwise import registration_records
-from mapper.evaluators.compare.tables import tables_of, tables_text
 from mapper.evaluators.metrics.odometry import PathErrors
 from mapper.simulation.config import STREET, LidarSensorConfig
 from mapper.simulation.lidar import LidarSimulator

@@ -8,11 +8,9 @@ import pytest
 from mapper.core.errors import FrameError
 from mapper.core.frames import PinholeCamera, RgbdFrame, Scan
 from mapper.core.geometry import angle_between, apply, exp, inverse
-from mapper.evaluators.compare.catalogue import methods_for
+from mapper.evaluators.compare.catalogue import kiss_icp, methods_for, registrations_for
 from mapper.evaluators.compare.config import CompareConfig, RgbdCompareConfig
-from mapper.evaluators.compare.frames import FrameReader
-from mapper.evaluators.compare.methods import FrameToFrame, OdometryPairs
-from mapper.evaluators.compare.scales import kiss_icp, registrations_for
+from mapper.evaluators.compare.methods import FrameReader, FrameToFrame, OdometryPairs
 from mapper.features.frame_view import ScanView
 from mapper.odometry.base import Diagnostics, FrameResult
 from mapper.odometry.config import IsvdOdometryConfig

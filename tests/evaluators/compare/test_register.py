@@ -10,8 +10,7 @@ from mapper.config.register import register_config
 from mapper.core.errors import ConfigError
 from mapper.core.frames import Scan
 from mapper.core.geometry import apply, exp, inverse
-from mapper.evaluators.register.files import registration_text
-from mapper.evaluators.register.registration import register
+from mapper.evaluators.compare.registration import register, registration_text
 from mapper.odometry.config import IsvdOdometryConfig
 from mapper.registration.config import GicpConfig
 from mapper.registration.hough.config import HoughGicpConfig

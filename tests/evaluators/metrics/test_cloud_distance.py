@@ -3,7 +3,7 @@ import pytest
 
 from mapper.core.errors import DataError
 from mapper.core.geometry import exp, inverse
-from mapper.evaluators.metrics.cloud_distance import DistanceTo
+from mapper.evaluators.metrics.map_quality import DistanceTo
 
 
 def test_mean_and_median_are_those_of_every_distance_told_by_brute_force():

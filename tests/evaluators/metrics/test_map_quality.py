@@ -7,11 +7,15 @@ import pytest
 
 from mapper.core.errors import DataError, MapperError
 from mapper.core.geometry import exp, inverse, transform
-from mapper.evaluators.metrics.map_reference import check_occupancy, read_reference
+from mapper.evaluators.metrics.map_reference import (
+    check_occupancy,
+    outdoor_distance_m,
+    read_reference,
+    scene_distance,
+)
 from mapper.evaluators.metrics.occupancy import assess_by_points, check_metrics
-from mapper.evaluators.metrics.scenes import outdoor_distance_m, scene_distance
 from mapper.evaluators.metrics.sharpness import Views, sharpness_metrics
-from mapper.evaluators.pictures.map_agreement import write_map_errors
+from mapper.evaluators.pictures.errors import write_map_errors
 from mapper.export.mesh_files import write_ply
 from mapper.octree.config import OctreeConfig
 from mapper.octree.map import OctreeMap

@@ -8,8 +8,8 @@ from mapper.core.errors import DataError
 from mapper.core.geometry import exp, transform
 from mapper.core.trajectory import Trajectory
 from mapper.evaluators.metrics.evaluate import assess
-from mapper.evaluators.metrics.run_summary import summary
-from mapper.evaluators.pictures.path_errors import write_trajectory_errors
+from mapper.evaluators.pictures.errors import write_trajectory_errors
+from mapper.evaluators.sweep.build_job import summary
 from mapper.run import files
 from mapper.run.folder import Run
 from mapper.run.manifest import Counts, Input, Manifest

@@ -7,9 +7,16 @@ import pytest
 
 from mapper.core.trajectory import trajectory_from
 from mapper.evaluators.papers.files import tables_text, write_reproduction
-from mapper.evaluators.papers.layout import as_printed, compared, everything
-from mapper.evaluators.papers.model import PaperCell, PaperPath, PaperTable, Reproduction
-from mapper.evaluators.tables.table import Column, latex_table, latex_text, markdown_table, shown_cells
+from mapper.evaluators.papers.model import (
+    PaperCell,
+    PaperPath,
+    PaperTable,
+    Reproduction,
+    as_printed,
+    compared,
+    everything,
+)
+from mapper.evaluators.study.table import Column, latex_table, latex_text, markdown_table, shown_cells
 from mapper.sources.trajectory_files import write_tum
 
 

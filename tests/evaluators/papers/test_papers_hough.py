@@ -5,10 +5,17 @@ from mapper.core.errors import ConfigError, SourceError
 from mapper.core.frames import Scan
 from mapper.core.geometry import apply, rotation_exp, transform
 from mapper.core.trajectory import trajectory_from
-from mapper.evaluators.papers.hough import METHODS, HoughTrial, hough_jobs
-from mapper.evaluators.papers.hough_pairs import ALL_RINGS, FEW_RINGS, Clouds, LogPair, find_pairs
-from mapper.evaluators.papers.hough_tables import hough_reproduction
-from mapper.evaluators.papers.scan_pairs import fewer_rings, merged, perturbed
+from mapper.evaluators.papers.hough import METHODS, HoughTrial, hough_jobs, hough_reproduction
+from mapper.evaluators.papers.hough_pairs import (
+    ALL_RINGS,
+    FEW_RINGS,
+    Clouds,
+    LogPair,
+    fewer_rings,
+    find_pairs,
+    merged,
+    perturbed,
+)
 from mapper.runtime.resumable_jobs import JobResult
 from mapper.sources.trajectory_files import read_kitti, write_kitti
 from tests.support.paths import DATA

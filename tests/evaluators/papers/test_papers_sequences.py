@@ -3,8 +3,7 @@
 import pytest
 
 from mapper.core.errors import ConfigError, SourceError
-from mapper.evaluators.papers.published import figures, published
-from mapper.evaluators.papers.sequences import find_sequences
+from mapper.evaluators.papers.paper import figures, find_sequences, published
 
 NAMES = ["fr1/xyz", "fr1/desk", "fr1/desk2", "fr3/long_office", "fr2/pioneer_slam", "Poznań/trajectory1"]
 

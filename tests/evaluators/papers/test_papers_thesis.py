@@ -9,13 +9,11 @@ from mapper.config.loading import load_config
 from mapper.core.errors import ConfigError, DataError
 from mapper.core.geometry import exp
 from mapper.core.trajectory import trajectory_from
-from mapper.evaluators.papers.ablation import follow
-from mapper.evaluators.papers.measurements import CONFIGS, cells_of, job_for
 from mapper.evaluators.papers.model import PaperCell
-from mapper.evaluators.papers.paper import Cut
-from mapper.evaluators.papers.thesis import PAPER, ThesisJob, table_of
+from mapper.evaluators.papers.paper import CONFIGS, Cut, cells_of, job_for
+from mapper.evaluators.papers.thesis import PAPER, ThesisJob, follow, table_of
 from mapper.evaluators.papers.thesis_tables import tables
-from mapper.evaluators.study.seeds import seeded
+from mapper.evaluators.study.engine import seeded
 from mapper.odometry.config import IsvdOdometryConfig
 from mapper.pipeline.solve import solve
 from mapper.pipeline.track import track_log

@@ -8,9 +8,8 @@ import pytest
 from pyarrow import parquet
 
 from mapper.core.errors import ConfigError, RunError, SourceError
-from mapper.evaluators.study.versions import SameVersions, versions
-from mapper.evaluators.sweep.chart import Line, dot_chart
-from mapper.evaluators.sweep.files import write_sweep
+from mapper.evaluators.study.engine import SameVersions, versions
+from mapper.evaluators.sweep.page import Line, dot_chart, write_sweep
 from mapper.evaluators.sweep.plan import plan_sweep, run_sweep
 from mapper.evaluators.sweep.tables import QUANTITIES, best_of, grouped, summary_text, sweep_records
 from mapper.runtime.executor import Workers

@@ -5,9 +5,8 @@ from itertools import chain
 import pytest
 
 from mapper.core.errors import DataError
-from mapper.doctor import libraries, machine
-from mapper.doctor.libraries import Requirement, check_library, requirements
-from mapper.doctor.machine import Finding
+from mapper.runtime import doctor
+from mapper.runtime.doctor import Finding, Requirement, check_library, requirements
 from tests.support.command_line import invoke
 from tests.support.paths import ROOT
 
@@ -27,7 +26,7 @@ def test_requirements_know_what_is_optional(monkeypatch):
         'octree-mapper[viewer]; extra == "all"',
         'evo>=1.31; extra == "dev"',
     ]
-    monkeypatch.setattr(libraries.metadata, "requires", lambda _name: lines)
+    monkeypatch.setattr(doctor.metadata, "requires", lambda _name: lines)
     assert requirements() == [Requirement("laspy", "2.7"), Requirement("kiss-matcher", "1.0", "peers")]
 
 
@@ -55,23 +54,23 @@ def test_libraries_are_there_and_new_enough(wanted, verdict, said):
 def test_a_library_that_cannot_be_imported_fails_alone(tmp_path, monkeypatch, code, remedy):
     (tmp_path / "broken.py").write_text(code)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    monkeypatch.setitem(libraries.MODULES, "gtsam", "broken")
+    monkeypatch.setitem(doctor.MODULES, "gtsam", "broken")
     finding = check_library(Requirement("gtsam"))
     assert finding.verdict == "failed"
     assert finding.remedy.startswith(remedy)
 
 
 def test_missing_system_libraries_have_a_package_or_a_way_to_find_it():
-    finding = machine.check_system_libraries(["libnothing.so.7"])
+    finding = doctor.check_system_libraries(["libnothing.so.7"])
     assert (finding.verdict, "libnothing.so.7" in finding.detail) == ("failed", True)
-    assert machine.apt_line(["libGL.so.1", "libEGL.so.1"]) == "sudo apt-get install libgl1 libegl1"
+    assert doctor.apt_line(["libGL.so.1", "libEGL.so.1"]) == "sudo apt-get install libgl1 libegl1"
 
 
 def test_a_cache_that_cannot_be_written_fails(monkeypatch, tmp_path):
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
-    assert machine.check_kernels().verdict == "warning"
-    monkeypatch.setattr(machine.os, "access", lambda _path, _mode: False)
-    assert machine.check_kernels().verdict == "failed"
+    assert doctor.check_kernels().verdict == "warning"
+    monkeypatch.setattr(doctor.os, "access", lambda _path, _mode: False)
+    assert doctor.check_kernels().verdict == "failed"
 
 
 def test_kernels_are_counted_once_however_often_they_were_compiled(monkeypatch, tmp_path):
@@ -80,14 +79,14 @@ def test_kernels_are_counted_once_however_often_they_were_compiled(monkeypatch, 
     for name in ("kernels._add-12.py311.nbi", "kernels._add-15.py311.nbi", "kernels._add-12.py311.1.nbc"):
         (folder / name).touch()
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    assert machine.compiled_kernels() == {folder / "kernels._add"}
+    assert doctor.compiled_kernels() == {folder / "kernels._add"}
 
 
 def test_what_is_scarce_is_a_warning(monkeypatch):
-    monkeypatch.setattr(machine, "_LEAST_GB", 1e9)
-    assert machine.check_room().verdict == "warning"
+    monkeypatch.setattr(doctor, "_LEAST_GB", 1e9)
+    assert doctor.check_room().verdict == "warning"
     monkeypatch.setenv("OMP_NUM_THREADS", "8")
-    assert machine.check_machine().verdict == "warning"
+    assert doctor.check_machine().verdict == "warning"
 
 
 def test_a_finding_that_is_not_well_says_what_to_do():
@@ -97,7 +96,7 @@ def test_a_finding_that_is_not_well_says_what_to_do():
 
 def test_the_verb_fails_when_a_library_does(monkeypatch):
     wanted = [Requirement("zstandard"), Requirement("no-such-library")]
-    monkeypatch.setattr(libraries, "requirements", lambda: wanted)
+    monkeypatch.setattr(doctor, "requirements", lambda: wanted)
     result = invoke("doctor", "--json")
     verdicts = {told["name"]: told["verdict"] for told in json.loads(result.stdout)["findings"]}
     assert result.exit_code == 1

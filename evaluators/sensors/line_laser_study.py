@@ -8,8 +8,8 @@ import numpy as np
 
 from mapper.core.frames import Image
 from mapper.core.geometry import Array, Transform
-from mapper.evaluators.line_laser.scores import PERCENT, TABLE_2_1, Counts, count_all, summed
-from mapper.evaluators.tables.table import Column, Record, Table, Value
+from mapper.evaluators.sensors.line_laser import PERCENT, TABLE_2_1, Counts, count_all, summed
+from mapper.evaluators.study.table import Column, Record, Table, Value
 from mapper.line_laser.calibration import CalibrationShot, calibrate, find_board
 from mapper.line_laser.config import (
     LineLaserCalibration,

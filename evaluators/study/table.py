@@ -1,14 +1,17 @@
-"""Tables of results: text for a terminal, Markdown and LaTeX for a report, CSV for other programs."""
+"""Tables of results: text for a terminal, Markdown and LaTeX for a report, CSV and Parquet for programs."""
 
 import csv
 import io
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from textwrap import fill
 
 import numpy as np
 
 from mapper.core.geometry import Array
+from mapper.runtime.atomic import atomic_file
+from mapper.runtime.extras import extra
 
 Value = str | int | float | None
 Record = Mapping[str, Value]
@@ -158,3 +161,31 @@ def shown_cells(columns: Sequence[Column], records: Sequence[Record]) -> list[li
 
 def _cell(column: Column, value: Value) -> str:
     return MISSING if value is None else column.shown(value)
+
+
+def write_parquet(path: Path, records: Sequence[Record]) -> None:
+    """Write records, whole or not at all: text, whole numbers and numbers as columns of their type.
+
+    A column without any value is one of numbers.
+
+    Args:
+        path: File to write.
+        records: One or more, all with the first one's names.
+    """
+    with extra("study", path.name):
+        import pyarrow as pa  # takes a second
+        from pyarrow import parquet
+
+    columns = {}
+    for name in records[0]:
+        values = [record[name] for record in records]
+        kinds = {type(value) for value in values if value is not None}
+        if kinds <= {str} and kinds:
+            kind = pa.string()
+        elif kinds <= {int} and kinds:
+            kind = pa.int64()
+        else:
+            kind = pa.float64()
+        columns[name] = pa.array(values, kind)
+    with atomic_file(path) as part:
+        parquet.write_table(pa.table(columns), part)

@@ -1,1 +1,0 @@
-"""A depth camera's errors and noise, measured on planes."""

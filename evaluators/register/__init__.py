@@ -1,1 +1,0 @@
-"""One registration of two clouds, step by step."""

@@ -1,1 +1,0 @@
-"""Examination of a machine and an installation, before a log is built."""
