@@ -15,6 +15,12 @@ _CHECKED = 17
 _MOST_MOVED = 1000
 """Sides of the image, beyond which a pixel without its distortion is nowhere: the search for it diverged."""
 
+_MOST_UNLIKE = 0.3
+"""Pixels are square, and those of analogue video, the least so, 12:11."""
+_MOST_OFF_CENTRE = 0.4
+"""Principal point's distance from the centre as a share of the side: images are cropped by less."""
+_CENTRED = 0.05
+
 _Distortion = tuple[float, float, float, float, float]
 
 
@@ -53,7 +59,8 @@ class Calibration:
         """Return the camera of images of this size.
 
         Raises:
-            SourceError: The calibration holds for another size, or its distortion has no inverse.
+            SourceError: The calibration holds for another size, its numbers are not in order, or its
+                distortion has no inverse.
         """
         if self.size_px not in (None, (width_px, height_px)):
             width, height = self.size_px or (0, 0)
@@ -61,6 +68,7 @@ class Calibration:
                 f"{self.origin}: holds for {width}×{height} px, but the images have {width_px}×{height_px}; "
                 "give theirs in a calibration.toml beside the log"
             )
+        self._refuse_disorder(width_px, height_px)
         numbers = (self.fx_px, self.fy_px, self.cx_px, self.cy_px)
         camera = PinholeCamera(width_px, height_px, *numbers, distortion=self.distortion)
         grid = np.meshgrid(np.linspace(0, width_px - 1, _CHECKED), np.linspace(0, height_px - 1, _CHECKED))
@@ -69,6 +77,27 @@ class Calibration:
             numbers_text = ", ".join(f"{number:g}" for number in self.distortion)
             raise SourceError(f"{self.origin}: distortion {numbers_text} cannot be taken out of the images")
         return camera
+
+    def _refuse_disorder(self, width_px: int, height_px: int) -> None:
+        """Refuse numbers that no camera has, naming those that seem to have changed places."""
+        fx, fy, cx, cy = abs(self.fx_px), abs(self.fy_px), self.cx_px, self.cy_px
+        off, swapped = (
+            [abs((x + 0.5) / width_px - 0.5), abs((y + 0.5) / height_px - 0.5)]
+            for x, y in ((cx, cy), (cy, cx))
+        )
+        if abs(fy - fx) > _MOST_UNLIKE * fx:
+            found = "fy and cx" if abs(cx - fx) <= _MOST_UNLIKE * fx else "the focal lengths"
+        elif max(off) > _MOST_OFF_CENTRE:
+            found = "the principal point"
+        elif max(swapped) < _CENTRED < min(off):
+            found = "cx and cy"
+        else:
+            return
+        what = "have changed places" if " and " in found else "cannot be right"
+        raise SourceError(
+            f"{self.origin}: fx {self.fx_px:g}, fy {self.fy_px:g}, cx {cx:g}, cy {cy:g} px for images of "
+            f"{width_px}×{height_px} px: {found} {what}; want the order fx fy cx cy, and their size"
+        )
 
 
 def configured(camera: CameraConfig | None) -> Calibration | None:

@@ -31,6 +31,7 @@ _FILE_NAMES = (
     "camera-intrinsics.txt",  # 3DMatch
     "camera_intrinsics.txt",
     "intrinsics.txt",
+    "intrinsics.K.txt",
     "intrinsic.txt",
     "calibration.txt",  # ETH3D
     "K.txt",
@@ -38,6 +39,10 @@ _FILE_NAMES = (
     "intrinsic_color.txt",
     "info.txt",  # BundleFusion
     "_info.txt",
+    "cam.info.txt",
+    "sensors.yaml",  # OpenLORIS
+    "transforms.json",  # nerfstudio, instant-ngp
+    "metadata.json",  # Record3D
 )
 """Globs in a log's folder, the first that is there counts."""
 
@@ -47,7 +52,7 @@ _Numbers = Mapping[str, Sequence[float]]
 def calibration_file(folder: Path) -> Path | None:
     """Return the file of intrinsics beside a log; None without one."""
     found = (path for name in _FILE_NAMES for path in sorted(folder.glob(name)) if path.is_file())
-    return next((path for path in found if not path.name.endswith("info.txt") or _is_sensor_info(path)), None)
+    return next((path for path in found if not path.name.endswith(_MAY_BE_OTHER) or _has_camera(path)), None)
 
 
 def read_calibration(path: Path) -> Calibration:
@@ -69,10 +74,12 @@ def read_calibration(path: Path) -> Calibration:
                 raise DataError(f"{unknown[0]}: unknown key; known are {', '.join(sorted(_KEYS))}")
         elif path.suffix == ".json":
             numbers = _json_numbers(json.loads(text))
-        elif path.suffix == ".txt":
-            numbers = _info_numbers(text) if _INFO_KEY in text else _text_numbers(text)
+        elif path.suffix == ".txt" and _INFO_KEY in text:
+            numbers = _info_numbers(text)
+        elif path.suffix == ".txt" and not _KEY_AND_NUMBER.search(text):
+            numbers = _text_numbers(text)
         else:
-            numbers = _yaml_numbers(text)
+            numbers = _yaml_numbers(text.replace("=", ":") if path.suffix == ".txt" else text)
         return _interpret(numbers, f"{path}")
     except (ValueError, RecursionError) as error:  # RecursionError: of brackets within brackets
         raise SourceError(f"{path}: not valid {path.suffix[1:].upper()}: {error}") from None
@@ -97,12 +104,12 @@ def calibration_text(camera: PinholeCamera, *, depth_units_per_m: float) -> str:
 
 # What each number is called: by us, ROS, OpenCV, Kalibr and ORB-SLAM ("Camera.fx" counts as "fx").
 _NAMES = {
-    "fx": ("fx_px", "fx"),
-    "fy": ("fy_px", "fy"),
+    "fx": ("fx_px", "fx", "fl_x"),
+    "fy": ("fy_px", "fy", "fl_y"),
     "cx": ("cx_px", "cx"),
     "cy": ("cy_px", "cy"),
-    "width": ("width_px", "width", "image_width"),
-    "height": ("height_px", "height", "image_height"),
+    "width": ("width_px", "width", "image_width", "w"),
+    "height": ("height_px", "height", "image_height", "h"),
     "size": ("resolution",),
     "depth_factor": ("depth_factor", "depthmapfactor"),
     "matrix": ("camera_matrix", "k"),
@@ -127,6 +134,8 @@ def _interpret(numbers: _Numbers, origin: str) -> Calibration:
         found = {"fx": K[0:1], "cx": K[2:3], "fy": K[4:5], "cy": K[5:6], **found}
     for several, names in (("intrinsics", ("fx", "fy", "cx", "cy")), ("size", ("width", "height"))):
         if len(values := found.get(several, ())) == len(names):
+            if several == "intrinsics" and _is_by_axis(*values):
+                names = ("fx", "cx", "fy", "cy")
             found = {**{name: [value] for name, value in zip(names, values, strict=True)}, **found}
     one = {meaning: values[0] for meaning, values in found.items() if len(values) == 1}
     missing = [meaning for meaning in ("fx", "fy", "cx", "cy") if meaning not in one]
@@ -149,6 +158,11 @@ def _interpret(numbers: _Numbers, origin: str) -> Calibration:
     )
 
 
+def _is_by_axis(first: float, second: float, third: float, _: float) -> bool:
+    """Return whether four intrinsics are OpenLORIS' fx cx fy cy: the focal lengths of a camera are alike."""
+    return abs(second - first) > _ALIKE * abs(first) >= abs(third - first)
+
+
 def _toml_numbers(table: Mapping[str, Any]) -> dict[str, Sequence[float]]:
     numbers: dict[str, Sequence[float]] = {}
     for key, value in table.items():
@@ -163,8 +177,12 @@ def _toml_numbers(table: Mapping[str, Any]) -> dict[str, Sequence[float]]:
 
 
 _HEAD_BYTES = 1 << 16
-_INFO_KEY = "m_calibrationColorIntrinsic"
 _ANY_LINE = re.IGNORECASE | re.MULTILINE
+_INFO_KEY = "m_calibrationColorIntrinsic"
+_MAY_BE_OTHER = ("info.txt", "metadata.json", "transforms.json")
+_KEY_AND_NUMBER = re.compile(r"(?:fl?_?x(?:_px)?|camera_matrix|\bk)\"?\s*[:=]", re.IGNORECASE)
+_ALIKE = 0.05
+_COLOUR_SECTION = re.compile(r"^\w*(?:color|colour|rgb)\w*:[ \t]*\n(?:[ \t]+.*\n?|\s*\n)+", _ANY_LINE)
 _YAML_ENTRY = re.compile(
     r"^[ \t]*(?:\w+\.)?(?P<key>\w+)[ \t]*:[ \t]*(?P<value>\[[^\]]*\]|(?:\n[ \t]*-[ \t][^\n]*)+|[^\n#]*)",
     re.MULTILINE,
@@ -174,9 +192,13 @@ _YAML_ENTRY = re.compile(
 def _yaml_numbers(text: str) -> dict[str, Sequence[float]]:
     """Take the numbers of "key: 1.0", "key: [1.0, …]", "- 1.0" lines, and a matrix's nested "data: […]".
 
+    Of several sections only that of the colour camera is read, where one is called so.
+
     Raises:
         DataError: The lens has another model, or a number stands for two cameras.
     """
+    if len(sections := _COLOUR_SECTION.findall(text)) == 1:
+        text = sections[0]
     if model := re.search(r"equidistant|fisheye|kannalabrandt|:\s*(?:omni|eucm|ds|fov)\s*$", text, _ANY_LINE):
         raise DataError(
             f"{model[0].strip(': ')} lens; only Brown–Conrady (plumb_bob) distortion is supported"
@@ -201,16 +223,21 @@ def _yaml_numbers(text: str) -> dict[str, Sequence[float]]:
 
 
 def _json_numbers(table: Any) -> _Numbers:
-    """Take Open3D's matrix, which it writes column by column, or the table "camera" of Replica."""
+    """Take the matrix of Open3D and Record3D, column by column, or the numbers of Replica and nerfstudio."""
     camera = table.get("camera", table) if isinstance(table, dict) else None
     if not isinstance(camera, dict):
         raise DataError("no table of numbers")
-    numbers = _toml_numbers({key: value for key, value in camera.items() if _is_numeric(value)})
-    if len(K := numbers.get("intrinsic_matrix", ())) == 9:
+    if "FISHEYE" in str(camera.get("camera_model", "")) or camera.get("is_fisheye"):
+        raise DataError("fisheye lens; only Brown–Conrady (plumb_bob) distortion is supported")
+    frames = camera.get("frames")
+    first = frames[0] if isinstance(frames, list) and frames and isinstance(frames[0], dict) else {}
+    numbers = _toml_numbers({key: v for key, v in {**first, **camera}.items() if _is_numeric(v)})
+    if len(K := numbers.get("intrinsic_matrix", numbers.get("k", ()))) == 9:
         is_by_column = not (K[2] or K[5])
         numbers["k"] = np.reshape(K, (3, 3)).T.ravel().tolist() if is_by_column else K
-    short = {"w": "width", "h": "height", "scale": "depth_factor"} if camera is not table else {}
-    return {short.get(key, key): values for key, values in numbers.items()}
+    if camera is not table and "scale" in numbers:
+        numbers["depth_factor"] = numbers["scale"]
+    return numbers
 
 
 def _is_numeric(value: Any) -> bool:
@@ -231,9 +258,10 @@ def _text_numbers(text: str) -> _Numbers:
     return {"camera_matrix": [value for row in rows[:3] for value in row[:3]]}
 
 
-def _is_sensor_info(path: Path) -> bool:
+def _has_camera(path: Path) -> bool:
     with suppress(OSError), path.open("rb") as file:
-        return _INFO_KEY.encode() in file.read(_HEAD_BYTES)
+        head = file.read(_HEAD_BYTES).decode(errors="replace")
+        return _INFO_KEY in head or _KEY_AND_NUMBER.search(head) is not None
     return False
 
 

@@ -2,7 +2,7 @@ import pytest
 
 from mapper.core.errors import SourceError
 from mapper.core.frames import PinholeCamera
-from mapper.sources.calibration import FREIBURG, freiburg_camera
+from mapper.sources.calibration import FREIBURG, Calibration, freiburg_camera
 from mapper.sources.calibration_file import calibration_text, read_calibration
 
 ROS = """
@@ -95,7 +95,7 @@ def test_every_dialect_gives_the_same_camera(tmp_path, name, text):
 
 
 def test_what_is_written_reads_back_exactly(tmp_path):
-    camera = PinholeCamera(321, 243, 1 / 3, 2.0 / 7, -0.1, 1e-9, (0.1, 0.2, 0.3, 0.4, 0.5))
+    camera = PinholeCamera(321, 243, 1 / 3, 2.0 / 7, 100 / 3, 1e2 / 7 + 60, (0.1, 0.2, 0.3, 0.4, 0.5))
     path = tmp_path / "calibration.toml"
     path.write_text(calibration_text(camera, depth_units_per_m=999.7))
     calibration = read_calibration(path)
@@ -134,6 +134,27 @@ def test_another_image_size_is_refused(tmp_path):
     path.write_text(OURS)
     with pytest.raises(SourceError, match=r"holds for 640×480 px, but the images have 320×240"):
         read_calibration(path).camera(width_px=320, height_px=240)
+
+
+@pytest.mark.parametrize(
+    ("numbers", "why"),
+    [
+        ((517.3, 318.6, 516.5, 255.3), "fy and cx have changed places"),
+        ((517.3, 250.0, 318.6, 255.3), "the focal lengths cannot be right"),
+        ((517.3, 516.5, 639.0, 255.3), "the principal point cannot be right"),
+        ((517.3, 516.5, 318.6, 4.0), "the principal point cannot be right"),
+        ((517.3, 516.5, 241.0, 322.0), "cx and cy have changed places"),
+    ],
+)
+def test_numbers_that_no_camera_has_are_refused(numbers, why):
+    with pytest.raises(SourceError, match=why):
+        Calibration("K.txt", *numbers).camera(width_px=640, height_px=480)
+
+
+def test_cropped_images_and_pixels_that_are_not_square_are_right():
+    numbers = (540.0, 630.0, 110.0, 400.0)
+    camera = Calibration("K.txt", *numbers).camera(width_px=640, height_px=480)
+    assert tuple(camera.intrinsics) == numbers
 
 
 @pytest.mark.parametrize("number", ["-1e308", "1e100", "50.0"])

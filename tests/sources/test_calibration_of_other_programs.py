@@ -25,6 +25,27 @@ m_calibrationColorIntrinsic = 60.0 0 31.5 0 0 61.0 23.5 0 0 0 1 0 0 0 0 1
 """
 REPLICA = '{"camera": {"w": 64, "h": 48, "fx": 60, "fy": 61, "cx": 31.5, "cy": 23.5, "scale": 6553.5}}'
 TWO_CAMERAS = KALIBR + KALIBR.replace("cam0", "cam1").replace("31.5", "33.0")
+NERFSTUDIO = '{"fl_x": 60.0, "fl_y": 61, "cx": 31.5, "cy": 23.5, "w": 64, "h": 48, "aabb_scale": 16}'
+OPENLORIS = """%YAML:1.0
+d400_color_optical_frame:
+   fps: 30
+   height: 48
+   width: 64
+   intrinsics: !!opencv-matrix
+     cols: 4
+     dt: d
+     rows: 1
+     data: [ 6.0e+01, 3.15e+01, 6.1e+01, 2.35e+01 ] # fx cx fy cy
+
+t265_fisheye1_optical_frame:
+   height: 800
+   width: 848
+   intrinsics: !!opencv-matrix
+     cols: 4
+     dt: d
+     rows: 1
+     data: [ 2.8e+02, 4.1e+02, 2.8e+02, 4.0e+02 ]
+"""
 FILES = [
     ("camera_intrinsic.json", OPEN3D),
     ("intrinsic.json", OPEN3D),
@@ -36,6 +57,17 @@ FILES = [
     ("intrinsics.txt", "60 61 31.5 23.5 0 0 0 0 0"),
     ("intrinsic/intrinsic_color.txt", "60 0 31.5 0\n0 61 23.5 0\n0 0 1 0\n0 0 0 1\n"),
     ("info.txt", INFO),
+    ("sensors.yaml", OPENLORIS),
+    ("intrinsics.txt", "60 31.5 61 23.5"),
+    ("intrinsics.K.txt", MATRIX),
+    ("cam.info.txt", "width = 64\nheight = 48\nfx = 60\nfy = 61\ncx = 31.5\ncy = 23.5\n"),
+    ("cam.info.txt", "K: [60.0, 0.0, 31.5, 0.0, 61.0, 23.5, 0.0, 0.0, 1.0]\n"),
+    ("transforms.json", NERFSTUDIO),
+    ("transforms.json", '{"camera_model": "OPENCV", "frames": [' + NERFSTUDIO + "]}"),
+    (
+        "metadata.json",
+        '{"w": 64, "h": 48, "fps": 60, "K": [60.0, 0, 0, 0, 61.0, 0, 31.5, 23.5, 1], "poses": []}',
+    ),
 ]
 
 
@@ -78,6 +110,8 @@ def test_notes_on_something_else_are_no_calibration(tmp_path, text):
         ("intrinsic.json", "[1]", "no table of numbers"),
         ("intrinsic.json", "{", "not valid JSON"),
         ("info.txt", "m_calibrationColorIntrinsic: 1", "no number fx_px"),
+        ("transforms.json", '{"fl_x": 60, "is_fisheye": true}', "fisheye lens"),
+        ("transforms.json", '{"fl_x": 60, "camera_model": "OPENCV_FISHEYE"}', "fisheye lens"),
     ],
 )
 def test_what_is_none_or_of_two_cameras_is_refused_in_words(tmp_path, name, text, why):
