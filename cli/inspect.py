@@ -84,6 +84,8 @@ def _log_rows(log: "LogFacts") -> list[tuple[str, str]]:
         )
     if log.readings:
         rows.append(("accelerations", f"{log.readings} readings"))
+    if log.gyroscope is not None:
+        rows.append(("gyroscope", f"{log.gyroscope.count} readings: {_timing_text(log.gyroscope)}"))
     if log.vehicle is not None:
         numbers = ",".join(f"{v:g}" for v in log.vehicle)
         rows.append(

@@ -48,6 +48,7 @@ def open_source(path: Path, config: SourceConfig = _DEFAULTS) -> "Log":
         SourceError: Nothing is there, no format fits, the log is malformed, nothing of it is selected, or it
             has no frame such as is to be its body.
     """
+    from mapper.sources.imu_files import read_imu
     from mapper.sources.listed_files import unused_note
     from mapper.sources.scan_folders.scan_folder import most_clouds
     from mapper.sources.selection import selected
@@ -68,6 +69,11 @@ def open_source(path: Path, config: SourceConfig = _DEFAULTS) -> "Log":
             if log.wheels is None and path.is_dir():
                 wheels, notes = read_wheels(path, config.wheels, sensor=log.sensor)
                 log = replace(log, wheels=wheels, notes=[*log.notes, *notes])
+            if log.gyroscope is None and path.is_dir():
+                gyroscope, accelerations, notes = read_imu(path)
+                log = replace(log, gyroscope=gyroscope, notes=[*log.notes, *notes])
+                if log.accelerations is None:
+                    log = replace(log, accelerations=accelerations)
         if name != RECORDING:
             log = replace(log, notes=[*log.notes, *unused_note(path, read)])
         return selected(log, config)

@@ -13,6 +13,7 @@ from mapper.core.frames import Frame, RgbdFrame, Scan, Sensor
 from mapper.core.geometry import Array, Transform
 from mapper.core.timebase import Stamps
 from mapper.core.trajectory import Trajectory
+from mapper.sensing.gyroscope import Gyroscope
 
 
 class ImageFile(Protocol):
@@ -143,6 +144,7 @@ class Log:
         entry_at: Returns the entry of frame 0 … N - 1; nothing is decoded yet.
         truth: True T_world_body, if the log has it.
         accelerations: Accelerometer readings, if the log has them.
+        gyroscope: Gyroscope readings, if the log has them.
         T_base_body: Mounting of the body on the robot, whose base has x forward and z up (REP 103), if the
             log states it.
         wheels: T_odom_body by wheel odometry, in a frame of its own that drifts, if the log has it.
@@ -159,6 +161,7 @@ class Log:
     entry_at: Callable[[int], FrameRef]
     truth: Trajectory | None = None
     accelerations: Accelerations | None = None
+    gyroscope: Gyroscope | None = None
     T_base_body: Transform | None = None
     wheels: Trajectory | None = None
     are_units_assumed: bool = False

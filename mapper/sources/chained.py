@@ -11,9 +11,10 @@ import numpy as np
 from mapper.core.frames import Frame, Scan
 from mapper.core.timebase import NS_PER_S
 from mapper.core.trajectory import Trajectory
+from mapper.sensing.gyroscope import Gyroscope
 from mapper.sources.base import Accelerations, FrameRef, ImageFiles, Log, Session, WrappedEntry
 
-_Stamped = TypeVar("_Stamped", Trajectory, Accelerations)
+_Stamped = TypeVar("_Stamped", Trajectory, Accelerations, Gyroscope)
 
 _PAUSE_NS = NS_PER_S
 """Time between two logs whose own stamps are not in order."""
@@ -44,8 +45,8 @@ class _ShiftedEntry(WrappedEntry):
 def chained(first: Log, second: Log, *, shift_ns: int | None = None) -> Log:
     """Return a log followed by another.
 
-    The chain has no accelerations, for two logs' readings may be in different axes, and no wheel odometry,
-    for each log's is in a frame of its own. Its ``sessions`` keep both.
+    The chain has no accelerations and no gyroscope, for two logs' readings may be in different axes, and no
+    wheel odometry, for each log's is in a frame of its own. Its ``sessions`` keep both.
 
     Args:
         first: A log, or several chained ones.
@@ -101,6 +102,7 @@ def _shifted(log: Log, shift_ns: int) -> Log:
         truth=_later(log.truth, shift_ns),
         wheels=_later(log.wheels, shift_ns),
         accelerations=_later(log.accelerations, shift_ns),
+        gyroscope=_later(log.gyroscope, shift_ns),
     )
 
 

@@ -53,6 +53,8 @@ class TopicsConfig(Config):
     """Point clouds; if set, they are mapped even if there are RGB-D images too."""
     imu: str | None = None
     """Inertial readings, whose accelerations show which way is up."""
+    gyroscope: str | None = None
+    """Inertial readings whose angular velocities are used; None is the same topic, or one that has them."""
     truth: str | None = None
     """True poses (Odometry, PoseStamped, TransformStamped); None is /ground_truth, if there is one."""
     wheels: str | None = None

@@ -78,6 +78,7 @@ class LogFacts:
         wheels: Timing of its wheels' readings; None without.
         wheels_path_m: Length of their path, metres.
         readings: Number of accelerations.
+        gyroscope: Timing of its angular velocities; None without.
         notes: Sentences on what opening it left out or assumed.
         warnings: Sentences on what is implausible about its depth.
         vehicle: Box around the sensor's own vehicle, least x y z and largest, metres, body frame; None where
@@ -94,6 +95,7 @@ class LogFacts:
     wheels: Timing | None
     wheels_path_m: float
     readings: int
+    gyroscope: Timing | None
     notes: Sequence[str]
     warnings: Sequence[str]
     vehicle: Box | None
@@ -168,6 +170,7 @@ def _inspected(path: Path, topics: Sequence[TopicFacts], source: Log) -> Inspect
         wheels=None if source.wheels is None else timing_of(source.wheels.stamps_ns),
         wheels_path_m=0.0 if source.wheels is None else source.wheels.path_length_m,
         readings=0 if source.accelerations is None else len(source.accelerations.stamps_ns),
+        gyroscope=None if source.gyroscope is None else timing_of(source.gyroscope.stamps_ns),
         notes=[*source.notes, *damage, *checks.notes()],
         warnings=depth_warnings(source),
         vehicle=vehicle_box(source),

@@ -18,6 +18,7 @@ from mapper.sources.base import Accelerations, FrameRef, Log, Skipped
 from mapper.sources.calibration_file import calibration_text
 from mapper.sources.image_files.reading import FINE_UNITS_PER_M, encode_colour, encode_depth, image_bytes
 from mapper.sources.image_folders.mbag import HEADER
+from mapper.sources.imu_files import write_gyroscope
 from mapper.sources.scan_folders.kitti_writing import write_kitti_log
 from mapper.sources.trajectory_files import write_tum
 from mapper.sources.wheel_files import write_wheels
@@ -68,8 +69,15 @@ def write_log(
 
 def left_out(source: Log, kind: LogKind) -> list[str]:
     """Return the parts of a log that a format has no place for, a sentence each."""
-    has = {"wheel odometry": source.wheels is not None, "accelerations": source.accelerations is not None}
-    no_place: dict[LogKind, list[str]] = {"mbag": ["wheel odometry"], "kitti": ["accelerations"]}
+    has = {
+        "wheel odometry": source.wheels is not None,
+        "accelerations": source.accelerations is not None,
+        "angular velocities": source.gyroscope is not None,
+    }
+    no_place: dict[LogKind, list[str]] = {
+        "mbag": ["wheel odometry", "angular velocities"],
+        "kitti": ["accelerations"],
+    }
     missing = [what for what in no_place.get(kind, []) if has[what]]
     if kind == "mcap" or kind == "bag":
         from mapper.sources.ros.log_writing import early_readings  # loads rosbags
@@ -112,6 +120,8 @@ def _write_images_log(
             write_tum(out / "groundtruth.txt", source.truth)
         if source.wheels is not None:
             write_wheels(out, source.wheels, sensor=source.sensor)
+        if source.gyroscope is not None:
+            write_gyroscope(out, source.gyroscope)
         depth_files = {frame.depth_stamp_ns: frame.depth for frame in written}
         colour_files = {frame.stamp_ns: frame.colour for frame in written}
         write_text(out / "depth.txt", _list_text("depth maps", source.name, depth_files))

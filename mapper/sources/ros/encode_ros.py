@@ -150,9 +150,14 @@ def odometry_message(
     )
 
 
-def imu_message(stamp_ns: int, topic: str, acceleration_mps2: Array, *, frame: str) -> SerializedMessage:
-    """Return a sensor_msgs/msg/Imu of an acceleration alone: −1 begins the covariance of what is absent."""
+def imu_message(
+    stamp_ns: int, topic: str, *, rates_radps: Array | None, acceleration_mps2: Array | None, frame: str
+) -> SerializedMessage:
+    """Return a sensor_msgs/msg/Imu of either reading or both; −1 begins the covariance of what is absent."""
     absent = np.array([-1.0, *[0.0] * 8])
+    rates, acceleration = (
+        np.zeros(3) if reading is None else reading for reading in (rates_radps, acceleration_mps2)
+    )
     return _serialized(
         "sensor_msgs/msg/Imu",
         stamp_ns,
@@ -160,10 +165,10 @@ def imu_message(stamp_ns: int, topic: str, acceleration_mps2: Array, *, frame: s
         frame,
         orientation=make_message("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0),
         orientation_covariance=absent,
-        angular_velocity=_vector(0.0, 0.0, 0.0),
-        angular_velocity_covariance=absent,
-        linear_acceleration=_vector(*acceleration_mps2.tolist()),
-        linear_acceleration_covariance=np.zeros(9),
+        angular_velocity=_vector(*rates.tolist()),
+        angular_velocity_covariance=absent if rates_radps is None else np.zeros(9),
+        linear_acceleration=_vector(*acceleration.tolist()),
+        linear_acceleration_covariance=absent if acceleration_mps2 is None else np.zeros(9),
     )
 
 

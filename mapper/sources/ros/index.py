@@ -10,11 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.errors import DataError, FrameError
+from mapper.core.geometry import Array
 from mapper.core.timebase import NS_PER_S, Stamps
 from mapper.sources.ros import decode_foxglove
 from mapper.sources.ros.decode import decode, decompressed
 from mapper.sources.ros.image_messages import size_of
-from mapper.sources.ros.messages import READ, SMALL, WITH_HEADER, ImageMessage, Message
+from mapper.sources.ros.imu_messages import readings_of
+from mapper.sources.ros.messages import IMUS, READ, SMALL, WITH_HEADER, ImageMessage, Message
 from mapper.sources.ros.recording import Place, Recording, Topic
 
 _NO_STAMP = 1 << 62  # in the year 2116; differences of smaller ones fit into 64 bits
@@ -34,6 +36,8 @@ class Series:
         undated: Number of others without a header that can be read; they are left out.
         are_stamps_recorded: ``stamps_ns`` is ``log_ns``, because every header has the same stamp.
         kept: Bytes of small messages by their number: to read them again would unpack the whole file again.
+        imu: (N, 6) angular velocity and acceleration of an IMU's messages, NaN of damaged ones; (0, 6) of
+            other types.
     """
 
     topic: Topic
@@ -43,6 +47,7 @@ class Series:
     undated: int
     are_stamps_recorded: bool = False
     kept: Mapping[int, bytes] = field(default_factory=dict)
+    imu: Array = field(default_factory=lambda: np.empty((0, 6)))
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
@@ -54,13 +59,14 @@ class Series:
 
 @dataclass(slots=True)
 class _SeriesBuilder:
-    """Messages of a topic found so far: 40 bytes each, and those that are kept whole."""
+    """Messages of a topic found so far: 40 bytes each, 48 more of an IMU, and those that are kept whole."""
 
     stamps_ns: "array[int]" = field(default_factory=lambda: array("q"))
     log_ns: "array[int]" = field(default_factory=lambda: array("q"))
     places: "array[int]" = field(default_factory=lambda: array("q"))
     undated: int = 0
     kept: dict[int, bytes] = field(default_factory=dict)
+    imu: "array[float]" = field(default_factory=lambda: array("d"))
 
 
 def index_of(recording: Recording) -> Mapping[str, Series]:
@@ -78,7 +84,9 @@ def index_of(recording: Recording) -> Mapping[str, Series]:
         if not (0 <= stamp_ns < _NO_STAMP and 0 <= log_ns < _NO_STAMP):
             series.undated += 1
             continue
-        if topic.type in SMALL and len(data) <= room_bytes:
+        if topic.type in IMUS:
+            series.imu.extend(readings_of(topic, data))
+        elif topic.type in SMALL and len(data) <= room_bytes:
             series.kept[len(series.stamps_ns)] = bytes(data)
             room_bytes -= len(data)
         series.stamps_ns.append(stamp_ns)
@@ -102,6 +110,7 @@ def _finished(topic: Topic, series: _SeriesBuilder) -> Series:
         undated=series.undated,
         are_stamps_recorded=are_all_the_same and not np.array_equal(stamps_ns, log_ns),
         kept=series.kept,
+        imu=np.array(series.imu, np.float64).reshape(-1, 6),
     )
 
 

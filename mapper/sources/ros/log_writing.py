@@ -2,7 +2,10 @@
 
 import heapq
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
+
+import numpy as np
 
 from mapper.core.errors import FrameError, SourceError
 from mapper.core.frames import PinholeCamera, RgbdFrame, Scan
@@ -23,7 +26,7 @@ from mapper.sources.ros.message_writers import RecordingKind, message_writer
 from mapper.sources.ros.topics import TRUTH, WHEELS
 
 COLOR, DEPTH = "/camera/color", "/camera/aligned_depth_to_color"
-POINTS, IMU = "/points", "/imu"
+POINTS, IMU, GYROSCOPE = "/points", "/imu", "/gyroscope"
 
 _CAMERA_FRAME, _LIDAR_FRAME, _IMU_FRAME = "camera_color_optical_frame", "lidar", "imu"
 _WORLD, _ODOM = "world", "odom"
@@ -39,7 +42,8 @@ def write_recording(
     Image files are copied byte for byte where ROS has a message for them: colour as CompressedImage, 16-bit
     PNGs of millimetres as compressedDepth. Depth in other units is written as float32 metres, which loses
     nothing. Of scans, points, times and colours are written. Truth is on /ground_truth, wheel odometry, as
-    poses of the sensor's own frame, on /wheel_odometry, and accelerations are on /imu.
+    poses of the sensor's own frame, on /wheel_odometry, accelerations and angular velocities on /imu, or the
+    latter on /gyroscope where their times differ.
 
     Args:
         source: Log that is written.
@@ -62,7 +66,7 @@ def write_recording(
             frames,
             _truth(source),
             _wheels(source),
-            _accelerations(source),
+            _imu(source),
             key=lambda message: message.stamp_ns,
         ):
             writer.write(message)
@@ -182,11 +186,33 @@ def _wheels(source: Log) -> Iterator[SerializedMessage]:
             yield odometry_message(stamp_ns, WHEELS, T, frame=_ODOM, child=body)
 
 
-def _accelerations(source: Log) -> Iterator[SerializedMessage]:
-    if (readings := source.accelerations) is not None:
-        for stamp_ns, reading in zip(readings.stamps_ns.tolist(), readings.acceleration_mps2, strict=True):
-            if stamp_ns >= 0:
-                yield imu_message(stamp_ns, IMU, reading, frame=_IMU_FRAME)
+def _imu(source: Log) -> Iterator[SerializedMessage]:
+    felt, turned = source.accelerations, source.gyroscope
+    body = _LIDAR_FRAME if source.sensor == "lidar" else _CAMERA_FRAME
+    if turned is not None and turned.R_body_imu is not None:  # in the body's axes, where no tf is needed
+        turned = replace(turned, rates_radps=turned.rates_radps @ turned.R_body_imu.T)
+    stamps_ns = np.empty(0, np.int64) if felt is None else felt.stamps_ns
+    is_one = turned is not None and turned.R_body_imu is None and np.array_equal(stamps_ns, turned.stamps_ns)
+    if felt is not None:
+        for k in np.flatnonzero(stamps_ns >= 0).tolist():
+            rates = turned.rates_radps[k] if turned is not None and is_one else None
+            yield imu_message(
+                int(stamps_ns[k]),
+                IMU,
+                rates_radps=rates,
+                acceleration_mps2=felt.acceleration_mps2[k],
+                frame=_IMU_FRAME,
+            )
+    if turned is not None and not is_one:
+        frame = _IMU_FRAME if turned.R_body_imu is None else body
+        for k in np.flatnonzero(turned.stamps_ns >= 0).tolist():
+            yield imu_message(
+                int(turned.stamps_ns[k]),
+                GYROSCOPE,
+                rates_radps=turned.rates_radps[k],
+                acceleration_mps2=None,
+                frame=frame,
+            )
 
 
 def early_readings(source: Log) -> dict[str, int]:
@@ -195,6 +221,7 @@ def early_readings(source: Log) -> dict[str, int]:
         "true poses": source.truth,
         "wheel readings": source.wheels,
         "accelerations": source.accelerations,
+        "angular velocities": source.gyroscope,
     }
     counts = {kind: int((held.stamps_ns < 0).sum()) for kind, held in kinds.items() if held is not None}
     return {kind: count for kind, count in counts.items() if count}

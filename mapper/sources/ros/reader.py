@@ -1,4 +1,4 @@
-"""Reader of a recording: an index from one pass over it, and its poses and accelerations."""
+"""Reader of a recording: an index from one pass over it, its poses, accelerations and angular velocities."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -13,6 +13,7 @@ from mapper.core.frames import Sensor
 from mapper.core.geometry import Transform
 from mapper.core.rotations import pose_of_row
 from mapper.core.trajectory import Trajectory
+from mapper.sensing.gyroscope import Gyroscope
 from mapper.sources.base import Accelerations
 from mapper.sources.config import WheelsConfig
 from mapper.sources.ros.decode import decode
@@ -23,7 +24,6 @@ from mapper.sources.ros.message_order import ordered
 from mapper.sources.ros.messages import (
     GRAVITY_MPS2,
     TRANSFORMS,
-    ImuMessage,
     Message,
     PoseMessage,
     frame_of,
@@ -111,26 +111,39 @@ class RecordingReader:
         if series is None:
             return None, []
         order, notes = ordered(series)
-        stamped = [
-            (stamp_ns, message)
-            for stamp_ns, message in self._messages(series, _spread(order, most=_MAX_READINGS))
-            if isinstance(message, ImuMessage) and np.isfinite(message.acceleration_mps2).all()
-        ]
-        readings = [reading for _, reading in stamped]
-        if not readings:
+        order = _spread(order, most=_MAX_READINGS)
+        order = order[np.isfinite(series.imu[order, 3:]).all(axis=1)]
+        if not len(order):
             return None, [*notes, f"{series.topic.name}: no readings"]
-        stamps_ns = np.array([stamp_ns for stamp_ns, _ in stamped], dtype=np.int64)
-        acceleration_imu = np.array([reading.acceleration_mps2 for reading in readings])
+        stamps_ns, acceleration_imu = series.stamps_ns[order], series.imu[order, 3:]
         unit = unit_mps2(np.median(np.linalg.norm(acceleration_imu, axis=1)) * np.eye(3)[0])
         if unit == GRAVITY_MPS2:
             acceleration_imu *= unit
             notes.append(f"{series.topic.name}: accelerations are as long as 1 at rest: taken as g")
-        imu = frame_of(readings[0])
+        imu = frame_of(self.firsts.get(series.topic.name))
         known, T_body_imu = self.tree_of(body, imu).find_each(body, imu, stamps_ns)
         if not known.any():
             return Accelerations(stamps_ns, acceleration_imu), notes
         acceleration_body = np.einsum("nij,nj->ni", T_body_imu[:, :3, :3], acceleration_imu[known])
         return Accelerations(stamps_ns[known], acceleration_body, are_axes_stated=True), notes
+
+    def gyroscope(self, series: Series | None, *, body: str) -> tuple[Gyroscope | None, list[str]]:
+        """Return the angular velocities of a topic, with the mounting if tf has one that stays, and notes."""
+        if series is None:
+            return None, []
+        order, notes = ordered(series)
+        order = order[np.isfinite(series.imu[order, :3]).all(axis=1)]
+        imu = frame_of(self.firsts.get(series.topic.name))
+        tree = self.tree_of(body, imu)
+        T_body_imu = None if tree.moves(body, imu) else tree.find(body, imu)
+        gyroscope = Gyroscope(
+            series.topic.name,
+            series.stamps_ns[order],
+            series.imu[order, :3],
+            None if T_body_imu is None else T_body_imu[:3, :3],
+        )
+        sound, more = gyroscope.without_saturation()
+        return sound, [*notes, *more]
 
     def base_of(self, frame: str) -> str | None:
         """Return the frame of the robot that carries a frame; None where tf names none."""

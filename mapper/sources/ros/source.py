@@ -73,6 +73,8 @@ def recording_log(reader: RecordingReader, config: SourceConfig) -> Log:
         frames = _lidar(reader, choice.frames, config)
     truth, truth_notes = reader.truth(choice.truth, body=frames.body)
     accelerations, imu_notes = reader.accelerations(choice.imu, body=frames.body)
+    gyroscope, gyroscope_notes = reader.gyroscope(choice.gyroscope, body=frames.body)
+    imu_notes = list(dict.fromkeys([*imu_notes, *gyroscope_notes]))  # of one topic, the same order
     wheels, wheel_notes = reader.wheels(
         choice.wheels, body=frames.body, config=config.wheels, sensor=frames.sensor
     )
@@ -85,6 +87,7 @@ def recording_log(reader: RecordingReader, config: SourceConfig) -> Log:
         entry_at=frames.entry_at,
         truth=truth,
         accelerations=accelerations,
+        gyroscope=gyroscope,
         T_base_body=reader.mounting(frames.body),
         wheels=wheels,
         notes=[*choice.notes, *problems, *frames.notes, *truth_notes, *wheel_notes, *imu_notes],

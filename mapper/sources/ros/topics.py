@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from itertools import product, takewhile
 from pathlib import Path
 
+import numpy as np
+
 from mapper.core.errors import SourceError
 from mapper.sources.config import TopicsConfig
 from mapper.sources.ros.image_messages import is_depth
@@ -18,7 +20,6 @@ from mapper.sources.ros.messages import (
     POSES,
     READ,
     ImageMessage,
-    ImuMessage,
     Message,
     frame_of,
     unit_mps2,
@@ -61,6 +62,7 @@ class Choice:
     Attributes:
         frames: Topics that are mapped: images, or clouds.
         imu: Inertial readings, if there are any.
+        gyroscope: Readings with angular velocities: the same topic, if it has them.
         truth: True poses, if there are any.
         wheels: Wheel odometry, if it was requested or is called so.
         notes: Guesses, a sentence each.
@@ -68,6 +70,7 @@ class Choice:
 
     frames: CameraTopics | Series
     imu: Series | None
+    gyroscope: Series | None
     truth: Series | None
     wheels: Series | None
     notes: Sequence[str]
@@ -94,7 +97,12 @@ def choose(
     color, depth = _of_one_camera(colors, depth_images, firsts)
     clouds = pick.candidates("points", config.points, CLOUDS, where=lambda name: len(series[name]) > 1)
     points = _best(clouds, _cloud_rank)
-    imu = pick.one("imu", config.imu, IMUS, _plain_rank, where=lambda name: _feels_gravity(firsts.get(name)))
+    imu = pick.one("imu", config.imu, IMUS, _plain_rank, where=lambda name: _feels_gravity(series[name]))
+    gyroscope = imu if imu is not None and _turns(imu) and config.gyroscope is None else None
+    if gyroscope is None:
+        gyroscope = pick.one(
+            "gyroscope", config.gyroscope, IMUS, _plain_rank, where=lambda name: _turns(series[name])
+        )
     truth = pick.one("truth", config.truth, POSES, _plain_rank, where=lambda name: name == TRUTH)
     wheels = pick.one("wheels", config.wheels, POSES, _plain_rank, where=lambda name: name == WHEELS)
     pick.refuse_own_runs()
@@ -124,9 +132,9 @@ def choose(
     if wheels is not None:
         notes.append(_choice_note(f"wheel odometry {wheels.topic.name}", config.wheels, "wheels"))
     is_chosen = bool(config.points or config.color or config.depth)
-    unused = [one for one in series.values() if one not in (*used, imu, truth, wheels)]
+    unused = [one for one in series.values() if one not in (*used, imu, gyroscope, truth, wheels)]
     notes += _unused_notes(unused, firsts, image_reason=None if is_chosen else image_reason)
-    return Choice(frames, imu, truth, wheels, notes)
+    return Choice(frames, imu, gyroscope, truth, wheels, notes)
 
 
 class _Picker:
@@ -287,7 +295,7 @@ def _unused_notes(
         elif type_ in CLOUDS and name in firsts:
             reason = "there is a single one" if len(one) == 1 else "those of one topic are mapped"
             kind = image_reason and f"point clouds that are not used, as {reason}"
-        elif type_ in IMUS and not _feels_gravity(firsts.get(name)):
+        elif type_ in IMUS and not _feels_gravity(one):
             kind = "accelerations that are not used, as they are not as long as gravity"
         elif type_ in IMUS:
             kind = "accelerations that are not used, as one topic is enough (source.topics.imu)"
@@ -307,9 +315,14 @@ def _listed(names: Sequence[str]) -> str:
     return f"{', '.join(names[:_MOST_LISTED])}{more}"
 
 
-def _feels_gravity(message: Message | None) -> bool:
+def _feels_gravity(series: Series) -> bool:
     """Return whether an accelerometer feels gravity: a gyroscope's empty accelerations do not."""
-    return isinstance(message, ImuMessage) and unit_mps2(message.acceleration_mps2) is not None
+    return unit_mps2(series.imu[0, 3:]) is not None
+
+
+def _turns(series: Series) -> bool:
+    """Return whether a topic has angular velocities: an accelerometer's are empty."""
+    return bool((np.nan_to_num(series.imu[:, :3]) != 0.0).any())
 
 
 def _what_there_is(color: Series | None, depth: Series | None, series: Iterable[Series]) -> str:

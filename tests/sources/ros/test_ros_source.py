@@ -34,8 +34,14 @@ def odometry(stamp_ns, T, *, child="base_link", topic="/odom"):
     return odometry_message(stamp_ns, topic, T, frame="odom", child=child)
 
 
-def imu(stamp_ns, acceleration, *, frame="imu", topic="/imu/data"):
-    return imu_message(stamp_ns, topic, np.array(acceleration), frame=frame)
+def imu(stamp_ns, acceleration, *, rates=None, frame="imu", topic="/imu/data"):
+    return imu_message(
+        stamp_ns,
+        topic,
+        rates_radps=None if rates is None else np.array(rates),
+        acceleration_mps2=np.array(acceleration),
+        frame=frame,
+    )
 
 
 def opened(path, messages, **config):
@@ -310,6 +316,21 @@ def test_accelerations_are_told_in_the_body_where_tf_ties_the_two(tmp_path):
     without = [message for message in messages if "tf" not in message.topic]
     told = opened(tmp_path / "b.mcap", without).accelerations
     np.testing.assert_array_equal(told.acceleration_mps2, np.tile([0.1, 0.2, 9.8], (3, 1)))
+
+
+def test_angular_velocities_come_from_the_topic_that_has_them(tmp_path):
+    messages = [
+        transforms(("base_link", "lidar", T_BASE_LIDAR), ("base_link", "imu", np.eye(4))),
+        *(cloud(t) for t in stamps(3)),
+        *(imu(t, [0.0, 0.0, 9.8], topic="/accel") for t in stamps(3)),
+        *(imu(t, [0.0, 0.0, 0.0], rates=[0.1, 0.2, -0.3 * t / 1e18], topic="/gyro") for t in stamps(9)),
+    ]
+    log = opened(tmp_path / "a.mcap", messages)
+    assert log.accelerations.stamps_ns.tolist() == stamps(3)
+    assert (log.gyroscope.name, log.gyroscope.stamps_ns.tolist()) == ("/gyro", stamps(9))
+    np.testing.assert_allclose(log.gyroscope.rates_radps[:, 2], [-0.3 * t / 1e18 for t in stamps(9)])
+    np.testing.assert_allclose(log.gyroscope.R_body_imu, T_BASE_LIDAR[:3, :3].T, atol=1e-12)
+    assert opened(tmp_path / "b.mcap", messages[:-9]).gyroscope is None
 
 
 def test_a_camera_of_rectified_images_has_no_distortion(tmp_path):

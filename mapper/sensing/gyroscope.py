@@ -1,0 +1,152 @@
+"""Gyroscope: angular velocities of a log, and the rotation between two times that they integrate to."""
+
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from mapper.core.geometry import Array
+from mapper.core.timebase import NS_PER_S, Stamps
+
+_GAP_INTERVALS, _LEAST_GAP_NS = 5, 20_000_000
+"""Readings farther apart than this number of their usual intervals, and this time, have a gap between."""
+_SATURATED_READINGS, _LEAST_SATURATED = 5, 1.0
+"""Readings that have exactly the largest number of the log, beyond 1 rad/s, are at the end of their range."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Gyroscope:
+    """Angular velocities of an inertial measurement unit.
+
+    Attributes:
+        name: Topic or file.
+        stamps_ns: (N,) int64 nanoseconds, strictly increasing.
+        rates_radps: (N, 3) float64, in the unit's own axes; rad/s as far as the log says.
+        R_body_imu: (3, 3) its mounting, if the log states it.
+    """
+
+    name: str
+    stamps_ns: Stamps
+    rates_radps: Array
+    R_body_imu: Array | None = None
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+
+    @property
+    def gap_ns(self) -> int:
+        """Time between two readings beyond which the rotation between them is unknown."""
+        if len(self) < 2:
+            return _LEAST_GAP_NS
+        return max(_GAP_INTERVALS * int(np.median(np.diff(self.stamps_ns))), _LEAST_GAP_NS)
+
+    @property
+    def rate_hz(self) -> float:
+        """Usual number of readings a second; 0 of fewer than two."""
+        return 0.0 if len(self) < 2 else NS_PER_S / float(np.median(np.diff(self.stamps_ns)))
+
+    def without_saturation(self) -> tuple["Gyroscope | None", list[str]]:
+        """Return the readings within the unit's range, None if there are none, and notes on them and on gaps.
+
+        The unit turned faster than a reading at the end of its range says; what is left has a gap there.
+        """
+        notes = []
+        largest = np.abs(self.rates_radps).max(axis=1, initial=0.0)
+        limit = float(largest.max(initial=0.0))
+        saturated = largest == limit
+        kept = self
+        if saturated.sum() >= _SATURATED_READINGS and limit > _LEAST_SATURATED:
+            notes.append(
+                f"{self.name}: {saturated.sum()} of {len(self)} angular velocities are at the end of the "
+                f"gyroscope's range, {limit:g}; left out"
+            )
+            kept = self._of(~saturated)
+        if len(kept) < 2:
+            return None, [*notes, f"{self.name}: no angular velocities"]
+        intervals_ns = np.diff(kept.stamps_ns)
+        gaps = intervals_ns[intervals_ns > kept.gap_ns]
+        if len(gaps):
+            notes.append(
+                f"{self.name}: {len(gaps)} gaps in the angular velocities, the longest of "
+                f"{gaps.max() / NS_PER_S:.2f} s"
+            )
+        return kept, notes
+
+    def rotations(self, begins_ns: Stamps, ends_ns: Stamps, bias: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """Return the rotations R_begin_end of the unit between pairs of times, and which are known.
+
+        The angular velocity is linear between readings; each of its pieces turns by the exponential of the
+        Magnus expansion's first two terms (Iserles & Nørsett 1999): its mean, and the coning.
+
+        Args:
+            begins_ns: (M,) times.
+            ends_ns: (M,) times not before these.
+            bias: (3,) that is subtracted from the readings, in their unit.
+
+        Returns:
+            (M, 3, 3), and (M,) false where readings do not cover the time or have a gap.
+        """
+        R_begin_end, known = _integrate(
+            self.stamps_ns, self.rates_radps, begins_ns, ends_ns, bias, self.gap_ns
+        )
+        return R_begin_end, known
+
+    def _of(self, kept: NDArray[np.bool_]) -> "Gyroscope":
+        return replace(self, stamps_ns=self.stamps_ns[kept], rates_radps=self.rates_radps[kept])
+
+    def scaled(self, factor: float) -> Self:
+        """Return the gyroscope with its angular velocities multiplied."""
+        return replace(self, rates_radps=factor * self.rates_radps)
+
+
+@njit(cache=True, nogil=True)
+def _integrate(stamps_ns, rates, begins_ns, ends_ns, bias, gap_ns):  # type: ignore[no-untyped-def]
+    """Return the rotation over each interval, and whether readings cover it."""
+    R_begin_end = np.empty((len(begins_ns), 3, 3))
+    known = np.zeros(len(begins_ns), np.bool_)
+    before, after, step = np.empty(3), np.empty(3), np.empty(3)
+    for m in range(len(begins_ns)):
+        R = np.eye(3)
+        begin, end = begins_ns[m], ends_ns[m]
+        if begin >= stamps_ns[0] and end <= stamps_ns[-1]:
+            k = max(np.searchsorted(stamps_ns, begin, side="right") - 1, 0)
+            known[m] = True
+            while stamps_ns[k] < end and k + 1 < len(stamps_ns):
+                first, last = max(begin, stamps_ns[k]), min(end, stamps_ns[k + 1])
+                width = stamps_ns[k + 1] - stamps_ns[k]
+                if width > gap_ns and last > first:
+                    known[m] = False
+                    break
+                duration_s = (last - first) * 1e-9
+                for a in range(3):
+                    slope = (rates[k + 1, a] - rates[k, a]) / width
+                    before[a] = rates[k, a] + slope * (first - stamps_ns[k]) - bias[a]
+                    after[a] = rates[k, a] + slope * (last - stamps_ns[k]) - bias[a]
+                cone = duration_s * duration_s / 12.0
+                for a in range(3):
+                    b, c = (a + 1) % 3, (a + 2) % 3
+                    step[a] = 0.5 * duration_s * (before[a] + after[a])
+                    step[a] += cone * (before[b] * after[c] - before[c] * after[b])
+                R = R @ rotation_of(step)
+                k += 1
+        R_begin_end[m] = R
+    return R_begin_end, known
+
+
+@njit(cache=True, nogil=True)
+def rotation_of(vector):  # type: ignore[no-untyped-def]
+    """Return the (3, 3) rotation of a (3,) rotation vector (Rodrigues' formula), for compiled code."""
+    x, y, z = vector
+    squared = x * x + y * y + z * z
+    if squared < 1e-16:
+        a, b = 1.0, 0.5
+    else:
+        angle = np.sqrt(squared)
+        a, b = np.sin(angle) / angle, (1.0 - np.cos(angle)) / squared
+    R = np.empty((3, 3))
+    R[0, 0], R[0, 1], R[0, 2] = 1.0 - b * (y * y + z * z), b * x * y - a * z, b * x * z + a * y
+    R[1, 0], R[1, 1], R[1, 2] = b * x * y + a * z, 1.0 - b * (x * x + z * z), b * y * z - a * x
+    R[2, 0], R[2, 1], R[2, 2] = b * x * z - a * y, b * y * z + a * x, 1.0 - b * (x * x + y * y)
+    return R

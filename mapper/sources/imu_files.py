@@ -1,0 +1,73 @@
+"""Inertial readings beside a log: ``imu.csv`` as of EuRoC, or angular velocities in ``gyroscope.txt``."""
+
+from pathlib import Path
+
+import numpy as np
+
+from mapper.core.errors import SourceError
+from mapper.core.geometry import Array
+from mapper.core.timebase import Stamps, seconds_text_from_ns
+from mapper.sensing.gyroscope import Gyroscope
+from mapper.sources.base import Accelerations
+from mapper.sources.text import parse_numbers, parse_stamp, read_lines, table, time_order
+
+BOTH, RATES = "imu.csv", "gyroscope.txt"
+_COLUMNS = np.dtype([("stamp_ns", "<i8"), ("rates", "<f8", 3), ("accelerations", "<f8", 3)])
+BOTH_HEADER = (
+    "#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],"
+    "a_RS_S_x [m s^-2],a_RS_S_y [m s^-2],a_RS_S_z [m s^-2]"
+)
+"""First line of the file (Burri et al. 2016)."""
+
+
+def read_imu(folder: Path) -> tuple[Gyroscope | None, Accelerations | None, list[str]]:
+    """Return angular velocities and accelerations of a log's folder, as far as it has them, and notes.
+
+    Args:
+        folder: Folder that may hold ``imu.csv`` (``stamp_ns,wx,wy,wz,ax,ay,az``, its first line EuRoC's) or
+            ``gyroscope.txt`` (``stamp wx wy wz``); rad/s and m/s², in the unit's own axes.
+
+    Raises:
+        SourceError: A file is malformed.
+    """
+    if (folder / RATES).is_file():
+        path = folder / RATES
+        stamps_ns, rates = [], []
+        for where, words in table(path, "stamp", "wx", "wy", "wz"):
+            stamps_ns.append(parse_stamp(words[0], where=where))
+            rates.append(parse_numbers(words[1:], where=where))
+        stamps = np.array(stamps_ns, np.int64)
+        gyroscope, notes = _gyroscope(path, stamps, np.array(rates, np.float64).reshape(-1, 3))
+        return gyroscope, None, notes
+    path = folder / BOTH
+    if not path.is_file():
+        return None, None, []
+    lines = read_lines(path)
+    if not lines or "w_RS_S_x" not in lines[0]:
+        return None, None, [f"{path.name}: its first line is not EuRoC's; not used"]
+    try:
+        rows = np.loadtxt(lines, _COLUMNS, delimiter=",", ndmin=1)
+    except ValueError as error:
+        raise SourceError(f"{path}: {error}; want stamp_ns,wx,wy,wz,ax,ay,az") from None
+    gyroscope, notes = _gyroscope(path, rows["stamp_ns"], rows["rates"])
+    felt = rows[np.isfinite(rows["accelerations"]).all(axis=1)]
+    order, _ = time_order(felt["stamp_ns"], what=path.name)
+    felt = felt[order]
+    accelerations = Accelerations(felt["stamp_ns"], felt["accelerations"]) if len(felt) else None
+    return gyroscope, accelerations, notes
+
+
+def write_gyroscope(folder: Path, gyroscope: Gyroscope) -> None:
+    """Write the angular velocities as the ``gyroscope.txt`` of a log."""
+    lines = ["# angular velocities, rad/s", "# timestamp wx wy wz"]
+    for stamp_ns, rates in zip(gyroscope.stamps_ns.tolist(), gyroscope.rates_radps.tolist(), strict=True):
+        lines.append(" ".join([seconds_text_from_ns(stamp_ns), *map(repr, rates)]))
+    (folder / RATES).write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def _gyroscope(path: Path, stamps_ns: Stamps, rates_radps: Array) -> tuple[Gyroscope | None, list[str]]:
+    finite = np.isfinite(rates_radps).all(axis=1)
+    order, notes = time_order(stamps_ns[finite], what=path.name)
+    gyroscope = Gyroscope(path.name, stamps_ns[finite][order], rates_radps[finite][order])
+    sound, more = gyroscope.without_saturation()
+    return sound, [*notes, *more]

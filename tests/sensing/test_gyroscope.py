@@ -1,0 +1,63 @@
+"""Gyroscope: integration of its angular velocities, gaps, and readings at the end of its range."""
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from mapper.core.timebase import NS_PER_S
+from mapper.sensing.gyroscope import Gyroscope
+
+
+def turning(*, seconds=2.0, rate_hz=200.0):
+    """A gyroscope in a rotation R(t) = Rx(t²) Rz(3t), and that rotation."""
+    times_s = np.arange(int(seconds * rate_hz) + 1) / rate_hz
+
+    def rotation_at(t):
+        return Rotation.from_rotvec([t * t, 0.0, 0.0]) * Rotation.from_rotvec([0.0, 0.0, 3.0 * t])
+
+    rates = [Rotation.from_rotvec([0.0, 0.0, -3.0 * t]).apply([2.0 * t, 0.0, 0.0]) for t in times_s]
+    rates = np.array(rates) + np.array([0.0, 0.0, 3.0])
+    return Gyroscope("/imu", np.round(times_s * NS_PER_S).astype(np.int64), rates), rotation_at
+
+
+def test_rotations_are_the_integral_of_the_rates():
+    gyroscope, rotation_at = turning()
+    begins_s, ends_s = np.array([0.0013, 0.5, 1.0]), np.array([1.7777, 0.5004, 1.0])
+    begins_ns, ends_ns = (np.round(times_s * NS_PER_S).astype(np.int64) for times_s in (begins_s, ends_s))
+    R, known = gyroscope.rotations(begins_ns, ends_ns, np.zeros(3))
+    assert known.all()
+    for begin_s, end_s, found in zip(begins_s, ends_s, R, strict=True):
+        expected = (rotation_at(begin_s).inv() * rotation_at(end_s)).as_matrix()
+        np.testing.assert_allclose(found, expected, atol=6e-5)
+
+
+def test_a_bias_is_subtracted():
+    gyroscope, _ = turning()
+    bias = np.array([0.01, -0.02, 0.03])
+    biased = Gyroscope("/imu", gyroscope.stamps_ns, gyroscope.rates_radps + bias)
+    span = np.array([0]), np.array([NS_PER_S])
+    np.testing.assert_allclose(
+        biased.rotations(*span, bias)[0], gyroscope.rotations(*span, np.zeros(3))[0], atol=1e-12
+    )
+
+
+def test_rotations_over_gaps_and_beyond_the_ends_are_unknown():
+    gyroscope, _ = turning()
+    kept = (gyroscope.stamps_ns < 500_000_000) | (gyroscope.stamps_ns > 700_000_000)
+    gapped = Gyroscope("/imu", gyroscope.stamps_ns[kept], gyroscope.rates_radps[kept])
+    begins = np.array([0, 400_000_000, 800_000_000, 1_900_000_000, -1])
+    known = gapped.rotations(begins, begins + 200_000_000, np.zeros(3))[1]
+    assert known.tolist() == [True, False, True, False, False]
+    assert len(gapped.without_saturation()[1]) == 1
+
+
+def test_readings_at_the_end_of_the_range_are_left_out():
+    gyroscope, _ = turning()
+    rates = np.clip(gyroscope.rates_radps, -2.5, 2.5)
+    sound, notes = Gyroscope("/imu", gyroscope.stamps_ns, rates).without_saturation()
+    assert sound is None
+    assert "2.5" in notes[0]
+    rates = gyroscope.rates_radps.copy()
+    rates[100:120, 0] = 9.0
+    sound, notes = Gyroscope("/imu", gyroscope.stamps_ns, rates).without_saturation()
+    assert len(sound) == len(gyroscope) - 20
+    assert len(notes) == 2
