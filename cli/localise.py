@@ -11,7 +11,7 @@ from mapper.cli.options import First, Last, Overrides, Overwrite, Stride, merged
 from mapper.runtime.result_paths import RUNS, name_of, place_of
 
 if TYPE_CHECKING:
-    from mapper.run.localised import LocalisedManifest
+    from mapper.run.manifest import LocalisedManifest
 
 
 def localise(

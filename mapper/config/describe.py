@@ -167,7 +167,6 @@ def _alternatives(annotation: Any) -> list[Any]:
 
 
 def _models(annotation: Any) -> list[type[BaseModel]]:
-    """Return the classes of settings that a field may hold."""
     parts = _alternatives(annotation)
     plain = [get_args(part)[0] if get_origin(part) is Annotated else part for part in parts]
     return [part for part in plain if isinstance(part, type) and issubclass(part, BaseModel)]
@@ -221,7 +220,6 @@ def _meaning(model: type[BaseModel], name: str) -> str:
 
 @cache
 def _attribute_docs(model: type[BaseModel]) -> Mapping[str, str]:
-    """Return the docstrings of a class's own fields by their names."""
     body = _class_bodies(inspect.getsourcefile(model) or "").get(model.__qualname__, [])
     docs = {}
     for statement, following in pairwise(body):
@@ -236,7 +234,6 @@ def _attribute_docs(model: type[BaseModel]) -> Mapping[str, str]:
 
 @cache
 def _class_bodies(path: str) -> Mapping[str, list[ast.stmt]]:
-    """Return the statements of a module's classes by the classes' names."""
     module = ast.parse(Path(path).read_text(encoding="utf-8"))
     return {node.name: node.body for node in module.body if isinstance(node, ast.ClassDef)}
 

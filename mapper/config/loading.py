@@ -190,7 +190,6 @@ def overridden(
 
 
 def _drop_other_kinds(tree: dict[str, Any], changed: Mapping[str, Any]) -> None:
-    """Empty the parts of a tree for which another kind is chosen."""
     for name, value in changed.items():
         part = tree.get(name)
         if isinstance(part, dict) and isinstance(value, dict):
@@ -328,7 +327,6 @@ def _members_at(model: type[Config], loc: Sequence[int | str]) -> list[type[Conf
 
 
 def _setting_names(model: type[Config]) -> Iterator[str]:
-    """Yield the dotted name of every setting of the default kinds and below."""
     for name, field in model.model_fields.items():
         yield name
         default = field.get_default(call_default_factory=False)

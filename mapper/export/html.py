@@ -58,7 +58,6 @@ def document(
 
 
 def _palette_css() -> str:
-    """Return the palette as CSS variables, so that pages and pictures agree."""
     named: dict[str, figures.Rgb] = {
         "backdrop": figures.BACKDROP,
         "estimate": figures.ESTIMATE,

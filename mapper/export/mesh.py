@@ -243,7 +243,6 @@ def in_order(points: Points32, colors: Colors, triangles: Triangles) -> Surface:
 
 
 def _max_depth_m(run: Run) -> float:
-    """Return the depth up to which measurements count."""
     if run.config.mesh.max_depth_m is not None:
         return run.config.mesh.max_depth_m
     depth = run.manifest.depth

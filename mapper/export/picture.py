@@ -126,7 +126,6 @@ def _draw_band(axes: "Axes", poses: UncertainPoses, low: Array, high: Array) -> 
 
 
 def _draw_doubtful(axes: "Axes", poses: UncertainPoses) -> None:
-    """Draw the stretches whose poses may be wrong over the estimate."""
     count = int(poses.is_doubtful.sum())
     label = f"{count} doubtful frame{'' if count == 1 else 's'}"
     for first, last in stretches(poses.is_doubtful, margin=1):
@@ -136,7 +135,6 @@ def _draw_doubtful(axes: "Axes", poses: UncertainPoses) -> None:
 
 
 def _draw_direction(axes: "Axes", positions: Array) -> None:
-    """Draw arrows in the direction of a path, evenly spread along it."""
     reached_m = distances_along(positions[:, :2])
     style = {
         "arrowstyle": "-|>",
@@ -319,7 +317,6 @@ def _over_grid(
 
 
 def _extent(grid: OccupancyGrid, paths_world: Sequence[Array]) -> tuple[Array, Array]:
-    """Return the lower and upper corner, metres, around everything known."""
     rows, columns = np.nonzero((grid.cells == FREE) | (grid.cells == OCCUPIED))
     cells = grid.origin_world_m + (np.column_stack([columns, rows]) + 0.5) * grid.resolution_m
     seen = np.concatenate([cells, *(path[:, :2] for path in paths_world)])
@@ -327,7 +324,6 @@ def _extent(grid: OccupancyGrid, paths_world: Sequence[Array]) -> tuple[Array, A
 
 
 def _mark_ends(axes: "Axes", positions: Array, *, end: str = "end") -> None:
-    """Mark where a path begins and ends."""
     ends = (positions[0], START, "o", "start"), (positions[-1], END, "s", end)
     for position, color, marker, label in ends:
         (mark,) = axes.plot(*position[:2], marker, color=hex_of(color), markersize=8, label=label)

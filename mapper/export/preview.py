@@ -26,8 +26,8 @@ if TYPE_CHECKING:  # a build begins without what its end needs
 PREVIEW = "preview.png"
 
 _FIRST_S, _REFRESH_S = 5.0, 2.0
-_PICTURES_SHARE, _POINTS_SHARE = 0.004, 0.004
-"""Largest shares of the build's CPU time that go into pictures after the first, and into points."""
+_CPU_SHARE = 0.008
+"""Largest share of the build's CPU time that goes into points, and into pictures after the first."""
 _WIDTH_PX, _HEIGHT_PX, _MARGIN_PX, _TEXT_PX = 640, 480, 24, 28
 _POINTS_OF_KEYFRAME = 500
 _OUTLIERS_PERCENT = 1.0  # far returns do not make the rest small
@@ -65,7 +65,7 @@ class Preview:
         self._right_forward = np.array([np.cross(axes.forward, axes.up), axes.forward])
         self._drawn_s = clock()
         self._began_cpu_s = time.process_time()
-        self._points_cpu_s = self._pictures_cpu_s = 0.0
+        self._cpu_s = 0.0
         self._frames = 0
         self._positions: list[Array] = []
         self._points: dict[int, Array] = {}
@@ -79,15 +79,13 @@ class Preview:
         track = step.track
         if track.node is not None:
             self._positions.append(track.T_world_body[:3, 3])
-        if track.is_keyframe and track.node is not None and self._points_cpu_s <= self._share(_POINTS_SHARE):
-            began_cpu_s = time.thread_time()
+        began_cpu_s = time.thread_time()
+        if track.is_keyframe and track.node is not None and self._is_cheap():
             self._keep_points(track.node, step)
-            self._points_cpu_s += time.thread_time() - began_cpu_s
         if self._is_due():
-            began_cpu_s = time.thread_time()
             self._draw(step)
             self._drawn_s = self._clock()
-            self._pictures_cpu_s += time.thread_time() - began_cpu_s
+        self._cpu_s += time.thread_time() - began_cpu_s
 
     def on_levelled(self, T_level_world: Transform, /) -> None:
         """Ignore the world."""
@@ -100,10 +98,10 @@ class Preview:
         waited_s = self._clock() - self._drawn_s
         if not self._has_picture:
             return waited_s >= _FIRST_S and bool(self._positions)
-        return waited_s >= _REFRESH_S and self._pictures_cpu_s <= self._share(_PICTURES_SHARE)
+        return waited_s >= _REFRESH_S and self._is_cheap()
 
-    def _share(self, ratio: float) -> float:
-        return ratio * (time.process_time() - self._began_cpu_s)
+    def _is_cheap(self) -> bool:
+        return self._cpu_s <= _CPU_SHARE * (time.process_time() - self._began_cpu_s)
 
     def _keep_points(self, node: int, step: Step) -> None:
         try:

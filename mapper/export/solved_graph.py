@@ -156,7 +156,6 @@ def write_graph_views(path: Path, graph: PoseGraph, solution: Solution, *, title
 
 
 def _draw_factors(axes: "Axes", seen: Array, graph: PoseGraph, solution: Solution) -> None:
-    """Draw the factors between the (N, 2) places of the graph's nodes."""
     from matplotlib.collections import LineCollection
 
     index = {node: k for k, node in enumerate(graph.T_world_node)}

@@ -268,7 +268,6 @@ def keep_tile(workspace: Workspace, tile: int, known: Path, overlaps: Sequence[O
 def _describe(
     workspace: Workspace, tile: int, octree: OctreeMap, overlaps: tuple[Overlap, ...]
 ) -> JoinedTile:
-    """Write the pieces of a finished tile."""
     depth = workspace.tiling.depth
     nodes = nodes_in_preorder(octree.blocks, root_depth=depth)
     color = (UNSET, UNSET, UNSET)

@@ -132,7 +132,6 @@ def _agreement(places: Sequence[SharedPlace], gate: GateConfig) -> NDArray[np.bo
 
 
 def _are_several(T_world_bodies: Sequence[Transform], gate: GateConfig) -> bool:
-    """Return whether poses are of more than one place."""
     same = Discrepancy(gate.slack_m, gate.slack_rad)
     first = T_world_bodies[0]
     return any(exceeds(discrepancy(np.eye(4), first, other), same) for other in T_world_bodies[1:])
@@ -191,7 +190,6 @@ class _SpanningTree:
         return [(min(step), max(step)) for step in steps]
 
     def _to_root(self, number: int) -> list[tuple[int, int]]:
-        """Return the steps from a run to run 0."""
         runs = [number]
         while runs[-1] in self.parents:
             runs.append(self.parents[runs[-1]])
@@ -216,7 +214,6 @@ def _spanning_tree(ties: Mapping[tuple[int, int], Sequence[SharedPlace]]) -> _Sp
 def _solve(
     T_map_worlds: Mapping[int, Transform], places: Sequence[SharedPlace], gate: GateConfig
 ) -> dict[int, Transform]:
-    """Return the worlds' poses by least squares over all places."""
     at_body = PoseSigmas(gate.slack_rad, gate.slack_m).information
     factors = []
     for place in places:
@@ -367,7 +364,6 @@ def solve_jointly(
 
 
 def _between(place: SharedPlace, first_nodes: Mapping[int, int]) -> LoopClosure:
-    """Return the loop of a shared place in the joint graph's numbers."""
     loop = place.loop
     return replace(loop, i=first_nodes[place.first] + loop.i, j=first_nodes[place.second] + loop.j)
 

@@ -259,7 +259,6 @@ def _join(
     split: Sequence[SplitRun],
     untouched: Mapping[int, KnownTile],
 ) -> dict[int, JoinedTile]:
-    """Return the result of every tile, in Morton order."""
     tiles = sorted({tile for part in split for tile in part.part_bytes})
     if not tiles:
         raise RunError("nothing is known in any of the runs' maps; there is nothing to merge")
@@ -286,7 +285,6 @@ def _complete(
     joined: Mapping[int, JoinedTile],
     columns: Sequence[SlicedColumn],
 ) -> MapManifest:
-    """Return the manifest of the map when it is whole, without notes."""
     runs_of = {tile: [run for run, part in enumerate(split) if tile in part.part_bytes] for tile in joined}
     counts = np.zeros((len(split), 3), np.int64)
     for tile, result in joined.items():

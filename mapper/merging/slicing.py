@@ -164,7 +164,6 @@ def _floor(
 def _slice_columns(
     workspace: Workspace, stages: Stages, columns: Collection[Sequence[int]], band: Band
 ) -> list[SlicedColumn]:
-    """Slice every column of tiles, several at once."""
     jobs = {
         workspace.tiling.name_of(tiles[0]): partial(
             slice_column,
@@ -241,7 +240,6 @@ def _save_ground(
     manifest: MapManifest,
     driven: DrivenGround | None,
 ) -> None:
-    """Write the ground below every column of tiles; see ``ground_heights``."""
     workspace = raster.workspace
     tiles_of_row = defaultdict(list)
     for tiles in columns:

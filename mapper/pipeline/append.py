@@ -165,7 +165,6 @@ def _joined(
 
 
 def _refuse_unconnected(second: Log, run: Run, loops: Sequence[LoopClosure], known: Set[int]) -> None:
-    """Refuse a session of which no loop leads to the known nodes."""
     between = [loop for loop in loops if loop.i in known and loop.j not in known]
     if accepted_loops(between):
         return

@@ -108,8 +108,6 @@ def build(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Solved:
-    """A log that was tracked, with its graph solved, in the levelled world."""
-
     tracking: TrackingResult
     report: Solve
     level: Level
@@ -117,8 +115,6 @@ class _Solved:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Steps:
-    """The steps of one build, with what they share."""
-
     source: Log
     config: BuildConfig
     writer: RunWriter

@@ -110,7 +110,6 @@ def without_doubtful_ends(
 
 
 def _relative_to_earlier(track: FrameResult, factor: BetweenFactor) -> FrameResult:
-    """Return a frame's result relative to node i of a factor instead of node j."""
     to_body = adjoint(inverse(track.T_node_body))
     covariance = to_body @ np.linalg.inv(factor.information) @ to_body.T
     if not track.is_keyframe and track.covariance is not None:

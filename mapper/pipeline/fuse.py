@@ -132,7 +132,6 @@ def carry_times(writer: RunWriter, timing: Timing) -> None:
 
 
 def _with_trajectory(run: Run, trajectory: Trajectory) -> StoredTracking:
-    """Return what a run keeps, with its trajectory replaced and the nodes of its graph moved along."""
     tracked = load_tracking(run)
     T_world_body = dict(trajectory.items())
     if T_world_body.keys().isdisjoint(tracked.trajectory.stamps_ns.tolist()):
@@ -232,7 +231,6 @@ def fuse_into(
 
 
 def _write_counts(writer: RunWriter, maps: Maps, trajectory: Trajectory) -> None:
-    """Write the sizes of the maps and the time that all of it took into a run's manifest."""
     counts = writer.manifest.counts.model_copy(
         update={
             "leaves": len(maps.octree),

@@ -75,7 +75,6 @@ class MarkedUpdates(ScanUpdateWriter):
             self._checkpoints.keep(self._snapshot)
 
     def _snapshot(self) -> Callable[[], None]:
-        """Note the length of the file; return the function that writes the mark."""
         self.flush()
         frames, end = self._frames, self._path.stat().st_size
         seconds = self._checkpoints.writer.clock.so_far()
@@ -113,7 +112,6 @@ def _holds(path: Path, mark: Mapping[str, Any]) -> bool:
 
 
 def _add(digest: "hashlib._Hash", path: Path, begin: int, end: int) -> None:
-    """Add a part of a file to a digest."""
     with path.open("rb") as file:
         file.seek(begin)
         while begin < end and (piece := file.read(min(end - begin, 1 << 20))):

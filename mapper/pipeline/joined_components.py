@@ -93,8 +93,6 @@ def joined(
 
 
 class _Search:
-    """Search for places that two parts of a path share."""
-
     def __init__(
         self,
         source: Log,
@@ -129,14 +127,12 @@ class _Search:
         return loops
 
     def _keyframes(self, parts: Sequence[Sequence[int]]) -> list[list[FrameResult]]:
-        """Return keyframes of every part, evenly spread over it."""
         frame_of = {track.node: track for track in self._tracks if track.is_keyframe}
         of_parts = [[frame_of[node] for node in nodes if node in frame_of] for nodes in parts]
         share = min(1.0, _VIEWS / max(sum(map(len, of_parts)), 1))
         return [_spread(frames, round(share * len(frames))) for frames in of_parts]
 
     def _around(self, frame: FrameResult) -> list[FrameResult]:
-        """Return a frame and those shortly before and after it."""
         index = self._tracks.index(frame)
         nearby = self._tracks[max(index - _AROUND, 0) : index + _AROUND + 1]
         return [other for other in nearby if abs(other.stamp_ns - frame.stamp_ns) <= _AROUND_NS]
@@ -216,7 +212,6 @@ def _between_nodes_of(best: _Link, link: _Link, graph: PoseGraph) -> tuple[Trans
 
 
 def _carried(information: Array, T_j_k: Transform) -> Array:
-    """Return the information of T_i_j · T_j_k from that of T_i_j."""
     to_j = adjoint(T_j_k)
     return to_j.T @ information @ to_j
 

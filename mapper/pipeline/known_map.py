@@ -85,7 +85,6 @@ def load_known_map(path: Path, *, progress: Progress = SILENT) -> KnownMap:
 
 
 def _members(merged: MergedMap) -> list[tuple[Run, dict[int, Transform]]]:
-    """Return the runs of a merged map, with the poses of their nodes in it."""
     members = []
     graph = merged.graph
     for member, run in zip(merged.manifest.runs, runs_of(merged), strict=True):

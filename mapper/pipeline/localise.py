@@ -1,9 +1,9 @@
 """Localising: a new log placed in a finished map, which stays as it is."""
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import compress, pairwise, product
+from itertools import compress, groupby, pairwise, product
 from pathlib import Path
 
 import numpy as np
@@ -30,9 +30,9 @@ from mapper.pipeline.solve import solve
 from mapper.pipeline.track import Start, noted_depth_warnings, session_odometry, track_log
 from mapper.pipeline.tracking_result import TrackingResult, from_tracking
 from mapper.run import files
-from mapper.run.localised import LocalisedManifest, find_stretches
-from mapper.run.manifest import Solve
-from mapper.run.pose_covariances import uncertain_poses, write_poses
+from mapper.run.frame_outcomes import FrameRecord
+from mapper.run.manifest import LocalisedManifest, Solve, Stretch, StretchState
+from mapper.run.pose_covariances import UncertainPoses, uncertain_poses, write_poses
 from mapper.run.results import RunResults
 from mapper.run.stored_tracking import save_frames
 from mapper.run.warnings import localisation_warnings, verdict_of
@@ -125,7 +125,6 @@ def _agree(a: _Constrained, b: _Constrained, gate: GateConfig) -> bool:
 
 
 def _cut(tracking: TrackingResult, last: int, first: int, map_node: int) -> TrackingResult:
-    """Return the result without what connects two nodes along the path."""
     graph = tracking.graph
     kept = (
         factor
@@ -142,6 +141,7 @@ def _cut(tracking: TrackingResult, last: int, first: int, map_node: int) -> Trac
     )
 
 
+_STATES: Mapping[str, StretchState] = {"tracked": "localised", "doubtful": "doubtful"}
 _LEAST_CONSTRAINTS = 3
 """A part of the path that fewer constraints tie to the map is not localised."""
 _FAR, _FAR_BEYOND = 3.0, 0.2
@@ -235,7 +235,6 @@ def _solved_in_map(
 
 
 def _refuse_unplaced(source: Log, known: KnownMap, tracking: TrackingResult) -> None:
-    """Refuse a log of which nothing is tied to the map."""
     if accepted_loops(tracking.loops):
         return
     why = why_none_accepted(tracking.loops)
@@ -347,7 +346,7 @@ def _write(writer: RunWriter, source: Log, known: KnownMap, tracking: TrackingRe
     write_poses(folder / files.POSES, poses)
     counts = writer.manifest.counts
     writer.update(
-        stretches=tuple(find_stretches(stored.records, poses, [loop.stamp_j_ns for loop in held])),
+        stretches=tuple(_stretches(stored.records, poses, [loop.stamp_j_ns for loop in held])),
     )
     results = RunResults(stored.trajectory, stored.graph, stored.records, held, stored.frame_ms, None, poses)
     warnings = localisation_warnings(results, writer.manifest)
@@ -362,3 +361,23 @@ def _write(writer: RunWriter, source: Log, known: KnownMap, tracking: TrackingRe
         lines=[counts.frames_text],
     )
     writer.record_timing(log_s=float(np.ptp(source.stamps_ns)) / NS_PER_S, frames=counts.read)
+
+
+def _stretches(
+    records: Sequence[FrameRecord], poses: UncertainPoses, recognised_ns: Sequence[int]
+) -> Iterator[Stretch]:
+    """Yield a log's stretches in time order, with how many of their keyframes were recognised in the map."""
+    stamps_ns, constrained_ns = poses.trajectory.stamps_ns, np.array(recognised_ns, np.int64)
+    for state, group in groupby(records, key=lambda record: _STATES.get(record.outcome, "not localised")):
+        frames = list(group)
+        first_ns, last_ns = frames[0].stamp_ns, frames[-1].stamp_ns
+        sigmas_m = poses.position_sigmas_m[(stamps_ns >= first_ns) & (stamps_ns <= last_ns)]
+        known = sigmas_m[np.isfinite(sigmas_m)]
+        yield Stretch(
+            state=state,
+            begin_s=(first_ns - records[0].stamp_ns) / NS_PER_S,
+            end_s=(last_ns - records[0].stamp_ns) / NS_PER_S,
+            frames=len(frames),
+            constraints=int(((constrained_ns >= first_ns) & (constrained_ns <= last_ns)).sum()),
+            sigma_m=float(np.median(known)) if state != "not localised" and len(known) else None,
+        )

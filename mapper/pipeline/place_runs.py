@@ -160,7 +160,6 @@ class _Recognised:
 
 
 def _measured_in(known: MergedMap, runs: Sequence[Run]) -> list[SharedPlace]:
-    """Return the places that were measured between the runs of a map."""
     first_nodes = [member.first_node or 0 for member in known.manifest.runs]
     places = []
     for loop in read_closures(known.path / files.LOOPS):
@@ -207,7 +206,6 @@ def _recognised(
 
 
 def _refuse_alone(runs: Sequence[Run], placed: int, left_out: Mapping[str, str]) -> None:
-    """Refuse a first run to which no other is tied."""
     if len(runs) > 1 and placed == 1:
         why = "; ".join(f"{path}: {reason}" for path, reason in left_out.items())
         raise RunError(

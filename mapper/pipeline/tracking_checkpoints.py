@@ -123,6 +123,5 @@ class TrackingCheckpoints:
             checkpoints.keep(partial(self._snapshot, odometry))
 
     def _snapshot(self, odometry: Odometry[Any]) -> Callable[[], None]:
-        """Copy the state of the odometry; return the function that writes it."""
         number, self._number = self._number, self._number + 1
         return self._checkpoints.snapshot(self._states, number, odometry, fixed=self._fixed)

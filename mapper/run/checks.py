@@ -7,8 +7,7 @@ from pathlib import Path
 from mapper.run import files
 from mapper.run.digests import fault_of
 from mapper.run.folder import Run, open_run
-from mapper.run.localised import LocalisedManifest
-from mapper.run.manifest import FileDigest, is_localised_log, read_manifest_of
+from mapper.run.manifest import FileDigest, LocalisedManifest, is_localised_log, read_manifest_of
 from mapper.runtime.atomic import is_temporary
 from mapper.runtime.doctor import Finding
 from mapper.runtime.ordered_map import ordered_map

@@ -96,8 +96,6 @@ def estimates_of_doubtful(
 
 
 class _MotionAround:
-    """Motion of the tracked frames over gaps between them, and how far off it is on this log."""
-
     def __init__(self, tracked: Trajectory) -> None:
         self._stamps_ns, self._poses = tracked.stamps_ns, tracked.T_world_body
         self._variances: dict[int, Array | None] = {}  # at the middle, by the duration of the gap

@@ -270,6 +270,37 @@ class Manifest(Config):
         write_text(path, self.model_dump_json(indent=2) + "\n")
 
 
+StretchState = Literal["localised", "doubtful", "not localised"]
+
+
+class Stretch(Config):
+    """Consecutive frames of a log with the same outcome."""
+
+    state: StretchState
+    begin_s: float
+    """Time of its first frame, in seconds since the log's first."""
+    end_s: float
+    frames: int
+    constraints: int
+    """Keyframes in it that were recognised in the map."""
+    sigma_m: float | None = None
+    """Median standard deviation of the position in its least certain direction; None if unknown."""
+
+
+class LocalisedManifest(Manifest):
+    """``manifest.json`` of a localised log; ``counts.loops`` are the constraints to the map that hold."""
+
+    kind: Literal["localised log"] = "localised log"
+    map: str
+    """Folder of the run or merged map, absolute."""
+    stretches: tuple[Stretch, ...] = ()
+
+    @property
+    def localised_share(self) -> float:
+        """Share of all frames of the log that are localised without a doubt."""
+        return self.counts.tracked / max(self.counts.listed, 1)
+
+
 AnyManifest = TypeVar("AnyManifest", bound=Manifest)
 
 

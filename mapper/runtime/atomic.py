@@ -322,7 +322,6 @@ def _empty(folder: Path, *, except_for: Collection[str]) -> None:
 
 
 def _swap(partial: Path, out: Path) -> None:
-    """Rename a whole folder to its final name, and remove the one that it replaces, if any."""
     if not out.exists():
         partial.rename(out)
         flush_to_disk(out.parent)

@@ -217,8 +217,6 @@ def run_jobs(
 
 
 class _InProcess(AbstractContextManager["_InProcess"]):
-    """Executor that runs jobs in this process."""
-
     def __exit__(self, *_: object) -> None:
         pass
 
@@ -266,8 +264,6 @@ class _ProcessPool(AbstractContextManager["_ProcessPool"]):
 
 
 class _DaskCluster(AbstractContextManager["_DaskCluster"]):
-    """Executor of a Dask scheduler's workers."""
-
     def __init__(self, scheduler: str) -> None:
         if not _ADDRESS.fullmatch(scheduler):  # Dask itself would try for a while first
             raise ConfigError(f"scheduler {scheduler!r}: not an address; want tcp://HOST:PORT")

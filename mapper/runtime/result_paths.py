@@ -60,7 +60,6 @@ def joined_names(paths: Sequence[Path]) -> str:
 
 
 def _is_taken(path: Path) -> bool:
-    """Return whether there is something, or another process is making it."""
     if path.exists() or path.is_symlink():
         return True
     partial = partial_of(path.resolve())

@@ -119,8 +119,6 @@ class JobRunner:
 
 @dataclass(frozen=True, slots=True)
 class _KeptJob:
-    """A job that writes its result where it runs."""
-
     job: Job
     folder: Path
 

@@ -238,8 +238,6 @@ class _Encoder:
 
 
 class _Decoder:
-    """Decoder of one state."""
-
     def __init__(
         self, data: bytes, fixed: Mapping[str, object], archived: Callable[[int], Archived[Any]] | None
     ) -> None:

@@ -1,9 +1,10 @@
-"""The voxel index against a dictionary."""
-
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from numba import njit
 
+from mapper.core.voxel_grid import thin
 from mapper.core.voxel_index import cell_key, claim_row, row_of, voxel_index
 
 
@@ -68,3 +69,23 @@ def test_no_axis_of_a_grid_crowds_the_table():
         index = voxel_index(len(cells), np.array([cell_key(*cell) for cell in cells.astype(float)]))
         vacant = np.flatnonzero(index.rows < 0)
         assert np.diff(vacant).max() < 100
+
+
+@given(seed=st.integers(0, 1000), voxel_m=st.sampled_from([0.1, 0.5, 2.0]))
+def test_keeps_the_first_point_of_every_voxel(seed, voxel_m):
+    rng = np.random.default_rng(seed)
+    points = rng.normal(0.0, 3.0, (rng.integers(1, 400), 3)).astype(np.float32)
+    cells = np.floor(points.astype(float) * (1.0 / voxel_m)).astype(int)
+    _, first = np.unique(cells, axis=0, return_index=True)
+
+    np.testing.assert_array_equal(thin(points, voxel_m), np.sort(first))
+
+
+def test_of_nothing_nothing_is_kept():
+    assert len(thin(np.empty((0, 3), np.float32), 0.2)) == 0
+
+
+def test_cells_on_both_sides_of_the_origin_differ():
+    points = np.array([[-0.05, 0.0, 0.0], [0.05, 0.0, 0.0]], np.float32)
+
+    assert thin(points, 0.2).tolist() == [0, 1]

@@ -62,7 +62,7 @@ def build_with_preview(desk_log, tmp_path):
 def test_the_first_picture_comes_after_five_seconds_and_the_run_is_as_without(
     build_with_preview, desk_log, tmp_path, monkeypatch
 ):
-    monkeypatch.setattr(module, "_PICTURES_SHARE", 1.0)
+    monkeypatch.setattr(module, "_CPU_SHARE", 1.0)
     run, looker, told = build_with_preview()
     first = next(index for index, picture in enumerate(looker.seen) if picture is not None)
     assert first == 3, "frames are 2 s apart"
@@ -85,8 +85,7 @@ def test_the_first_picture_comes_after_five_seconds_and_the_run_is_as_without(
 
 
 def test_pictures_and_points_cost_no_more_than_their_share(build_with_preview, monkeypatch):
-    monkeypatch.setattr(module, "_PICTURES_SHARE", 0.0)
-    monkeypatch.setattr(module, "_POINTS_SHARE", -1.0)
+    monkeypatch.setattr(module, "_CPU_SHARE", -1.0)
     _, looker, _ = build_with_preview()
     pictures = {picture for picture in looker.seen if picture is not None}
     assert len(pictures) == 1, "the first alone"

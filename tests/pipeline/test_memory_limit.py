@@ -3,9 +3,9 @@
 import pytest
 
 from mapper.octree import blocks
+from mapper.octree.blocks import FileArray
 from mapper.pipeline.fuse import fuse
 from mapper.run.folder import open_run
-from mapper.runtime.file_array import FileArray
 from mapper.sources import open_source
 from tests.support.files import files_of
 from tests.support.stopped_builds import MEASURED, Stage, resumed, start, stopped

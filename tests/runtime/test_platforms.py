@@ -8,11 +8,11 @@ import sys
 import numpy as np
 import pytest
 
+from mapper.octree.blocks import FileArray
 from mapper.octree.casting import sparse_zeros
 from mapper.runtime import atomic
 from mapper.runtime.atomic import FolderKind, atomic_folder, flush_to_disk
 from mapper.runtime.doctor import processors
-from mapper.runtime.file_array import FileArray
 from mapper.runtime.progress import forget_peak_memory, peak_memory_mb
 from tests.support.paths import ROOT
 

@@ -179,7 +179,6 @@ def no_map() -> dict[str, Any]:
 
 
 def _occupied_codes(octree: OctreeMap) -> NDArray[np.int64]:
-    """Return the Morton codes of the occupied voxels, increasing."""
     known = octree.leaves()
     return codes_of_keys(known.keys[known.log_odds >= octree.occupied_log_odds].astype(np.int64))
 

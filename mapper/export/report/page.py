@@ -177,12 +177,10 @@ def _settings(chapters: Sequence[Chapter]) -> str:
 
 
 def _plan(number: int, chapter: Chapter) -> str:
-    """Return the place of a run's plan."""
     return f'<figure class="plan" data-of="{number}"><figcaption>{escape(chapter.name)}</figcaption></figure>'
 
 
 def _view(number: int, chapter: Chapter) -> str:
-    """Return a run's cloud from two sides."""
     name, uri = escape(chapter.name), views_uri(chapter.run)
     picture = f'<img src="{uri}" alt="{name} from above and from the side">' if uri else "<p>no picture</p>"
     return f'<figure class="view" data-of="{number}"><figcaption>{name}</figcaption>{picture}</figure>'

@@ -91,7 +91,6 @@ class LiveRerun:
         self._log.log(self._log.body, transform_of(T_guess_body), stamp_ns=track.stamp_ns)
 
     def _show(self, step: Step) -> None:
-        """Load the frame again, in colour, and log what the sensor saw."""
         try:
             frame = step.entry.load()
         except FrameError:
