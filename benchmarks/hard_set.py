@@ -2,9 +2,10 @@
 
     python benchmarks/hard_set.py CACHE [--data DATA] [--only NAME…] [--seed 1] [--set key=value] [--json OUT]
     python benchmarks/hard_set.py CACHE --neighbours --only NAME --seed 1 2 3 4 5
+    python benchmarks/hard_set.py CACHE --from JSON…
 
-Logs are made once by `mapper synth` and kept in CACHE. With DATA also `tum_fr1_xyz`, `kitti_00` and
-`mulran_kaist03` in it are mapped, at several strides. Each log is tracked, searched for loops and solved with
+Logs are made once by `mapper synth` and kept in CACHE. With DATA also the real logs with truth in it are
+mapped, some at several strides. Each log is tracked, searched for loops and solved with
 the default settings, and doubtful frames are placed as in a run; no map is made.
 
 `ATE`: RMSE of the placed frames, SE(3)-aligned, in metres; `path`: length of the true path. `tracked`,
@@ -12,7 +13,11 @@ the default settings, and doubtful frames are placed as in a run; no map is made
 whose relative pose is off by more than 0.2 m or 5 degrees and, where covariances are known, by more than
 5 sigma; `silent`: those of them without a doubtful or lost frame (evaluators/metrics/silent_failures.py).
 `false`: accepted loops farther than 0.2 m or 0.1 rad from the truth, of all accepted
-(evaluators/metrics/loops.py).
+(evaluators/metrics/loops.py). `verdict`: whether the run would be trusted (docs/verdict.md).
+
+At the end is a table for each kind of sensor: runs that are right and whole (RMSE at most 1 % of the path or
+2 cm, at most 2 % of the frames lost) against the verdict, and every run for which the two differ.
+`--neighbours` and `--from JSON …` give it many runs.
 """
 
 import argparse
@@ -25,29 +30,41 @@ from pathlib import Path
 import cv2
 import numpy as np
 from hard_logs import HARD_LOGS
+from scipy.spatial.transform import Rotation
 
 from mapper.cli.main import app
+from mapper.config.build import BuildConfig
 from mapper.config.loading import load_config, load_source_config
 from mapper.core.errors import MapperError
+from mapper.core.trajectory import Trajectory
 from mapper.evaluators.metrics.loops import wrong_loops
 from mapper.evaluators.metrics.silent_failures import check_doubts
 from mapper.evaluators.metrics.trajectory import align, associate, ate
 from mapper.loops.closure import accepted_loops
+from mapper.pipeline.build import level_of
 from mapper.pipeline.components import largest_component
 from mapper.pipeline.joined_components import joined
 from mapper.pipeline.solve import solve
-from mapper.pipeline.track import track_log
-from mapper.pipeline.tracking_result import refuse_a_fragment
-from mapper.run.doubtful_frames import placed_by_neighbours
-from mapper.run.frame_outcomes import records_of
+from mapper.pipeline.track import noted_depth_warnings, track_log
+from mapper.pipeline.tracking_result import TrackingResult, from_tracking, refuse_a_fragment
+from mapper.run.doubtful_frames import without_doubtful
+from mapper.run.manifest import Levelling, Verdict
+from mapper.run.pose_covariances import uncertain_poses
+from mapper.run.results import RunResults
+from mapper.run.stored_tracking import StoredTracking
+from mapper.run.warnings import find_warnings, verdict_of
+from mapper.run.writer import first_manifest
 from mapper.runtime.progress import SILENT
 from mapper.sources import open_source
 from mapper.sources.base import Log
 
 REAL_LOGS: Mapping[str, Sequence[int]] = {
     "tum_fr1_xyz": (1, 5, 10, 15, 30),
+    "tum_fr3_teddy": (1, 2, 3),
+    "tum_fr3_cabinet_1_5hz": (1,),
     "kitti_00": (1, 2, 3),
     "mulran_kaist03": (1, 2, 3),
+    "courtyard_2hz": (1,),
 }
 """Folders of real logs, and at which strides they are mapped."""
 
@@ -71,6 +88,8 @@ NEIGHBOURS: Mapping[str, Sequence[Sequence[str]]] = {
 }
 """Ten settings beside the defaults by sensor; strides 2 and 3 make them twelve."""
 
+_GOOD_M, _GOOD_SHARE, _GOOD_LOST = 0.02, 0.01, 0.02
+
 
 @dataclass(frozen=True, slots=True)
 class Row:
@@ -93,6 +112,11 @@ class Row:
         false_loops: Number of these that are wrong.
         seconds: Wall time of tracking and solving.
         refused: Why no path was made; empty if one was.
+        sensor: Kind of its sensor.
+        verdict: That of a run of it.
+        doubts: Reasons against it.
+        worst_m: Largest error of a frame that is not doubtful.
+        worst_rad: Largest error of the rotation of one.
     """
 
     log: str
@@ -111,11 +135,23 @@ class Row:
     false_loops: int | None = None
     seconds: float = 0.0
     refused: str = ""
+    sensor: str = ""
+    verdict: str = ""
+    doubts: Sequence[str] = ()
+    worst_m: float = 0.0
+    worst_rad: float = 0.0
+
+    @property
+    def is_good(self) -> bool:
+        """Whether the path is right and whole."""
+        if self.ate_m is None or self.lost > _GOOD_LOST * self.frames:
+            return False
+        return self.ate_m <= max(_GOOD_M, _GOOD_SHARE * self.path_m)
 
 
 HEADER = (
     f"{'log':<22} {'frames':>6} {'path m':>7} {'ATE m':>8} {'tracked':>7} {'doubtf.':>7} {'lost':>5} "
-    f"{'f/r %':>6} {'wrong':>5} {'silent':>6} {'worst m':>7} {'loops':>5} {'false':>5} {'s':>6}"
+    f"{'f/r %':>6} {'wrong':>5} {'silent':>6} {'worst m':>7} {'loops':>5} {'false':>5} {'s':>6}  verdict"
 )
 
 
@@ -127,7 +163,7 @@ def line(row: Row) -> str:
     return (
         f"{start}{row.ate_m:>8.4f} {row.tracked:>7} {row.doubtful:>7} {row.lost:>5} "
         f"{100 * row.flagged_right_ratio:>6.1f} {row.wrong:>5} {row.silent:>6} {row.worst_silent_m:>7.2f} "
-        f"{row.loops:>5} {row.false_loops:>5} {row.seconds:>6.1f}"
+        f"{row.loops:>5} {row.false_loops:>5} {row.seconds:>6.1f}  {row.verdict}"
     )
 
 
@@ -144,24 +180,48 @@ def mapped(log: Log, name: str, overrides: Sequence[str] = ()) -> Row:
     path_m = float(np.linalg.norm(np.diff(log.truth.positions_world[during], axis=0), axis=1).sum())
     config = load_config(None, overrides, sensor=log.sensor)
     began = time.perf_counter()
-    row = Row(name, len(log), path_m)
+    row = Row(name, len(log), path_m, sensor=log.sensor)
     try:
-        tracking = joined(log, track_log(log, config, progress=SILENT), config, progress=SILENT)
-        tracking = largest_component(tracking, progress=SILENT)
-        if len(log) >= 2 * config.min_tracked_frames:  # a short log at a long stride is judged all the same
-            refuse_a_fragment(tracking, config, sensor=log.sensor)
-        solved = solve(tracking.graph, tracking.loops, config.graph)
-        tracking = replace(tracking, graph=solved.graph, loops=solved.loops)
-        tracking = largest_component(tracking, progress=SILENT)
-        seconds = time.perf_counter() - began
-        trajectory, records = tracking.trajectory(), records_of(tracking.tracks, tracking.skipped)
-        matched = associate(placed_by_neighbours(trajectory, tracking.graph, records), log.truth)
-        rmse_m = ate(align(matched, "se3").moved(matched)).rmse
+        tracking = solved(log, config)
+        row = replace(row, seconds=time.perf_counter() - began)
+        return compared(row, log, config, tracking, log.truth)
     except MapperError as error:
         return replace(row, refused=str(error))
-    check = check_doubts(trajectory, records, log.truth)
+
+
+def solved(log: Log, config: BuildConfig) -> TrackingResult:
+    """Return a log tracked and solved as ``mapper build`` does.
+
+    Raises:
+        TrackingError: Too few frames could be tracked.
+    """
+    tracking = joined(log, track_log(log, config, progress=SILENT), config, progress=SILENT)
+    tracking = largest_component(tracking, progress=SILENT)
+    if len(log) >= 2 * config.min_tracked_frames:  # a short log at a long stride is judged all the same
+        refuse_a_fragment(tracking, config, sensor=log.sensor)
+    graph = solve(tracking.graph, tracking.loops, config.graph)
+    tracking = replace(tracking, graph=graph.graph, loops=graph.loops)
+    return largest_component(tracking, progress=SILENT)
+
+
+def compared(row: Row, log: Log, config: BuildConfig, tracking: TrackingResult, truth: Trajectory) -> Row:
+    """Return a row with the errors of a solved log and with the verdict that a run of it gets.
+
+    Raises:
+        MapperError: The path and the truth have too few times in common.
+    """
+    stored = from_tracking(tracking, truth)
+    matched = associate(stored.trajectory, truth)
+    rmse_m = ate(align(matched, "se3").moved(matched)).rmse
+    sure = associate(without_doubtful(stored.trajectory, stored.records), truth)
+    sure = align(sure, "se3").moved(sure)
+    turned = Rotation.from_matrix(
+        sure.T_truth_body[:, :3, :3] @ sure.T_map_body[:, :3, :3].transpose(0, 2, 1)
+    )
+    check = check_doubts(tracking.trajectory(), stored.records, truth)
     accepted = accepted_loops(tracking.loops)
-    outcomes = [record.outcome for record in records]
+    outcomes = [record.outcome for record in stored.records]
+    found = verdict(log, config, tracking, stored)
     return replace(
         row,
         tracked=outcomes.count("tracked"),
@@ -174,9 +234,25 @@ def mapped(log: Log, name: str, overrides: Sequence[str] = ()) -> Row:
         silent_at_s=check.silent_at_s,
         worst_silent_m=check.worst_m,
         loops=len(accepted),
-        false_loops=sum(wrong_loops(accepted, log.truth)),
-        seconds=seconds,
+        false_loops=sum(wrong_loops(accepted, truth)),
+        verdict=found.state,
+        doubts=found.sentences,
+        worst_m=float(sure.position_errors_m.max()),
+        worst_rad=float((turned.mean().inv() * turned).magnitude().max()),
     )
+
+
+def verdict(log: Log, config: BuildConfig, tracking: TrackingResult, stored: StoredTracking) -> Verdict:
+    """Return the verdict on a run of a solved log, with no warning that rests on the truth."""
+    level = level_of(log, tracking, config)
+    levelling = Levelling(method=level.method, detail=level.detail, has_floor=level.has_floor)
+    warnings = (*noted_depth_warnings(log, SILENT), *tracking.warnings)
+    manifest = first_manifest(log).model_copy(update={"warnings": warnings, "levelling": levelling})
+    poses = uncertain_poses(stored.trajectory, stored.graph, stored.records)
+    results = RunResults(
+        stored.trajectory, stored.graph, stored.records, stored.loops, stored.frame_ms, None, poses
+    )
+    return verdict_of(find_warnings(results, manifest))
 
 
 def logs(
@@ -215,10 +291,11 @@ def neighbours(log: Log, name: str, overrides: Sequence[str]) -> list[Row]:
     rows = [mapped(log, name, overrides)]
     print(line(rows[0]), flush=True)
     for setting in NEIGHBOURS[log.sensor]:
-        rows.append(mapped(log, setting[0].removeprefix("odometry."), [*overrides, *setting]))
+        label = f"{name} {setting[0].removeprefix('odometry.')}"
+        rows.append(mapped(log, label, [*overrides, *setting]))
         print(line(rows[-1]), flush=True)
     for stride in (2, 3):
-        rows.append(mapped(every(log, stride), f"stride {stride}", overrides))
+        rows.append(mapped(every(log, stride), f"{name} stride {stride}", overrides))
         print(line(rows[-1]), flush=True)
     print(summary(name, [rows]))
     return rows
@@ -242,6 +319,29 @@ def summary(name: str, runs: Sequence[Sequence[Row]]) -> str:
     )
 
 
+def reliability(rows: Sequence[Row]) -> str:
+    """Return how verdicts and errors agree, by sensor, and the runs in which they do not."""
+    lines = ["sensor   runs  good  trusted  good of trusted  trusted of good"]
+    for sensor in ("rgbd", "lidar"):
+        of_sensor = [row for row in rows if row.sensor == sensor]
+        good = [row for row in of_sensor if row.is_good]
+        trusted = [row for row in of_sensor if row.verdict == "trusted"]
+        both = sum(row.is_good for row in trusted)
+        shares = [f"{both / len(one):.0%}" if one else "–" for one in (trusted, good)]
+        lines.append(
+            f"{sensor:<6} {len(of_sensor):>6} {len(good):>5} {len(trusted):>8} {shares[0]:>16} "
+            f"{shares[1]:>16}"
+        )
+    for row in rows:
+        if row.ate_m is not None and row.is_good != (row.verdict == "trusted"):
+            share = row.ate_m / row.path_m
+            lines.append(
+                f"{row.log:<30} {row.ate_m:.4f} m, {share:.1%} of the path, {row.lost} lost: {row.verdict}"
+                + "".join(f"\n    {sentence}" for sentence in row.doubts)
+            )
+    return "\n".join(lines)
+
+
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(
@@ -254,7 +354,11 @@ def main() -> None:
     parser.add_argument("--set", dest="overrides", action="append", default=[], help="key.path=value")
     parser.add_argument("--neighbours", action="store_true", help="12 neighbouring settings on each log")
     parser.add_argument("--json", type=Path, help="file for the table as JSON")
+    parser.add_argument("--from", dest="known", type=Path, nargs="+", help="such files; nothing is mapped")
     arguments = parser.parse_args()
+    if arguments.known:
+        print(reliability([Row(**row) for path in arguments.known for row in json.loads(path.read_text())]))
+        return
     cv2.setNumThreads(1)
     arguments.cache.mkdir(parents=True, exist_ok=True)
     print(HEADER)
@@ -274,6 +378,7 @@ def main() -> None:
     for name, of_seeds in runs.items():
         if len(of_seeds) > 1:
             print(summary(name, of_seeds))
+    print(reliability(rows))
     if not arguments.neighbours:
         silent = [row.log for row in rows if row.silent]
         false = sum(row.false_loops or 0 for row in rows)
