@@ -26,12 +26,14 @@ class Prepared:
 
     Attributes:
         normals: (N, 3) unit normals towards the origin; zero where there are too few neighbours.
+        near_normals: (N, 3) the same fitted to the nearer half of the neighbours.
         voxel_m: Edge of the voxels, metres.
         neighbours: Number of points that each normal is fitted to.
         tree: Search tree of the points; None without points.
     """
 
     normals: Array
+    near_normals: Array
     voxel_m: float
     neighbours: int
     tree: KdTree | None
@@ -60,7 +62,7 @@ def prepared(points: Points32 | Points, *, voxel_m: float, neighbours: int = _NE
         DataError: A point lies more than 2²⁰ voxels from the origin.
     """
     if len(points) == 0:
-        return Prepared(np.empty((0, 3)), voxel_m, neighbours, None)
+        return Prepared(np.empty((0, 3)), np.empty((0, 3)), voxel_m, neighbours, None)
     farthest_m, limit_m = float(np.abs(points).max()), _VOXELS_ACROSS * voxel_m
     if farthest_m >= limit_m:
         raise DataError(
@@ -68,15 +70,17 @@ def prepared(points: Points32 | Points, *, voxel_m: float, neighbours: int = _NE
             f"{voxel_m} m voxels; move the cloud to the origin or enlarge voxel_m"
         )
     tree = kd_tree(voxel_means(points, voxel_m))
-    return Prepared(_normals(tree, min(neighbours, len(tree.points))), voxel_m, neighbours, tree)
+    return Prepared(*_normals(tree, min(neighbours, len(tree.points))), voxel_m, neighbours, tree)
 
 
-def _normals(tree: KdTree, neighbours: int) -> Array:
-    normals = np.zeros_like(tree.points)
+def _normals(tree: KdTree, neighbours: int) -> tuple[Array, Array]:
+    normals, near_normals = np.zeros_like(tree.points), np.zeros_like(tree.points)
     if neighbours >= _FEWEST_NEIGHBOURS:
         about, _ = neighbours_of(tree.points, tree.axes, tree.cuts, tree.points, neighbours)
         _fit_normals(tree.points, about, normals)
-    return normals
+        nearer = max(_FEWEST_NEIGHBOURS, neighbours // 2)
+        _fit_normals(tree.points, np.ascontiguousarray(about[:, :nearer]), near_normals)
+    return normals, near_normals
 
 
 @njit(cache=True, nogil=True)

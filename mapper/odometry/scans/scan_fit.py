@@ -27,6 +27,9 @@ _FACING = 0.3
 """Share of one point's displacement along its normals, from which on its pair shows the motion: more than
 the errors of normals make."""
 _OFF_VOXELS = 1.0  # nearer to the keyframe rings lie on the same places, and so errors of normals are alike
+_SAME_VOXELS = 0.25
+"""So near the scan seems to stand where the keyframe was taken: in a corridor that is what its rings show of
+any motion along it."""
 _FEW_PAIRS, _ENOUGH_PAIRS = 8, 24
 """Pairs that face a motion and agree: a bare tunnel has up to 11 by chance, a field with two trees 13 to 60.
 They measure it to σ/√pairs, with the 0.1 m that a point agrees within to 0.02 m."""
@@ -117,7 +120,9 @@ def fit_of(
 
     The squared cosine of a motion and a fitted normal has the normal's error squared in it, so that even a
     bare tunnel seems to show the motion along it. Errors of the normals of two scans are independent, so the
-    product of both scans' cosines (instrumental variables; Fuller 1987, §1.4) has none.
+    product of both scans' cosines (instrumental variables; Fuller 1987, §1.4) has none. Where both scans seem
+    to be taken at one place they are not: to ten neighbours, columns of far points on two opposite walls are
+    a plane across the corridor. To the nearest five they are none, so the scan's normals are theirs.
 
     Args:
         keyframe: With the surfaces.
@@ -135,8 +140,10 @@ def fit_of(
     normals_key = target.normals[partners]
     residuals_m = np.einsum("ni,ni->n", normals_key, points_key[near] - target.points[partners])
     normals = normals_key @ T_key_scan[:3, :3]
-    own = source.normals[near]
-    own = own * np.sign(np.einsum("ni,ni->n", own, normals))[:, None]
+    moved_voxels = float(np.linalg.norm(T_key_scan[:3, 3])) / source.voxel_m
+    elsewhere = min(1.0, moved_voxels / _SAME_VOXELS)
+    own = elsewhere * _towards(source.normals[near], normals)
+    own += (1.0 - elsewhere) * _towards(source.near_normals[near], normals)
     rows = np.hstack([np.cross(points, normals), normals])
     own_rows = np.hstack([np.cross(points, own), own])
     shown = np.einsum("ni,nj->ij", rows, own_rows)
@@ -148,7 +155,7 @@ def fit_of(
     counts = FreeSpaceCheck(_MARGIN_M).count(keyframe.description, _checked(deskewed), T_key_scan)
     degeneracy = degeneracy_of(0.5 * (shown + shown.T), points=source.points, min_share=_SMALL_SHARE)
     observability = _observability(degeneracy, points, rows, own_rows, agree[near])
-    if np.linalg.norm(T_key_scan[:3, 3]) < _OFF_VOXELS * source.voxel_m:
+    if moved_voxels < _OFF_VOXELS:
         observability[: degeneracy.unobservable_count] = 0.0
     unobservable = ""
     if observability.min() < 0.5:
@@ -168,6 +175,12 @@ def fit_of(
         observability=observability,
         unobservable=unobservable,
     )
+
+
+def _towards(normals: Array, others: Array) -> Array:
+    """Return normals with the signs that make them point as others do."""
+    towards: Array = normals * np.sign(np.einsum("ni,ni->n", normals, others))[:, None]
+    return towards
 
 
 def _observability(

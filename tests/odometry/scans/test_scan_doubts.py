@@ -63,6 +63,33 @@ def tunnel_scan(stamp_ns, x_m, *, seed=0):
     return Scan(stamp_ns, points.astype(np.float32))
 
 
+def corridor_scan(*, seed, rings):
+    """Return what rings see of a corridor 160 m long, bare: at any place along it the same."""
+    rng = np.random.default_rng(seed)
+    azimuth, elevation = np.meshgrid(
+        np.linspace(0.0, 2.0 * np.pi, 900, endpoint=False), np.radians(np.linspace(-15.0, 15.0, rings))
+    )
+    parts = [np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)]
+    directions = np.stack(parts, axis=-1).reshape(-1, 3)
+    with np.errstate(divide="ignore"):
+        ends = np.array([[[-80.0, -1.2, -1.2]], [[80.0, 1.2, 1.4]]]) / directions
+    ranges = ends.max(axis=0).min(axis=1) + rng.normal(0.0, 0.015, len(directions))
+    points = (directions * ranges[:, None])[(ranges > 0.3) & (ranges < 30.0)]
+    return Scan(0, points.astype(np.float32))
+
+
+@pytest.mark.parametrize("rings", [16, 32, 64])
+def test_no_number_of_rings_shows_the_motion_along_a_bare_corridor(rings):
+    config = GicpOdometryConfig(voxel_m=0.15)
+    first, second = (corridor_scan(seed=seed, rings=rings) for seed in (0, 1))
+    odometry = ScanOdometry(config, GicpMatcher(config))
+    odometry.track(odometry.observe(first))
+    track = odometry.track(odometry.observe(replace(second, stamp_ns=100_000_000)))
+
+    assert track.diagnostics.unobservable == "translation along x"
+    assert [doubt.kind for doubt in track.doubts] == ["unobservable"]
+
+
 class MisledMatcher(GicpMatcher):
     """GICP that is off by 15° and 0.58 m when the predicted pose is used as it is."""
 
