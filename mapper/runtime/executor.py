@@ -5,24 +5,21 @@ cluster has to run the same version of this package on the same files: its worke
 """
 
 import logging
-import os
-import pickle
 import re
-import signal
-import threading
 import traceback
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass
 from functools import partial
-from multiprocessing import get_context, parent_process
-from multiprocessing.connection import Connection, wait
 from pathlib import Path
+from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any, Protocol, Self, TypeVar
 
 from mapper.core.errors import ConfigError, MapperError
 from mapper.runtime.extras import extra, one_thread_per_library
+from mapper.runtime.worker_process import WorkerEndedError, WorkerProcess
 
 if TYPE_CHECKING:
     from distributed import Future
@@ -60,60 +57,6 @@ def reason_of(error: BaseException) -> str:
     where = traceback.extract_tb(error.__traceback__)
     place = f" ({Path(where[-1].filename).name}:{where[-1].lineno})" if where else ""
     return f"{type(error).__name__}: {message}{place}"
-
-
-class WorkerProcess:
-    """A spawned process that runs the jobs sent to it, one at a time, and ends with its parent."""
-
-    def __init__(self) -> None:
-        context = get_context("spawn")  # a forked copy of a process with threads may hang
-        self.connection, theirs = context.Pipe()
-        self._process = context.Process(target=_serve, args=(theirs,), daemon=True)
-        self._process.start()
-        theirs.close()  # so that the pipe ends with the process
-
-    def kill(self) -> None:
-        """End the process at once."""
-        self._process.kill()
-        self._process.join()
-        self.connection.close()
-
-    def exit_reason(self) -> str:
-        """Return how the process ended, after its end of the pipe has closed."""
-        self._process.join()
-        self.connection.close()
-        code = self._process.exitcode or 0
-        if code < 0:
-            return f"its worker was killed by {signal.Signals(-code).name}"
-        return f"its worker ended with exit status {code}"
-
-
-def _serve(connection: Connection) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent handles it
-    one_thread_per_library()
-    threading.Thread(target=_exit_with_parent, daemon=True).start()
-    while True:
-        try:
-            packed = connection.recv_bytes()
-        except EOFError:
-            return
-        outcome = attempt(partial(_unpacked, packed))
-        try:
-            connection.send(outcome)
-        except (pickle.PicklingError, TypeError, AttributeError) as error:
-            connection.send(Failure(reason_of(error), 1))
-
-
-def _unpacked(packed: bytes) -> Any:
-    return pickle.loads(packed)()
-
-
-def _exit_with_parent() -> None:
-    """Exit once the parent has: a killed one cannot end its workers, which a second run must not find."""
-    parent = parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)
 
 
 R = TypeVar("R")
@@ -236,30 +179,37 @@ class _ProcessPool(AbstractContextManager["_ProcessPool"]):
     def __init__(self, count: int) -> None:
         self._count = count
         self._idle: list[WorkerProcess] = []
-        self._busy: dict[Connection, tuple[WorkerProcess, int]] = {}
+        self._busy: dict[int, WorkerProcess] = {}
+        self._threads = ThreadPoolExecutor(count, thread_name_prefix="worker")
+        self._done: SimpleQueue[tuple[int, Any, bool]] = SimpleQueue()
 
     def __exit__(self, *_: object) -> None:
-        for worker in [*self._idle, *(worker for worker, _ in self._busy.values())]:
+        for worker in [*self._idle, *self._busy.values()]:
             worker.kill()
+        self._threads.shutdown(cancel_futures=True)
 
     def size(self) -> int:
         return self._count
 
     def submit(self, index: int, job: Work) -> None:
-        worker = self._idle.pop() if self._idle else WorkerProcess()
-        with suppress(BrokenPipeError):  # it ended while idle; next_done will find the pipe closed
-            worker.connection.send(job)
-        self._busy[worker.connection] = worker, index
+        worker = self._busy[index] = self._idle.pop() if self._idle else WorkerProcess()
+        self._threads.submit(self._run, worker, index, job)
+
+    def _run(self, worker: WorkerProcess, index: int, job: Work) -> None:
+        try:
+            outcome, error = worker.call(partial(attempt, job))
+        except WorkerEndedError as ended:
+            self._done.put((index, Failure(f"its worker {ended}", 1), False))
+            return
+        except Exception as unpicklable:
+            outcome, error = None, unpicklable
+        self._done.put((index, outcome if error is None else Failure(reason_of(error), 1), True))
 
     def next_done(self) -> tuple[int, Any]:
-        connection = wait(list(self._busy))[0]
-        assert isinstance(connection, Connection)
-        worker, index = self._busy.pop(connection)
-        try:
-            outcome = connection.recv()
-        except (EOFError, ConnectionError):
-            return index, Failure(worker.exit_reason(), 1)
-        self._idle.append(worker)
+        index, outcome, is_alive = self._done.get()
+        worker = self._busy.pop(index)
+        if is_alive:
+            self._idle.append(worker)
         return index, outcome
 
 

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from mapper.core.errors import FrameError, MapperError
-from mapper.runtime.isolated import memory_limited
+from mapper.runtime.worker_process import memory_limited
 from tests.fuzz.peers import PEERS
 
 LONGEST_MESSAGE = 1000

@@ -7,7 +7,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from mapper.core.errors import FrameError
-from mapper.runtime.isolated import call_isolated
+from mapper.runtime.worker_process import call_isolated
 from mapper.sources.cloud_files.parsing import MOST_BYTES, Columns, refusing_damage
 
 _EXTRAS = ("gps_time", "red", "green", "blue")

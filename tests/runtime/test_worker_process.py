@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from mapper.core.errors import DataError
-from mapper.runtime.isolated import call_isolated
+from mapper.runtime.worker_process import call_isolated
 
 LIMIT = 64 << 20
 
@@ -24,7 +24,7 @@ def test_the_process_is_kept_until_it_ends():
     assert call_isolated(os.getpid, memory_bytes=LIMIT) == first != os.getpid()
     with pytest.raises(DataError, match="the process that reads it was killed by SIGKILL"):
         call_isolated(partial(os.kill, first, signal.SIGKILL), memory_bytes=LIMIT)
-    with pytest.raises(DataError, match="the process that reads it ended with status 3"):
+    with pytest.raises(DataError, match="the process that reads it ended with exit status 3"):
         call_isolated(partial(os._exit, 3), memory_bytes=LIMIT)
     assert call_isolated(os.getpid, memory_bytes=LIMIT) not in (first, os.getpid())
 
@@ -39,7 +39,7 @@ def test_each_call_has_its_limit_of_memory():
 def test_a_script_without_a_guard_runs_once(tmp_path):
     script = tmp_path / "script.py"
     script.write_text(
-        "import os\nfrom mapper.runtime.isolated import call_isolated\n"
+        "import os\nfrom mapper.runtime.worker_process import call_isolated\n"
         f"print(call_isolated(os.getpid, memory_bytes={LIMIT}) != os.getpid())\n"
     )
     run = subprocess.run([sys.executable, script], capture_output=True, text=True, check=True)
