@@ -7,7 +7,6 @@ import pytest
 from mapper.config.loading import read_config
 from mapper.core.errors import ConfigError, DataError, MapSizeError, SourceError
 from mapper.core.geometry import transform
-from mapper.core.rotations import rotation_from_euler
 from mapper.line_laser import detection
 from mapper.line_laser.calibration import (
     Board,
@@ -21,7 +20,7 @@ from mapper.line_laser.calibration import (
 )
 from mapper.line_laser.config import THESIS, LineLaserCalibration, LineLaserConfig, VehicleConfig
 from mapper.line_laser.files import find_images, read_shots
-from mapper.line_laser.ranging import line_scan, local_grid, scan_image
+from mapper.line_laser.ranging import LineScan, line_scan, local_grid, scan_image
 from mapper.line_laser.survey import drive, map_scans, scan_images, sensor_poses
 from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN
 from tests.support.grids import state_at
@@ -54,23 +53,15 @@ def test_hue_keeps_a_part_of_the_circle(rgb, between_deg, kept):
     assert detection.hue(image, from_deg=between_deg[0], to_deg=between_deg[1], saturation=64) == kept
 
 
-def test_intensity_keeps_what_reaches_the_threshold():
+def test_the_other_methods_see_what_is_bright_what_is_red_and_lines_of_some_contrast():
     red = np.array([[0, 249, 250, 255]], np.uint8)
     assert detection.intensity(red, threshold=250).tolist() == [[0, 0, 250, 255]]
-
-
-def test_weight_is_two_red_less_green_and_blue_within_a_byte():
-    image = np.array(
-        [[[200, 50, 60], [100, 60, 60], [100, 90, 75], [50, 200, 200], [255, 255, 255]]], np.uint8
-    )
-    assert detection.weight(image, threshold=40).tolist() == [[255, 80, 0, 0, 0]]
-
-
-@pytest.mark.parametrize(("levels", "is_edge"), [(0, False), (8, False), (40, True)])
-def test_edges_see_lines_of_some_contrast(levels, is_edge):
-    red = np.full((41, 41), 100, np.uint8)
-    red[19:22] += np.uint8(levels)
-    assert (detection.edges(red, sigma_px=1.5, threshold=150)[20, 20] > 0) == is_edge
+    colours = [[200, 50, 60], [100, 60, 60], [100, 90, 75], [50, 200, 200], [255, 255, 255]]
+    assert detection.weight(np.array([colours], np.uint8), threshold=40).tolist() == [[255, 80, 0, 0, 0]]
+    for levels, is_edge in ((0, False), (8, False), (40, True)):
+        line = np.full((41, 41), 100, np.uint8)
+        line[19:22] += np.uint8(levels)
+        assert (detection.edges(line, sigma_px=1.5, threshold=150)[20, 20] > 0) == is_edge
 
 
 def test_the_combination_is_the_larger_of_two_where_there_are_edges():
@@ -161,20 +152,10 @@ def test_the_fit_recovers_the_law_and_knows_its_doubt():
 def test_shots_that_give_no_law_are_refused(shots, why):
     with pytest.raises(DataError, match=why):
         calibrate(shots, **SIZE)
-
-
-def test_a_shot_knows_what_cannot_be():
     with pytest.raises(DataError, match="want both > 0"):
         CalibrationShot(Board(10.0, 5), -1.0)
     with pytest.raises(DataError, match="does not show it whole"):
         CalibrationShot(Board(10.0, None), 1.0, 0.4)
-
-
-def test_a_calibration_file_gives_back_what_was_written(tmp_path):
-    calibration = calibrate(exact_shots(RANGES_M), **SIZE).calibration
-    path = tmp_path / "C.toml"
-    path.write_text(calibration_text(calibration))
-    assert read_config(path, LineLaserCalibration) == calibration
 
 
 @pytest.mark.parametrize(
@@ -187,11 +168,13 @@ def test_a_calibration_file_gives_back_what_was_written(tmp_path):
     ],
 )
 def test_a_calibration_file_is_checked(tmp_path, before, after, why):
-    text = calibration_text(THESIS)
+    text, path = calibration_text(THESIS), tmp_path / "C.toml"
+    path.write_text(text)
+    assert read_config(path, LineLaserCalibration) == THESIS
     assert before in text
-    (tmp_path / "C.toml").write_text(text.replace(before, after))
+    path.write_text(text.replace(before, after))
     with pytest.raises(ConfigError, match=rf"C.toml: .*({why})"):
-        read_config(tmp_path / "C.toml", LineLaserCalibration)
+        read_config(path, LineLaserCalibration)
 
 
 def test_a_board_is_the_level_stripe_in_the_middle():
@@ -265,15 +248,6 @@ def test_a_wall_is_occupied_and_what_lies_before_it_free():
     )
     assert state_at(apart, 0.9, 0.355) == FREE
     assert state_at(apart, 0.9, 0.0) == UNKNOWN
-
-
-def test_the_same_wall_from_elsewhere_is_the_same_wall():
-    T = transform(rotation_from_euler(0.0, 0.0, np.pi / 2), np.array([1.01, -2.0, 0.0]))
-    seen = [(y + 2.0, 0.0) for _, y in WALL]
-    grid = map_scans([scan_at(*WALL), scan_at(*seen)], np.array([np.eye(4), T]), CONFIG.map)
-    assert {tuple(c) for c in np.argwhere(grid.cells == OCCUPIED)[:, 1:]} == {
-        (int((1.01 - grid.origin_world_m[0]) / 0.02),)
-    }
 
 
 @pytest.mark.parametrize(("misses", "state"), [(2, OCCUPIED), (3, FREE)])
@@ -392,3 +366,41 @@ def test_shots_that_show_less_than_they_should_are_told(tmp_path):
     assert len(notes) == 2
     assert "the board leaves wide.png" in notes[0]
     assert "dark.png shows no level stripe" in notes[1]
+
+
+@pytest.mark.parametrize(
+    ("method", "setting", "value"),
+    [
+        ("hue", "hue_from_deg", 359.0),
+        ("hue", "hue_to_deg", 0.5),
+        ("hue", "saturation_threshold", 200),
+        ("intensity", "intensity_threshold", 251),
+        ("weight", "weight_threshold", 250),
+        ("edges", "edge_threshold", 255),
+        ("edges", "edge_sigma_px", 6.0),
+    ],
+)
+def test_each_threshold_of_the_stripe_belongs_to_one_method(method, setting, value):
+    image = np.full((60, 80, 3), 60, np.uint8)
+    image[9:12] = (85, 60, 60)  # of little contrast
+    image[29:32] = (250, 130, 125)  # of hue 2.4°
+    image[29:32, 40:] = (250, 125, 130)  # of hue 357.6°
+    stricter = CONFIG.stripe.model_copy(update={setting: value})
+    before, after = (detection.responses(image, config) for config in (CONFIG.stripe, stricter))
+    assert np.count_nonzero(after[method]) < np.count_nonzero(before[method])
+    others = {"hue", "intensity", "weight", "edges"} - {method}
+    assert all(np.array_equal(after[other], before[other]) for other in others)
+
+
+def test_the_local_grid_ends_where_its_settings_say():
+    points = np.array([[0.505, -0.105], [1.005, 0.995], [1.505, 0.0]])
+    scan = LineScan(0, np.arange(3), np.zeros(3), points, np.zeros(3, np.bool_))
+    smaller = CONFIG.map.model_copy(update={"width_cells": 40, "depth_cells": 120})
+    assert np.argwhere(local_grid(scan, smaller)).tolist() == [[50, 20 + 10]]
+
+
+def test_the_floor_begins_a_margin_before_the_reach():
+    rows = np.array([row_px(THESIS, range_m) for range_m in (1.7, 1.79, 1.83, 1.89)])
+    for margin_m, is_floor in ((0.08, [False, False, True, True]), (0.15, [False, True, True, True])):
+        config = CONFIG.map.model_copy(update={"floor_margin_m": margin_m})
+        assert line_scan(rows, THESIS, config, stamp_ns=0).is_floor.tolist() == is_floor

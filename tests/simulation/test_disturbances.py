@@ -5,10 +5,8 @@ import json
 import numpy as np
 import pytest
 
-from mapper.core.geometry import angle_between
 from mapper.simulation import CameraSimulator, write_tum_log
 from mapper.simulation.config import (
-    UNCALIBRATED,
     DisturbanceConfig,
     SensorConfig,
     SynthConfig,
@@ -83,16 +81,6 @@ def test_a_hand_covers_its_share_of_image_and_depth(source, share):
         np.testing.assert_array_equal(covered.depth_m[~is_near], bare.depth_m[~is_near])
         assert (covered.image[is_near] != bare.image[is_near]).any(axis=1).mean() > 0.95
     np.testing.assert_array_equal(behind.observe(30).image, source.observe(30).image)
-
-
-def test_a_hand_below_the_least_depth_has_none(source):
-    sensor = SensorConfig()
-    config = changed(
-        PLAIN,
-        sensor=sensor,
-        disturbances=DisturbanceConfig(hand_duration_s=1.0, hand_distance_m=0.2, hand_share=0.6),
-    )
-    assert (CameraSimulator(config, source.scene).observe(3).depth_m == 0.0).mean() > 0.55
 
 
 def test_the_gain_jumps_at_each_step_and_saturates(source):
@@ -208,23 +196,6 @@ def test_depth_is_scaled_and_its_disparity_warped_alike_in_all_frames(source):
     np.testing.assert_allclose(errors[0], errors[1], atol=1e-3)
     assert errors[0].std() == pytest.approx(0.3, rel=0.1)
     assert np.abs(np.diff(errors[0], axis=1)).max() < 0.05
-
-
-def test_the_uncalibrated_sensor_changes_every_part(source):
-    known = set(SensorConfig.model_fields)
-    assert set(UNCALIBRATED) <= known
-    config = changed(SPIN, sensor=SensorConfig().model_copy(update=UNCALIBRATED))
-    frame = CameraSimulator(config, source.scene).observe(20)
-    usual = CameraSimulator(changed(SPIN, sensor=SensorConfig()), source.scene).observe(20)
-    assert (frame.image != usual.image).any(axis=2).mean() > 0.5
-    both = (frame.depth_m > 0.0) & (usual.depth_m > 0.0)
-    assert np.median(frame.depth_m[both] / usual.depth_m[both]) > 1.002
-
-
-def test_truth_is_that_of_the_middle_row_and_does_not_change(source):
-    rough = CameraSimulator(changed(SPIN, sensor=changed(IDEAL_SENSOR, **UNCALIBRATED)), source.scene)
-    np.testing.assert_array_equal(rough.truth.T_world_body, seen_by(source).truth.T_world_body)
-    assert angle_between(rough.truth.T_world_body[0, :3, :3], rough.truth.T_world_body[1, :3, :3]) > 0.05
 
 
 def test_later_settings_are_written_only_where_they_are_set(tmp_path):

@@ -112,13 +112,6 @@ def test_image_noise_has_its_size_and_no_bias():
     assert image.mean() == pytest.approx(128.0, abs=0.05)
 
 
-def test_an_ideal_sensor_changes_nothing(source):
-    rendering = source.render(40)
-    image, depth_m = observe(rendering, focal_px=131, sensor=IDEAL_SENSOR, rng=np.random.default_rng(0))
-    np.testing.assert_array_equal(image, rendering.rgb)
-    np.testing.assert_array_equal(depth_m, rendering.depth_m)
-
-
 def test_exposure_blurs_what_moves_and_leaves_depth_alone(source):
     spin = changed(PLAIN, path="spin", max_yaw_rate_rad_s=2.0)
     sharp = CameraSimulator(spin, source.scene).render(30)

@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 
 from mapper.core.geometry import exp, transform
-from mapper.graph.uncertainty import compare
+from mapper.graph.uncertainty import compare, with_model_error
+from tests.support.planar import at
 
 NOTHING = np.zeros((6, 6))
 
@@ -48,3 +49,12 @@ def test_honest_measurements_pass_but_for_one_in_a_thousand():
 def test_the_numbers_are_told():
     told = str(compare(shifted(3.0, 0.2), np.eye(4), NOTHING, slack_m=1.0, slack_rad=0.5))
     assert told.startswith("3.00 m and 0.20 rad off, at most 1.00 m and 0.50 rad (")
+
+
+def test_model_errors_grow_with_the_distance_between_the_views():
+    tight = np.eye(6) * 1e8
+    near, far = with_model_error(tight, at(0.1)), with_model_error(tight, at(2.0))
+    assert np.linalg.inv(far)[3, 3] ** 0.5 == pytest.approx(0.041, rel=0.01)
+    assert np.linalg.inv(near)[3, 3] < np.linalg.inv(far)[3, 3]
+    loose = np.eye(6)
+    np.testing.assert_allclose(with_model_error(loose, at(0.1)), loose, rtol=1e-3)
