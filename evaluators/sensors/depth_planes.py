@@ -39,7 +39,6 @@ from mapper.sources.base import FrameRef, Log
 _MIN_MEASURED_RATIO = 0.5
 _MAX_TILT_RAD = np.radians(30.0)
 _MAX_DISTANCE_RATIO = 0.2
-_DECODERS = 2
 
 
 class _Pixels:
@@ -118,7 +117,7 @@ def depth_at(
     planes: list[SeenPlane] = []
     reasons: list[str] = []
     with progress.stage(f"{distance_m:g} m") as report:
-        for done, result in enumerate(ordered_map(seen, source.entries(), workers=_DECODERS), start=1):
+        for done, result in enumerate(ordered_map(seen, source.entries()), start=1):
             if isinstance(result, str):
                 reasons.append(result)
             else:
@@ -242,7 +241,7 @@ def depth_of_planes(
     planes: list[tuple[int, SeenPlane]] = []
     best, most, unread = None, 0, 0
     with progress.stage("planes") as report:
-        for done, looked in enumerate(ordered_map(look, entries, workers=_DECODERS), start=1):
+        for done, looked in enumerate(ordered_map(look, entries), start=1):
             if looked is None:
                 unread += 1
             else:

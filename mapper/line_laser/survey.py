@@ -112,9 +112,6 @@ def _neighbours(columns: NDArray[np.int64]) -> Iterator[slice]:
     yield from starmap(slice, pairwise(bounds))
 
 
-_WORKERS = 2
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Drive:
     """Scans with their poses by wheel odometry.
@@ -161,7 +158,7 @@ def scan_images(
     scans: dict[Path, LineScan] = {}
     notes: list[str] = []
     with progress.stage("scan") as report:
-        results = ordered_map(scanned, range(len(images)), workers=_WORKERS)
+        results = ordered_map(scanned, range(len(images)))
         for done, (path, result) in enumerate(zip(images, results, strict=True), start=1):
             if isinstance(result, FrameError):
                 notes.append(f"{result}; left out")

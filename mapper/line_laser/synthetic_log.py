@@ -26,7 +26,6 @@ _START_NS = 1_000 * NS_PER_S
 _READING_NS, _FINE_NS = 50_000_000, 20_000_000
 _TICK_M = 0.002  # of path between two ticks of the encoder
 _STEERING_NOISE_RAD = 0.003
-_WORKERS = 2
 
 
 def write_line_laser_log(out: Path, config: LineLaserSynthConfig, *, progress: Progress = SILENT) -> None:
@@ -56,7 +55,7 @@ def write_line_laser_log(out: Path, config: LineLaserSynthConfig, *, progress: P
             return name, shot
 
         with progress.stage("render") as report:
-            shots = ordered_map(image_at, range(len(T_world_sensor)), workers=_WORKERS)
+            shots = ordered_map(image_at, range(len(T_world_sensor)))
             for done, (name, shot) in enumerate(shots, start=1):
                 labels.extend(
                     f"{name},{column},{shot.rows[column]:.3f},{shot.ranges_m[column]:.4f}"

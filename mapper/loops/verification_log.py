@@ -1,6 +1,5 @@
 """Record of a loop detector's searches, from which its state is restored without repeating them."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -10,7 +9,7 @@ from mapper.loops.base import Verification, Verifier
 from mapper.runtime.archived import Archived, archived
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(slots=True, eq=False)
 class LoopSearch:
     """Record of a search for loops from one node: the parts that take long to repeat.
 
@@ -19,8 +18,8 @@ class LoopSearch:
         found: Result of comparing two places, by their stamps (i, j).
     """
 
-    place: Archived[Any] | None
-    found: Mapping[tuple[int, int], Verification]
+    place: Archived[Any] | None = None
+    found: dict[tuple[int, int], Verification] = field(default_factory=dict)
 
 
 class VerificationLog:
@@ -34,7 +33,7 @@ class VerificationLog:
         """Start before the first node; None is for a detector that compares nothing."""
         self._verifier = verifier
         self._repeated: LoopSearch | None = None
-        self._new = _Search()
+        self._new = LoopSearch()
 
     def describe(self, seen: FrameView, /) -> Any:
         """Return the description of a keyframe that is kept; see ``Verifier``."""
@@ -57,13 +56,13 @@ class VerificationLog:
 
     def take(self) -> LoopSearch:
         """Return the search since the last call."""
-        new, self._new = self._new, _Search()
-        return LoopSearch(new.place, new.found)
+        new, self._new = self._new, LoopSearch()
+        return new
 
     def repeat(self, search: LoopSearch | None) -> None:
         """Return a search's results from now on; None returns to verifying."""
         self._repeated = search
-        self._new = _Search()
+        self._new = LoopSearch()
 
     def view(self) -> FrameView:
         """Return what stands for the view of the node whose search is repeated.
@@ -75,9 +74,3 @@ class VerificationLog:
             raise FrameError("a frame from which no loop was searched")
         view: FrameView = self._repeated.place.data
         return view
-
-
-@dataclass(slots=True, eq=False)
-class _Search:
-    place: Archived[Any] | None = None
-    found: dict[tuple[int, int], Verification] = field(default_factory=dict)

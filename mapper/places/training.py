@@ -17,8 +17,6 @@ from mapper.runtime.ordered_map import ordered_map
 from mapper.runtime.progress import SILENT, Progress
 from mapper.sources.base import FrameRef, Log, Skipped
 
-_WORKERS = 2
-
 
 def descriptors_of(source: Log, config: VocabularyConfig, *, progress: Progress = SILENT) -> list[Bits]:
     """Return (N_i, 4) uint64 descriptors of each of up to ``frames_per_log`` evenly spaced frames.
@@ -45,7 +43,7 @@ def descriptors_of(source: Log, config: VocabularyConfig, *, progress: Progress 
     images: list[Bits] = []
     with progress.stage("detect") as report:
         entries = compress(source.entries(), is_used)
-        for done, result in enumerate(ordered_map(detect, entries, workers=_WORKERS), start=1):
+        for done, result in enumerate(ordered_map(detect, entries), start=1):
             report(done, total)
             if isinstance(result, Skipped):
                 progress.note(f"skipped: {result.reason}")

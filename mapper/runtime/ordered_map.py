@@ -11,7 +11,7 @@ Result = TypeVar("Result")
 
 
 def ordered_map(
-    work: Callable[[Item], Result], items: Iterable[Item], *, workers: int, ahead: int = 8
+    work: Callable[[Item], Result], items: Iterable[Item], *, workers: int = 2, ahead: int = 8
 ) -> Iterator[Result]:
     """Yield ``work(item)`` for every item, in order, computing up to ``ahead`` results early.
 

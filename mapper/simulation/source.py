@@ -46,7 +46,6 @@ _COLOUR_PNG = (
 )
 _DEPTH_PNG = (cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_SUB)
 _GOOD_JPG = (cv2.IMWRITE_JPEG_QUALITY, 92)
-_WORKERS = 2
 
 
 def camera_of(config: SynthConfig) -> PinholeCamera:
@@ -243,7 +242,7 @@ def _write(folder: Path, simulator: CameraSimulator, on_progress: Callable[[int,
         _save_images(folder, name, frame, image_format=config.image_format)
         return name
 
-    for done, name in enumerate(ordered_map(save, simulator.kept.tolist(), workers=_WORKERS), start=1):
+    for done, name in enumerate(ordered_map(save, simulator.kept.tolist()), start=1):
         lists["rgb"].append(f"{name} rgb/{name}.{config.image_format}")
         lists["depth"].append(f"{name} depth/{name}.png")
         on_progress(done, len(log))

@@ -28,7 +28,6 @@ _GAP_PERIODS = 3.0
 """Median periods that a pause must exceed to be a gap."""
 _MOST_LOADED = 200
 """Frames of an RGB-D log that are loaded, evenly spread: a second or two of reading, whatever its length."""
-_WORKERS = 2
 """Threads; what decodes images releases the interpreter's lock."""
 
 
@@ -251,7 +250,7 @@ def _unreadable(log: Log, indices: Iterable[int]) -> list[str]:
             return str(error)
         return None
 
-    reasons = ordered_map(reason, indices, workers=_WORKERS)
+    reasons = ordered_map(reason, indices)
     return [why for why in reasons if why is not None]
 
 

@@ -29,8 +29,6 @@ from mapper.sources.scan_folders.kitti_writing import save_scan
 from mapper.sources.trajectory_files import write_kitti
 from mapper.sources.wheel_files import write_wheels
 
-_WORKERS = 2
-
 
 def firing_times_s(sensor: LidarSensorConfig) -> Array:
     """Return (A,) seconds after the stamp at which the columns of a sweep are fired."""
@@ -168,7 +166,7 @@ def write_lidar_log(
     with new_folder(out) as folder:
         clouds = folder / "velodyne"
         clouds.mkdir()
-        for done, _ in enumerate(ordered_map(save, range(len(log)), workers=_WORKERS), start=1):
+        for done, _ in enumerate(ordered_map(save, range(len(log))), start=1):
             if on_progress is not None:
                 on_progress(done, len(log))
         times = [seconds_text_from_ns(stamp_ns) for stamp_ns in log.stamps_ns.tolist()]
