@@ -1,9 +1,17 @@
-"""Geometric verification of a loop between two images: ISVD on points, then reprojection in pixels."""
+"""Geometric verification of a loop between two images: ISVD on points, then reprojection in pixels.
+
+From distances that differ by more than ORB bears, by about two, it is SIFT and P3P (``verify_wide``). The few
+features that such views share may as well be those of an object that stands in two rooms, so that the whole
+images have to agree.
+"""
+
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.errors import ConfigError
+from mapper.core.frames import RgbdFrame
 from mapper.core.geometry import Array, Points, Transform, adjoint, apply, inverse
 from mapper.features.frame_view import FrameView, ImageView
 from mapper.features.hamming import match_mutual_bits
@@ -12,20 +20,44 @@ from mapper.graph.uncertainty import with_model_error
 from mapper.loops.base import Verification
 from mapper.loops.config import ImageVerificationConfig
 from mapper.registration.base import Alignment
+from mapper.registration.image_agreement import ImageAgreement, image_agreement
 from mapper.registration.isvd import Isvd
 from mapper.registration.reprojection import (
+    disparity_sigmas_px,
     image_measurements,
     normal_matrix,
     ransac_p3p,
     refine_pose,
     residual_statistics,
 )
+from mapper.sensing.config import KINECT_NOISE
+from mapper.sensing.depth_noise import depth_sigma_m
 
 MAX_SIGMA_M = 0.05
 """A motion whose translation is less certain in any direction is no loop: far scenes leave it uncertain."""
 _LM_ROUNDS, _LM_ITERATIONS = 4, 10
 _MAX_HAMMING = 64
 _P3P_PAIRS, _P3P_TOLERANCE_PX, _P3P_ITERATIONS = 4, 4.0, 300
+
+_MAX_WIDE_RATIO = 0.85
+_DEPTH_SHARE = 0.02
+"""Error of depths beside the sensor's noise: its scale, and the slope where a feature lies."""
+_MIN_WIDE_INLIERS = 8
+"""Random pairs agree with one motion by three to six, seldom by ten: fewer would only take longer."""
+_MIN_SAME, _MAX_THROUGH, _MIN_CORRELATION = 0.8, 0.05, 0.6
+"""Share of the surfaces at the same depth, share in space that the other image sees through, and correlation
+of the grey levels. Views of one place give at least 0.89 and 0.7, and at most 0.03; those of an object that
+stands in another room too, 0.8 where grey levels correlate by 0.5, and 0.6 where they do by 0.6."""
+_MIN_LOCAL_CORRELATION = 0.4
+"""The same correlation without the local mean and contrast. Two walls of a hall with posters alike gave 0.94
+and 0.32 (once 0.43); views of one place give at least 0.46."""
+
+_MIN_ZOOM = 1.5
+"""Least ratio of the distances from which both see the place. From alike distances ORB recognises it; where
+it does not, what agrees is a texture that repeats, as of the floor along a corridor."""
+
+FrameOf = Callable[[int], RgbdFrame]
+"""Reads the frame of a stamp."""
 
 
 class ImageVerifier:
@@ -124,7 +156,7 @@ class ImageVerifier:
             reason = f"reprojection: {inliers} of {len(pairs)} pairs agree, want {wanted:.0f}"
             return Verification(matches, reason, inliers, rmse_m)
         seen = T_j_i, points[agree], measured[agree], weights[agree], intrinsics
-        residual_px = rms_residual_px(*seen)
+        residual_px = _rms_residual_px(*seen)
         T_ci_cj, information, scale = alignment.T_target_source, alignment.information, 1.0
         if config.measure == "reprojection":
             T_ci_cj = inverse(T_j_i)
@@ -132,9 +164,7 @@ class ImageVerifier:
             information = 0.5 * normal_matrix(*seen)
             scale = 1.0 / residual_statistics(*seen).variance_factor
         assert information is not None  # ISVD converged
-        to_camera = adjoint(inverse(j.T_body_camera))
-        information = to_camera.T @ information @ to_camera
-        T_i_j = i.T_body_camera @ T_ci_cj @ inverse(j.T_body_camera)
+        T_i_j, information = _between_bodies(i, j, T_ci_cj, information)
         sigma_m = _largest_sigma_m(with_model_error(information, T_i_j))
         if sigma_m > MAX_SIGMA_M:
             reason = f"loose: translation known to {sigma_m:.2f} m, want {MAX_SIGMA_M} m"
@@ -143,7 +173,16 @@ class ImageVerifier:
         return Verification(matches, "", inliers, rmse_m, residual_px, T_i_j, information)
 
 
-def rms_residual_px(
+def _between_bodies(
+    i: ImageView, j: ImageView, T_ci_cj: Transform, information: Array
+) -> tuple[Transform, Array]:
+    """Return the pose of j's body in i's, and its information, by those of the cameras."""
+    to_camera = adjoint(inverse(j.T_body_camera))
+    T_i_j = i.T_body_camera @ T_ci_cj @ inverse(j.T_body_camera)
+    return T_i_j, to_camera.T @ information @ to_camera
+
+
+def _rms_residual_px(
     T_j_i: Transform, points: Points, measured: Array, weights: Array, intrinsics: Array
 ) -> float:
     """Return the root mean square of the weighted distances of projected points from their pixels."""
@@ -170,4 +209,94 @@ def _measurements(view: ImageView, features: NDArray[np.intp]) -> tuple[Array, A
         view.intrinsics,
         sigma_px=sigma_px,
         disparity_sigma_px=sigma_px,
+    )
+
+
+def verify_wide(i: ImageView, j: ImageView, frame_of: FrameOf) -> Verification:
+    """Return the pose of view j in view i, or why they do not show one place.
+
+    Args:
+        i: SIFT features of one frame.
+        j: Those of another.
+        frame_of: Reads the two frames, only if the features agree.
+    """
+    pairs = match_mutual(i, j, max_ratio=_MAX_WIDE_RATIO)
+    pairs = pairs[~np.isnan(i.points_camera[pairs[:, 0], 2])]
+    matches = len(pairs)
+    found = _pose(i, j, pairs)
+    if found is None:
+        return Verification(
+            matches, f"matching: of {matches} pairs no {_MIN_WIDE_INLIERS} agree with one motion"
+        )
+    T_j_i, pairs = found
+    zoom = _zoom(i, pairs, T_j_i)
+    if max(zoom, 1.0 / zoom) < _MIN_ZOOM:
+        reason = f"distance: seen from {zoom:.1f} times as far away, where ORB would have recognised it"
+        return Verification(matches, reason, len(pairs))
+    seen_i, seen_j = frame_of(i.stamp_ns), frame_of(j.stamp_ns)
+    for alike in (image_agreement(seen_i, seen_j, T_j_i), image_agreement(seen_j, seen_i, inverse(T_j_i))):
+        if not _is_one_place(alike):
+            reason = (
+                f"images: {alike.same_ratio:.0%} of the surfaces are at the same depth, and grey levels "
+                f"correlate by {alike.correlation:.2f}, details by {alike.local_correlation:.2f}; "
+                f"want {_MIN_SAME:.0%}, {_MIN_CORRELATION} and {_MIN_LOCAL_CORRELATION}"
+            )
+            return Verification(matches, reason, len(pairs))
+    return _measured(i, j, pairs, T_j_i, matches=matches)
+
+
+def _zoom(i: ImageView, pairs: Pairs, T_j_i: Transform) -> float:
+    """Return the distance of the paired points from camera j relative to that from camera i."""
+    points_i = i.points_camera[pairs[:, 0]]
+    distances_m = (np.linalg.norm(points, axis=1) for points in (points_i, apply(T_j_i, points_i)))
+    near, far = (float(np.median(distance_m)) for distance_m in distances_m)
+    return far / near
+
+
+def _is_one_place(alike: ImageAgreement) -> bool:
+    return (
+        alike.same_ratio >= _MIN_SAME
+        and alike.through_ratio <= _MAX_THROUGH
+        and alike.correlation >= _MIN_CORRELATION
+        and alike.local_correlation >= _MIN_LOCAL_CORRELATION
+    )
+
+
+def _pose(i: ImageView, j: ImageView, pairs: Pairs) -> tuple[Transform, Pairs] | None:
+    """Return the pose of camera i in camera j with the pairs that agree; None if they are too few."""
+    if len(pairs) < _MIN_WIDE_INLIERS:
+        return None
+    points, pixels = i.points_camera[pairs[:, 0]], j.pixels[pairs[:, 1]]
+    found = ransac_p3p(
+        points, pixels, j.intrinsics, tolerance_px=_P3P_TOLERANCE_PX, iterations=_P3P_ITERATIONS
+    )
+    if found is None or len(found[1]) < _MIN_WIDE_INLIERS:
+        return None
+    T_j_i, agreeing = found
+    pairs = pairs[agreeing]
+    T_j_i, agree, _ = refine_pose(
+        T_j_i, points[agreeing], *_wide_measurements(j, pairs[:, 1]), _LM_ROUNDS, _LM_ITERATIONS
+    )
+    return (T_j_i, pairs[agree]) if agree.sum() >= _MIN_WIDE_INLIERS else None
+
+
+def _measured(i: ImageView, j: ImageView, pairs: Pairs, T_j_i: Transform, *, matches: int) -> Verification:
+    seen = (T_j_i, i.points_camera[pairs[:, 0]], *_wide_measurements(j, pairs[:, 1]))
+    # i's points were measured no better than j's pixels, so the information is halved.
+    information = 0.5 * normal_matrix(*seen) / residual_statistics(*seen).variance_factor
+    T_i_j, information = _between_bodies(i, j, inverse(T_j_i), information)
+    information = with_model_error(information, T_i_j)
+    return Verification(matches, "", len(pairs), None, _rms_residual_px(*seen), T_i_j, information)
+
+
+def _wide_measurements(view: ImageView, features: NDArray[np.intp]) -> tuple[Array, Array, Array]:
+    """Return (M, 3) u, v, bf/z, their (M, 3) inverse variances, and (5,) intrinsics."""
+    z = view.points_camera[features, 2]
+    sigma_m = np.hypot(depth_sigma_m(KINECT_NOISE, z), _DEPTH_SHARE * z)
+    return image_measurements(
+        view.pixels[features],
+        z,
+        view.intrinsics,
+        sigma_px=view.sigma_px[features],
+        disparity_sigma_px=disparity_sigmas_px(z, sigma_m),
     )

@@ -18,7 +18,7 @@ from mapper.graph.model import PoseGraph
 from mapper.loops.base import Verification
 from mapper.loops.closure import Discrepancy, LoopClosure, accepted_loops, discrepancy, exceeds
 from mapper.loops.config import GateConfig, PlaceLoopsConfig
-from mapper.loops.wide_baseline import verify_wide
+from mapper.loops.image_verification import verify_wide
 from mapper.odometry.base import FrameResult
 from mapper.odometry.config import IsvdOdometryConfig
 from mapper.pipeline.reobserve import reobserve

@@ -7,7 +7,7 @@ import pytest
 
 from mapper.core.geometry import inverse
 from mapper.features.config import SiftConfig
-from mapper.loops.wide_baseline import verify_wide
+from mapper.loops.image_verification import verify_wide
 from mapper.odometry.config import IsvdOdometryConfig
 from mapper.odometry.factory import build_frame_odometry
 from mapper.registration.image_agreement import image_agreement
