@@ -31,7 +31,7 @@ from mapper.octree.config import OctreeConfig
 from mapper.octree.map import OctreeMap
 from mapper.octree.moving_objects import remove_moving_objects
 from mapper.octree.scan_updates import pack
-from mapper.sensing.depth_noise import DepthLimit
+from mapper.sensing.depth import DepthLimit
 from mapper.simulation.config import COURTYARD, STREET, LidarSynthConfig, SynthConfig
 from mapper.simulation.lidar import LidarSimulator
 from mapper.simulation.source import CameraSimulator

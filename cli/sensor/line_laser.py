@@ -63,8 +63,7 @@ def line_laser(
     from mapper.config.loading import overridden, read_config
     from mapper.evaluators.sensors.line_laser import read_labels, score
     from mapper.line_laser.config import THESIS, LineLaserCalibration, LineLaserConfig
-    from mapper.line_laser.files import find_images
-    from mapper.line_laser.products import FOLDER, write_drive, write_scans
+    from mapper.line_laser.files import FOLDER, find_images, write_drive, write_scans
     from mapper.line_laser.survey import drive, scan_images, sensor_poses
     from mapper.runtime.atomic import atomic_folder
 
@@ -173,7 +172,7 @@ def accuracy(
     from mapper.evaluators.sensors.line_laser_study import detections, study, table_2_1
     from mapper.evaluators.study.table import csv_text
     from mapper.line_laser.config import LineLaserConfig
-    from mapper.line_laser.products import DETECTIONS
+    from mapper.line_laser.files import DETECTIONS
     from mapper.runtime.atomic import MANIFEST_NAME, FolderKind, atomic_folder, write_text
 
     config = overridden(LineLaserConfig(), set_ or [])

@@ -14,7 +14,7 @@ from mapper.evaluators.sensors.depth_study import DepthStudy, NoiseFit, records_
 from mapper.evaluators.study.table import csv_text
 from mapper.export.figures import FAINT, LINE, TEXT, Rgb, caption, hex_of, page, panel, save
 from mapper.runtime.atomic import MANIFEST_NAME, FolderKind, write_json, write_text
-from mapper.sensing.depth_noise import depth_sigma_m
+from mapper.sensing.depth import depth_sigma_m
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -23,7 +23,7 @@ from mapper.evaluators.sensors.depth_accuracy import (
 )
 from mapper.runtime.ordered_map import ordered_map
 from mapper.runtime.progress import SILENT, Progress
-from mapper.sensing.depth_filter import dif
+from mapper.sensing.depth import dif
 from mapper.sensing.planes import (
     MAX_NOISE_RATIO,
     MIN_FRAMES,

@@ -14,7 +14,7 @@ from mapper.core.geometry import Array
 from mapper.evaluators.study.table import Column, Record, Table, csv_text, decimals
 from mapper.line_laser.config import StripeConfig
 from mapper.line_laser.detection import METHODS, Method, Response, responses, stripe_rows
-from mapper.line_laser.products import DETECTIONS, RANGE_ERRORS
+from mapper.line_laser.files import DETECTIONS, RANGE_ERRORS
 from mapper.line_laser.ranging import LineScan
 from mapper.runtime.atomic import write_text
 from mapper.sources.image_files.reading import read_colour

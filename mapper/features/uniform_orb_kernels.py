@@ -31,6 +31,7 @@ _BLOCK = 512  # pixels per step; the buffers stay in the first-level cache
 
 _OFFSETS = np.arange(-PATCH_RADIUS_PX, PATCH_RADIUS_PX + 1)
 _DISC = (np.add.outer(_OFFSETS**2, _OFFSETS**2) <= PATCH_RADIUS_PX**2).astype(np.uint8)
+_DEPTH = 12  # 4096 columns and rows of leaves: finer than any image's pixels
 
 
 @njit(cache=True, nogil=True)
@@ -182,9 +183,6 @@ def orientations(image: Image, pixels: Pixels) -> NDArray[np.float32]:
             moment_y += dy * int(total)
         angles[i] = math.atan2(moment_y, moment_x)
     return angles
-
-
-_DEPTH = 12  # 4096 columns and rows of leaves: finer than any image's pixels
 
 
 @njit(cache=True, nogil=True)

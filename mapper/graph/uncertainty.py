@@ -10,6 +10,9 @@ MEDIAN_CHI2 = 5.348
 """Median of χ² with six degrees of freedom."""
 _LIMIT_CHI2 = 22.458
 """99.9 % of χ² with six degrees of freedom (Bar-Shalom, Li & Kirubarajan 2001, §1.5.4)."""
+_SHARE = 0.02
+"""Model error as a share of distance and angle: calibration and depth distortion, common to all pixels."""
+_LEAST_M, _LEAST_RAD = 1e-3, 1e-3
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,11 +72,6 @@ def compare(
         allowed_rad,
         float(np.sqrt(twist @ np.linalg.solve(total, twist))),
     )
-
-
-_SHARE = 0.02
-"""Model error as a share of distance and angle: calibration and depth distortion, common to all pixels."""
-_LEAST_M, _LEAST_RAD = 1e-3, 1e-3
 
 
 def with_model_error(information: Array, T_i_j: Transform, *, scale: float = 1.0) -> Array:

@@ -28,6 +28,25 @@ _HEIGHT_M = 0.8  # the camera sees no higher where the laser shows anything
 _WALL_LIGHTNESS = (0.45, 0.95)
 _FLOOR_LIGHTNESS = (0.3, 0.6)
 _WOOD = np.array([0.0, 0.25, 0.5])  # what the brownest of floors takes away of red, green and blue
+_CAMERA_M, _LASER_M = 0.324, 0.615
+"""Heights above the floor; with the default focal length and reach they put the stripe within 0.3 % of where
+eq. 2.44 has it."""
+_LASER_LEVELS = 600.0
+"""Brightness that the laser adds to a white wall 1 m away, where 255 is the most a pixel can show: the stripe
+is seen on the floor at its reach, where the thesis measured its farthest point."""
+_STRIPE_M = 0.004  # four standard deviations
+_GLOSS = 0.15  # share of light that the floor reflects like a mirror
+_JPEG_QUALITY = 85
+_LENS_PX = 0.9
+_TEXTURE_PX_PER_M = 150.0
+_TEXTURE_GAIN = 0.08
+_LIGHT_FROM = np.array([0.8, 0.6])
+_FAR_M = 50.0
+_NOWHERE = 0.3  # what is beyond all walls returns of the room's light
+_BLOOM_PX, _BLOOM_RATIO = 7.0, 0.12
+_CROSSTALK = 0.1  # of the laser's light, in the pixels of the other colours
+_SPILL = 0.6  # of what is too bright for the red ones
+_SPECKLE = 0.25
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,27 +145,6 @@ def _patch(rng: np.random.Generator, wall: int, length_m: float, kind: str) -> P
         return Patch(wall, along_m, up_m, "dull", (0.04, 0.04, 0.04))
     red = float(rng.uniform(0.45, 0.95))
     return Patch(wall, along_m, up_m, "red", (red, 0.25 * red, 0.2 * red))
-
-
-_CAMERA_M, _LASER_M = 0.324, 0.615
-"""Heights above the floor; with the default focal length and reach they put the stripe within 0.3 % of where
-eq. 2.44 has it."""
-_LASER_LEVELS = 600.0
-"""Brightness that the laser adds to a white wall 1 m away, where 255 is the most a pixel can show: the stripe
-is seen on the floor at its reach, where the thesis measured its farthest point."""
-_STRIPE_M = 0.004  # four standard deviations
-_GLOSS = 0.15  # share of light that the floor reflects like a mirror
-_JPEG_QUALITY = 85
-_LENS_PX = 0.9
-_TEXTURE_PX_PER_M = 150.0
-_TEXTURE_GAIN = 0.08
-_LIGHT_FROM = np.array([0.8, 0.6])
-_FAR_M = 50.0
-_NOWHERE = 0.3  # what is beyond all walls returns of the room's light
-_BLOOM_PX, _BLOOM_RATIO = 7.0, 0.12
-_CROSSTALK = 0.1  # of the laser's light, in the pixels of the other colours
-_SPILL = 0.6  # of what is too bright for the red ones
-_SPECKLE = 0.25
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -31,7 +31,7 @@ from mapper.registration.reprojection import (
     residual_statistics,
 )
 from mapper.sensing.config import KINECT_NOISE
-from mapper.sensing.depth_noise import depth_sigma_m
+from mapper.sensing.depth import depth_sigma_m
 
 MAX_SIGMA_M = 0.05
 """A motion whose translation is less certain in any direction is no loop: far scenes leave it uncertain."""

@@ -16,9 +16,9 @@ from mapper.loops.scan_context_proposer import ScanPlace
 from mapper.registration.base import Alignment
 from mapper.registration.degeneracy import degeneracy_of
 from mapper.registration.free_space import FreeSpaceCheck, FreeSpaceCounts, ScanDescription, range_image
+from mapper.registration.hough.description import centres_of
 from mapper.registration.hough.ground import find_ground, find_obstacles, level
 from mapper.registration.hough.ground_kernels import thin
-from mapper.registration.hough.object_detection import centres_of
 from mapper.registration.hough.voting import vote
 from mapper.registration.refining import refine
 from mapper.registration.surfaces import Prepared, prepared

@@ -15,7 +15,7 @@ from mapper.octree import casting_kernels as kernels
 from mapper.octree.casting_kernels import Window
 from mapper.octree.config import OctreeConfig
 from mapper.octree.keys import BLOCK_BITS, BLOCK_VOXELS, KEY_BITS, KEY_COUNT, KEY_ZERO
-from mapper.sensing.depth_noise import DepthLimit
+from mapper.sensing.depth import DepthLimit
 
 _LIMIT_BYTES = 1 << 33
 """Limit of a window. Address space, not memory: only pages that a ray crosses are ever backed by memory."""

@@ -69,7 +69,7 @@ from mapper.octree.keys import (
 from mapper.octree.map import OctreeMap
 from mapper.octree.scan_updates import ScanUpdate
 from mapper.sensing.config import DepthNoiseConfig
-from mapper.sensing.depth_noise import depth_sigma_m
+from mapper.sensing.depth import depth_sigma_m
 
 _LEAST_SEEN_THROUGH, _SEEN_THROUGH_RATIO = 2, 0.5
 _LEAST_PASSES, _PASSES_RATIO = 8, 2.0

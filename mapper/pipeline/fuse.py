@@ -40,7 +40,7 @@ from mapper.run.warnings import FLOOR, find_warnings, floor_warnings, verdict_of
 from mapper.run.writer import RunWriter, write_run
 from mapper.runtime.atomic import is_temporary
 from mapper.runtime.progress import SILENT, Progress
-from mapper.sensing.depth_noise import DepthLimit
+from mapper.sensing.depth import DepthLimit
 from mapper.sources.base import Log
 
 _FUSE_CONFIGS = frozenset(

@@ -17,6 +17,9 @@ from mapper.runtime.ordered_map import ordered_map
 from mapper.runtime.progress import SILENT, Progress
 from mapper.sources.base import FrameRef, Log, Skipped
 
+MIN_IMAGES = 2
+"""With one image every word would be in all images and weigh nothing."""
+
 
 def descriptors_of(source: Log, config: VocabularyConfig, *, progress: Progress = SILENT) -> list[Bits]:
     """Return (N_i, 4) uint64 descriptors of each of up to ``frames_per_log`` evenly spaced frames.
@@ -50,10 +53,6 @@ def descriptors_of(source: Log, config: VocabularyConfig, *, progress: Progress 
             else:
                 images.append(result)
     return images
-
-
-MIN_IMAGES = 2
-"""With one image every word would be in all images and weigh nothing."""
 
 
 def train(

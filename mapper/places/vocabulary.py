@@ -20,6 +20,14 @@ from mapper.runtime.checked_file import CheckedFormat
 
 Ids = NDArray[np.int32]
 """(N,) int32: words or nodes."""
+DESCRIPTOR = "orb"
+"""Kind of the descriptors: of detectors "orb" and "uniform-orb"."""
+DESCRIPTOR_BYTES = 32
+ONE = 32_768
+"""Sum of an image's weights."""
+_FORMAT = CheckedFormat(b"\x89mapper-words\r\n", version=1, remedy="train it again", error=VocabularyError)
+SHIPPED = Path(__file__).with_name("orb.words")
+"""Trained on synthetic logs by ``scripts/train_vocabulary.py``."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,17 +102,6 @@ class WordTree:
         while (deeper := self.depth[node] > level).any():
             node = np.where(deeper, self._parent[node], node)
         return node
-
-
-DESCRIPTOR = "orb"
-"""Kind of the descriptors: of detectors "orb" and "uniform-orb"."""
-DESCRIPTOR_BYTES = 32
-ONE = 32_768
-"""Sum of an image's weights."""
-
-_FORMAT = CheckedFormat(b"\x89mapper-words\r\n", version=1, remedy="train it again", error=VocabularyError)
-SHIPPED = Path(__file__).with_name("orb.words")
-"""Trained on synthetic logs by ``scripts/train_vocabulary.py``."""
 
 
 class _Header(Config):

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from mapper.core.frames import Image, RgbdFrame, ray_table
 from mapper.core.geometry import Transform, apply
 from mapper.sensing.config import KINECT_NOISE
-from mapper.sensing.depth_noise import depth_sigma_m
+from mapper.sensing.depth import depth_sigma_m
 
 _ROWS = 120
 """Rows of the pixels that are compared."""

@@ -19,6 +19,9 @@ HUBER_2DOF, HUBER_3DOF = np.sqrt(CHI2_2DOF), np.sqrt(CHI2_3DOF)
 
 VIRTUAL_BASELINE_PX_M = 40.0
 """bf where no setting has it: depth z counts as the disparity bf / z (Mur-Artal & Tardós 2017)."""
+_CONFIDENCE = 0.999
+_COLUMNS, _ROWS = 4, 3
+"""Cells of the image; features of one cell share the errors of lens, depth and shutter."""
 
 
 def image_measurements(
@@ -232,9 +235,6 @@ def refine_pose(T_camera_world, points, measured, weights, intrinsics, rounds, i
     return T, inlier, H
 
 
-_CONFIDENCE = 0.999
-
-
 def ransac_p3p(
     points_world: Points,
     pixels: Array,
@@ -274,10 +274,6 @@ def ransac_p3p(
     T_camera_world[:3, :3], _ = cv2.Rodrigues(rotation)
     T_camera_world[:3, 3] = translation[:, 0]
     return T_camera_world, np.sort(order[inliers[:, 0]])
-
-
-_COLUMNS, _ROWS = 4, 3
-"""Cells of the image; features of one cell share the errors of lens, depth and shutter."""
 
 
 @dataclass(frozen=True, slots=True)

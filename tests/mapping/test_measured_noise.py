@@ -7,7 +7,7 @@ from mapper.core.errors import FrameError
 from mapper.core.frames import PinholeCamera, RgbdFrame, ray_table
 from mapper.mapping.measured_noise import measure_noise
 from mapper.sensing.config import KINECT_NOISE, DepthNoiseConfig
-from mapper.sensing.depth_noise import depth_sigma_m
+from mapper.sensing.depth import depth_sigma_m
 from tests.support.logs import MemoryEntry, log_in_memory
 
 CAMERA = PinholeCamera(width_px=320, height_px=240, fx_px=260.0, fy_px=260.0, cx_px=159.5, cy_px=119.5)

@@ -17,7 +17,7 @@ from mapper.pipeline.build import build
 from mapper.pipeline.fuse import fuse
 from mapper.run.folder import open_run
 from mapper.run.manifest import read_manifest
-from mapper.sensing.depth_noise import depth_sigma_m
+from mapper.sensing.depth import depth_sigma_m
 from mapper.sources import open_source
 from mapper.sources.cloud_files import read_cloud
 from tests.support.desk import REPEATABLE

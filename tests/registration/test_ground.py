@@ -9,9 +9,9 @@ from mapper.registration.hough.config import (
     LevellingConfig,
     ObjectsConfig,
 )
+from mapper.registration.hough.description import centres_of
 from mapper.registration.hough.ground import find_ground, find_obstacles, level, surroundings
 from mapper.registration.hough.ground_kernels import column_heights
-from mapper.registration.hough.object_detection import centres_of
 
 HEIGHT_M = 1.7
 

@@ -8,7 +8,7 @@ from mapper.core.frames import PinholeCamera, RgbdFrame, Scan, ray_table
 from mapper.evaluators.sensors.depth_accuracy import Patch, accuracy_of, quantisation_step_m
 from mapper.evaluators.sensors.depth_planes import depth_at, depth_of_planes
 from mapper.evaluators.sensors.depth_study import fit_noise, study_depth
-from mapper.sensing.depth_noise import depth_sigma_m
+from mapper.sensing.depth import depth_sigma_m
 from mapper.sensing.planes import fit_planes
 from mapper.simulation.config import SensorConfig, SynthConfig
 from mapper.simulation.source import CameraSimulator

@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from mapper.core.errors import DataError
-from mapper.sensing.depth_filter import dif
+from mapper.sensing.depth import dif
 
 DEPTHS = arrays(
     np.float32,

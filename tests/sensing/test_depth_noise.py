@@ -11,7 +11,7 @@ from mapper.octree.map import OctreeMap
 from mapper.odometry.config import LocalMapConfig
 from mapper.odometry.factory import build_frame_odometry
 from mapper.sensing.config import KINECT_NOISE, DepthNoiseConfig
-from mapper.sensing.depth_noise import DepthLimit, depth_sigma_m, feature_depth_sigma_m
+from mapper.sensing.depth import DepthLimit, depth_sigma_m, feature_depth_sigma_m
 from mapper.simulation.config import SynthConfig
 from mapper.simulation.source import CameraSimulator
 

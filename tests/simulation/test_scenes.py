@@ -8,7 +8,7 @@ from mapper.simulation import CameraSimulator, render
 from mapper.simulation.config import CAMERA_SCENES, LIDAR_SCENES, SynthConfig
 from mapper.simulation.lidar import LidarSimulator
 from mapper.simulation.lidar.scene import make_outdoor_scene
-from mapper.simulation.lidar.staircase import STOREY_M
+from mapper.simulation.lidar.things import STOREY_M
 from mapper.simulation.path import seconds_of
 from mapper.simulation.plan import TWIN_DISTANCE_M
 from tests.support.ideal_sensors import IDEAL_LIDAR, IDEAL_SENSOR

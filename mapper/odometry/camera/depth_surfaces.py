@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from mapper.core.frames import DepthImage, PinholeCamera
 from mapper.core.geometry import Array, Points
 from mapper.sensing.config import KINECT_NOISE, DepthNoiseConfig
-from mapper.sensing.depth_noise import depth_sigma_m
+from mapper.sensing.depth import depth_sigma_m
 
 _COLUMNS = 80
 _SAMPLES = 4

@@ -20,7 +20,7 @@ from mapper.odometry.config import KeyframeOdometryConfig
 from mapper.places.vocabulary import Vocabulary
 from mapper.runtime.archived import Archivable
 from mapper.sensing.config import KINECT_NOISE
-from mapper.sensing.depth_noise import depth_sigma_m, feature_depth_m, feature_depth_sigma_m
+from mapper.sensing.depth import depth_sigma_m, feature_depth_m, feature_depth_sigma_m
 
 _MIN_DEPTH_M = 0.05
 FEW_MOVING = 0.05

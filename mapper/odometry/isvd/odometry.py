@@ -38,8 +38,7 @@ from mapper.registration.reprojection import (
 )
 from mapper.runtime.archived import Archived, archived
 from mapper.sensing.config import KINECT_NOISE
-from mapper.sensing.depth_filter import dif
-from mapper.sensing.depth_noise import depth_sigma_m, feature_depth_m
+from mapper.sensing.depth import depth_sigma_m, dif, feature_depth_m
 
 _DEPTH_SHARE = 0.01
 """Error of depths beside the sensor's noise, as a share: its scale, and the slope where a feature lies."""

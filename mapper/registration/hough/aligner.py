@@ -42,6 +42,8 @@ MAX_CONTRADICTING_RATIO_OF_MANY = 0.03
 Right answers had 0.023 and less, wrong ones 0.1 and more."""
 CONTRADICTION_WEIGHT = 5.0
 """A motion's score is the share of obstacles that agree, less so many times the share that contradicts."""
+NEAR_SCORE = 0.3
+"""Candidates are refined whose scores are this near to the best."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -125,10 +127,6 @@ def rejection(
                 f"{other.score:.2f}, within {acceptance.min_lead:g} of the best"
             )
     return ""
-
-
-NEAR_SCORE = 0.3
-"""Candidates are refined whose scores are this near to the best."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -22,6 +22,8 @@ BELOW_WEIGHT = 1.0
 MIN_INLIER_RATIO = 0.03
 """With a smaller share of inliers there is no ground, and the scan is taken as level."""
 _REFITS = 3
+MIN_POINTS = 3
+"""Columns with fewer points are noise."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -87,10 +89,6 @@ def _refitted(points: Points, plane: Array, inlier_m: float) -> Array:
     up = np.linalg.eigh(offsets.T @ offsets)[1][:, 0]
     up *= np.copysign(1.0, up[2])
     return np.append(up, -up @ centre)
-
-
-MIN_POINTS = 3
-"""Columns with fewer points are noise."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

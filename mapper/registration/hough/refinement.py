@@ -12,7 +12,7 @@ from mapper.core.geometry import Points, Transform, apply, planar_motion, rotati
 from mapper.registration.hough.config import HoughConfig, NdtStagesConfig, OverlapConfig
 from mapper.registration.hough.description import HoughDescription
 from mapper.registration.hough.ground import Ground
-from mapper.registration.hough.planar_kernels import FULL_OVERLAP, hill_climb
+from mapper.registration.hough.search_kernels import FULL_OVERLAP, hill_climb
 from mapper.registration.ndt import refine_by_cells
 from mapper.registration.refining import refined_motion
 from mapper.registration.surfaces import Prepared, prepared

@@ -11,7 +11,7 @@ from mapper.core.rotations import rotation_from_quaternion
 from mapper.core.timebase import NS_PER_S, Stamps
 from mapper.simulation.config import LidarSynthConfig, SynthConfig
 from mapper.simulation.lidar.solids import Ground
-from mapper.simulation.lidar.staircase import ROUTE_SIZE_M, heights_m
+from mapper.simulation.lidar.things import ROUTE_SIZE_M, heights_m
 from mapper.simulation.path import START_NS
 from mapper.simulation.plan import closed_spline, make_plan
 from mapper.simulation.streams import Stream, rng_of

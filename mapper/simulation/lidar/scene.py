@@ -15,7 +15,7 @@ from mapper.simulation.lidar import things
 from mapper.simulation.lidar.cast import World, sort_into_cells
 from mapper.simulation.lidar.route import Route, flat_of, make_route
 from mapper.simulation.lidar.solids import Ground, Shape, Site, Solids, make_ground
-from mapper.simulation.lidar.staircase import build_staircase, storeys_of
+from mapper.simulation.lidar.things import build_staircase, storeys_of
 from mapper.simulation.scene import make_scene
 from mapper.simulation.streams import Stream, rng_of
 
