@@ -23,6 +23,8 @@ _MAX_STILL_WORLD_RATIO = 0.5
 """If more of the far cells stand still, so does the sensor, or it moves along a tunnel."""
 _MAX_STEP_CELLS = 2
 """At most one empty cell lies between two members of a group."""
+_MAX_RETURNS_RATIO = 1.0 / 3.0
+"""What takes up more of the view is no vehicle: it is the object that is scanned."""
 _STEP_M = 0.05
 _POINTS = 60_000
 
@@ -58,7 +60,7 @@ def vehicle_box(log: Log) -> Box | None:
     those of walls along the way do. Ground below a LiDAR stands still too, and is left out by its height.
     """
     scale = _SCALES[log.sensor]
-    clouds = _clouds(log, scale)
+    clouds, returns = _clouds(log, scale)
     if len(clouds) < _MIN_FRAMES:
         return None
     cells, standing = _counted(clouds, scale)
@@ -83,24 +85,29 @@ def vehicle_box(log: Log) -> Box | None:
         return None
     lower = np.floor(own_cells.min(axis=0) * scale.cell_m / _STEP_M + 1e-6) * _STEP_M - _STEP_M
     upper = np.ceil((own_cells.max(axis=0) + 1) * scale.cell_m / _STEP_M - 1e-6) * _STEP_M + _STEP_M
+    inside = sum(int(((points >= lower) & (points <= upper)).all(axis=1).sum()) for points in clouds)
+    if inside > _MAX_RETURNS_RATIO * returns:
+        return None
     x_low, y_low, z_low, x_high, y_high, z_high = (round(float(v), 3) for v in (*lower, *upper))
     return x_low, y_low, z_low, x_high, y_high, z_high
 
 
-def _clouds(log: Log, scale: _Scale) -> list[Points]:
-    """Return the points around the sensor of some frames, without the ground."""
+def _clouds(log: Log, scale: _Scale) -> tuple[list[Points], int]:
+    """Return the points around the sensor of some frames, without the ground, and the number of all."""
     clouds: list[Points] = []
+    returns = 0
     for entry in log.spread_entries(_FRAMES):
         try:
             points = entry.scan().points_body
         except FrameError:
             continue
         points = points[:: max(1, len(points) // _POINTS)].astype(np.float64)
+        returns += len(points)
         clouds.append(points[np.linalg.norm(points, axis=1) <= scale.around_m])
     if scale.ground_m is not None and clouds:
         limit_m = _ground_m(np.concatenate([points[:, 2] for points in clouds])) + scale.ground_m
         clouds = [points[points[:, 2] > limit_m] for points in clouds]
-    return clouds
+    return clouds, returns
 
 
 def _ground_m(heights_m: Array) -> float:

@@ -64,6 +64,17 @@ def test_few_frames_tell_nothing():
     assert vehicle_box(log.subset(np.arange(5))) is None
 
 
+@pytest.mark.parametrize(("columns", "is_vehicle"), [(20, True), (60, False)])
+def test_what_takes_up_most_of_the_view_is_scanned_and_no_vehicle(columns, is_vehicle):
+    entries = []
+    for k in range(FRAMES):
+        depth_m = np.full((60, 80), 1.3 + 0.12 * k, np.float32)
+        depth_m[:, 40 - columns // 2 : 40 + columns // 2] = 0.6
+        frame = RgbdFrame(k, np.zeros((60, 80), np.uint8), depth_m, CAMERA)
+        entries.append(MemoryEntry(k, frame))
+    assert (vehicle_box(log_in_memory(entries)) is not None) == is_vehicle
+
+
 @pytest.mark.parametrize("bumper", [True, False])
 def test_a_bumper_below_a_camera_is_found(bumper):
     entries = []
