@@ -283,8 +283,9 @@ class RgbdFrame:
         )
         colors = None
         if self.image.ndim == 3:
-            depth_m = self.depth_m[::stride_px, ::stride_px]
-            colors = self.image[::stride_px, ::stride_px][(depth_m > 0.0) & (depth_m <= max_depth_m)]
+            depth_m = self.depth_m[::stride_px, ::stride_px].ravel()
+            pixels = self.image[::stride_px, ::stride_px].reshape(-1, 3)
+            colors = np.compress((depth_m > 0.0) & (depth_m <= max_depth_m), pixels, axis=0)
         return Scan(
             stamp_ns=self.stamp_ns,
             points_body=points_body,

@@ -79,6 +79,7 @@ def fuse_clouds(
         for done, returns in enumerate(ordered_map(read, frames, workers=config.workers), start=1):
             report(done, len(frames))
             if returns is not None:
-                still.add(returns.points_world[~returns.moving], returns.colors[~returns.moving])
-                moving.add(returns.points_world[returns.moving], returns.colors[returns.moving])
+                for builder, chosen in ((still, ~returns.moving), (moving, returns.moving)):
+                    points_world = np.compress(chosen, returns.points_world, axis=0)
+                    builder.add(points_world, np.compress(chosen, returns.colors, axis=0))
     return still.points_and_colors(), moving.points_and_colors()

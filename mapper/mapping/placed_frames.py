@@ -49,9 +49,12 @@ def within_reach(scan: Scan, T_world_body: Transform, config: OctreeConfig) -> t
 
     A single return that is damaged, and yet not beyond what a sensor reaches, must not end a build.
     """
-    points_world = scan.points_body @ T_world_body[:3, :3].T + T_world_body[:3, 3]
     # Two voxels short of the reach: the octree rounds points to single precision and to voxels' centres.
     limit_m = reach_m(config.resolution_m) - 2.0 * config.resolution_m
+    farthest_m = np.sqrt(3.0) * np.abs(scan.points_body).max(initial=0.0)
+    if farthest_m + np.abs(T_world_body[:3, 3]).max() < limit_m:
+        return scan, 0
+    points_world = scan.points_body @ T_world_body[:3, :3].T + T_world_body[:3, 3]
     kept = np.abs(points_world).max(axis=1) < limit_m
     colors = None if scan.colors is None else scan.colors[kept]
     reached = Scan(scan.stamp_ns, scan.points_body[kept], scan.origin_body, colors)
