@@ -102,7 +102,6 @@ def _synthetic(out: Path, scene: str, seed: int, day: int) -> Path:
 
 
 def _built(out: Path, log: Log) -> tuple[Run, float]:
-    """Return the map of a log and the CPU seconds that it took; NaN if it was there."""
     if out.exists():
         return open_run(out), float("nan")
     config: BuildConfig = load_config(None, ["min_tracked_frames=5"], sensor=log.sensor)
@@ -145,7 +144,6 @@ def _measure(out: Path, log: Log, built: tuple[Run, float], *, name: str = "") -
 
 
 def _errors(folder: Path, log: Log, run: Run) -> str:
-    """Return the wrong frames and the errors of those that are placed without a doubt."""
     poses, records = read_poses(folder / files.POSES), read_records(folder / files.FRAMES)
     is_tracked = np.isin(
         poses.trajectory.stamps_ns, [record.stamp_ns for record in records if record.outcome == "tracked"]

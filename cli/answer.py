@@ -3,11 +3,10 @@
 import functools
 import inspect
 import json
-import math
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, is_dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -138,24 +137,14 @@ def _show(answer: Answer, output: Output) -> None:
 
 def plain(value: Any) -> Any:
     """Return a value as JSON has it: numbers that are not finite are null."""
-    match value:
-        case Mapping():
-            return {str(key): plain(one) for key, one in value.items()}
-        case str() | bool() | int() | None:
-            return value
-        case float():
-            return value if math.isfinite(value) else None
-        case Path():
-            return str(value)
-        case _ if is_dataclass(value) and not isinstance(value, type):
-            return plain(asdict(value))
-        case _ if hasattr(value, "model_dump"):
-            return value.model_dump(mode="json")
-        case _ if hasattr(value, "tolist"):
-            return plain(value.tolist())
-        case Iterable():
-            return [plain(one) for one in value]
-    raise TypeError(f"{type(value).__name__} has no form in JSON")
+    from pydantic_core import to_jsonable_python
+
+    def other(value: Any) -> Any:
+        if isinstance(value, Mapping):
+            return dict(value)
+        return value.tolist() if hasattr(value, "tolist") else list(value)
+
+    return to_jsonable_python(value, inf_nan_mode="null", fallback=other)
 
 
 def rows_text(rows: Sequence[tuple[str, str]], *, width: int | None = None) -> str:

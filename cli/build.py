@@ -32,7 +32,6 @@ from mapper.runtime.result_paths import RUNS, name_of, place_of
 if TYPE_CHECKING:
     from mapper.config.build import BuildConfig
     from mapper.core.geometry import Transform
-    from mapper.evaluators.metrics.metric import Metric
     from mapper.mapping.fusion import Maps
     from mapper.run.folder import Run
     from mapper.run.observers import Observer, Step
@@ -97,7 +96,7 @@ def build(
     overrides = merged(selection(first, last, stride, require_truth), set_)
     make_observer = observer_factory(rerun, step=step, overwrite=overwrite)
     if onto is None:
-        run, metrics = built(
+        run = built(
             log,
             config,
             overrides,
@@ -112,11 +111,11 @@ def build(
         refuse_with("--onto", {"--config": config}, remedy="give single settings by --set")
         refuse_with("--onto", {"--rerun": rerun}, remedy="look at the new run with mapper view")
         refuse_with("--onto", {"--fresh": fresh})
-        run, metrics = appended(log, onto, overrides, out, overwrite=overwrite, output=output)
+        run = appended(log, onto, overrides, out, overwrite=overwrite, output=output)
     from mapper.cli.summary import summary_of  # a build begins without what its end needs
 
     error = untrusted(run.path, run.verdict) if strict else None
-    return replace(summary_of(run, metrics), error=error)
+    return replace(summary_of(run), error=error)
 
 
 def built(
@@ -130,8 +129,8 @@ def built(
     fresh: bool = False,
     prompts: bool = False,
     make_observer: "ObserverFactory | None" = None,
-) -> "tuple[Run, Sequence[Metric]]":
-    """Build a run and judge its trajectory by the truth, if the log has any."""
+) -> "Run":
+    """Build a run of a log."""
     from mapper.config.loading import load_config, load_source_config
     from mapper.pipeline.build import build as build_run
     from mapper.run.observers import Observers
@@ -146,16 +145,12 @@ def built(
     preview = _preview(source, out, progress)
     with nullcontext(preview) if make_observer is None else make_observer(source, config) as observer:
         watching = preview if make_observer is None else Observers(observer, preview)
-        run = build_run(
+        return build_run(
             source, config, out, progress=progress, observer=watching, overwrite=overwrite, fresh=fresh
         )
-    from mapper.evaluators.metrics.evaluate import evaluate
-
-    return run, evaluate(run.trajectory, run.truth).metrics
 
 
 def _preview(source: "Log", out: Path, progress: "Progress") -> "Observer":
-    """Return the observer that keeps a picture among the files that are being written."""
     from mapper.export.preview import PREVIEW, Preview
     from mapper.runtime.atomic import partial_of
 
@@ -193,10 +188,9 @@ def observer_factory(rerun: str | None, *, step: bool, overwrite: bool) -> "Obse
 
 def appended(
     log: Path, onto: Path, overrides: "Sequence[str]", out: Path, *, overwrite: bool, output: Output
-) -> "tuple[Run, Sequence[Metric]]":
+) -> "Run":
     """Build a run from a run and a later log of the same place, by the run's configuration."""
     from mapper.config.loading import overridden
-    from mapper.evaluators.metrics.evaluate import evaluate
     from mapper.pipeline.append import append
     from mapper.run.folder import open_run
     from mapper.sources import open_source
@@ -207,8 +201,7 @@ def appended(
     source = open_source(log, config.source)
     progress = output.progress()
     preview = _preview(source, out, progress)
-    run = append(source, first, config, out, progress=progress, observer=preview, overwrite=overwrite)
-    return run, evaluate(run.trajectory, run.truth).metrics
+    return append(source, first, config, out, progress=progress, observer=preview, overwrite=overwrite)
 
 
 DEMO_LOG = ("path=loop", "width_px=320", "height_px=240")
@@ -238,9 +231,9 @@ def demo(
     if not _is_made(log, scene):
         with output.progress().stage("render") as report:
             write_tum_log(log, scene, on_progress=report)
-    run, metrics = built(log, None, set_ or (), out / "run", overwrite=True, output=output)
+    run = built(log, None, set_ or (), out / "run", overwrite=True, output=output)
     pictures = [run.path / name for name in (files.SUMMARY, files.CLOUD_VIEWS, f"{files.SLICE}.png")]
-    summary, below = summary_of(run, metrics), "\n".join(map(str, pictures))
+    summary, below = summary_of(run), "\n".join(map(str, pictures))
     return Answer(
         {**summary.document, "pictures": pictures},
         f"{summary.text}\n{below}",

@@ -163,7 +163,6 @@ def _path_errors(
     frames_ns: "Stamps | None",
     names: tuple[str, str],
 ) -> "Assessment":
-    """Return the errors of a path, over segments of the given lengths."""
     from mapper.evaluators.metrics.evaluate import assess
 
     if lengths is not None and truth is None:
@@ -178,7 +177,6 @@ def _path_errors(
 
 
 def _answer(run: "Run | None", metrics: "list[Metric]", found: "Assessment", format_: Format) -> Answer:
-    """Return the metrics and, of a run, its verdict."""
     from mapper.evaluators.metrics.metric import records_of
 
     text = _text(metrics, found, format_)
@@ -201,7 +199,6 @@ def _plot(
     name: str,
     map_: Path | None,
 ) -> None:
-    """Draw the errors of the path, and those of the map if it was compared."""
     from mapper.evaluators.metrics.evaluate import ALIGNED
     from mapper.evaluators.pictures.errors import write_map_errors, write_trajectory_errors
 
@@ -281,7 +278,6 @@ def _numbers(text: str) -> list[float]:
 
 
 def _every_metric(metrics: "list[Metric]", found: "Assessment") -> "list[Metric]":
-    """Return the metrics, and after them those of each length of the segments."""
     from mapper.evaluators.metrics.segments import segment_metrics
 
     if len(found.lengths) <= 1:

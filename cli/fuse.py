@@ -27,7 +27,6 @@ def fuse(
     """
     from mapper.cli.summary import summary_of
     from mapper.config.loading import overridden
-    from mapper.evaluators.metrics.evaluate import evaluate
     from mapper.pipeline.fuse import fuse as fuse_run
     from mapper.run.folder import moved_log, open_run
     from mapper.sources.trajectory_files import read_tum
@@ -36,11 +35,12 @@ def fuse(
     if log:
         built = moved_log(built, *log)
     config = overridden(built.config, set_ or ())
-    fused = fuse_run(
-        built.open_log(),
-        built,
-        config,
-        trajectory=None if trajectory is None else read_tum(trajectory),
-        progress=output.progress(),
+    return summary_of(
+        fuse_run(
+            built.open_log(),
+            built,
+            config,
+            trajectory=None if trajectory is None else read_tum(trajectory),
+            progress=output.progress(),
+        )
     )
-    return summary_of(fused, evaluate(fused.trajectory, fused.truth).metrics)

@@ -77,7 +77,6 @@ class VerbGroup(TyperGroup):
 
 
 def _rank(verb: Any) -> int:
-    """Return the place of a verb's panel in the help."""
     panel = verb.rich_help_panel
     return PANELS.index(panel) if panel in PANELS else len(PANELS)
 
@@ -131,7 +130,6 @@ def _no_verb(word: str, known: Sequence[str]) -> str:
 
 
 def _too_many(words: Sequence[str], path: str) -> str:
-    """Return that there are more arguments than the verb takes."""
     text = f"does not take {' '.join(words)} too"
     if path.endswith(" build"):
         text += "; want one log: build each, then mapper merge, or --onto RUN"

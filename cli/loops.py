@@ -53,7 +53,6 @@ def loops(
     built, solved = open_run(run), None
     if add or remove:
         from mapper.cli.summary import summary_of
-        from mapper.evaluators.metrics.evaluate import evaluate
         from mapper.pipeline.edit import edit_loops
 
         if log:
@@ -65,7 +64,7 @@ def loops(
             remove=[_pair("--remove", text) for text in remove or ()],
             progress=output.progress(),
         )
-        solved = summary_of(built, evaluate(built.trajectory, built.truth).metrics)
+        solved = summary_of(built)
     shown = [loop for loop in built.loops if loop.verdict == "accepted" or not accepted]
     if solved is None:
         return Answer({"run": built.path, "loops": shown}, loops_text(shown))

@@ -167,7 +167,6 @@ def merge(
 
 
 def _bent(run: "RunInMap") -> str:
-    """Return how far the joint graph has moved a run's map within its world."""
     from mapper.evaluators.study.table import MISSING
 
     if run.first_node is None:

@@ -84,7 +84,6 @@ def _figures(run: "Run") -> "list[Figure]":
 
 
 def _correctness(run: "Run") -> list[tuple[str, str]]:
-    """Return names and values of what a run itself says about its errors."""
     import numpy as np
 
     from mapper.export.figures import SIGMAS
@@ -100,7 +99,6 @@ def _correctness(run: "Run") -> list[tuple[str, str]]:
 
 
 def _completeness(run: "Run") -> list[tuple[str, str]]:
-    """Return names and values of how many frames a run has, and how large its results are."""
     counts = run.manifest.counts
     incomplete = (("doubtful", counts.doubtful), ("lost", counts.lost), ("skipped", counts.skipped))
     return [
@@ -113,7 +111,6 @@ def _completeness(run: "Run") -> list[tuple[str, str]]:
 
 
 def _speed(run: "Run") -> list[tuple[str, str]]:
-    """Return names and values of a run's time and memory."""
     timing = run.manifest.timing
     return [
         ("build", f"{timing.total_s:.{_DIGITS}g} s for {timing.log_s:.{_DIGITS}g} s of log"),
@@ -125,7 +122,6 @@ def _speed(run: "Run") -> list[tuple[str, str]]:
 
 
 def _question(quantity: str) -> "Question":
-    """Return what a metric answers first of all."""
     if quantity in _ACCURACY:
         return "Is it right?"
     return "Is it complete?" if quantity in _COVERAGE else ""

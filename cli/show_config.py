@@ -114,7 +114,6 @@ def _explained(setting: "Setting", values: Mapping[str, Any], more: Sequence[tup
 
 
 def _in_short(setting: "Setting", values: Mapping[str, Any]) -> str:
-    """Return a setting's value, and the first sentence of its meaning."""
     value = _value_of(setting, values)
     text = setting.default_text if value is None else _text_of(value)
     only = "".join(f" ({' or '.join(kinds)})" for _, kinds in setting.needs[:1])
@@ -123,7 +122,6 @@ def _in_short(setting: "Setting", values: Mapping[str, Any]) -> str:
 
 
 def _neighbours(setting: "Setting", every: "Sequence[Setting]") -> list[tuple[str, str]]:
-    """Return a row of the other settings in its table."""
     table = setting.key.rpartition(".")[0]
     siblings = [
         name

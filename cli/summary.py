@@ -18,6 +18,7 @@ from mapper.evaluators.metrics.evaluate import (
     RPE_RMSE_M,
     RPE_RMSE_RAD,
     START_TO_END,
+    evaluate,
 )
 from mapper.evaluators.metrics.metric import Metric, records_of
 from mapper.loops.closure import LoopClosure, accepted_loops, rejections
@@ -29,8 +30,9 @@ _SHOWN_NOTES = frozenset({"gap", "lost", "doubtful", "skipped", "levelling", "sh
 _SHOWN = frozenset({ATE_RMSE, RPE_RMSE_M, RPE_RMSE_RAD, PATH_LENGTH, START_TO_END})
 
 
-def summary_of(run: Run, metrics: Sequence[Metric]) -> Answer:
-    """Return a run as the answer of the verb that made it."""
+def summary_of(run: Run) -> Answer:
+    """Return a run as the answer of the verb that made it, its path judged by the truth if there is any."""
+    metrics = evaluate(run.trajectory, run.truth).metrics
     return Answer(run_document(run, metrics), short_text(run, metrics), summary_text(run, metrics))
 
 
@@ -91,7 +93,6 @@ def short_text(run: Run, metrics: Sequence[Metric]) -> str:
 
 
 def _resumed_text(timing: Timing) -> str:
-    """Return where a build that was stopped was resumed; empty if it was not stopped."""
     return "; ".join(resumption.text for resumption in timing.resumed)
 
 
@@ -132,7 +133,6 @@ def verdict_text(run: Run) -> str:
 
 
 def _verdict_rows(run: Run) -> list[tuple[str, str]]:
-    """Return the verdict, and below it why the run is not trusted and what to try."""
     verdict = run.verdict
     notes = [
         warning.text
@@ -188,7 +188,6 @@ def _loops_text(loops: Sequence[LoopClosure]) -> str:
 
 
 def _left_open(records: Sequence[FrameRecord]) -> list[tuple[str, str]]:
-    """Return a row on the motions that no surface showed, if there were any."""
     unseen = Counter(record.diagnostics.unobservable for record in records if record.diagnostics.unobservable)
     if not unseen:
         return []

@@ -185,7 +185,6 @@ def _line_laser(
 
 
 def _scene(known: Mapping[str, Settings], name: SceneName, sensor: SensorKind) -> Settings:
-    """Return the settings of a scene by its name."""
     if name not in known:
         raise ConfigError(
             f"--scene {name}: has no meaning with --sensor {sensor}; want one of {', '.join(known)}"
@@ -194,7 +193,6 @@ def _scene(known: Mapping[str, Settings], name: SceneName, sensor: SensorKind) -
 
 
 def _at_wall(distance_m: float | None) -> dict[str, object]:
-    """Return the settings of a tripod before an empty wall."""
     from mapper.simulation.config import SynthConfig
 
     if distance_m is None:
@@ -211,7 +209,6 @@ def _at_wall(distance_m: float | None) -> dict[str, object]:
 
 
 def _camera_noise(noise: float | None) -> dict[str, object]:
-    """Return every noise setting of the camera, scaled from its default."""
     from mapper.simulation.config import SensorConfig
 
     if noise is None:
@@ -227,7 +224,6 @@ def _camera_noise(noise: float | None) -> dict[str, object]:
 
 
 def _lidar_noise(noise: float | None) -> dict[str, object]:
-    """Return every noise setting of the LiDAR, scaled from its default."""
     from mapper.simulation.config import LidarSensorConfig
 
     if noise is None:

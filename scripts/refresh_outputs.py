@@ -150,7 +150,6 @@ def _folder_for(path: Path, page: str, logs: Path, work: Path) -> Path:
 
 
 def _run(command: Sequence[str], folder: Path) -> list[str] | None:
-    """Return the lines that a command prints; None where it fails, which is reported."""
     environment = {
         name: value for name, value in os.environ.items() if name not in ("COLUMNS", "FORCE_COLOR")
     }

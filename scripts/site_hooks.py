@@ -96,7 +96,6 @@ def _outside(markdown: str, page: File) -> Iterator[str]:
 
 
 def _copy_of(target: str) -> str:
-    """Return where a file of the repository lies in the site; as text, which every browser shows."""
     return f"source/{target}.txt"
 
 
@@ -115,7 +114,6 @@ def _relinked(markdown: str, page: File) -> str:
 
 
 def _settings() -> Iterator[str]:
-    """Yield the Markdown of the settings, a table for each part."""
     from mapper.config.describe import settings
 
     of_lidar = {(one.key, one.needs): one for one in settings("lidar")}
@@ -147,7 +145,6 @@ def _settings() -> Iterator[str]:
 
 
 def _commands() -> Iterator[str]:
-    """Yield the Markdown of the verbs: usage, description, arguments and options of each."""
     import click
     import typer
 
@@ -164,7 +161,6 @@ def _commands() -> Iterator[str]:
 
 
 def _command(name: str, verb: Any, parent: Any) -> Iterator[str]:
-    """Yield the Markdown of a verb and of those below it."""
     context = verb.make_context(name, [], parent=parent, resilient_parsing=True)
     yield f"\n### {context.command_path}\n\n{_prose(verb.help or '')}\n"
     yield f"```text\n{verb.get_usage(context).removeprefix('Usage: ')}\n```\n"
@@ -185,7 +181,6 @@ def _parameter(parameter: Any, context: Any) -> str | None:
 
 
 def _prose(docstring: str) -> str:
-    """Return a verb's help as paragraphs, its example as code."""
     paragraphs = [" ".join(part.split()) for part in docstring.replace("\b", "").split("\n\n")]
     return "\n\n".join(
         re.sub(r"(Example: |, or(?: just)?: |, then: )(mapper [^,]*)", r"\1`\2`", part)
@@ -200,13 +195,11 @@ def _cell(text: str) -> str:
 
 
 def _escaped(text: str) -> str:
-    """Keep what Markdown would take for markup, outside of code."""
     parts = re.split(r"(`[^`]*`)", text)
     return "".join(part if part.startswith("`") else re.sub(r"([*_<\[\]])", r"\\\1", part) for part in parts)
 
 
 def _api() -> Iterator[str]:
-    """Yield mkdocstrings' directive for every public name of the library."""
     import mapper
 
     for name in sorted(getattr(mapper, "__all__", []), key=str.lower):

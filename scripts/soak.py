@@ -88,7 +88,6 @@ class Soak:
         self.random.choice(kinds)()
 
     def _work(self) -> list[object]:
-        """Draw a verb that writes into the run or replaces it by the same."""
         works: list[list[object]] = [
             ["build", self.log, "--out", self.run, "--overwrite", "--quiet", *self.settings],
             ["fuse", self.run, "--quiet"],

@@ -92,7 +92,6 @@ def depth(
 def _distances(
     logs: Sequence[Path], plane_at: list[float] | None, *, fit_plane: bool, keep_tilt: bool
 ) -> Sequence[float] | None:
-    """Return the distance of each log's plane, or None where planes are to be fitted."""
     if fit_plane:
         refuse_with(
             "--fit-plane, which finds distance and tilt", {"--plane-at": plane_at, "--keep-tilt": keep_tilt}

@@ -198,7 +198,6 @@ def _draw(
     config: "StripeConfig",
     labels: "Mapping[str, tuple[Array, Array]]",
 ) -> None:
-    """Draw the detections in the first image, in the last, and between."""
     from mapper.evaluators.pictures.line_laser import write_detections
     from mapper.sources.image_files.reading import read_colour
 

@@ -124,7 +124,6 @@ def compare(source: Log, config: CompareConfig, folder: Path, *, progress: Progr
 
 
 def _run_of(method: str, record: Any) -> OdometryRun:
-    """Return what ``MethodRun.record`` has recorded."""
     stamps_ns = np.array(record["stamps_ns"], np.int64)
     return OdometryRun(
         method=method,
@@ -137,7 +136,6 @@ def _run_of(method: str, record: Any) -> OdometryRun:
 
 
 def _by_pair(trials: Sequence[Record]) -> tuple[Record, ...]:
-    """Return the trials of all methods pair by pair."""
     pairs = dict.fromkeys((trial["target_ns"], trial["source_ns"]) for trial in trials)
     number = {pair: index for index, pair in enumerate(pairs)}
     return tuple(sorted(trials, key=lambda trial: number[trial["target_ns"], trial["source_ns"]]))
@@ -182,7 +180,6 @@ class MethodJob:
         ]
 
     def _warm_up(self, method: Method) -> None:
-        """Let the method load its libraries and compiled code before anything is timed."""
         reader = FrameReader(self.config.rgbd)
         frames = []
         for entry in islice(self.source.entries(), _WARM_UP_FRAMES):
@@ -215,7 +212,6 @@ class MethodJob:
         return np.array(frames_ns, np.int64), skipped
 
     def _register(self, method: Method, truth: Trajectory) -> list[Record]:
-        """Register pairs of frames from every guess."""
         if not self.config.pairs:
             return []
         entries: list[FrameRef] = list(self.source.entries())

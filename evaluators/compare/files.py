@@ -180,7 +180,6 @@ def tables_of(comparison: Comparison) -> list[Table]:
 
 
 def _odometry(comparison: Comparison) -> Table:
-    """Return one record for each method's run over the whole log."""
     step = comparison.step.text
     broken = [f"{run.method} {run.broke}" for run in comparison.runs if run.broke]
     frames = max(run.frames for run in comparison.runs)
@@ -226,7 +225,6 @@ def _odometry(comparison: Comparison) -> Table:
 
 
 def _registration(comparison: Comparison) -> Table:
-    """Return one record for each method and kind of guess."""
     config = comparison.trials_config
     apart = ", ".join(map(str, config.frames_apart))
     pairs = {(trial["target_ns"], trial["source_ns"]) for trial in comparison.trials}

@@ -237,7 +237,6 @@ class OdometryPair:
 
 
 def _seen_from(T_target_source: Transform, source: Frame) -> Frame:
-    """Return a scan's points in the target's frame; an image as it is."""
     if isinstance(source, RgbdFrame):
         return source
     points = apply(T_target_source, source.points_body.astype(np.float64)).astype(np.float32)
@@ -279,7 +278,6 @@ class FrameToFrame:
         return trajectory_from(self._poses)
 
     def _guess(self, gap_ns: int) -> Transform:
-        """Return the motion over a time at the velocity of the last motion."""
         if self._before_ns == 0:
             return np.eye(4)
         return interpolate(np.eye(4), self._T_before_last, gap_ns / self._before_ns)

@@ -229,7 +229,6 @@ def _alignment_metrics(matched: Matched, similarity: Similarity, alignment: Alig
 
 
 def _clock_metrics(estimate: Trajectory, truth: Trajectory, alignment: AlignmentKind) -> list[Metric]:
-    """Return the clock offset that explains most of the position error, if there is one."""
     if not (have_clock(estimate.stamps_ns) and have_clock(truth.stamps_ns)):
         return []
     found = clock_offset(estimate, truth, alignment)

@@ -67,7 +67,6 @@ def revisits_of(keyframes_ns: Stamps, truth: Trajectory) -> NDArray[np.bool_]:
 
 
 def _along(keyframes_ns: Stamps, truth: Trajectory) -> Array:
-    """Return (N,) metres of true path up to every keyframe."""
     index, _ = nearest(truth.stamps_ns, keyframes_ns)
     return distances_along(truth.positions_world)[index]
 

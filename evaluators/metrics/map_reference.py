@@ -186,7 +186,6 @@ def _distances_m(scene: OutdoorScene, points: Points) -> Array:
 
 
 def _of_solid(points: Points, half: Array, shape: Shape) -> Array:
-    """Return the distances of (N, 3) points from a solid, in its own axes."""
     if shape is Shape.ELLIPSOID:
         return _of_ellipse(points, half)
     beyond = np.abs(points) - half

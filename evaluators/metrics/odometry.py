@@ -144,7 +144,6 @@ def _drift_ratio(matched: Matched) -> float | None:
 
 
 def _step_errors(matched: Matched, delta: float, unit: DeltaUnit) -> tuple[Array, Array]:
-    """Return the errors over all steps; none where no two poses are that far apart."""
     try:
         return step_errors(matched, delta=delta, unit=unit)
     except DataError:

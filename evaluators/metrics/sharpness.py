@@ -144,7 +144,6 @@ def _patches(views: Views, radius_m: float) -> Iterator[Array]:
 
 
 def _covariance(offsets: Array) -> Array:
-    """Return the (3, 3) sample covariance of (N, 3) points, m²."""
     centred = offsets - (offsets / len(offsets)).sum(axis=0)
     covariance: Array = (centred[:, :, None] * centred[:, None, :] / (len(offsets) - 1)).sum(axis=0)
     return covariance

@@ -94,8 +94,6 @@ def check_doubts(
 
 
 class _WrongWindow(NamedTuple):
-    """Window whose relative pose is wrong, by the indices of its first and last frame."""
-
     first: int
     last: int
     error_m: float
@@ -154,7 +152,6 @@ def _covariance(
 
 
 def _sigmas(error: Array, covariance: Array) -> float:
-    """Return the Mahalanobis distance of an error."""
     return float(np.sqrt(error @ np.linalg.solve(covariance + 1e-12 * np.eye(6), error)))
 
 

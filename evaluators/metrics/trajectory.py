@@ -160,7 +160,6 @@ def align(matched: Matched, kind: AlignmentKind) -> Similarity:
 
 
 def _fit_yaw(target: Points, source: Points) -> Transform:
-    """Return the shift and turn about z that take (N, 3) points to their partners with least squares."""
     target_mean, source_mean = target.mean(axis=0), source.mean(axis=0)
     covariance = (target - target_mean).T @ (source - source_mean)
     sine, cosine = covariance[1, 0] - covariance[0, 1], covariance[0, 0] + covariance[1, 1]

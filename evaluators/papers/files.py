@@ -90,7 +90,6 @@ def _shown(each: PaperTable, notes: Sequence[str], *, with_spread: bool = True) 
 
 
 def _remarks(each: PaperTable) -> list[str]:
-    """Return what must be known to read a table, its verdicts counted first."""
     return [*([counted(each)] if compares(each) else []), *each.notes]
 
 
@@ -99,7 +98,6 @@ def _everything_known(each: PaperTable) -> list[str]:
 
 
 def _closing(reproduction: Reproduction) -> list[str]:
-    """Return what holds for all tables, a sentence each."""
     seeds = reproduction.seeds
     return [
         *reproduction.notes,
@@ -116,7 +114,6 @@ def _markdown(reproduction: Reproduction) -> str:
 
 
 def _latex(reproduction: Reproduction) -> str:
-    """Return the tables in their printed layout, each to be put into a paper."""
     parts = ["% \\usepackage{booktabs}, then \\input this file, or copy the table you want."]
     for each in _filled(reproduction):
         caption = latex_text(f"{headline(each)}. Printed: {each.source}.")
@@ -248,7 +245,6 @@ def _write_boxes(path: Path, table: PaperTable) -> None:
 
 
 def _write_scenes(path: Path, tables: Sequence[PaperTable], *, title: str) -> None:
-    """Draw the figures of each table's rows, a panel for each column and a box for each table."""
     columns = _columns(tables[0])
     figure, across, down = _sheet(title, len(columns), height_in=0.9 + _BOX_IN * len(tables))
     left_in = _label_in([_short(table) for table in tables])
@@ -260,7 +256,6 @@ def _write_scenes(path: Path, tables: Sequence[PaperTable], *, title: str) -> No
 
 
 def _figures_of(table: PaperTable, column: str) -> Array:
-    """Return every scene's figure, ours or else the printed one."""
     cells = [cell for cell in table.cells if cell.column == column]
     figures = [cell.published if cell.median is None else cell.median for cell in cells]
     return np.array([figure for figure in figures if figure])  # the scale is logarithmic
@@ -271,7 +266,6 @@ def _short(table: PaperTable) -> str:
 
 
 def _write_paths(path: Path, paths: Sequence[PaperPath]) -> None:
-    """Draw every path over its truth, coloured by its error; those of one sequence by one scale."""
     matched = [associate(read_tum(each.estimate), read_tum(each.truth)) for each in paths]
     errors_m = [pairs.position_errors_m for pairs in matched]
     most_m: dict[str, float] = {}
@@ -287,24 +281,20 @@ def _write_paths(path: Path, paths: Sequence[PaperPath]) -> None:
 
 
 def _sheet(title: str, panels: int, *, height_in: float = _HEIGHT_IN) -> tuple["Figure", int, int]:
-    """Return a page for a number of panels, and the numbers of its columns and rows."""
     across = min(_COLUMNS, panels)
     down = -(-panels // across)
     return page(title, columns=across, rows=down, width_in=_WIDTH_IN, height_in=height_in), across, down
 
 
 def _title(table: PaperTable) -> str:
-    """Return a title short enough for a single panel."""
     return f"{table.name}: {table.metric}, {table.unit}"
 
 
 def _label_in(labels: Sequence[str]) -> float:
-    """Return the width in inches that the longest label needs at a panel's left."""
     return 0.3 + _LETTER_IN * max(map(len, labels))
 
 
 def _by_row(table: PaperTable) -> dict[str, list[PaperCell]]:
-    """Return the rows that have a figure of ours."""
     rows: dict[str, list[PaperCell]] = {}
     for cell in table.cells:
         rows.setdefault(cell.row, []).append(cell)

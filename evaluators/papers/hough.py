@@ -224,7 +224,6 @@ def hough_reproduction(results: Iterable[JobResult], *, pictures: Path) -> Repro
 
 
 def _summary(trials: Trials) -> PaperTable:
-    """Return how often, how near and how fast, over the pairs of a sensor: one figure per seed."""
     cells, notes = [], []
     for (sensor, method), of_both in _grouped(trials, "sensor", "method").items():
         row, printed = f"{sensor}, {method}", _printed_sums(str(sensor))
@@ -244,13 +243,11 @@ def _summary(trials: Trials) -> PaperTable:
 
 
 def _near_of(pairs: Collection[Trials], key: str) -> str:
-    """Return in how many of the pairs for which a distance is known its median is small."""
     medians = [median(known) for pair in pairs if (known := _known(pair, key))]
     return f"{sum(distance_m < NEAR_M for distance_m in medians)} of {len(medians)}"
 
 
 def _share_without(key: str) -> Callable[[Trials], float | None]:
-    """Return the percentage of trials in which a flag is not set, of those for which it is known."""
     return lambda trials: 100.0 * (1.0 - mean(known)) if (known := _known(trials, key)) else None
 
 

@@ -272,7 +272,6 @@ def _of_log(folder: Path) -> list[Pair]:
 
 
 def _posed(log: Path) -> list[tuple[FrameRef, Transform]]:
-    """Return the scans of a log whose pose is known."""
     source = open_source(log)
     if source.truth is None or source.sensor != "lidar":
         return []

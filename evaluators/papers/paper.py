@@ -2,13 +2,14 @@
 
 import json
 import re
+from abc import ABC, abstractmethod
 from collections import defaultdict
-from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, Protocol
+from typing import Any, Literal, NamedTuple
 
 from mapper.config.build import BuildConfig
 from mapper.core.errors import ConfigError, DataError, SourceError
@@ -154,36 +155,71 @@ class Place(NamedTuple):
     column: str
 
 
-class Measurement(Hashable, Protocol):
-    """One log measured once, for some figures; can be pickled."""
+@dataclass(frozen=True, slots=True)
+class Cut:
+    """Range of the frames that are used of every sequence.
+
+    Attributes:
+        first: Index of the first.
+        last: Index of the last; None is the log's.
+    """
+
+    first: int = 0
+    last: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.first < 0 or (self.last is not None and self.last < self.first):
+            raise ConfigError(f"--first {self.first} --last {self.last}: want 0 ≤ first ≤ last")
 
     @property
+    def is_whole(self) -> bool:
+        """Nothing is cut."""
+        return self == Cut()
+
+    def __str__(self) -> str:
+        return f"{self.first} … {'end' if self.last is None else self.last}"
+
+    def overrides(self, most: int | None = None) -> list[str]:
+        """Return the settings that choose these frames; a paper may itself use so many frames at most."""
+        ends = [] if self.last is None else [self.last]
+        if most is not None:
+            ends.append(most - 1)
+        return [f"source.first_frame={self.first}", *(f"source.last_frame={end}" for end in sorted(ends)[:1])]
+
+
+@dataclass(frozen=True, slots=True)
+class Measurement(ABC):
+    """One sequence measured once, for some figures; can be pickled.
+
+    Attributes:
+        sequence: Name of the sequence in the paper.
+        log: Its folder or file.
+        seed: Seed of the method's random draws.
+        cut: Frames that are used.
+    """
+
+    sequence: str
+    log: Path
+    seed: int
+    cut: Cut
+
+    @property
+    @abstractmethod
     def name(self) -> str:
         """Name of the measurement, as a part of a file's name."""
-        ...
 
     @property
-    def log(self) -> Path:
-        """The log."""
-        ...
-
-    @property
-    def seed(self) -> int:
-        """Seed of the method's random draws."""
-        ...
-
-    @property
+    @abstractmethod
     def places(self) -> Sequence[Place]:
         """Places of the figures that it gives."""
-        ...
 
+    @abstractmethod
     def configs(self) -> Mapping[str, BuildConfig]:
-        """Return the settings that are run, by name."""
-        ...
+        """Return the settings that are run, with the seed and the frames in use, by name."""
 
+    @abstractmethod
     def __call__(self) -> list[Record]:
         """Return ``measured`` and ``failed`` records, one for every place."""
-        ...
 
 
 Results = Mapping[Any, JobResult]
@@ -269,38 +305,6 @@ def _records_of(table: str, result: JobResult) -> list[tuple[Place, Mapping[str,
         for record in result.records
         if record["table"] == table
     ]
-
-
-@dataclass(frozen=True, slots=True)
-class Cut:
-    """Range of the frames that are used of every sequence.
-
-    Attributes:
-        first: Index of the first.
-        last: Index of the last; None is the log's.
-    """
-
-    first: int = 0
-    last: int | None = None
-
-    def __post_init__(self) -> None:
-        if self.first < 0 or (self.last is not None and self.last < self.first):
-            raise ConfigError(f"--first {self.first} --last {self.last}: want 0 ≤ first ≤ last")
-
-    @property
-    def is_whole(self) -> bool:
-        """Nothing is cut."""
-        return self == Cut()
-
-    def __str__(self) -> str:
-        return f"{self.first} … {'end' if self.last is None else self.last}"
-
-    def overrides(self, most: int | None = None) -> list[str]:
-        """Return the settings that choose these frames; a paper may itself use so many frames at most."""
-        ends = [] if self.last is None else [self.last]
-        if most is not None:
-            ends.append(most - 1)
-        return [f"source.first_frame={self.first}", *(f"source.last_frame={end}" for end in sorted(ends)[:1])]
 
 
 @dataclass(frozen=True, slots=True)

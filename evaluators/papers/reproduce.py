@@ -101,8 +101,6 @@ def reproduce(
 
 
 class _Sequences:
-    """Sequences of a paper that are at hand, and the tables that are requested of them."""
-
     def __init__(self, request: Request, paper: Paper) -> None:
         self._request, self._paper = request, paper
         self._tables = [name for name in paper.sequences if not request.tables or name in request.tables]

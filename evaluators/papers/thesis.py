@@ -13,6 +13,7 @@ from mapper.evaluators.metrics.trajectory import align, associate, ate
 from mapper.evaluators.papers.model import PaperPath, PaperTable
 from mapper.evaluators.papers.paper import (
     Cut,
+    Measurement,
     Paper,
     Place,
     Results,
@@ -99,23 +100,15 @@ def follow(source: Log, variants: Mapping[str, BuildConfig]) -> dict[str, Varian
 
 
 @dataclass(frozen=True, slots=True)
-class ThesisJob:
+class ThesisJob(Measurement):
     """Measurement of all settings of some tables on one sequence with one seed.
 
     Attributes:
         tables: Tables from ``thesis_tables.tables()``; they use the same frames of the sequence.
-        sequence: Name of the sequence in the thesis.
-        log: Its folder or file.
-        seed: Seed of RANSAC.
-        cut: Frames that are used.
         paths: Folder for the trajectories.
     """
 
     tables: tuple[str, ...]
-    sequence: str
-    log: Path
-    seed: int
-    cut: Cut
     paths: Path
 
     @property
@@ -148,7 +141,6 @@ class ThesisJob:
         return records
 
     def _variants(self) -> dict[tuple[str, str], Setting]:
-        """Return the settings by table and what they are called there."""
         return {
             (table, name): setting
             for table in self.tables
@@ -182,7 +174,6 @@ class ThesisJob:
         return table == "5.5" and self.seed == 0
 
     def _keep(self, setting: str, estimate: Trajectory, truth: Trajectory) -> None:
-        """Write both trajectories, the estimate aligned with the truth."""
         T_truth_map = align(associate(estimate, truth), "se3").T_truth_map
         write_tum(self._path(setting), estimate.moved(T_truth_map))
         write_tum(self._path("truth"), truth.during(estimate.stamps_ns[0], estimate.stamps_ns[-1]))
@@ -223,7 +214,7 @@ def _measurements(
         ablation = tables()[name]
         if sequence in ablation.sequences:
             alike.setdefault((ablation.sequences[sequence], ablation.alone), []).append(name)
-    return [ThesisJob(tuple(group), sequence, log, seed, cut, paths) for group in alike.values()]
+    return [ThesisJob(sequence, log, seed, cut, tuple(group), paths) for group in alike.values()]
 
 
 PAPER = Paper(
@@ -289,8 +280,6 @@ class _SharedDetector:
 
 
 class _VariantRun:
-    """One variant, frame by frame."""
-
     def __init__(self, config: BuildConfig, odometry: IsvdOdometryConfig, shared: _SharedDetector) -> None:
         self._config = config
         self._odometry = IsvdOdometry(odometry, detector=shared, register=shared.comparing(odometry))

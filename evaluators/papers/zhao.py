@@ -13,6 +13,7 @@ from mapper.evaluators.papers.model import PaperCell, PaperTable
 from mapper.evaluators.papers.paper import (
     CONFIGS,
     Cut,
+    Measurement,
     Paper,
     Place,
     Results,
@@ -90,20 +91,8 @@ TABLES: Mapping[str, Printed] = {
 
 
 @dataclass(frozen=True, slots=True)
-class ZhaoJob:
-    """Measurement of the method as published on one sequence with one seed.
-
-    Attributes:
-        sequence: Name of the sequence in the paper.
-        log: Its folder or file.
-        seed: Seed of RANSAC.
-        cut: Frames that are used.
-    """
-
-    sequence: str
-    log: Path
-    seed: int
-    cut: Cut
+class ZhaoJob(Measurement):
+    """Measurement of the method as published on one sequence with one seed."""
 
     @property
     def name(self) -> str:
@@ -178,7 +167,6 @@ PAPER = Paper(
 
 
 def _processor() -> str:
-    """Return what the processor calls itself."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:

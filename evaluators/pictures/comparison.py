@@ -125,7 +125,6 @@ def write_registration_errors(
 
 
 def _draw_shares(axes: "Axes", errors: Mapping[str, Array], names: Sequence[str]) -> None:
-    """Draw the cumulative share of each name's errors over their size."""
     everything = np.concatenate([np.empty(0), *errors.values()])
     finite = everything[np.isfinite(everything) & (everything > 0.0)]
     farthest = 1.3 * float(finite.max()) if len(finite) else 1.0
@@ -142,7 +141,6 @@ def _draw_shares(axes: "Axes", errors: Mapping[str, Array], names: Sequence[str]
 
 
 def _reference(paths: Mapping[str, Trajectory], truth: Trajectory | None) -> Array:
-    """Return the positions that determine what is shown."""
     shown = [truth] if truth is not None else [path for path in paths.values() if len(path)]
     return np.concatenate([np.zeros((0, 3)), *(path.positions_world for path in shown)])
 

@@ -60,7 +60,6 @@ def write_depth_study(folder: Path, study: DepthStudy) -> None:
 
 
 def _sensor_toml(study: DepthStudy) -> str:
-    """Return the noise as a configuration that ``mapper build`` reads."""
     fit = study.fit
     settings = toml_text({"odometry": {"depth_noise": fit.noise.model_dump()}})
     return (
@@ -122,7 +121,6 @@ def _kinds(levels: Sequence[DepthLevel]) -> tuple[tuple[str, Rgb, list[Accuracy]
 def _draw_known(
     axes: "Axes", distance_m: Sequence[float], values_m: Sequence[float | None], *, marker: str, label: str
 ) -> None:
-    """Mark a figure that is not known at every distance."""
     known = [(x, _MM * value) for x, value in zip(distance_m, values_m, strict=True) if value is not None]
     if known:
         axes.plot(*np.array(known).T, marker, color=FAINT, markersize=5, label=label, fillstyle="none")

@@ -93,13 +93,11 @@ def write_before_and_after(
 
 
 def _thinned(points: Points32) -> Array:
-    """Return evenly chosen points, as many as a picture can show."""
     step = max(len(points) // _DRAWN, 1)
     return points[::step].astype(np.float64)
 
 
 def _window(flat: Array) -> tuple[Array, Array]:
-    """Return the corners of what is shown of (N, 2) points."""
     low, high = np.percentile(flat, _INSIDE, axis=0)
     margin = _MARGIN * float((high - low).max()) + 1e-3
     return low - margin, high + margin

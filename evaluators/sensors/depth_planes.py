@@ -262,7 +262,6 @@ def depth_of_planes(
 
 
 def _planes(frame: RgbdFrame, where: Patch, side: int, *, number: int) -> tuple[list[SeenPlane], ResidualMap]:
-    """Return the planes that tiles of a frame show, and a picture of them."""
     depth_m = cut_tiles(frame.depth_m[where.slices], side)
     rays = cut_tiles(ray_table(frame.camera)[where.slices], side)
     filtered_m = cut_tiles(dif(frame.depth_m)[where.slices], side)
@@ -290,7 +289,6 @@ def _planes(frame: RgbdFrame, where: Patch, side: int, *, number: int) -> tuple[
 
 
 def _joined(tiles: Array, side: int, *, across: int) -> Array:
-    """Return the image of (T, side²) tiles, so many across."""
     return tiles.reshape(-1, across, side, side).swapaxes(1, 2).reshape(-1, across * side)
 
 
@@ -317,7 +315,6 @@ def _shape_m(error_m: Array) -> Array:
 
 
 def _levels(name: str, planes: list[tuple[int, SeenPlane]]) -> list[DepthLevel]:
-    """Return the distances at which enough frames show enough planes."""
     frame_of = np.array([number for number, _ in planes], np.intp)
     distance_m = np.array([plane.distance_m for _, plane in planes])
     return [

@@ -14,7 +14,7 @@ from mapper.core.errors import DataError, MapperError
 from mapper.core.trajectory import Trajectory
 from mapper.evaluators.metrics.odometry import ONE_SECOND, PathErrors, path_errors
 from mapper.evaluators.metrics.segments import lengths_for, segment_errors
-from mapper.evaluators.metrics.trajectory import AlignmentKind, Matched, align, associate, start_end_offset
+from mapper.evaluators.metrics.trajectory import Matched, align, associate, start_end_offset
 from mapper.evaluators.study.table import Record, Value
 from mapper.pipeline.build import build
 from mapper.run.files import CONFIG, MANIFEST, OCTREE_MAP, SUMMARY, TRAJECTORY, TRUTH
@@ -23,19 +23,15 @@ from mapper.runtime.progress import forget_peak_memory
 from mapper.sources import open_source
 
 
-def summary(run: Run, *, alignment: AlignmentKind = "se3") -> dict[str, Value]:
+def summary(run: Run) -> dict[str, Value]:
     """Return the errors of a run's path, and which share of its log has poses; None is not known.
 
     Nothing is known of the errors where the log has no truth or too few poses have one, nothing of those over
     a second or over stretches of the path where there are none. ``relative_…`` are means over the
     segments of :func:`mapper.evaluators.metrics.segments.lengths_for`, as KITTI's table has them.
-
-    Args:
-        run: A finished run.
-        alignment: Alignment of its path with the truth.
     """
     counts, trajectory, truth = run.manifest.counts, run.trajectory, run.truth
-    matched = None if truth is None else _aligned(trajectory, truth, alignment)
+    matched = None if truth is None else _aligned(trajectory, truth)
     errors = PathErrors() if matched is None else path_errors(matched, ONE_SECOND)
     relative = _relative(matched, 0.0 if truth is None else truth.path_length_m)
     return {
@@ -55,16 +51,15 @@ def summary(run: Run, *, alignment: AlignmentKind = "se3") -> dict[str, Value]:
     }
 
 
-def _aligned(trajectory: Trajectory, truth: Trajectory, alignment: AlignmentKind) -> Matched | None:
+def _aligned(trajectory: Trajectory, truth: Trajectory) -> Matched | None:
     try:
         matched = associate(trajectory, truth)
-        return align(matched, alignment).moved(matched)
+        return align(matched, "se3").moved(matched)
     except DataError:
         return None
 
 
 def _relative(matched: Matched | None, path_m: float) -> tuple[float, float] | tuple[None, None]:
-    """Return the mean relative errors of translation and rotation over all segments."""
     lengths = () if matched is None else segment_errors(matched, lengths_for(path_m))
     if not any(map(len, lengths)):
         return None, None

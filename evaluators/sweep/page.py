@@ -75,7 +75,6 @@ def _statuses(records: Sequence[Record]) -> list[str]:
 
 
 def _compared(groups: Groups, quantity: Quantity) -> str:
-    """Return a row for each log and a column for each kind of build, and a drawing of it."""
     variants = list(next(iter(groups.values())))
     rows = []
     for log, of_log in groups.items():
@@ -99,7 +98,6 @@ def _has_range(groups: Groups) -> bool:
 
 
 def _head(variants: Sequence[Variant]) -> str:
-    """Return two rows: methods, each over its configurations."""
     methods = list(dict.fromkeys(method for method, _ in variants))
     wide = len(variants) // len(methods)
     above = "".join(f'<th colspan="{wide}">{escape(method)}</th>' for method in methods)
@@ -128,14 +126,12 @@ def _chart(log: str, of_log: Mapping[Variant, Group], quantity: Quantity) -> str
 
 
 def _table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
-    """Return a table; its cells are plain text."""
     top = "".join(f"<th>{escape(text)}</th>" for text in head)
     body = "".join(f"<tr>{''.join(map(_cell, row))}</tr>" for row in rows)
     return f'<div class="scroll"><table><thead><tr>{top}</tr></thead><tbody>{body}</tbody></table></div>'
 
 
 def _builds(records: Sequence[Record]) -> str:
-    """Return everything that was measured, a row for each build, with a link to its picture."""
     names = [name for name in records[0] if name not in _ELSEWHERE]
     has_links = any(record.get("run") for record in records)
     head = "".join(f"<th>{escape(name)}</th>" for name in names) + "<th>kept</th>" * has_links
@@ -236,7 +232,6 @@ def _widened(low: float, high: float) -> tuple[float, float]:
 
 
 def _ticks(low: float, high: float) -> list[float]:
-    """Return a few round numbers between two limits."""
     powers = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
     fine = [m * 10.0**power for power in powers for m in (1, 2, 5) if low <= m * 10.0**power <= high]
     if len(fine) < _FEWEST_TICKS:

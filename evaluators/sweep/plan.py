@@ -32,7 +32,6 @@ from mapper.sources.config import SourceConfig
 
 
 def _assignments(given: Any) -> Any:
-    """Return a table of settings as ``key.path=value``; a list as it is."""
     if not isinstance(given, Mapping):
         return given
     flat = flattened(given)

@@ -124,7 +124,7 @@ def test_values_become_json_without_losing_or_inventing_any():
     document = {"a": np.float64(0.5), "b": math.nan, "c": (Kind.ONE, True, None), "d": Inner(Path("x"))}
     assert plain(document) == {"a": 0.5, "b": None, "c": ["one", True, None], "d": {"path": "x"}}
     assert plain({"rows": np.eye(2, dtype=np.int64)}) == {"rows": [[1, 0], [0, 1]]}
-    with pytest.raises(TypeError, match="object has no form in JSON"):
+    with pytest.raises(TypeError, match="object"):
         plain(object())
 
 

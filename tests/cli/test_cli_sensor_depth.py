@@ -29,10 +29,6 @@ def measured(walls, tmp_path_factory):
     return out, mapper("sensor", "depth", *walls, *planes, "--out", out)
 
 
-def test_help_has_an_example():
-    assert "Example: mapper sensor depth " in mapper("sensor", "depth", "--help").stdout
-
-
 def test_a_table_and_a_noise_are_printed(measured):
     out, result = measured
     for words in ("Δd mm", "DIF s", "in time", "noise  σ_z = ", f"--config {out / 'sensor.toml'}"):

@@ -9,15 +9,9 @@ from mapper.core.geometry import exp, inverse, transform
 from mapper.graph.g2o import read_g2o, write_g2o
 from mapper.graph.model import BetweenFactor, PoseGraph, PoseSigmas
 from mapper.sources.trajectory_files import read_tum
-from tests.support.command_line import invoke
+from tests.support.command_line import mapper
 
 INFORMATION = PoseSigmas(rotation_rad=0.01, translation_m=0.02).information
-
-
-def solved(*arguments):
-    result = invoke("solve", *arguments)
-    assert result.exit_code == 0, result.output
-    return result
 
 
 def ring(n=20, *, seed=0):
@@ -50,14 +44,11 @@ def test_a_folder_holds_graph_path_picture_and_report(tmp_path):
     graph, truth = ring()
     write_g2o(tmp_path / "ring.g2o", with_a_false_loop(graph))
 
-    shown = solved(tmp_path / "ring.g2o", "--out", tmp_path / "out").stdout
+    shown = mapper("solve", tmp_path / "ring.g2o", "--out", tmp_path / "out").stdout
 
     report = json.loads((tmp_path / "out/solve.json").read_text())
-    assert report["nodes"] == 20
-    assert report["edges"] == 24
-    assert report["loops"] == 5
-    assert report["rejected"] == [[5, 12]]
-    assert report["component_sizes"] == [20]
+    found = [report[name] for name in ("nodes", "edges", "loops", "rejected", "component_sizes")]
+    assert found == [20, 24, 5, [[5, 12]], [20]]
     assert 0.0 < report["error_after"] < report["error_before"]
     assert "4 of 5 accepted" in shown
     again = read_g2o(tmp_path / "out/graph.g2o")
@@ -73,7 +64,7 @@ def test_a_folder_holds_graph_path_picture_and_report(tmp_path):
 def test_a_file_is_the_same_graph_with_solved_nodes(tmp_path):
     graph, _ = ring()
     write_g2o(tmp_path / "ring.g2o", graph)
-    result = solved(tmp_path / "ring.g2o", "--out", tmp_path / "out.g2o", "--quiet")
+    result = mapper("solve", tmp_path / "ring.g2o", "--out", tmp_path / "out.g2o", "--quiet")
     assert result.stdout == ""
     again = read_g2o(tmp_path / "out.g2o")
     assert again.stamps_ns == graph.stamps_ns
@@ -91,8 +82,8 @@ def stripped(path):
 def test_a_foreign_file_is_plain_least_squares_unless_doubt_is_asked_for(tmp_path):
     write_g2o(tmp_path / "ring.g2o", with_a_false_loop(ring()[0]))
     foreign = stripped(tmp_path / "ring.g2o")
-    plain = solved(foreign, "--out", tmp_path / "plain").stdout
-    solved(foreign, "--out", tmp_path / "robust", "--robust", "dcs")
+    plain = mapper("solve", foreign, "--out", tmp_path / "plain").stdout
+    mapper("solve", foreign, "--out", tmp_path / "robust", "--robust", "dcs")
     plain_report = json.loads((tmp_path / "plain/solve.json").read_text())
     robust_report = json.loads((tmp_path / "robust/solve.json").read_text())
     assert plain_report["loops"] == 0
@@ -108,7 +99,7 @@ def test_components_are_reported(tmp_path):
     graph.add_node(101, 101 * 10**9, np.eye(4))
     graph.add_factors([BetweenFactor(100, 101, transform(np.eye(3), [1.0, 0.0, 0.0]), INFORMATION)])
     write_g2o(tmp_path / "two.g2o", graph)
-    shown = solved(tmp_path / "two.g2o", "--out", tmp_path / "out.g2o").stdout
+    shown = mapper("solve", tmp_path / "two.g2o", "--out", tmp_path / "out.g2o").stdout
     assert "2, each solved on its own: 20, 2 nodes" in shown
     assert read_g2o(tmp_path / "out.g2o").T_world_node[101][0, 3] == pytest.approx(1.0)
 
@@ -116,7 +107,7 @@ def test_components_are_reported(tmp_path):
 def test_every_knob_of_the_graph_turns(tmp_path):
     write_g2o(tmp_path / "ring.g2o", ring()[0])
     knobs = ("--robust", "none", "--initial", "given", "--set", "graph.max_iterations=1")
-    solved(tmp_path / "ring.g2o", "--out", tmp_path / "out", *knobs)
+    mapper("solve", tmp_path / "ring.g2o", "--out", tmp_path / "out", *knobs)
     report = json.loads((tmp_path / "out/solve.json").read_text())
     assert report["iterations"] == 1
     assert report["config"]["initial"] == "given"
@@ -124,33 +115,24 @@ def test_every_knob_of_the_graph_turns(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("setting", "message"),
     [
-        (["--set", "octree.resolution_m=1"], "octree: unknown; known are"),
-        (["--set", "max_iterations=0"], "max_iterations: Input should be greater than 0"),
+        ("octree.resolution_m=1", "octree: unknown; known are"),
+        ("max_iterations=0", "max_iterations: Input should be greater than 0"),
     ],
 )
-def test_a_knob_that_is_none_is_refused(tmp_path, arguments, message):
+def test_a_knob_that_is_none_is_refused(tmp_path, setting, message):
     write_g2o(tmp_path / "ring.g2o", ring()[0])
-    result = invoke("solve", tmp_path / "ring.g2o", "--out", tmp_path / "out.g2o", *arguments)
-    assert result.exit_code == 1
+    result = mapper("solve", tmp_path / "ring.g2o", "--out", tmp_path / "out.g2o", "--set", setting, status=1)
     assert message in result.stderr
 
 
-def test_a_folder_that_is_there_is_not_written_into(tmp_path):
-    write_g2o(tmp_path / "ring.g2o", ring()[0])
-    (tmp_path / "out").mkdir()
-    result = invoke("solve", tmp_path / "ring.g2o", "--out", tmp_path / "out")
-    assert result.exit_code == 1
-    assert "exists already" in result.stderr
-    assert not any((tmp_path / "out").iterdir())
-
-
-def test_a_file_that_is_there_is_not_replaced(tmp_path):
-    path = tmp_path / "ring.g2o"
+def test_what_is_there_is_neither_replaced_nor_written_into(tmp_path):
+    path, folder = tmp_path / "ring.g2o", tmp_path / "out"
     write_g2o(path, ring()[0])
+    folder.mkdir()
     before = path.read_bytes()
-    result = invoke("solve", path, "--out", path)
-    assert result.exit_code == 1
-    assert "ring.g2o: exists already; choose another --out" in result.stderr
+    for out in (path, folder):
+        assert f"{out.name}: exists already" in mapper("solve", path, "--out", out, status=1).stderr
     assert path.read_bytes() == before
+    assert not any(folder.iterdir())

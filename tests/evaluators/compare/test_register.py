@@ -18,13 +18,9 @@ from mapper.simulation.config import STREET, LidarSensorConfig
 from mapper.simulation.lidar import LidarSimulator
 from mapper.sources import open_source
 from mapper.sources.scan_folders.clouds import read_scan
-from tests.support.command_line import invoke
+from tests.support.command_line import mapper
 
 T_TURNED = exp(np.array([0.0, 0.0, 1.2]), np.array([3.0, -2.0, 0.0]))
-
-
-def mapper(*arguments):
-    return invoke("register", *arguments)
 
 
 def write_kitti(path, points):
@@ -57,9 +53,7 @@ def test_a_turned_scan_is_found_without_a_guess_and_all_is_written(clouds, tmp_p
     target, source, T_target_source = clouds
     out = tmp_path / "registered"
 
-    result = mapper(source, target, "--out", out)
-
-    assert result.exit_code == 0, result.output
+    result = mapper("register", source, target, "--out", out)
     words = ["hough-gicp", "trusted  yes", "xyz", "rpy", "MHD", "MPD", "before", "Hough", "refined", "vote"]
     for word in words:
         assert word in result.stdout
@@ -87,21 +81,10 @@ def test_a_guess_and_a_knob_reach_the_method(clouds):
     x, y, z = T_target_source[:3, 3]
     guess = f"{x + 0.3} {y - 0.2} {z} 0 0 {yaw_deg + 2.0}"
 
-    good = mapper(source, target, "--method", "gicp", "--guess", guess)
-    assert good.exit_code == 0, good.output
-    assert "trusted  yes" in good.stdout
+    asked = (source, target, "--method", "gicp", "--guess", guess)
 
-    strict = mapper(
-        source,
-        target,
-        "--method",
-        "gicp",
-        "--guess",
-        guess,
-        "--set",
-        "registration.acceptance.min_agreeing_ratio=1",
-    )
-    assert strict.exit_code == 1
+    assert "trusted  yes" in mapper("register", *asked).stdout
+    strict = mapper("register", *asked, "--set", "registration.acceptance.min_agreeing_ratio=1", status=1)
     assert "less than 100%" in strict.stderr
 
 
@@ -109,9 +92,8 @@ def test_what_is_not_trusted_is_written_all_the_same_and_told_in_one_line(clouds
     target, source, _ = clouds
     out = tmp_path / "wrong"
 
-    result = mapper(source, target, "--method", "icp", "--guess", "20 20 0 0 0 0", "--out", out, "--quiet")
-
-    assert result.exit_code == 1
+    wrong = ("--method", "icp", "--guess", "20 20 0 0 0 0")
+    result = mapper("register", source, target, *wrong, "--out", out, "--quiet", status=1)
     assert len(result.stderr.splitlines()) == 1
     assert "source.bin on " in result.stderr
     assert "not trusted: " in result.stderr
@@ -131,8 +113,7 @@ def test_clouds_that_never_meet_leave_nothing_refined(street):
 
 def test_frames_of_a_log_are_named_by_their_number(desk_log):
     for method in ("isvd", "gicp"):
-        result = mapper(f"{desk_log}@2", f"{desk_log}@0", "--method", method)
-        assert result.exit_code == 0, result.output
+        result = mapper("register", f"{desk_log}@2", f"{desk_log}@0", "--method", method)
         assert f"method   {method}" in result.stdout
 
 
@@ -141,11 +122,10 @@ def test_a_cameras_frame_beside_a_cloud_file_is_a_cameras_still(desk_log, tmp_pa
     first = next(open_source(desk_log).entries()).scan()
     np.save(cloud, first.points_body)
     for source, target in ((f"{desk_log}@1", cloud), (cloud, f"{desk_log}@1")):
-        result = mapper(source, target, "--method", "gicp", "--out", out, "--overwrite")
-        assert result.exit_code == 0, result.output
+        mapper("register", source, target, "--method", "gicp", "--out", out, "--overwrite")
         record = json.loads((out / "manifest.json").read_text())
         assert record["config"]["registration"]["voxel_m"] == 0.05
-        assert "a camera's frame has it ahead" in mapper(source, target).stderr
+        assert "a camera's frame has it ahead" in mapper("register", source, target, status=1).stderr
 
 
 def test_clouds_in_other_units_are_scaled_as_told(clouds, tmp_path):
@@ -156,12 +136,9 @@ def test_clouds_in_other_units_are_scaled_as_told(clouds, tmp_path):
         np.save(in_mm[-1], 1000.0 * read_scan(path).points_body)
     out = tmp_path / "registered"
 
-    refused = mapper(*in_mm)
-    assert refused.exit_code == 1
+    refused = mapper("register", *in_mm, status=1)
     assert "--set source.cloud_scale=0.001" in refused.stderr
-    result = mapper(*in_mm, "--set", "source.cloud_scale=0.001", "--out", out)
-
-    assert result.exit_code == 0, result.output
+    mapper("register", *in_mm, "--set", "source.cloud_scale=0.001", "--out", out)
     found = np.array(json.loads((out / "manifest.json").read_text())["T_target_source"])
     assert np.linalg.norm((inverse(T_target_source) @ found)[:3, 3]) < 0.1
 
@@ -169,10 +146,10 @@ def test_clouds_in_other_units_are_scaled_as_told(clouds, tmp_path):
 def test_it_can_be_watched_in_rerun(clouds, tmp_path):
     target, source, _ = clouds
     recording = tmp_path / "registered.rrd"
-    assert mapper(source, target, "--rerun", recording, "--quiet").exit_code == 0
+    mapper("register", source, target, "--rerun", recording, "--quiet")
     assert recording.read_bytes().startswith(b"RRF2")
-    assert "exists already" in mapper(source, target, "--rerun", recording).stderr
-    assert "want FILE.rrd" in mapper(source, target, "--rerun", "somewhere").stderr
+    assert "exists already" in mapper("register", source, target, "--rerun", recording, status=1).stderr
+    assert "want FILE.rrd" in mapper("register", source, target, "--rerun", "somewhere", status=1).stderr
 
 
 @pytest.mark.parametrize(
@@ -195,8 +172,7 @@ def test_it_can_be_watched_in_rerun(clouds, tmp_path):
     ],
 )
 def test_a_mistake_is_one_line(arguments, complaint, desk_log):
-    result = mapper(*(argument.format(log=desk_log) for argument in arguments))
-    assert result.exit_code == 1
+    result = mapper("register", *(argument.format(log=desk_log) for argument in arguments), status=1)
     assert complaint.format(log=desk_log) in result.stderr
     assert len(result.stderr.splitlines()) == 1
 

@@ -57,7 +57,6 @@ def test_a_row_says_how_wrong_a_path_is_and_of_how_much_of_the_log(tmp_path):
     assert row["relative_translation_ratio"] == pytest.approx(0.1, rel=0.15)
     assert row["relative_rotation_radpm"] < 1e-6
     assert row["path_m"] == pytest.approx(1.1 * path_of().path_length_m)
-    assert summary(run_in(tmp_path, path_of(scale=1.1), path_of()), alignment="sim3")["ate_m"] < 1e-6
 
 
 def test_what_is_not_known_is_none(tmp_path):

@@ -141,7 +141,7 @@ def test_only_isvd_is_followed(desk_log):
 
 @pytest.fixture
 def job(desk_log, tmp_path):
-    return ThesisJob(("5.5",), "fr1/xyz", desk_log, 0, Cut(0, 9), tmp_path / "trajectories")
+    return ThesisJob("fr1/xyz", desk_log, 0, Cut(0, 9), ("5.5",), tmp_path / "trajectories")
 
 
 def test_a_job_gives_every_figure_and_keeps_the_paths(job):
@@ -161,13 +161,13 @@ def test_a_job_gives_every_figure_and_keeps_the_paths(job):
 def test_another_log_seed_or_part_is_another_cell_and_another_place_is_not(job, desk_log, tmp_path):
     (tmp_path / "moved").symlink_to(desk_log)
     others = [
-        ThesisJob(("5.2",), job.sequence, job.log, 0, job.cut, job.paths),
-        ThesisJob(("5.5",), "fr1/rpy", job.log, 0, job.cut, job.paths),
-        ThesisJob(("5.5",), job.sequence, job.log, 1, job.cut, job.paths),
-        ThesisJob(("5.5",), job.sequence, job.log, 0, Cut(0, 12), job.paths),
-        ThesisJob(("5.5",), job.sequence, tmp_path, 0, job.cut, job.paths),
+        ThesisJob(job.sequence, job.log, 0, job.cut, ("5.2",), job.paths),
+        ThesisJob("fr1/rpy", job.log, 0, job.cut, ("5.5",), job.paths),
+        ThesisJob(job.sequence, job.log, 1, job.cut, ("5.5",), job.paths),
+        ThesisJob(job.sequence, job.log, 0, Cut(0, 12), ("5.5",), job.paths),
+        ThesisJob(job.sequence, tmp_path, 0, job.cut, ("5.5",), job.paths),
     ]
-    moved = ThesisJob(("5.5",), job.sequence, tmp_path / "moved", 0, job.cut, tmp_path)
+    moved = ThesisJob(job.sequence, tmp_path / "moved", 0, job.cut, ("5.5",), tmp_path)
 
     assert len({job_for(each).key for each in [job, *others]}) == 6
     assert job_for(moved).key == job_for(job).key
@@ -178,7 +178,7 @@ def test_a_log_without_truth_has_no_error(tiny_tum_log, tmp_path):
     (log / "groundtruth.txt").unlink()
 
     with pytest.raises(DataError, match="no ground truth"):
-        ThesisJob(("5.2",), "fr1/xyz", log, 0, Cut(), tmp_path)()
+        ThesisJob("fr1/xyz", log, 0, Cut(), ("5.2",), tmp_path)()
 
 
 def test_tables_of_the_same_frames_are_measured_together(job):
@@ -193,7 +193,7 @@ def test_tables_of_the_same_frames_are_measured_together(job):
 
 def test_a_long_log_is_cut_where_the_thesis_cuts_it(job):
     def last(cut):
-        long_job = ThesisJob(("4.2",), "fr3/long_office", job.log, 0, cut, job.paths)
+        long_job = ThesisJob("fr3/long_office", job.log, 0, cut, ("4.2",), job.paths)
         return {config.source.last_frame for config in long_job.configs().values()}
 
     assert last(Cut()) == {2099}
@@ -223,7 +223,7 @@ def test_the_end_of_a_path_is_off_in_the_axes_of_its_start():
 
 
 def test_the_thesiss_own_log_stands_beside_ours_without_a_ratio(job):
-    jobs = [ThesisJob(("4.1",), "fr1/xyz", job.log, 0, job.cut, job.paths)]
+    jobs = [ThesisJob("fr1/xyz", job.log, 0, job.cut, ("4.1",), job.paths)]
     results = {jobs[0]: JobResult("k", "l", tuple(figure(place, 1.0) for place in jobs[0].places), 1.0)}
 
     table = table_of("4.1", results)
@@ -243,7 +243,7 @@ def figure(place, value, failure=None, note=""):
 
 
 def test_seeds_are_gathered_and_failures_told(job):
-    jobs = [ThesisJob(("5.2",), "fr1/xyz", job.log, seed, job.cut, job.paths) for seed in range(3)]
+    jobs = [ThesisJob("fr1/xyz", job.log, seed, job.cut, ("5.2",), job.paths) for seed in range(3)]
     mp1, mp2, *_ = jobs[0].places
     outcomes = [
         JobResult("a", "a", (figure(mp1, 0.03), figure(mp2, 0.02, note="5 lost.")), 1.0),
@@ -284,7 +284,7 @@ def test_verdicts_follow_the_median(ours, published, in_part, verdict):
 
 @pytest.mark.skipif(not FR1_XYZ.is_dir(), reason=f"{FR1_XYZ} is not here")
 def test_isvd_as_published_follows_the_first_second_of_a_real_log(tmp_path):
-    records = ThesisJob(("5.1", "5.2"), "fr1/xyz", FR1_XYZ, 0, Cut(0, 11), tmp_path)()
+    records = ThesisJob("fr1/xyz", FR1_XYZ, 0, Cut(0, 11), ("5.1", "5.2"), tmp_path)()
 
     ours_m = {f"{record['table']} {record['column']}": record["value"] for record in records}
     assert len(ours_m) == 17

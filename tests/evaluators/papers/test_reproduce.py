@@ -49,7 +49,7 @@ def test_the_thesiss_tables_are_measured_once_and_written_whole(logs, tmp_path, 
 
 def test_measurements_travel_to_other_processes(desk_log, tmp_path):
     for job in (
-        ThesisJob(("5.1", "5.2"), "fr1/xyz", desk_log, 1, Cut(0, 9), tmp_path),
+        ThesisJob("fr1/xyz", desk_log, 1, Cut(0, 9), ("5.1", "5.2"), tmp_path),
         ZhaoJob("fr1/xyz", desk_log, 1, Cut()),
     ):
         assert pickle.loads(pickle.dumps(job)) == job
