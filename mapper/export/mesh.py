@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.config.build import MeshConfig
+from mapper.core.back_projection import back_project
 from mapper.core.errors import DependencyError, FrameError, RunError
 from mapper.core.frames import (
     NO_DISTORTION,
@@ -22,7 +23,6 @@ from mapper.core.frames import (
     PinholeCamera,
     Points32,
     RgbdFrame,
-    back_project,
     ray_table,
     undistortion_maps,
 )

@@ -4,8 +4,9 @@ import gtsam
 import numpy as np
 import pytest
 
+from mapper.core.back_projection import back_project
 from mapper.core.deskew import Twist, deskewed
-from mapper.core.frames import PinholeCamera, Scan, back_project, ray_table
+from mapper.core.frames import PinholeCamera, Scan, ray_table
 from mapper.core.geometry import adjoint, apply, exp, inverse, log, rotation_exp, transform
 from mapper.core.rotations import row_of_pose
 from mapper.core.trajectory import Trajectory

@@ -2,8 +2,9 @@ import cv2
 import numpy as np
 import pytest
 
+from mapper.core.back_projection import back_project
 from mapper.core.errors import DataError
-from mapper.core.frames import PinholeCamera, RgbdFrame, Scan, back_project, ray_table
+from mapper.core.frames import PinholeCamera, RgbdFrame, Scan, ray_table
 from mapper.core.geometry import apply, exp
 from mapper.sources.calibration import FREIBURG
 
