@@ -85,21 +85,13 @@ def test_equals_octomap_far_from_the_map_and_without_a_range(discretize):
 
 
 @BOTH_MODES
-@pytest.mark.skipif(not FR1_XYZ.exists(), reason="needs ../shared/data/tum_fr1_xyz")
-def test_equals_octomap_on_depth_frames(discretize, tmp_path):
-    settings = {"resolution_m": 0.05, "max_range_m": 4.0, "discretize": discretize}
-    scans = fr1_xyz_scans(4)
-
-    write_ot(tmp_path / "map.ot", octree_of(scans, **settings))
-
-    assert (tmp_path / "map.ot").read_bytes() == fuse(scans, **settings).write()
-
-
-@BOTH_MODES
-@pytest.mark.skipif(not KITTI.exists(), reason="needs ../shared/data/kitti_00")
-def test_equals_octomap_on_lidar_scans(discretize, tmp_path):
-    settings = {"resolution_m": 0.4, "max_range_m": 60.0, "discretize": discretize}
-    scans = kitti_scans(3)
+@pytest.mark.skipif(not (FR1_XYZ.exists() and KITTI.exists()), reason="needs ../shared/data")
+@pytest.mark.parametrize(
+    ("scans_of", "resolution_m", "max_range_m"), [(fr1_xyz_scans, 0.05, 4.0), (kitti_scans, 0.4, 60.0)]
+)
+def test_equals_octomap_on_real_frames(scans_of, resolution_m, max_range_m, discretize, tmp_path):
+    settings = {"resolution_m": resolution_m, "max_range_m": max_range_m, "discretize": discretize}
+    scans = scans_of(3)
 
     write_ot(tmp_path / "map.ot", octree_of(scans, **settings))
 

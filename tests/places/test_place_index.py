@@ -60,11 +60,6 @@ def test_a_query_equals_comparing_with_everything(vocabulary, index, vectors, be
         assert found == expected[:10]
 
 
-def test_every_node_finds_itself_first(index, vectors):
-    for number, vector in enumerate(vectors):
-        assert index.query(vector, min_similarity=0.9, limit=1) == [(1000 + number, 1.0)]
-
-
 def test_an_outstanding_place_is_found_at_any_similarity(vocabulary, index, vectors):
     strangers = np.setdiff1d(np.arange(vocabulary.words), vectors[7].ids)[:12]
     mixed = vocabulary.vector(np.concatenate([vectors[7].ids[:18], strangers]))

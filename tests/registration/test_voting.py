@@ -106,8 +106,3 @@ def test_nothing_votes_for_nothing():
     assert vote(np.empty((0, 2)), np.ones((3, 2)), VotingConfig()) == []
     assert vote(np.ones((3, 2)), np.empty((0, 2)), VotingConfig()) == []
     assert vote(np.zeros((1, 2)), np.full((1, 2), 500.0), VotingConfig()) == []
-
-
-def test_one_centre_each_meets_at_any_angle():
-    peaks = vote(np.array([[3.0, 4.0]]), np.array([[1.0, 1.0]]), VotingConfig())
-    assert peaks[0].votes == 1
