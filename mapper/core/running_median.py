@@ -1,19 +1,13 @@
 """Running statistics of a log's figures, by which a new one is found to be unusual."""
 
 from collections import deque
-
-import numpy as np
+from statistics import median
 
 _NORMAL = 1.4826  # standard deviations in a median absolute deviation of normal errors
 
 
 class RunningMedian:
-    """Median and robust standard deviation of a figure's last values.
-
-    Attributes:
-        median: Median of the values; 0 while there are too few.
-        sigma: 1.4826 times their median absolute deviation; 0 while there are too few.
-    """
+    """Median and robust standard deviation of a figure's last values."""
 
     def __init__(self, *, memory: int | None, fewest: int = 1) -> None:
         """Start without values.
@@ -24,7 +18,6 @@ class RunningMedian:
         """
         self._values: deque[float] = deque(maxlen=memory)
         self._fewest = fewest
-        self.median = self.sigma = 0.0
 
     def __len__(self) -> int:
         return len(self._values)
@@ -34,15 +27,23 @@ class RunningMedian:
         """Whether there are enough values."""
         return len(self._values) >= self._fewest
 
+    @property
+    def median(self) -> float:
+        """Median of the values; 0 while there are too few."""
+        return median(self._values) if self.is_known else 0.0
+
+    @property
+    def sigma(self) -> float:
+        """1.4826 times the median absolute deviation of the values; 0 while there are too few."""
+        if not self.is_known:
+            return 0.0
+        middle = self.median
+        return _NORMAL * median(abs(value - middle) for value in self._values)
+
     def add(self, value: float) -> None:
         """Add a value."""
         self._values.append(value)
-        if self.is_known:
-            values = np.array(self._values)
-            self.median = float(np.median(values))
-            self.sigma = _NORMAL * float(np.median(np.abs(values - self.median)))
 
     def clear(self) -> None:
         """Forget all values."""
         self._values.clear()
-        self.median = self.sigma = 0.0
