@@ -31,7 +31,10 @@ _UNITS_PER_S = (1, 1_000, 1_000_000, NS_PER_S)
 _MAX_WRONG_SHARE = 0.05
 """Share of the points whose times may be damaged; with more of them nothing tells which times are right."""
 _SAMPLED = 1000
-_HALF_COUNTER = 1 << 31
+_PERIODS = (float(1 << 32), *(s * unit for s in (1, 3600, 86_400, 604_800) for unit in _UNITS_PER_S))
+"""Counts after which times begin anew: 32 bits; a second, an hour, a day and a week in every unit."""
+_NEARLY_ALL = 0.99
+"""Share of a period that times span which began anew during a sweep."""
 
 _SAME_STEP_RAD, _NEXT_STEP_RAD = 1e-6, 0.1
 """Azimuths of consecutive points of a spinning LiDAR's file: of one column, or of two columns nearby."""
@@ -53,8 +56,8 @@ def relative_times_s(values: NDArray[np.number], stamp_ns: int) -> NDArray[np.fl
     ``MAX_SWEEP_S`` of zero are offsets from the stamp already; others within as much of the stamp are times
     on its clock; all others are on a clock of the sensor's own, and the first point is taken at the stamp.
 
-    A few values that are not within ``MAX_SWEEP_S`` of the others are damaged: the driver wrote zero or NaN,
-    or its 32-bit counter began anew, which costs nothing, for it is counted on.
+    A few values that are not within ``MAX_SWEEP_S`` of the others are damaged: the driver wrote zero or NaN.
+    Where a counter of 32 bits, or of the second, hour, day or week began anew, it is counted on.
 
     Args:
         values: (N,) of any integer or floating type, of the points that measured something.
@@ -91,11 +94,22 @@ def without_untimed(scan: Scan) -> Scan:
 
 
 def _counted_on(values: NDArray[np.number]) -> NDArray[np.number]:
-    """Return the values of a 32-bit counter as if it had not begun anew during the sweep."""
-    if values.dtype != np.uint32 or np.ptp(values) <= _HALF_COUNTER:
+    """Return the values as if a counter had not begun anew during the sweep."""
+    first, last = values.min(), values.max()
+    if not (np.isfinite(first) and np.isfinite(last)):
         return values
-    middle = int(values[len(values) // 2])
-    return (values.astype(np.int64) - middle + _HALF_COUNTER) % (2 * _HALF_COUNTER) - _HALF_COUNTER + middle
+    span = float(_less(last, first))
+    period = next((p for p in _PERIODS if _NEARLY_ALL * p < span <= p), None)
+    if period is None:
+        return values
+    ordered = np.sort(values)
+    steps = _less(ordered[1:], ordered[0]) - _less(ordered[:-1], ordered[0])
+    widest = int(steps.argmax())
+    if steps[widest] < 0.5 * period:
+        return values
+    wide = values.astype(np.float64 if values.dtype.kind == "f" else np.int64)
+    wide[values <= ordered[widest]] += int(period)
+    return wide
 
 
 def _middle_and_unit(values: NDArray[np.number]) -> tuple[np.number, int | None]:

@@ -79,6 +79,20 @@ def test_a_32_bit_counter_that_begins_anew_is_counted_on():
     np.testing.assert_allclose(np.diff(found), 1e-4, atol=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("period_s", "unit"), [(1, 1e9), (3600, 1e6), (3600, 1.0), (86_400, 1.0), (604_800, 1e3)]
+)
+def test_a_clock_that_begins_anew_is_counted_on(period_s, unit):
+    values = (period_s - 0.03 + np.arange(1000) * 1e-4) % period_s * unit
+    found = relative_times_s(values, stamp_ns=STAMP_NS)
+    np.testing.assert_allclose(np.diff(found), 1e-4, atol=1e-6)
+
+
+def test_a_sweep_of_a_second_with_a_blind_sector_is_as_it_was():
+    values = np.r_[0.0:0.3:1e-3, 0.7:1.0:1e-3]
+    np.testing.assert_allclose(relative_times_s(values, stamp_ns=STAMP_NS), values, atol=1e-6)
+
+
 def test_times_of_which_many_are_damaged_are_none():
     times = np.linspace(0.0, 1e8, 1000) + 1.7e18
     times[:100] = 0.0

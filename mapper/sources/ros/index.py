@@ -52,6 +52,11 @@ class Series:
     def __len__(self) -> int:
         return len(self.stamps_ns)
 
+    @property
+    def clock_ns(self) -> int:
+        """Usual difference of the stamps to the times of recording."""
+        return int(np.sort(self.stamps_ns - self.log_ns)[len(self) // 2])
+
     def place(self, i: int) -> Place:
         """Return where message ``i`` lies."""
         return Place(*self.places[i].tolist())

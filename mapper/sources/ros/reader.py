@@ -12,6 +12,7 @@ from mapper.core.errors import DataError, FrameError
 from mapper.core.frames import Sensor
 from mapper.core.geometry import Transform
 from mapper.core.rotations import pose_of_row
+from mapper.core.timebase import NS_PER_S
 from mapper.core.trajectory import Trajectory
 from mapper.sensing.gyroscope import Gyroscope
 from mapper.sources.base import Accelerations
@@ -36,6 +37,8 @@ _MAX_READINGS = 20_000  # levelling asks for fewer, and an hour of a fast unit w
 _MAX_TRANSFORMS = 1_000
 _BASES = ("base_link", "base_footprint")
 """Frames of a robot's base (REP 105, REP 120)."""
+SAME_CLOCK_NS = 60 * NS_PER_S
+"""Messages are recorded within seconds of their stamps."""
 _UNIT_TOLERANCE = 0.01
 _FARTHEST_M = 1e8  # farther than anything drives: a damaged message
 
@@ -55,12 +58,17 @@ class RecordingReader:
         self.recording = recording
         self.series: Mapping[str, Series] = index_of(recording)
         self.firsts: Mapping[str, Message] = first_messages(recording, self.series.values())
+        self._clock_ns = 0
         self.tree = FrameTree(self._transforms(most=_MAX_TRANSFORMS))
 
     @cached_property
     def whole_tree(self) -> FrameTree:
         """The coordinate frames with every pose of those that move."""
         return FrameTree(self._transforms(most=None))
+
+    def follow_clock(self, frames: Series) -> None:
+        """Move transforms without stamps, and those on another clock than some frames, to that of these."""
+        self._clock_ns = frames.clock_ns
 
     def tree_of(self, to: str, from_: str) -> FrameTree:
         """Return a tree with every pose of the frames between two."""
@@ -176,7 +184,10 @@ class RecordingReader:
                 one, _spread(np.arange(len(one)), most=most or len(one))
             ):
                 if isinstance(message, list):
-                    yield from (replace(pose, stamp_ns=pose.stamp_ns or recorded_ns) for pose in message)
+                    followed_ns = recorded_ns + self._clock_ns
+                    for pose in message:
+                        is_near = abs(pose.stamp_ns - followed_ns) <= SAME_CLOCK_NS
+                        yield pose if is_near else replace(pose, stamp_ns=followed_ns)
 
     def _poses(self, series: Series, indices: NDArray[np.intp]) -> Iterator[PoseMessage]:
         for stamp_ns, message in self._messages(series, indices):

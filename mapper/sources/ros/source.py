@@ -7,13 +7,14 @@ import numpy as np
 
 from mapper.core.errors import SourceError
 from mapper.core.frames import NO_DISTORTION, Sensor
-from mapper.core.timebase import Stamps
+from mapper.core.timebase import NS_PER_S, Stamps
 from mapper.sources.base import FrameRef, Log
 from mapper.sources.calibration import Calibration, configured
 from mapper.sources.config import SourceConfig
 from mapper.sources.image_files.image_sizes import RecordedCamera, Size, recorded_camera
 from mapper.sources.image_files.reading import FINE_UNITS_PER_M
 from mapper.sources.image_folders.pairing import depth_offset_ns
+from mapper.sources.point_times import relative_times_s, time_field
 from mapper.sources.ros.entries import CloudEntry, rgbd_entry
 from mapper.sources.ros.frame_tree import is_fixed
 from mapper.sources.ros.image_messages import MILLIMETRES_PER_M, has_float_depth, size_of
@@ -28,8 +29,8 @@ from mapper.sources.ros.messages import (
     Window,
     frame_of,
 )
-from mapper.sources.ros.reader import RecordingReader
-from mapper.sources.ros.topics import CameraTopics, choose, is_called_registered
+from mapper.sources.ros.reader import SAME_CLOCK_NS, RecordingReader
+from mapper.sources.ros.topics import CameraTopics, Choice, choose, is_called_registered
 from mapper.sources.undistorted import FISHEYE_MODELS, POLYNOMIAL_MODELS, Lens, UndistortedEntry
 
 _SAME_LENS_RATIO = 0.01
@@ -67,6 +68,9 @@ def recording_log(reader: RecordingReader, config: SourceConfig) -> Log:
         choice = choose(reader.series, reader.firsts, config.topics, path=recording.path)
     except SourceError as error:
         raise SourceError("; ".join([str(error), *problems])) from None
+    main = choice.frames.color if isinstance(choice.frames, CameraTopics) else choice.frames
+    reader.follow_clock(main)
+    choice, clock_notes = _on_clock_of(main, choice)
     if isinstance(choice.frames, CameraTopics):
         frames = _rgbd(reader, choice.frames, config)
     else:
@@ -90,8 +94,31 @@ def recording_log(reader: RecordingReader, config: SourceConfig) -> Log:
         gyroscope=gyroscope,
         T_base_body=reader.mounting(frames.body),
         wheels=wheels,
-        notes=[*choice.notes, *problems, *frames.notes, *truth_notes, *wheel_notes, *imu_notes],
+        notes=[*choice.notes, *problems, *clock_notes, *frames.notes, *truth_notes, *wheel_notes, *imu_notes],
     )
+
+
+def _on_clock_of(main: Series, choice: Choice) -> tuple[Choice, list[str]]:
+    """Return the choice with the stamps of every topic on the clock of one, and notes on those moved."""
+    notes: list[str] = []
+
+    def moved(series: Series) -> Series:
+        shift_ns = main.clock_ns - series.clock_ns
+        spans = [(int(one.stamps_ns.min()), int(one.stamps_ns.max())) for one in (main, series)]
+        overlap = spans[0][0] <= spans[1][1] and spans[1][0] <= spans[0][1]
+        if abs(shift_ns) <= SAME_CLOCK_NS or overlap:
+            return series
+        notes.append(
+            f"{series.topic.name}: its stamps are on another clock than those of {main.topic.name}: moved by "
+            f"{shift_ns / NS_PER_S:.1f} s, as the times of recording say"
+        )
+        return replace(series, stamps_ns=series.stamps_ns + shift_ns)
+
+    frames = choice.frames
+    if isinstance(frames, CameraTopics):
+        frames = replace(frames, depth=moved(frames.depth))
+    imu, truth, wheels = (one and moved(one) for one in (choice.imu, choice.truth, choice.wheels))
+    return replace(choice, frames=frames, imu=imu, truth=truth, wheels=wheels), notes
 
 
 def _rgbd(reader: RecordingReader, topics: CameraTopics, config: SourceConfig) -> _Frames:
@@ -106,7 +133,9 @@ def _rgbd(reader: RecordingReader, topics: CameraTopics, config: SourceConfig) -
     i, j, notes = paired(color, depth, max_gap_s=config.max_pair_gap_s, where=where)
     first_color, first_depth = _first_image(reader, color), _first_image(reader, depth)
     camera = _camera(reader, topics, config)
-    _refuse_unregistered(reader, topics, camera)
+    has_other = topics.own_info is not None and topics.own_info is not topics.info
+    own = _camera(reader, replace(topics, info=topics.own_info), config) if has_other else camera
+    _refuse_unregistered(reader, topics, own)
     notes += camera.notes()
     frame, depth_frame = frame_of(first_color), frame_of(first_depth)
     if config.topics.depth is None and not is_called_registered(depth.topic.name):
@@ -141,6 +170,9 @@ def _lidar(reader: RecordingReader, clouds: Series, config: SourceConfig) -> _Fr
     first = reader.firsts.get(clouds.topic.name)
     if isinstance(first, CloudMessage):
         notes += [f"{clouds.topic.name}: {note}" for note in first.notes]
+        times = time_field(first.points.dtype.names or ())
+        if times and relative_times_s(first.points[times], first.stamp_ns) is None:
+            notes.append(f"{clouds.topic.name}: field {times} holds no times; scans are not deskewed")
     frame = frame_of(first)
     body, body_notes = _body_of(reader, frame, config, name=clouds.topic.name)
     notes += body_notes

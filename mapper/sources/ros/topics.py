@@ -45,13 +45,15 @@ class CameraTopics:
     Attributes:
         color: Colour or grey images.
         depth: Depth images.
-        info: The colour camera's calibration, if there is any.
+        info: The colour camera's calibration, if there is any: the user's choice, else ``own_info``.
+        own_info: The calibration that the recording has beside the colour images, if there is any.
         depth_info: The depth camera's own, if there is any.
     """
 
     color: Series
     depth: Series
     info: Series | None
+    own_info: Series | None
     depth_info: Series | None
 
 
@@ -111,11 +113,13 @@ def choose(
         infos = pick.all(CAMERAS)
         info = pick.one("camera_info", config.camera_info, CAMERAS, _plain_rank, where=set().__contains__)
         only = infos if len(infos) == 1 else []
-        info = info or next(iter([*_beside(color, infos), *_of_frame(color, infos, firsts), *only]), None)
-        depth_info = next((one for one in _beside(depth, infos) if one is not info), None)
-        frames = CameraTopics(color, depth, info, depth_info)
+        own = next(iter([*_beside(color, infos), *_of_frame(color, infos, firsts), *only]), None)
+        depth_info = next((one for one in _beside(depth, infos) if one is not own), None)
+        frames = CameraTopics(color, depth, info or own, own, depth_info)
         chosen = f"colour {color.topic.name}, depth {depth.topic.name}"
         notes = [_choice_note(chosen, config.color and config.depth, "color=… and source.topics.depth")]
+        if info is not None and own not in (None, info):
+            notes.append(f"camera info {info.topic.name} was chosen; that of the images is {own.topic.name}")
         if points is not None:
             notes.append(
                 f"there are point clouds too: to map those, source.topics.points={points.topic.name}"

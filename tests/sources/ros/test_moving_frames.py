@@ -139,6 +139,26 @@ def test_readings_without_stamps_have_the_times_of_recording(tmp_path):
     assert log.truth.stamps_ns.tolist() == STAMPS_NS
 
 
+def test_stamps_of_another_clock_are_moved_by_the_times_of_recording(tmp_path):
+    boot_ns = STAMPS_NS[0] - 5_000_000_000
+    points = [apply(inverse(pan(t)), POINTS_BASE).astype(np.float32) for t in STAMPS_NS]
+    scans = [
+        cloud_message("/points", Scan(t - boot_ns, each), frame="lidar")._replace(stamp_ns=t)
+        for t, each in zip(STAMPS_NS, points, strict=True)
+    ]
+    others = [
+        *(odometry_message(t, "/odom", drive(t), frame="odom", child="base_link") for t in STAMPS_NS),
+        *(imu_message(t, "/imu", np.array([0.0, 0.0, 9.8]), frame="base_link") for t in STAMPS_NS),
+    ]
+    messages = sorted([*moving(pan, "base_link", "lidar"), *scans, *others], key=lambda one: one.stamp_ns)
+    log = opened(tmp_path / "a.mcap", messages, topics=TopicsConfig(truth="/odom"))
+    all_near(log, POINTS_BASE)
+    expected = [t - boot_ns for t in STAMPS_NS]
+    for stamps_ns in (log.stamps_ns, log.truth.stamps_ns, log.accelerations.stamps_ns):
+        assert stamps_ns.tolist() == expected
+    assert sum("clock" in note for note in log.notes) == 2
+
+
 def test_a_body_that_stays_is_refused(tmp_path):
     messages = [*moving(drive, "map", "base_link"), *clouds(lambda _: np.eye(4), frame="base_link")]
     with pytest.raises(SourceError, match="want a frame of the robot: base_link"):
