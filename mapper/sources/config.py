@@ -137,7 +137,7 @@ class SourceConfig(Config):
     truth_file: Path | None = None
     """Poses of a LiDAR log, in TUM's or KITTI's text; None looks for groundtruth.txt and poses.txt."""
     cloud_scale: PositiveFloat | None = None
-    """Metres per unit of a LiDAR log's files; None is 1, and refuses what looks like millimetres."""
+    """Metres per unit of a LiDAR log's points; None is 1, and refuses what looks like millimetres."""
     bin_columns: int | None = Field(default=None, ge=3, le=64)
     """float32 numbers of a point in a LiDAR log's .bin files, of which the first three are x y z, e.g. 5 for
     nuScenes; None is KITTI's 4, and refuses what shows another number."""

@@ -12,7 +12,7 @@ from mapper.core.timebase import MAX_TRUTH_GAP_NS, NS_PER_S, Stamps, check_stamp
 from mapper.core.trajectory import Trajectory
 from mapper.runtime.ordered_map import ordered_map
 from mapper.sources import RECORDING, format_of, open_source
-from mapper.sources.base import Log
+from mapper.sources.base import Log, read_depth
 from mapper.sources.config import SourceConfig
 from mapper.sources.depth_scale import depth_warnings
 from mapper.sources.reading_checks import ReadingChecks
@@ -28,7 +28,7 @@ _GAP_PERIODS = 3.0
 """Median periods that a pause must exceed to be a gap."""
 _MOST_LOADED = 200
 """Frames of an RGB-D log that are loaded, evenly spread: a second or two of reading, whatever its length."""
-"""Threads; what decodes images releases the interpreter's lock."""
+_FEW = 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,7 +174,15 @@ def _inspected(path: Path, topics: Sequence[TopicFacts], source: Log) -> Inspect
         warnings=depth_warnings(source),
         vehicle=vehicle_box(source),
     )
-    return Inspection(path, topics, log, problem or _unwritable(source))
+    return Inspection(path, topics, log, problem or _without_depth(source) or _unwritable(source))
+
+
+def _without_depth(source: Log) -> str | None:
+    """Return that an RGB-D log has no depth; None if it has."""
+    frames = [frame for entry in source.spread_entries(_FEW) if (frame := read_depth(entry)) is not None]
+    if not frames or any((frame.depth_m > 0.0).any() for frame in frames):
+        return None
+    return f"no depth in any of {len(frames)} frames looked at: all of it is 0, or the limit of 16 bits"
 
 
 def _unwritable(source: Log) -> str | None:

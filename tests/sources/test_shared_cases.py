@@ -1,5 +1,9 @@
 """Recordings of public bug reports in ../shared/cases: what each states is used, or refused by its cause."""
 
+import json
+import subprocess
+import sys
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -7,7 +11,7 @@ import numpy as np
 import pytest
 
 from mapper.config.loading import load_config
-from mapper.core.errors import GraphError, SourceError
+from mapper.core.errors import GraphError, MapperError, SourceError
 from mapper.core.frames import RgbdFrame, Scan
 from mapper.graph.config import GraphConfig
 from mapper.graph.g2o import read_g2o
@@ -17,7 +21,7 @@ from mapper.sources import open_source
 from mapper.sources.config import CameraConfig, SourceConfig
 from mapper.sources.depth_scale import depth_warnings
 from mapper.sources.inspection import inspect_log
-from tests.support.paths import SHARED
+from tests.support.paths import CONFIGS, SHARED
 
 
 def case(name: str) -> Path:
@@ -25,6 +29,11 @@ def case(name: str) -> Path:
     if not path.exists():
         pytest.skip(f"{path} is not here")
     return path
+
+
+def build_case(name: str, out: Path) -> None:
+    log = open_source(case(name), SourceConfig())
+    build(log, load_config(None, sensor=log.sensor), out)
 
 
 def scans_of(name: str, config: SourceConfig | None = None) -> list[Scan]:
@@ -173,6 +182,57 @@ def test_accelerations_in_g_are_converted():
     log = open_source(case("21_imu_in_g/bag.bag"), SourceConfig())
     lengths = np.linalg.norm(log.accelerations.acceleration_mps2, axis=1)
     np.testing.assert_allclose(np.median(lengths), 9.81, atol=0.1)
+
+
+REFUSED = {
+    "01_realsense_viewer_bag/viewer.bag",
+    "01_realsense_viewer_bag/same_frame_ids.bag",
+    "05_clouds_in_the_world_frame/bag",
+    "12_h264_colour/bag",
+    "14_32FC1_in_millimetres/bag",
+    "18_utm_clouds_in_a_bag/bag",
+}
+MAPPED = {
+    "02_own_dataset_with_associations_in_mm/log",
+    "03_depth_png_as_compressed_image/ros2",
+    "04_two_lidars_one_topic/bag",
+    "07_binning/binning2",
+    "08_rational_polynomial/bag",
+    "09_folder_of_split_bags/log",
+    "10_row_step_wrong/half",
+    "11_header_stamps_zero/bag",
+    "15_point_times_partly_wrong/wrapped",
+    "17_field_of_unknown_datatype/bag",
+    "20_upside_down_lidar/imu_mps2.bag",
+    "21_imu_in_g/bag.bag",
+}
+
+
+@pytest.mark.parametrize("name", sorted(REFUSED | MAPPED))
+def test_inspect_refuses_what_a_build_must_refuse(tmp_path, name):
+    problem = inspect_log(case(name), SourceConfig()).problem
+    assert (problem is not None) == (name in REFUSED)
+    if problem is None:
+        return
+    for internal in ("stride", "index out of range", "offset", "16 bits", "itemsize", "more of the log"):
+        assert internal not in problem
+    with pytest.raises(MapperError):
+        build_case(name, tmp_path / "run")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("voxel_m", [0.1, 0.15, 0.4, 0.8])
+def test_a_corridor_that_shows_no_motion_along_it_is_not_trusted_at_any_voxel_size(tmp_path, voxel_m):
+    script = case("23_bare_corridor") / "make.py"
+    subprocess.run([sys.executable, script], cwd=tmp_path, check=True)
+    with suppress(MapperError):  # too few frames are tracked
+        log = open_source(tmp_path / "corridor", SourceConfig())
+        indoor = load_config(CONFIGS / "lidar_indoor.toml", [f"odometry.voxel_m={voxel_m}"], sensor="lidar")
+        build(log, indoor, tmp_path / "run")
+    (manifest,) = tmp_path.glob("run*/manifest.json")
+    frames = json.loads(manifest.read_text())["counts"]
+    assert frames["tracked"] <= 10
+    assert frames["tracked"] + frames["doubtful"] == 80
 
 
 @pytest.mark.parametrize("is_mounting_stated", [True, False])

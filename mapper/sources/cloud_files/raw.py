@@ -61,7 +61,7 @@ def cloud_from(columns: Columns, *, path: Path, scale: float | None) -> RawCloud
         points = points.compress(is_measured, axis=0)  # three times as fast as an index
         times = None if times is None else times[is_measured]
         colors = None if colors is None else colors.compress(is_measured, axis=0)
-    _check_range(points, path=path, is_scaled=scale is not None)
+    check_range(points, where=f"{path}", is_scaled=scale is not None)
     return RawCloud(points, times, colors)
 
 
@@ -73,7 +73,19 @@ def _measured(points: Points32) -> NDArray[np.bool_]:
     return measured
 
 
-def _check_range(points: Points32, *, path: Path, is_scaled: bool) -> None:
+def check_range(points: Points32, *, where: str, is_scaled: bool) -> None:
+    """Refuse points that are not metres around the sensor.
+
+    Args:
+        points: (N, 3) as recorded, or scaled.
+        where: Name of the cloud in an error.
+        is_scaled: Whether the user set a unit.
+
+    Raises:
+        FrameError: A twentieth of them are farther than sensors reach.
+    """
+    if not len(points):
+        return
     sample = points[:: 1 + len(points) // _SAMPLES].astype(np.float64)
     range_m = np.percentile(np.linalg.norm(sample, axis=1), 95)
     if range_m <= _MAX_RANGE_M:
@@ -81,12 +93,12 @@ def _check_range(points: Points32, *, path: Path, is_scaled: bool) -> None:
     size_m = np.percentile(np.linalg.norm(sample - np.median(sample, axis=0), axis=1), 95)
     if range_m > _AWAY_RATIO * size_m:
         raise FrameError(
-            f"{path}: points {size_m:.3g} m around a place {range_m:.0f} m away from the origin; "
+            f"{where}: points {size_m:.3g} m around a place {range_m:.0f} m away from the origin; "
             "want them around the sensor: subtract a common offset before single precision rounds them"
         )
     if not is_scaled:
         raise FrameError(
-            f"{path}: 5 % of the points are farther than {range_m:.0f} m, which looks like millimetres; "
+            f"{where}: 5 % of the points are farther than {range_m:.0f} m, which looks like millimetres; "
             "--set source.cloud_scale=0.001, or 1 if these are metres, 0.01 if centimetres"
         )
 

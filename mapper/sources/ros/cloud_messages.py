@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from mapper.core.errors import DataError, FrameError
 from mapper.core.frames import Scan
 from mapper.core.geometry import Transform, apply
+from mapper.sources.cloud_files.raw import check_range
 from mapper.sources.point_times import relative_times_s, time_field, without_untimed
 from mapper.sources.ros.messages import CloudMessage
 from mapper.sources.valid_returns import valid_returns
@@ -55,6 +56,11 @@ def structured(
             f"a cloud of {rows}×{columns} points of {point_bytes} bytes needs {needed} bytes, but "
             f"{len(data)} are there"
         )
+    ends = [at + np.dtype(kind).itemsize for at, kind in zip(offsets, formats, strict=True)]
+    if (end := max(ends, default=1)) > point_bytes:
+        raise DataError(
+            f"a cloud of {rows}×{columns} points of {point_bytes} bytes, but fields up to byte {end}"
+        )
     try:
         point = np.dtype({"names": names, "offsets": offsets, "formats": formats, "itemsize": point_bytes})
         strides = (row_bytes or columns * point_bytes, point_bytes)
@@ -67,7 +73,14 @@ def structured(
         ) from None
 
 
-def scan_from(message: CloudMessage, *, T_body_frame: Transform, with_colours: bool, where: str) -> Scan:
+def scan_from(
+    message: CloudMessage,
+    *,
+    T_body_frame: Transform,
+    with_colours: bool,
+    where: str,
+    scale: float | None = None,
+) -> Scan:
     """Return the valid points of a cloud, in the body frame.
 
     Drivers write missing returns as points that are not finite or at the sensor itself; points beyond the
@@ -78,15 +91,18 @@ def scan_from(message: CloudMessage, *, T_body_frame: Transform, with_colours: b
         T_body_frame: Pose of the cloud's frame in the body's.
         with_colours: Take the points' colours too, if there are any.
         where: Name of the message in an error.
+        scale: Metres per unit; None is 1, and refuses what looks like millimetres.
 
     Raises:
-        FrameError: The points have no x, y and z.
+        FrameError: The points have no x, y and z, or are not metres around the sensor.
     """
     points = message.points
     names = points.dtype.names or ()
     if not {"x", "y", "z"} <= set(names):
-        raise FrameError(f"{where}: points of {', '.join(names)}; want x, y and z")
-    points_body, rows, far = valid_returns(_coordinates(points))
+        raise FrameError(f"{where}: points of {', '.join(names) or 'no fields'}; want x, y and z")
+    coordinates = _coordinates(points) if scale is None else _coordinates(points) * np.float32(scale)
+    points_body, rows, far = valid_returns(coordinates)
+    check_range(points_body, where=where, is_scaled=scale is not None)
     kept = slice(None) if rows is None else rows
     T_body_points = T_body_frame @ message.T_frame_points
     if not np.array_equal(T_body_points, np.eye(4)):

@@ -39,8 +39,10 @@ def decode_ros(topic: Topic, data: memoryview) -> Message:
     deserialize = store.deserialize_ros1 if topic.encoding == "ros1" else store.deserialize_cdr
     try:
         message = deserialize(data, topic.type)
-    except (SerdeError, AssertionError, IndexError, ValueError) as error:  # raised for damaged lengths
-        raise DataError(f"a damaged message: {error}") from None
+    except (SerdeError, AssertionError, IndexError, ValueError):  # raised for damaged lengths
+        raise DataError(
+            f"a damaged message: its {len(data)} bytes end early or are no {topic.type}"
+        ) from None
     return read(message)
 
 

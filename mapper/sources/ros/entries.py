@@ -101,11 +101,13 @@ class CloudEntry:
         cloud: The message.
         body: Coordinate frame of the scan.
         tree: Coordinate frames that tie each message's own frame to the body's.
+        scale: Metres per unit of the points, as the user set it.
     """
 
     cloud: Located
     body: str
     tree: FrameTree
+    scale: float | None = None
     files: ImageFiles | None = None
 
     @property
@@ -132,7 +134,13 @@ class CloudEntry:
                 f"{self.cloud}: its points are in frame {frame}, which tf does not connect to "
                 f"{self.body}{when}"
             )
-        scan = scan_from(message, T_body_frame=T_body_frame, with_colours=colour, where=f"{self.cloud}")
+        scan = scan_from(
+            message,
+            T_body_frame=T_body_frame,
+            with_colours=colour,
+            where=f"{self.cloud}",
+            scale=self.scale,
+        )
         if frame != self.body and is_fixed(frame):
             # Where the sensor was is not stated; what turned its points into that frame has deskewed them.
             scan = replace(scan, origin_body=np.zeros(3), times_s=None)

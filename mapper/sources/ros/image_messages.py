@@ -70,6 +70,8 @@ def size_of(message: ImageMessage, *, where: str) -> tuple[int, int]:
         FrameError: It is an image file that cannot be decoded.
     """
     if isinstance(message, PixelsMessage):
+        if message.width_px < 1 or message.height_px < 1:
+            raise FrameError(f"{where}: an image of {message.width_px}×{message.height_px} px")
         return message.width_px, message.height_px
     if is_depth(message):
         height_px, width_px = depth_m_of(message, units_per_m=MILLIMETRES_PER_M, where=where).shape

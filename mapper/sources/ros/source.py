@@ -69,6 +69,11 @@ def recording_log(reader: RecordingReader, config: SourceConfig) -> Log:
     except SourceError as error:
         raise SourceError("; ".join([str(error), *problems])) from None
     main = choice.frames.color if isinstance(choice.frames, CameraTopics) else choice.frames
+    if len(main) > 1 and not np.ptp(main.stamps_ns):
+        raise SourceError(
+            f"{recording.path}: all {len(main)} messages of {main.topic.name} have the same stamp and the "
+            "same time of recording: nothing tells when they were measured"
+        )
     reader.follow_clock(main)
     choice, clock_notes = _on_clock_of(main, choice)
     if isinstance(choice.frames, CameraTopics):
@@ -117,8 +122,11 @@ def _on_clock_of(main: Series, choice: Choice) -> tuple[Choice, list[str]]:
     frames = choice.frames
     if isinstance(frames, CameraTopics):
         frames = replace(frames, depth=moved(frames.depth))
-    imu, truth, wheels = (one and moved(one) for one in (choice.imu, choice.truth, choice.wheels))
-    return replace(choice, frames=frames, imu=imu, truth=truth, wheels=wheels), notes
+    others = (choice.imu, choice.gyroscope, choice.truth, choice.wheels)
+    imu, gyroscope, truth, wheels = (one and moved(one) for one in others)
+    return replace(choice, frames=frames, imu=imu, gyroscope=gyroscope, truth=truth, wheels=wheels), list(
+        dict.fromkeys(notes)
+    )
 
 
 def _rgbd(reader: RecordingReader, topics: CameraTopics, config: SourceConfig) -> _Frames:
@@ -180,7 +188,7 @@ def _lidar(reader: RecordingReader, clouds: Series, config: SourceConfig) -> _Fr
         notes.append(f"points are in {body}, whose z looks forward; source.body_frame can take another")
 
     def entry_at(index: int) -> FrameRef:
-        return CloudEntry(reader.located(clouds, int(i[index])), body, tree)
+        return CloudEntry(reader.located(clouds, int(i[index])), body, tree, config.cloud_scale)
 
     tree = reader.tree_of(body, frame)
     return _Frames("lidar", body, clouds.stamps_ns[i], entry_at, notes)

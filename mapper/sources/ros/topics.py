@@ -331,10 +331,16 @@ def _turns(series: Series) -> bool:
 
 def _what_there_is(color: Series | None, depth: Series | None, series: Iterable[Series]) -> str:
     if color is not None:
-        return f"colour images {color.topic.name}, but neither depth images nor point clouds"
+        others = [one for one in series if one.topic.type in IMAGES]
+        names = _listed([color.topic.name, *(one.topic.name for one in others if one is not color)])
+        return f"colour images {names}, but neither depth images nor point clouds"
     if depth is not None:
         return f"depth images {depth.topic.name}, but neither colour images nor point clouds"
-    names = ", ".join(f"{one.topic.name} ({one.topic.type})" for one in series)
+    names = ", ".join(
+        f"{one.topic.name} ({one.topic.type}{', a single one' if len(one) == 1 else ''})" for one in series
+    )
     return (
-        f"no images with depth and no point clouds, only {names}" if names else "no message of it can be read"
+        f"neither images with depth nor several point clouds, only {names}"
+        if names
+        else "no message of it can be read"
     )

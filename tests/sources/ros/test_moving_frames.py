@@ -53,6 +53,10 @@ def on_mast():
     return clouds(lambda t: inverse(pan(t)), frame="lidar")
 
 
+def imu(stamp_ns, acceleration_mps2, *, frame):
+    return imu_message(stamp_ns, "/imu", rates_radps=None, acceleration_mps2=acceleration_mps2, frame=frame)
+
+
 def opened(path, messages, **config):
     return open_source(write(path, messages), SourceConfig(**config))
 
@@ -103,7 +107,7 @@ def test_what_is_recorded_of_the_base_is_led_to_a_moving_body(tmp_path):
         *moving(pan, "base_link", "lidar"),
         *on_mast(),
         *(odometry_message(t, "/odom", drive(t), frame="odom", child="base_link") for t in STAMPS_NS),
-        *(imu_message(t, "/imu", np.array([0.3, 0.1, 9.8]), frame="base_link") for t in STAMPS_NS),
+        *(imu(t, np.array([0.3, 0.1, 9.8]), frame="base_link") for t in STAMPS_NS),
     ]
     config = {"body_frame": "lidar", "topics": TopicsConfig(truth="/odom", wheels="/odom")}
     log = opened(tmp_path / "a.mcap", messages, **config)
@@ -128,7 +132,7 @@ def test_transforms_without_stamps_have_the_times_of_recording(tmp_path):
 
 
 def test_readings_without_stamps_have_the_times_of_recording(tmp_path):
-    readings = [imu_message(0, "/imu", np.array([0.0, 0.0, 9.8]), frame="lidar") for _ in STAMPS_NS]
+    readings = [imu(0, np.array([0.0, 0.0, 9.8]), frame="lidar") for _ in STAMPS_NS]
     poses = [odometry_message(0, "/odom", drive(t), frame="odom", child="lidar") for t in STAMPS_NS]
     dated = [
         m._replace(stamp_ns=t) for many in (readings, poses) for t, m in zip(STAMPS_NS, many, strict=True)
@@ -148,7 +152,7 @@ def test_stamps_of_another_clock_are_moved_by_the_times_of_recording(tmp_path):
     ]
     others = [
         *(odometry_message(t, "/odom", drive(t), frame="odom", child="base_link") for t in STAMPS_NS),
-        *(imu_message(t, "/imu", np.array([0.0, 0.0, 9.8]), frame="base_link") for t in STAMPS_NS),
+        *(imu(t, np.array([0.0, 0.0, 9.8]), frame="base_link") for t in STAMPS_NS),
     ]
     messages = sorted([*moving(pan, "base_link", "lidar"), *scans, *others], key=lambda one: one.stamp_ns)
     log = opened(tmp_path / "a.mcap", messages, topics=TopicsConfig(truth="/odom"))

@@ -145,7 +145,7 @@ def test_numbers_that_do_not_fit_the_payload_are_refused(numbers):
 )
 def test_rows_that_overlap_are_refused(numbers):
     """A message of 48 kB must not become a cloud of gigabytes."""
-    with pytest.raises(DataError, match=r"a cloud of \d+×\d+ points of \d+ bytes (in 48000|needs \d+ b)"):
+    with pytest.raises(DataError, match=r"a cloud of \d+×\d+ points of \d+ bytes"):
         structured(memoryview(bytes(48_000)), XYZ if numbers["point_bytes"] else [], **numbers)
 
 

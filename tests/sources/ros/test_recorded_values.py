@@ -1,0 +1,64 @@
+"""Values in recordings that contradict their labels, or that nothing can be made of."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mapper.core.errors import SourceError
+from mapper.core.frames import Scan
+from mapper.sources import open_source
+from mapper.sources.config import SourceConfig, TopicsConfig
+from mapper.sources.inspection import inspect_log
+from mapper.sources.ros.encode_ros import cloud_message
+from tests.support.recordings import CAMERA, COLOR, DEPTH, camera_info, image, shots, write
+from tests.support.tum_logs import FIRST_NS, PERIOD_NS
+
+STAMPS_NS = [FIRST_NS + i * PERIOD_NS for i in range(3)]
+
+
+def clouds(points, stamps_ns=STAMPS_NS, **fields):
+    return [cloud_message("/points", Scan(t, points, **fields), frame="lidar") for t in stamps_ns]
+
+
+def test_a_calibration_of_another_camera_that_is_chosen_skips_no_check(tmp_path):
+    other = replace(CAMERA, fx_px=40.0, fy_px=40.0)
+    depth_info = camera_info(FIRST_NS, "/cam/aligned_depth/camera_info", other)
+    config = SourceConfig(topics=TopicsConfig(camera_info="/cam/aligned_depth/camera_info"))
+    with pytest.raises(SourceError, match=r"focal length 40\.0 px\) is not registered"):
+        open_source(write(tmp_path / "a.mcap", [*shots(2), depth_info]), config)
+    same = camera_info(FIRST_NS, "/other/camera_info", CAMERA)
+    config = SourceConfig(topics=TopicsConfig(camera_info="/other/camera_info"))
+    log = open_source(write(tmp_path / "b.mcap", [*shots(2), same]), config)
+    assert sum("/other/camera_info" in note for note in log.notes) == 1
+
+
+@pytest.mark.parametrize("value", [0.0, 0.05])
+def test_a_field_of_times_that_holds_none_is_noted(tmp_path, value):
+    points = np.random.default_rng(3).uniform(-9.0, 9.0, (20, 3)).astype(np.float32)
+    messages = clouds(points, times_s=np.full(20, value, np.float32))
+    log = open_source(write(tmp_path / "a.mcap", messages), SourceConfig())
+    assert sum("no times" in note for note in log.notes) == 1
+    assert log[0].times_s is None
+
+
+def test_clouds_in_millimetres_are_refused_and_the_setting_reads_them(tmp_path):
+    points = np.random.default_rng(3).uniform(-9000.0, 9000.0, (2000, 3)).astype(np.float32)
+    path = write(tmp_path / "a.mcap", clouds(points))
+    assert "source.cloud_scale=0.001" in inspect_log(path, SourceConfig()).problem
+    found = inspect_log(path, SourceConfig(cloud_scale=0.001))
+    assert found.problem is None
+    (scan, *_) = open_source(path, SourceConfig(cloud_scale=0.001))
+    np.testing.assert_allclose(scan.points_body, points / 1000.0, rtol=1e-6)
+
+
+def test_messages_of_one_stamp_and_one_time_of_recording_are_refused(tmp_path):
+    messages = clouds(np.ones((20, 3), np.float32), [FIRST_NS] * 4)
+    assert "all 4 messages" in inspect_log(write(tmp_path / "a.mcap", messages), SourceConfig()).problem
+
+
+def test_images_without_pixels_and_depth_without_values_are_refused(tmp_path):
+    none, zero = np.zeros((1, 0, 3), np.uint8), np.zeros((48, 64), np.uint16)
+    for name, topic, made in (("a", COLOR, (none, "rgb8")), ("b", DEPTH, (zero, "16UC1"))):
+        messages = [image(m.stamp_ns, topic, *made) if m.topic == topic else m for m in shots(3)]
+        assert inspect_log(write(tmp_path / f"{name}.mcap", messages), SourceConfig()).problem is not None
