@@ -22,12 +22,16 @@ class GuessConfig(Config):
         return f"{self.offset_m:g} m, {math.degrees(self.turn_rad):.3g}°"
 
 
+FramesApart = Annotated[tuple[PositiveInt, ...], Field(min_length=1)]
+Guesses = Annotated[tuple[GuessConfig, ...], Field(min_length=1)]
+
+
 class TrialsConfig(Config):
     """Settings of trials: pairs of frames, kinds of guesses, and what counts as right."""
 
-    frames_apart: Annotated[tuple[PositiveInt, ...], Field(min_length=1)]
+    frames_apart: FramesApart
     """Each distance gets as many pairs as the others."""
-    guesses: Annotated[tuple[GuessConfig, ...], Field(min_length=1)]
+    guesses: Guesses
     max_error_m: PositiveFloat
     max_error_rad: PositiveFloat
     """A registration farther off than either is wrong."""
@@ -40,8 +44,8 @@ class RgbdCompareConfig(TrialsConfig):
     """Deeper measurements are left out of a scan."""
     stride_px: PositiveInt = 2
     """Every n-th row and column of the depth image becomes a point of the scan."""
-    frames_apart: Annotated[tuple[PositiveInt, ...], Field(min_length=1)] = (1, 5, 15)
-    guesses: Annotated[tuple[GuessConfig, ...], Field(min_length=1)] = (
+    frames_apart: FramesApart = (1, 5, 15)
+    guesses: Guesses = (
         GuessConfig(offset_m=0.05, turn_rad=math.radians(3.0)),
         GuessConfig(offset_m=0.2, turn_rad=math.radians(10.0)),
         GuessConfig(offset_m=0.5, turn_rad=math.radians(20.0)),
@@ -53,8 +57,8 @@ class RgbdCompareConfig(TrialsConfig):
 class LidarCompareConfig(TrialsConfig):
     """Settings for LiDAR logs, whose scenes are a street wide; guesses are off in the plane only."""
 
-    frames_apart: Annotated[tuple[PositiveInt, ...], Field(min_length=1)] = (1, 5, 10)
-    guesses: Annotated[tuple[GuessConfig, ...], Field(min_length=1)] = (
+    frames_apart: FramesApart = (1, 5, 10)
+    guesses: Guesses = (
         GuessConfig(offset_m=0.5, turn_rad=math.radians(5.0)),
         GuessConfig(offset_m=2.0, turn_rad=math.radians(20.0)),
         GuessConfig(offset_m=10.0, turn_rad=math.radians(180.0)),

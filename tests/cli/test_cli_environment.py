@@ -1,11 +1,16 @@
 """What the command line tells numba and OpenCV, and what it asks of them."""
 
 import os
+import signal
 import subprocess
 import sys
+import time
 from types import SimpleNamespace
 
-from mapper.cli.environment import note_compilation
+import pytest
+
+from mapper.cli.environment import interrupt, note_compilation
+from mapper.core.errors import Terminated
 
 
 def test_compilation_is_noted_until_numba_has_kept_its_code(tmp_path, monkeypatch):
@@ -31,3 +36,30 @@ def test_opencv_starts_no_threads_unless_the_user_says_so():
             [sys.executable, "-c", script], env=clean | given, capture_output=True, text=True, check=True
         )
         assert done.stdout.strip() == threads
+
+
+def frame_in(*modules):
+    """Return a stack of frames, the innermost of which is in the first module."""
+    frame = None
+    for module in reversed(modules):
+        frame = SimpleNamespace(f_globals={"__name__": module}, f_back=frame)
+    return frame
+
+
+@pytest.mark.parametrize(
+    ("number", "error"), [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, Terminated)]
+)
+def test_an_interrupt_ends_python_code(number, error):
+    with pytest.raises(error):
+        interrupt(number, frame_in("mapper.pipeline.track", "mapper.cli.build"))
+
+
+@pytest.mark.parametrize("module", ["llvmlite.binding.ffi", "importlib._bootstrap", "numba.core.dispatcher"])
+def test_an_interrupt_waits_for_compilers_and_imports(module, monkeypatch):
+    sent = []
+    monkeypatch.setattr("os.kill", lambda _, number: sent.append(number))
+    interrupt(signal.SIGTERM, frame_in("ctypes", module, "mapper.cli.build"))
+    until = time.monotonic() + 5.0
+    while not sent and time.monotonic() < until:
+        time.sleep(0.01)
+    assert sent == [signal.SIGTERM]
