@@ -37,6 +37,7 @@ _NOT_OF: Mapping[SensorKind, tuple[str, ...]] = {
         "--scene",
         "--rings",
         "--wheels",
+        "--imu",
         "--moving",
         "--uncalibrated",
     ),
@@ -72,6 +73,9 @@ def synth(
     wheels: Annotated[
         bool, typer.Option("--wheels", help="The sensor is on wheels; wheels.txt has their odometry.")
     ] = False,
+    imu: Annotated[
+        bool, typer.Option("--imu", help="imu.csv has the readings of an inertial measurement unit.")
+    ] = False,
     moving: Annotated[
         bool,
         typer.Option(
@@ -106,6 +110,7 @@ def synth(
         "--scene": scene,
         "--rings": rings,
         "--wheels": wheels,
+        "--imu": imu,
         "--moving": moving,
         "--uncalibrated": uncalibrated,
     }
@@ -131,7 +136,13 @@ def _write_camera_log(
 ) -> None:
     from mapper.config.loading import overridden
     from mapper.simulation import write_tum_log
-    from mapper.simulation.config import CAMERA_SCENES, MOVING_INDOORS, UNCALIBRATED, SynthWheelsConfig
+    from mapper.simulation.config import (
+        CAMERA_SCENES,
+        MOVING_INDOORS,
+        UNCALIBRATED,
+        SynthImuConfig,
+        SynthWheelsConfig,
+    )
 
     start = _scene(CAMERA_SCENES, name, "rgbd")
     if start.scene != "flat":
@@ -139,6 +150,8 @@ def _write_camera_log(
     changed: dict[str, object] = dict(MOVING_INDOORS) if options["--moving"] else {}
     if options["--wheels"]:
         changed["wheels"] = SynthWheelsConfig()
+    if options["--imu"]:
+        changed["imu"] = SynthImuConfig()
     if options["--uncalibrated"]:
         changed["sensor"] = start.sensor.model_copy(update=UNCALIBRATED)
     config = overridden(start.model_copy(update=changed), overrides)
@@ -150,7 +163,13 @@ def _write_lidar_log(
     out: Path, name: SceneName, options: Mapping[str, object], overrides: list[str], output: Output
 ) -> None:
     from mapper.config.loading import overridden
-    from mapper.simulation.config import LIDAR_SCENES, MOVING_OUTDOORS, PEDESTRIANS, SynthWheelsConfig
+    from mapper.simulation.config import (
+        LIDAR_SCENES,
+        MOVING_OUTDOORS,
+        PEDESTRIANS,
+        SynthImuConfig,
+        SynthWheelsConfig,
+    )
     from mapper.simulation.lidar import write_lidar_log
 
     start = _scene(LIDAR_SCENES, name, "lidar")
@@ -159,6 +178,8 @@ def _write_lidar_log(
         changed |= MOVING_OUTDOORS if name == "street" else PEDESTRIANS
     if options["--wheels"]:
         changed["wheels"] = SynthWheelsConfig()
+    if options["--imu"]:
+        changed["imu"] = SynthImuConfig()
     config = overridden(start.model_copy(update=changed), overrides)
     with output.progress().stage("scan") as report:
         write_lidar_log(out, config, on_progress=report)

@@ -1,13 +1,16 @@
 """Deskewing: the points of a sweep are moved to where they would have been measured at the scan's stamp."""
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Self
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
-from mapper.core.frames import Scan
-from mapper.core.geometry import Array, Transform, exp, inverse, log
+from mapper.core.frames import Points32, Scan
+from mapper.core.geometry import Array, Transform, exp, inverse, log, rotation_log
+from mapper.core.linear import rotation_of
 from mapper.core.timebase import NS_PER_S
 from mapper.core.trajectory import Trajectory
 
@@ -38,8 +41,55 @@ class Twist:
         """Return T_before_after (4, 4), the motion of the body in a duration."""
         return exp(self.rotation_radps * duration_s, self.translation_mps * duration_s)
 
+    def about(self, _moment_s: float) -> Self:
+        """Return the same motion with time counted from another moment."""
+        return self
+
 
 STILL = Twist(np.zeros(3), np.zeros(3))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SampledMotion:
+    """A rotation that was measured at some times, as by a gyroscope, and a constant velocity in the world.
+
+    Attributes:
+        times_s: (K,) increasing, K ≥ 2; the body's own axes are those at time 0.
+        R: (K, 3, 3) rotation of the body at these times, in its axes at time 0.
+        translation_mps: (3,) metres per second, in its axes at time 0.
+    """
+
+    times_s: Array
+    R: Array
+    translation_mps: Array
+
+    def over(self, duration_s: float) -> Transform:
+        """Return T_before_after (4, 4), the motion of the body from time 0 on."""
+        T = np.eye(4)
+        T[:3, :3] = _rotation_at(self.times_s, self.R, self._rates(), duration_s)
+        T[:3, 3] = duration_s * self.translation_mps
+        return T
+
+    def about(self, moment_s: float) -> "SampledMotion":
+        """Return the same motion with time counted from another moment, in the body's axes then."""
+        R_moment = self.over(moment_s)[:3, :3].T
+        return SampledMotion(self.times_s - moment_s, R_moment @ self.R, R_moment @ self.translation_mps)
+
+    def move(self, points: Points32, times_s: NDArray[np.float32]) -> Points32:
+        """Return (N, 3) points, each measured at its own time, as of time 0."""
+        moved: Points32 = _moved_by_samples(
+            points, times_s, self.times_s, self.R, self._rates(), self.translation_mps
+        )
+        return moved
+
+    def _rates(self) -> Array:
+        """Return the (K - 1, 3) angular velocity after each time but the last."""
+        turns = [rotation_log(before.T @ after) for before, after in pairwise(self.R)]
+        return np.array(turns) / np.diff(self.times_s)[:, None]
+
+
+Motion = Twist | SampledMotion
+"""Motion of the body during a sweep."""
 
 
 def twist_between(T_world_before: Transform, T_world_after: Transform, *, duration_s: float) -> Twist:
@@ -58,15 +108,17 @@ def twist_at(trajectory: Trajectory, index: int) -> Twist:
     return twist_between(poses[first], poses[last], duration_s=duration_s)
 
 
-def deskewed(scan: Scan, twist: Twist) -> Scan:
+def deskewed(scan: Scan, motion: Motion) -> Scan:
     """Return the scan with all points moved to its stamp; without times per point, the scan itself.
 
-    A point measured τ after the stamp moves by exp(τ·twist): constant velocity, as in KISS-ICP (Vizzo et al.
-    2023, eq. 2).
+    A point measured τ after the stamp moves by exp(τ·twist) under a constant velocity, as in KISS-ICP (Vizzo
+    et al. 2023, eq. 2), and by the rotation at τ and τ times the velocity where the rotation was measured.
     """
     if scan.times_s is None:
         return scan
-    points_body = _moved(scan.points_body, scan.times_s, twist.rotation_radps, twist.translation_mps)
+    if isinstance(motion, SampledMotion):
+        return replace(scan, points_body=motion.move(scan.points_body, scan.times_s), times_s=None)
+    points_body = _moved(scan.points_body, scan.times_s, motion.rotation_radps, motion.translation_mps)
     return replace(scan, points_body=points_body, times_s=None)
 
 
@@ -95,4 +147,24 @@ def _moved(points, times_s, rotation_radps, translation_mps):  # type: ignore[no
         moved[index, 0] = x + a * px + b * qx + t * vx + b * ux + c * sx
         moved[index, 1] = y + a * py + b * qy + t * vy + b * uy + c * sy
         moved[index, 2] = z + a * pz + b * qz + t * vz + b * uz + c * sz
+    return moved
+
+
+@njit(cache=True, nogil=True)
+def _rotation_at(times_s, R, rates_radps, time_s):  # type: ignore[no-untyped-def]
+    """Return the (3, 3) rotation at a time; the angular velocity is constant between two samples."""
+    k = min(max(np.searchsorted(times_s, time_s, side="right") - 1, 0), len(rates_radps) - 1)
+    return R[k] @ rotation_of(rates_radps[k] * (time_s - times_s[k]))
+
+
+@njit(cache=True, nogil=True)
+def _moved_by_samples(points, point_times_s, times_s, R, rates_radps, translation_mps):  # type: ignore[no-untyped-def]
+    """Return R(τ)·p + τ·v of every point."""
+    moved = np.empty_like(points)
+    for index in range(len(points)):
+        t = float(point_times_s[index])
+        R_t = _rotation_at(times_s, R, rates_radps, t)
+        x, y, z = points[index]
+        for a in range(3):
+            moved[index, a] = R_t[a, 0] * x + R_t[a, 1] * y + R_t[a, 2] * z + t * translation_mps[a]
     return moved

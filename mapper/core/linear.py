@@ -86,3 +86,20 @@ def twist_exp(delta, T):
         for k in range(3):
             moved[i, k] /= norm
     return moved
+
+
+@njit(cache=True, nogil=True)
+def rotation_of(vector):
+    """Return the (3, 3) rotation of a (3,) rotation vector (Rodrigues' formula), for compiled code."""
+    x, y, z = vector
+    squared = x * x + y * y + z * z
+    if squared < 1e-16:
+        a, b = 1.0, 0.5
+    else:
+        angle = np.sqrt(squared)
+        a, b = np.sin(angle) / angle, (1.0 - np.cos(angle)) / squared
+    R = np.empty((3, 3))
+    R[0, 0], R[0, 1], R[0, 2] = 1.0 - b * (y * y + z * z), b * x * y - a * z, b * x * z + a * y
+    R[1, 0], R[1, 1], R[1, 2] = b * x * y + a * z, 1.0 - b * (x * x + z * z), b * y * z - a * x
+    R[2, 0], R[2, 1], R[2, 2] = b * x * z - a * y, b * y * z + a * x, 1.0 - b * (x * x + y * y)
+    return R

@@ -17,7 +17,7 @@ from mapper.graph.model import BetweenFactor
 from mapper.sources.base import FrameRef
 
 if TYPE_CHECKING:
-    from mapper.core.deskew import Twist
+    from mapper.core.deskew import Motion
     from mapper.features.frame_view import FrameView
 
 
@@ -73,7 +73,7 @@ class FrameResult:
     diagnostics: Diagnostics
     factors: Sequence[BetweenFactor] = field(default_factory=tuple)
     links: Sequence[BetweenFactor] = field(default_factory=tuple)
-    twist: Twist | None = None
+    twist: Motion | None = None
     is_sharp: bool = True
     doubts: tuple[Doubt, ...] = ()
     covariance: Array | None = None
@@ -150,7 +150,7 @@ class Odometry(Protocol[Observation]):
         """Track the next frame, in time order."""
         ...
 
-    def view(self, observation: Observation, twist: Twist | None = None, /) -> FrameView:
+    def view(self, observation: Observation, twist: Motion | None = None, /) -> FrameView:
         """Return the view for place recognition. Pure.
 
         Args:
@@ -184,6 +184,15 @@ class SensorCheck(Protocol):
 
     def calibration_warnings(self) -> Sequence[str]:
         """Return what in the log contradicts the sensor's calibration, a sentence each."""
+        ...
+
+
+@runtime_checkable
+class GyroscopeUser(Protocol):
+    """Odometry whose prediction of the motion uses a gyroscope."""
+
+    def gyroscope_notes(self) -> Sequence[str]:
+        """Return how it was used once the log has ended, a sentence each; nothing if the log has none."""
         ...
 
 

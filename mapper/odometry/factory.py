@@ -26,6 +26,7 @@ from mapper.odometry.scans.config import (
 
 if TYPE_CHECKING:
     from mapper.odometry.scans.scan_matcher import ScanMatcher
+    from mapper.sensing.gyroscope import Gyroscope
     from mapper.sources.base import Log
 
 
@@ -41,11 +42,14 @@ def odometry_for(
     from mapper.odometry.given_poses import poses_for
     from mapper.odometry.scans.surroundings import adapted_to
 
-    return build_odometry(adapted_to(config, log), poses_for(config, log), motion_check)
+    return build_odometry(adapted_to(config, log), poses_for(config, log), motion_check, log.gyroscope)
 
 
 def build_odometry(
-    config: OdometryConfig, poses: Trajectory | None = None, motion_check: MotionCheck | None = None
+    config: OdometryConfig,
+    poses: Trajectory | None = None,
+    motion_check: MotionCheck | None = None,
+    gyroscope: "Gyroscope | None" = None,
 ) -> Odometry[Any]:
     """Return the odometry that the settings choose, before its first frame; its module is imported only now.
 
@@ -53,6 +57,7 @@ def build_odometry(
         config: Settings of one method.
         poses: T_odom_body of the log's wheel odometry, or known poses, as ``poses_for`` returns them.
         motion_check: Another measurement of the motion, which rules out poses after a gap.
+        gyroscope: Angular velocities of the log, if it has any.
 
     Raises:
         ConfigError: Wheel odometry or known poses are chosen, and the log has none; or a caller's own.
@@ -82,11 +87,13 @@ def build_odometry(
                 "choose another kind, or give it to mapper.build(…, odometry=…)"
             )
         case _:
-            return build_frame_odometry(config, motion_check)
+            return build_frame_odometry(config, motion_check, gyroscope)
 
 
 def build_frame_odometry(
-    config: FrameOdometryConfig, motion_check: MotionCheck | None = None
+    config: FrameOdometryConfig,
+    motion_check: MotionCheck | None = None,
+    gyroscope: "Gyroscope | None" = None,
 ) -> FrameOdometry[Any]:
     """Return the odometry that the settings choose among those that use the frames' images or scans."""
     match config:
@@ -107,7 +114,7 @@ def build_frame_odometry(
         case GicpOdometryConfig() | IcpOdometryConfig() | KissOdometryConfig() | HoughOdometryConfig():
             from mapper.odometry.scans.odometry import ScanOdometry
 
-            return ScanOdometry(config, _build_matcher(config))
+            return ScanOdometry(config, _build_matcher(config), gyroscope)
         case _:
             assert_never(config)
 

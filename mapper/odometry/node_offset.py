@@ -4,10 +4,10 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Generic
 
-from mapper.core.deskew import Twist
+from mapper.core.deskew import Motion
 from mapper.features.frame_view import FrameView
 from mapper.graph.model import BetweenFactor
-from mapper.odometry.base import FeatureMatches, FrameResult, Observation, Odometry
+from mapper.odometry.base import FeatureMatches, FrameResult, GyroscopeUser, Observation, Odometry
 from mapper.sources.base import FrameRef
 
 
@@ -26,13 +26,17 @@ class NodeOffset(Generic[Observation]):
         """Track the next frame, in time order."""
         return _numbered(self._odometry.track(observation), self._first_node)
 
-    def view(self, observation: Observation, twist: Twist | None = None, /) -> FrameView:
+    def view(self, observation: Observation, twist: Motion | None = None, /) -> FrameView:
         """Return the view for place recognition. Pure."""
         return self._odometry.view(observation, twist)
 
     def matches(self) -> FeatureMatches | None:
         """Return the matches of the frame tracked last."""
         return self._odometry.matches()
+
+    def gyroscope_notes(self) -> Sequence[str]:
+        """Return how the gyroscope was used."""
+        return self._odometry.gyroscope_notes() if isinstance(self._odometry, GyroscopeUser) else ()
 
     def finish(self) -> Sequence[BetweenFactor]:
         """Return the measurements that were still being refined when the log ended."""

@@ -5,7 +5,7 @@ from functools import cached_property
 
 import numpy as np
 
-from mapper.core.deskew import Twist, twist_at
+from mapper.core.deskew import Motion, Twist, twist_at
 from mapper.core.frames import Scan
 from mapper.core.geometry import Transform, inverse
 from mapper.core.timebase import NS_PER_S
@@ -85,7 +85,7 @@ class WheelsOdometry:
             twist=self._twist(stamp_ns),
         )
 
-    def view(self, observation: FrameRef, twist: Twist | None = None, /) -> FrameView:
+    def view(self, observation: FrameRef, twist: Motion | None = None, /) -> FrameView:
         """Read the frame now, and return the view for place recognition. Pure.
 
         Raises:

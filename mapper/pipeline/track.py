@@ -16,7 +16,7 @@ from mapper.loops.closure import LoopClosure, accepted_loops
 from mapper.loops.detector import LoopDetector
 from mapper.loops.factory import build_loop_detector, build_verifier
 from mapper.loops.verification_log import VerificationLog
-from mapper.odometry.base import FrameResult, Odometry, SensorCheck
+from mapper.odometry.base import FrameResult, GyroscopeUser, Odometry, SensorCheck
 from mapper.odometry.factory import build_odometry, odometry_for
 from mapper.pipeline.components import without_doubtful_ends
 from mapper.pipeline.tracking_checkpoints import FrameCheckpoint, TrackingCheckpoints
@@ -249,6 +249,8 @@ class _FirstPass:
             wrong = odometry.calibration_warnings()
             warnings += [RunWarning(kind="camera", sentence=sentence, weight="doubt") for sentence in wrong]
             warnings += [RunWarning(kind="shutter", sentence=note) for note in odometry.sensor_notes()]
+        if isinstance(odometry, GyroscopeUser):
+            warnings += [RunWarning(kind="imu", sentence=note) for note in odometry.gyroscope_notes()]
         return warnings
 
 

@@ -22,11 +22,12 @@ from mapper.places.vocabulary import Vocabulary
 from mapper.runtime.archive import pack, unpack
 from mapper.runtime.journal import StateFile
 from mapper.runtime.state_file import dumps, fixed_parts, loads
+from mapper.sensing.gyroscope import Gyroscope
 from mapper.sensing.wheel_kinematics import Odometer
 from mapper.sources.base import Skipped
 from mapper.sources.reading_checks import ReadingChecks
 
-_FIXED_PARTS = (Detector, Vocabulary, WheelMeasurements, Trajectory, Odometer)
+_FIXED_PARTS = (Detector, Vocabulary, WheelMeasurements, Trajectory, Odometer, Gyroscope)
 """Parts of an odometry that exist before the first frame and never change."""
 _FRAME = b"frame "
 """Beginning of a frame's record; others are data of the archive, whose packed bytes begin otherwise."""

@@ -23,7 +23,7 @@ from mapper.run.timeline import TimeLine, counted
 
 FLOOR = "floor"
 INPUT_KINDS = frozenset(
-    {"log", "depth", "camera", "shutter", "sweep", "frozen", "far returns", "conflict", "level", FLOOR}
+    {"log", "depth", "camera", "shutter", "imu", "sweep", "frozen", "far returns", "conflict", "level", FLOOR}
 )
 """Kinds that are found while the log is read or fused; a finished run has them in its manifest alone."""
 

@@ -1,7 +1,6 @@
 """Gyroscope: angular velocities of a log, and the rotation between two times that they integrate to."""
 
-from dataclasses import dataclass, replace
-from typing import Self
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,12 +23,18 @@ class Gyroscope:
         stamps_ns: (N,) int64 nanoseconds, strictly increasing.
         rates_radps: (N, 3) float64, in the unit's own axes; rad/s as far as the log says.
         R_body_imu: (3, 3) its mounting, if the log states it.
+        interval_ns: Usual time between two readings; 0 of fewer than two.
     """
 
     name: str
     stamps_ns: Stamps
     rates_radps: Array
     R_body_imu: Array | None = None
+    interval_ns: int = field(init=False)
+
+    def __post_init__(self) -> None:
+        usual_ns = int(np.median(np.diff(self.stamps_ns))) if len(self) > 1 else 0
+        object.__setattr__(self, "interval_ns", usual_ns)
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
@@ -37,14 +42,7 @@ class Gyroscope:
     @property
     def gap_ns(self) -> int:
         """Time between two readings beyond which the rotation between them is unknown."""
-        if len(self) < 2:
-            return _LEAST_GAP_NS
-        return max(_GAP_INTERVALS * int(np.median(np.diff(self.stamps_ns))), _LEAST_GAP_NS)
-
-    @property
-    def rate_hz(self) -> float:
-        """Usual number of readings a second; 0 of fewer than two."""
-        return 0.0 if len(self) < 2 else NS_PER_S / float(np.median(np.diff(self.stamps_ns)))
+        return max(_GAP_INTERVALS * self.interval_ns, _LEAST_GAP_NS)
 
     def without_saturation(self) -> tuple["Gyroscope | None", list[str]]:
         """Return the readings within the unit's range, None if there are none, and notes on them and on gaps.
@@ -73,7 +71,9 @@ class Gyroscope:
             )
         return kept, notes
 
-    def rotations(self, begins_ns: Stamps, ends_ns: Stamps, bias: Array) -> tuple[Array, NDArray[np.bool_]]:
+    def rotations(
+        self, begins_ns: Stamps, ends_ns: Stamps, bias: Array, scale: float = 1.0
+    ) -> tuple[Array, NDArray[np.bool_]]:
         """Return the rotations R_begin_end of the unit between pairs of times, and which are known.
 
         The angular velocity is linear between readings; each of its pieces turns by the exponential of the
@@ -82,7 +82,8 @@ class Gyroscope:
         Args:
             begins_ns: (M,) times.
             ends_ns: (M,) times not before these.
-            bias: (3,) that is subtracted from the readings, in their unit.
+            bias: (3,) that is subtracted from the readings after these are multiplied, rad/s.
+            scale: Factor on the readings.
 
         Returns:
             (M, 3, 3), and (M,) false where readings do not cover the time or have a gap.
@@ -90,13 +91,9 @@ class Gyroscope:
         from mapper.sensing.gyroscope_kernels import integrate  # numba takes long to import
 
         R_begin_end, known = integrate(
-            self.stamps_ns, self.rates_radps, begins_ns, ends_ns, bias, self.gap_ns
+            self.stamps_ns, self.rates_radps, begins_ns, ends_ns, bias, scale, self.gap_ns
         )
         return R_begin_end, known
 
     def _of(self, kept: NDArray[np.bool_]) -> "Gyroscope":
         return replace(self, stamps_ns=self.stamps_ns[kept], rates_radps=self.rates_radps[kept])
-
-    def scaled(self, factor: float) -> Self:
-        """Return the gyroscope with its angular velocities multiplied."""
-        return replace(self, rates_radps=factor * self.rates_radps)

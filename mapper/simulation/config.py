@@ -58,6 +58,24 @@ class SynthWheelsConfig(Config):
     path."""
 
 
+class SynthImuConfig(Config):
+    """Inertial measurement unit beside the sensor; by default one of a hand-held LiDAR."""
+
+    rate_hz: PositiveFloat = 200.0
+    gyroscope_noise_radps: NonNegativeFloat = 0.003
+    """Standard deviation of each reading."""
+    bias_radps: NonNegativeFloat = 0.01
+    """Standard deviation, over logs, of the gyroscope's bias at the start."""
+    bias_walk_radps_per_sqrt_s: NonNegativeFloat = 2e-4
+    accelerometer_noise_mps2: NonNegativeFloat = 0.05
+    mounting_rad: tuple[float, float, float] = (0.1, -0.2, 1.5)
+    """Rotation vector of the unit in the body."""
+    offset_s: NonNegativeFloat = 0.007
+    """Time by which the unit's clock is ahead of the sensor's."""
+    in_g: bool = False
+    """Accelerations are in units of gravity, as Livox's driver writes them."""
+
+
 class DisturbanceConfig(Config):
     """Disturbances of a recording; by default there are none."""
 
@@ -136,6 +154,8 @@ class SynthConfig(Config):
     shake_rad: NonNegativeFloat = 0.02
     wheels: SynthWheelsConfig | None = None
     """The camera is on wheels with odometry, and neither shakes nor nods; None is a walker's hand."""
+    imu: SynthImuConfig | None = None
+    """Inertial readings of the log; None is none."""
 
     width_px: PositiveInt = 640
     height_px: PositiveInt = 480
@@ -275,6 +295,8 @@ class LidarSynthConfig(Config):
     """Angle by which the sensor turns to either side of the direction of travel."""
     wheels: SynthWheelsConfig | None = None
     """What is read of the vehicle's wheels."""
+    imu: SynthImuConfig | None = None
+    """Inertial readings of the log; None is none."""
 
     sensor: LidarSensorConfig = LidarSensorConfig()
 
@@ -297,13 +319,13 @@ class LidarSynthConfig(Config):
 
 _LATER = {
     SynthConfig: {
-        *("moving_boxes", "wheels", "scene", "hall_length_m", "hall_width_m", "hall_clearance_m"),
+        *("moving_boxes", "wheels", "imu", "scene", "hall_length_m", "hall_width_m", "hall_clearance_m"),
         *("people", "people_stand_s", "texture_contrast", "disturbances", "day"),
     },
     SensorConfig: {
         *("readout_s", "depth_delay_s", "radial_k1", "radial_k2", "depth_scale", "disparity_warp_px"),
     },
-    LidarSynthConfig: {"wheels", "cars", "cyclists", "pedestrians", "day"},
+    LidarSynthConfig: {"wheels", "imu", "cars", "cyclists", "pedestrians", "day"},
     LidarSensorConfig: set(),
 }
 """Settings that came after the first logs."""

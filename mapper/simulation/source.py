@@ -21,6 +21,7 @@ from mapper.simulation.boxes import write_scene
 from mapper.simulation.builder import FACES
 from mapper.simulation.config import LidarSynthConfig, SynthConfig, set_or_first
 from mapper.simulation.disturbances import between, disturbed, shown_frames
+from mapper.simulation.imu_readings import measure_imu
 from mapper.simulation.movers import Movers, make_movers
 from mapper.simulation.path import Motion, frame_stamps, make_motion, seconds_of
 from mapper.simulation.raycast import Rendering
@@ -31,6 +32,7 @@ from mapper.simulation.streams import Stream, noise_index, rng_of
 from mapper.simulation.wheel_readings import counted
 from mapper.sources.base import ImageFiles, Log
 from mapper.sources.calibration_file import calibration_text
+from mapper.sources.imu_files import write_imu
 from mapper.sources.trajectory_files import write_tum
 from mapper.sources.wheel_files import write_wheels
 
@@ -46,6 +48,7 @@ _COLOUR_PNG = (
 )
 _DEPTH_PNG = (cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_SUB)
 _GOOD_JPG = (cv2.IMWRITE_JPEG_QUALITY, 92)
+_IMU_AFTER_S = 0.5  # readings go on for so long after the last stamp, beyond the last sweep
 
 
 def camera_of(config: SynthConfig) -> PinholeCamera:
@@ -87,7 +90,7 @@ def synthetic_log(
     poses: Callable[[Array], Array],
     simulate: Callable[[int, bool], Frame],
 ) -> Log:
-    """Return the log of a simulated sensor, with wheel odometry where it is configured.
+    """Return the log of a simulated sensor, with wheel odometry and inertial readings where configured.
 
     Args:
         config: Settings of the log.
@@ -106,6 +109,14 @@ def synthetic_log(
             sensor=sensor,
             rng=rng_of(config.seed, Stream.WHEELS),
         )
+    gyroscope, accelerations = None, None
+    if config.imu is not None:
+        gyroscope, accelerations = measure_imu(
+            config.imu,
+            poses,
+            duration_s=float(seconds_of(truth.stamps_ns[-1:])[0]) + _IMU_AFTER_S,
+            rng=rng_of(config.seed, Stream.IMU),
+        )
     return Log(
         path=Path(name),
         name=name,
@@ -115,6 +126,8 @@ def synthetic_log(
         entry_at=lambda index: SyntheticEntry(int(truth.stamps_ns[index]), partial(simulate, index)),
         truth=truth,
         wheels=wheels,
+        gyroscope=gyroscope,
+        accelerations=accelerations,
     )
 
 
@@ -253,6 +266,8 @@ def _write(folder: Path, simulator: CameraSimulator, on_progress: Callable[[int,
     (folder / "calibration.toml").write_text(calibration, encoding="utf-8")
     if log.wheels is not None:
         write_wheels(folder, log.wheels, sensor=log.sensor)
+    if log.gyroscope is not None and log.accelerations is not None:
+        write_imu(folder, log.gyroscope, log.accelerations)
     unset = {"wall_distance_m"} if config.path != "wall" else set()
     settings = set_or_first(config, exclude=unset)
     moving = simulator.movers.as_json(seconds_of(simulator.truth.stamps_ns))

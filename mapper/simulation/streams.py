@@ -22,6 +22,7 @@ class Stream(IntEnum):
     GAINS = 11
     WARP = 12
     DAY = 13
+    IMU = 14
 
 
 def rng_of(seed: int, stream: Stream, index: int = 0) -> np.random.Generator:

@@ -65,6 +65,19 @@ def write_gyroscope(folder: Path, gyroscope: Gyroscope) -> None:
     (folder / RATES).write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
+def write_imu(folder: Path, gyroscope: Gyroscope, accelerations: Accelerations) -> None:
+    """Write both readings as the ``imu.csv`` of a log; their stamps are the same."""
+    lines = [BOTH_HEADER]
+    for stamp_ns, rates, felt in zip(
+        gyroscope.stamps_ns.tolist(),
+        gyroscope.rates_radps.tolist(),
+        accelerations.acceleration_mps2.tolist(),
+        strict=True,
+    ):
+        lines.append(",".join([str(stamp_ns), *map(repr, rates), *map(repr, felt)]))
+    (folder / BOTH).write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
 def _gyroscope(path: Path, stamps_ns: Stamps, rates_radps: Array) -> tuple[Gyroscope | None, list[str]]:
     finite = np.isfinite(rates_radps).all(axis=1)
     order, notes = time_order(stamps_ns[finite], what=path.name)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mapper.core.deskew import STILL, Twist, deskewed, twist_at, twist_between
+from mapper.core.deskew import STILL, SampledMotion, Twist, deskewed, twist_at, twist_between
 from mapper.core.frames import Scan
 from mapper.core.geometry import apply, exp
 from mapper.core.trajectory import Trajectory
@@ -46,6 +46,16 @@ def test_a_body_at_rest_moves_nothing_and_its_input_stays():
     np.testing.assert_array_equal(deskewed(scan, STILL).points_body, before)
     deskewed(scan, TWIST)
     np.testing.assert_array_equal(scan.points_body, before)
+
+
+def test_a_measured_rotation_moves_points_as_the_twist_that_it_samples():
+    scan = swept()
+    times_s = np.linspace(-0.04, 0.1, 8)
+    R = np.array([TWIST.over(t)[:3, :3] for t in times_s])
+    turning = Twist(TWIST.rotation_radps, np.zeros(3))
+    shift = scan.times_s[:, np.newaxis] * np.array([1.0, 2.0, 3.0])
+    found = deskewed(scan, SampledMotion(times_s, R, np.array([1.0, 2.0, 3.0])))
+    np.testing.assert_allclose(found.points_body, deskewed(scan, turning).points_body + shift, atol=2e-5)
 
 
 def test_a_scan_without_times_is_returned_as_it_is():

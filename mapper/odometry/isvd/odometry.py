@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.core.deskew import Twist
+from mapper.core.deskew import Motion
 from mapper.core.errors import ConfigError, FrameError
 from mapper.core.frames import Frame, PinholeCamera, RgbdFrame
 from mapper.core.geometry import Array, Transform, apply, inverse, mean_pose, mean_rotation, transform
@@ -187,7 +187,7 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
         last_world = self._recent[-1].T_world_body
         return lost_frame(observation.stamp_ns, last_world, features=len(observation.features))
 
-    def view(self, observation: IsvdObservation, _twist: Twist | None = None, /) -> ImageView:
+    def view(self, observation: IsvdObservation, _twist: Motion | None = None, /) -> ImageView:
         """Return the view for place recognition. Pure."""
         features, camera = observation.features, observation.camera
         return ImageView(

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from mapper.core.deskew import Twist
+from mapper.core.deskew import Motion, Twist
 from mapper.core.frames import Frame
 from mapper.core.geometry import Array, inverse
 from mapper.features.factory import build_detector
@@ -108,9 +108,9 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
             return self._add_keyframe(pose, neighbour=pose.reference, assessed=assessed)
         return self._frame(pose, information, assessed)
 
-    def view(self, observation: ImageObservation, twist: Twist | None = None, /) -> ImageView:
+    def view(self, observation: ImageObservation, twist: Motion | None = None, /) -> ImageView:
         """Return the view for place recognition, by the readout time as it is known now."""
-        return (observation if twist is None else self._shutter.correct(observation, twist)).view()
+        return (self._shutter.correct(observation, twist) if isinstance(twist, Twist) else observation).view()
 
     def matches(self) -> FeatureMatches | None:
         """Return the features matched to landmarks, and these landmarks' pixels in an earlier frame."""

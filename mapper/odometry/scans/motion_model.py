@@ -4,10 +4,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mapper.core.deskew import STILL, Twist, twist_between
+from mapper.core.deskew import STILL, SampledMotion, Twist, twist_between
 from mapper.core.geometry import Array, Transform, angle_between, inverse
 from mapper.core.running_median import RunningMedian
 from mapper.core.timebase import NS_PER_S
+from mapper.odometry.motion_prior import MotionPrior
 
 _MIN_ELAPSED_S = 0.005  # over less, an error of millimetres becomes a large velocity
 _ERRORS, _FEWEST_ERRORS = 50, 5  # of recent predictions: of so many the median is taken, of fewer none
@@ -29,11 +30,14 @@ class MotionModel:
     Attributes:
         T_world_last: (4, 4) pose in the middle of the last scan that was placed.
         twist: Velocity until then.
+        prior: Predicts the motion since.
     """
 
-    def __init__(self, time_ns: int, T_world_last: Transform) -> None:
+    def __init__(self, time_ns: int, T_world_last: Transform, prior: MotionPrior) -> None:
         self.T_world_last = T_world_last
         self.twist: Twist = STILL
+        self.prior = prior
+        self._velocity_world = np.zeros(3)
         self._time_ns = time_ns
         self._elapsed_s = 0.0
         self._placed = 0
@@ -45,8 +49,31 @@ class MotionModel:
         return (time_ns - self._time_ns) / NS_PER_S
 
     def predicted(self, time_ns: int) -> Transform:
-        """Return T_world_body (4, 4) at a time, if the velocity stays."""
-        return self.T_world_last @ self.twist.over(self.elapsed_s(time_ns))
+        """Return T_world_body (4, 4) at a time, by the gyroscope, or if the velocity stays."""
+        velocity_mps = self.T_world_last[:3, :3].T @ self._velocity_world
+        return self.T_world_last @ self.prior.predict(self._time_ns, time_ns, self.twist, velocity_mps)
+
+    def sweep(
+        self, middle_ns: int, half_s: float, T_world_middle: Transform | None = None
+    ) -> SampledMotion | None:
+        """Return the motion about the middle of a sweep by the gyroscope; None if it does not know it.
+
+        Args:
+            middle_ns: Time of the middle.
+            half_s: Half of the sweep's duration.
+            T_world_middle: (4, 4) pose then, to which the velocity is the mean one; None if it is not known
+                yet, and the velocity stays.
+        """
+        velocity_world, R_world_middle = self._velocity_world, self.T_world_last[:3, :3]
+        if T_world_middle is None:
+            turn = self.prior.turn(self._time_ns, middle_ns)
+            R_world_middle = R_world_middle if turn is None else R_world_middle @ turn
+        else:
+            R_world_middle = T_world_middle[:3, :3]
+            elapsed_s = self.elapsed_s(middle_ns)
+            if elapsed_s >= _MIN_ELAPSED_S:
+                velocity_world = (T_world_middle[:3, 3] - self.T_world_last[:3, 3]) / elapsed_s
+        return self.prior.sweep(middle_ns, half_s, R_world_middle.T @ velocity_world)
 
     def spread(self, time_ns: int) -> Spread | None:
         """Return the spread of a predicted pose; None before enough predictions could be compared.
@@ -128,17 +155,21 @@ class MotionModel:
         self._placed += 1
         if elapsed_s >= _MIN_ELAPSED_S:
             if is_certain and self._placed > 1:  # the first is predicted without a velocity
+                constant = self.twist.over(elapsed_s)
+                T_last_body = inverse(self.T_world_last) @ T_world_body
                 error = inverse(self.predicted(time_ns)) @ T_world_body
                 lengths = angle_between(np.eye(3), error[:3, :3]), float(np.linalg.norm(error[:3, 3]))
                 time_s2 = _time_s2(elapsed_s, self._elapsed_s)
                 self._turn_errors.add(lengths[0] / time_s2)
                 self._shift_errors.add(lengths[1] / time_s2)
+                self.prior.learn(self._time_ns, time_ns, T_last_body[:3, :3], constant[:3, :3])
             if measured is None:
                 covariance = np.diag(self.velocity_sigmas(time_ns) ** 2)
                 self.twist, self._covariance = self.mean_twist(time_ns, T_world_body), covariance
             else:
                 self.twist, self._covariance = measured
             self._elapsed_s = elapsed_s if measured is None else 0.0
+            self._velocity_world = (T_world_body[:3, 3] - self.T_world_last[:3, 3]) / elapsed_s
         self.T_world_last, self._time_ns = T_world_body, time_ns
 
 

@@ -1,11 +1,12 @@
 """Scan-to-map odometry by any scan matcher, with checks of each pose against the last keyframe."""
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from mapper.core.deskew import STILL, Twist
+from mapper.core.deskew import STILL, Motion
 from mapper.core.doubts import Doubt
 from mapper.core.frames import Frame
 from mapper.core.geometry import Array, Transform, adjoint, inverse
@@ -13,6 +14,7 @@ from mapper.features.frame_view import ScanView
 from mapper.graph.model import BetweenFactor
 from mapper.odometry.base import Diagnostics, FrameOdometry, FrameResult, lost_frame
 from mapper.odometry.keyframe_distance import is_far
+from mapper.odometry.motion_prior import MotionPrior
 from mapper.odometry.scans.config import ScanOdometryConfig
 from mapper.odometry.scans.motion_model import MotionModel
 from mapper.odometry.scans.pose_assessment import PoseAssessment
@@ -22,6 +24,7 @@ from mapper.odometry.scans.scan_matcher import DeskewedScan, ScanMatcher
 from mapper.odometry.scans.scan_noise import PoseNoise, ScanNoise
 from mapper.odometry.scans.scan_observation import ScanObservation, observe_scan
 from mapper.odometry.scans.sweep_registration import PlacedScan, SweepRegistration
+from mapper.sensing.gyroscope import Gyroscope
 
 _KEYFRAMES = 5  # the last ones, with which a scan is compared
 _DISPLACED = 0.5
@@ -40,13 +43,23 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
     do not show are predicted, with a covariance that grows until they are seen again.
     """
 
-    def __init__(self, config: ScanOdometryConfig, matcher: ScanMatcher) -> None:
+    def __init__(
+        self, config: ScanOdometryConfig, matcher: ScanMatcher, gyroscope: Gyroscope | None = None
+    ) -> None:
+        """Begin before the first scan.
+
+        Args:
+            config: Settings.
+            matcher: Finds poses in the local map.
+            gyroscope: Angular velocities of the log; None if it has none.
+        """
         self._config = config
         self._matcher = matcher
         self._assessment = PoseAssessment(config)
         self._registration = SweepRegistration(config, matcher, PoseSearch(config, matcher, self._assessment))
         self._noise = ScanNoise()
-        self._motion = MotionModel(0, np.eye(4))
+        self._prior = MotionPrior(gyroscope)
+        self._motion = MotionModel(0, np.eye(4), self._prior)
         self._keyframes: deque[ScanKeyframe] = deque(maxlen=_KEYFRAMES)  # the newest first
         self._doubtful: ScanKeyframe | None = None
         self._last: ScanKeyframe | None = None
@@ -81,9 +94,13 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
         result = self._insert(observation, placed, covariance, is_doubtful=bool(doubts))
         return replace(result, doubts=(*doubts, *noise.doubts))
 
-    def view(self, observation: ScanObservation, twist: Twist | None = None, /) -> ScanView:
+    def view(self, observation: ScanObservation, twist: Motion | None = None, /) -> ScanView:
         """Return the view for place recognition. Pure."""
         return observation.view(twist)
+
+    def gyroscope_notes(self) -> Sequence[str]:
+        """Return how the gyroscope was used, if the log has one."""
+        return self._prior.notes()
 
     def matches(self) -> None:
         """Return None: the pose is not from features."""
@@ -127,7 +144,8 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
     ) -> FrameResult:
         """Insert a scan into the map unless it is doubtful, as a keyframe if it is far; return its result."""
         found, deskewed = placed.found, placed.deskewed
-        T_world_body = found.T_world_middle @ self._motion.twist.over(-observation.middle_s)
+        motion: Motion = self._motion.twist if placed.sweep is None else placed.sweep
+        T_world_body = found.T_world_middle @ motion.over(-observation.middle_s)
         T_key_body = inverse(found.keyframe.T_world_body) @ T_world_body
         is_keyframe = is_far(T_key_body, self._config)
         at_stamp = observation.middle_s**2 * placed.velocity_covariance
@@ -159,7 +177,7 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
             diagnostics=found.diagnostics(points=len(deskewed.prepared.points)),
             factors=factors,
             links=factors,
-            twist=self._motion.twist,
+            twist=motion.about(-observation.middle_s),
             covariance=covariance,
         )
 
@@ -186,7 +204,7 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
         self._matcher.clear()
         self._next_node = self._keyframes[0].node
         T_world_middle = self._keyframes[0].T_world_body @ twist.over(first.middle_s)
-        self._motion = MotionModel(first.middle_ns, T_world_middle)
+        self._motion = MotionModel(first.middle_ns, T_world_middle, self._prior)
         self._motion.twist = twist
         self._add_keyframe(first, first.deskew(twist), T_world_middle)
         return self._registration.register(second, self._path)
@@ -198,7 +216,7 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
         self._noise.restart()
         self._lost_scans, self._first = 0, observation
         deskewed = observation.deskew(STILL)
-        self._motion = MotionModel(observation.middle_ns, T_world_body)
+        self._motion = MotionModel(observation.middle_ns, T_world_body, self._prior)
         node = self._add_keyframe(observation, deskewed, T_world_body)
         return FrameResult(
             stamp_ns=observation.scan.stamp_ns,

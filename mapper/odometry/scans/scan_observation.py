@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mapper.core.deskew import STILL, Twist, deskewed
+from mapper.core.deskew import STILL, Motion, deskewed
 from mapper.core.errors import FrameError
 from mapper.core.frames import Frame, Scan
 from mapper.core.timebase import NS_PER_S
@@ -44,21 +44,21 @@ class ScanObservation:
         """Time of the middle of the sweep."""
         return self.scan.stamp_ns + round(self.middle_s * NS_PER_S)
 
-    def deskew(self, twist: Twist) -> DeskewedScan:
-        """Return the scan as taken all at once in the middle of the sweep, under a constant velocity.
+    def deskew(self, motion: Motion) -> DeskewedScan:
+        """Return the scan as taken all at once in the middle of the sweep, under a motion about it.
 
         In the middle an error of the velocity cancels: half of the points move one way and half the other. At
         the start of the sweep it would move the pose, and so increase the next velocity's error.
         """
-        return self.deskewed or _prepared(deskewed(self.sweep(self.middle_s), twist), self.voxel_m)
+        return self.deskewed or _prepared(deskewed(self.sweep(self.middle_s), motion), self.voxel_m)
 
     def displacement(self, turning_radps: float) -> float:
         """Return how far a change of the rotation, rad/s, displaces the sweep's outer points, in voxels."""
         return turning_radps * self.half_s * self.range_m / self.voxel_m
 
-    def view(self, twist: Twist | None) -> ScanView:
-        """Return the points as taken all at once at the stamp, one per voxel; no twist is no motion."""
-        points = deskewed(self.scan, twist or STILL).points_body
+    def view(self, motion: Motion | None) -> ScanView:
+        """Return the points as taken all at once at the stamp, one per voxel; None is no motion."""
+        points = deskewed(self.scan, motion or STILL).points_body
         return ScanView(self.scan.stamp_ns, points[thin(points, self.voxel_m)])
 
     def sweep(self, moment_s: float) -> Scan:

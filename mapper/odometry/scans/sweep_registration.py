@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mapper.core.deskew import Twist, deskewed
+from mapper.core.deskew import SampledMotion, Twist, deskewed
 from mapper.core.frames import Scan
 from mapper.core.geometry import Array, Transform, apply, exp, inverse
 from mapper.odometry.scans.config import ScanOdometryConfig
@@ -42,12 +42,14 @@ class PlacedScan:
         found: Its pose in the middle of the sweep.
         twist: Velocity then, if it was measured; None is the mean one since the scan before.
         velocity_covariance: (6, 6) of the velocity, (rad/s)² and (m/s)².
+        sweep: Motion about the middle of the sweep by a gyroscope; None if none knows it.
     """
 
     deskewed: DeskewedScan
     found: PoseCandidate
     twist: Twist | None
     velocity_covariance: Array
+    sweep: SampledMotion | None = None
 
 
 class SweepRegistration:
@@ -63,15 +65,40 @@ class SweepRegistration:
 
         Where the velocity may have changed so much that it displaces the points of the sweep, it is found
         together with the pose; not before the errors of a few predictions are known, as two scans, each with
-        a velocity of its own, fit under wrong ones, too.
+        a velocity of its own, fit under wrong ones, too. Nor where a gyroscope knows the rotation.
         """
         motion, time_ns = path.motion, observation.middle_ns
+        measured = motion.sweep(time_ns, observation.half_s)
+        if measured is not None:
+            return self._by_gyroscope(observation, path, measured)
         sigmas = motion.velocity_sigmas(time_ns)
         if motion.spread(time_ns) is None or observation.displacement(float(sigmas[0])) <= _NEGLIGIBLE:
             return self._at_velocity(observation, path, np.diag((_CHANGED * sigmas) ** 2))
         placed = self._with_velocity(observation, path)
         if placed is None:
             placed = self._at_velocity(observation, path, None)
+        return placed
+
+    def _by_gyroscope(
+        self, observation: ScanObservation, path: KnownPath, measured: SampledMotion
+    ) -> PlacedScan | None:
+        """Register a scan, deskewed by the gyroscope and the velocity, until this is that of its pose."""
+        motion, time_ns = path.motion, observation.middle_ns
+        T_world_guess, placed = None, None
+        for _ in range(_ROUNDS):
+            deskewed = observation.deskew(measured)
+            found = self._search.find(deskewed, path, time_ns, T_world_guess)
+            if found is None:
+                break
+            again = motion.sweep(time_ns, observation.half_s, found.T_world_middle)
+            assert again is not None
+            sigmas = np.concatenate([[motion.prior.spread_radps()] * 3, motion.velocity_sigmas(time_ns)[3:]])
+            sigmas[3:] *= _CHANGED
+            placed = PlacedScan(deskewed, found, None, np.diag(sigmas**2), again)
+            change_mps = np.linalg.norm(again.translation_mps - measured.translation_mps)
+            if change_mps * observation.half_s < _SETTLED * observation.voxel_m:
+                break
+            measured, T_world_guess = again, found.T_world_middle
         return placed
 
     def _at_velocity(

@@ -7,6 +7,7 @@ import pytest
 
 from mapper.core.frames import Scan
 from mapper.core.geometry import angle_between, apply, exp, inverse, log
+from mapper.odometry.motion_prior import MotionPrior
 from mapper.odometry.scans.config import GicpOdometryConfig
 from mapper.odometry.scans.gicp import GicpMatcher
 from mapper.odometry.scans.motion_model import MotionModel, Spread
@@ -218,7 +219,7 @@ def test_unusual_shares():
 
 def test_the_spread_of_predictions_is_the_logs_own():
     rng = np.random.default_rng(1)
-    motion = MotionModel(0, np.eye(4))
+    motion = MotionModel(0, np.eye(4), MotionPrior(None))
     assert motion.spread(100_000_000) is None
     x_m = 0.0
     for k in range(1, 60):

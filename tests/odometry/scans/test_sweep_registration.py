@@ -7,6 +7,7 @@ import numpy as np
 from mapper.core.deskew import STILL, Twist, deskewed
 from mapper.core.frames import Scan
 from mapper.core.geometry import angle_between, apply, exp, inverse
+from mapper.odometry.motion_prior import MotionPrior
 from mapper.odometry.scans.config import GicpOdometryConfig
 from mapper.odometry.scans.gicp import GicpMatcher
 from mapper.odometry.scans.motion_model import MotionModel
@@ -81,7 +82,7 @@ def test_too_few_pairs_tell_no_velocity():
 
 
 def test_the_expected_velocity_goes_on_as_it_changed():
-    motion = MotionModel(0, np.eye(4))
+    motion = MotionModel(0, np.eye(4), MotionPrior(None))
     turn = np.array([0.0, 0.0, 1.0])
     motion.follow(500_000_000, exp(0.5 * turn, np.zeros(3)), measured=(Twist(turn, np.zeros(3)), np.eye(6)))
 

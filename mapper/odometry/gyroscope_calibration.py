@@ -1,0 +1,191 @@
+"""Calibration of a gyroscope by the rotations that an odometry measures: mounting, bias, clock and unit."""
+
+from dataclasses import dataclass
+from math import pi
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from mapper.core.geometry import Array
+from mapper.core.timebase import NS_PER_S, Stamps
+from mapper.sensing.gyroscope import Gyroscope
+
+_STATED_RAD, _UNSTATED_RAD = 0.1, 2.0  # a mounting in tf is right to some degrees, or wrong altogether
+_BIAS_RADPS, _OFFSET_S = 0.02, 0.05  # of units without calibration, and of unsynchronised clocks
+_TRIED_OFFSETS_S = 0.025 * np.arange(-10, 11)
+_DIFFERENCE_NS = 5_000_000
+_ITERATIONS = 8
+_KERNEL = 2.4  # Cauchy's, in standard deviations
+_LEAST_SIGMA_RAD = 1e-4
+DEGREES = pi / 180.0
+_SAME_UNIT = 1.25  # ratio of the turns of two units that are one
+_LEFT_HANDED_COST = 0.5  # of that of right-handed axes, below which they are left-handed
+_CLEAR_RAD = 0.02  # smaller turns do not show the unit
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GyroscopeCalibration:
+    """How a gyroscope measures the body's rotation.
+
+    Attributes:
+        R_body_imu: (3, 3) mounting.
+        bias: (3,) of the readings, after they are multiplied by ``scale``, rad/s.
+        offset_s: Added to the frames' stamps it gives the readings'.
+        scale: Factor to rad/s; negative where the unit's axes are left-handed, for their mirror image is a
+            rotation of the opposite velocity.
+        covariance: (7, 7) of small rotations of the mounting, bias and offset.
+        ratio: Turns of the body by those of the readings, before scaling; 1 if the unit is as stated.
+    """
+
+    R_body_imu: Array
+    bias: Array
+    offset_s: float
+    scale: float
+    covariance: Array
+    ratio: float = 1.0
+
+    def turns(
+        self, gyroscope: Gyroscope, begins_ns: Stamps, ends_ns: Stamps
+    ) -> tuple[Array, Array, NDArray[np.bool_]]:
+        """Return (M, 3, 3) rotations of the body, (M, 3, 7) what they change with, and (M,) which are known.
+
+        Args:
+            gyroscope: The readings.
+            begins_ns: (M,) times of frames.
+            ends_ns: (M,) later ones.
+        """
+        shift_ns = round(self.offset_s * NS_PER_S)
+        G, early, late = (
+            gyroscope.rotations(begins_ns + shift, ends_ns + shift, self.bias, self.scale)
+            for shift in (shift_ns, shift_ns - _DIFFERENCE_NS, shift_ns + _DIFFERENCE_NS)
+        )
+        R = self.R_body_imu
+        R_begin_end = R @ G[0] @ R.T
+        seconds = (ends_ns - begins_ns) / NS_PER_S
+        by_time = _logs(early[0].transpose(0, 2, 1) @ late[0]) / (2 * _DIFFERENCE_NS / NS_PER_S)
+        J = np.empty((len(seconds), 3, 7))
+        J[:, :, :3] = R_begin_end.transpose(0, 2, 1) - np.eye(3)
+        J[:, :, 3:6] = -0.5 * seconds[:, None, None] * (R @ (np.eye(3) + G[0].transpose(0, 2, 1)))
+        J[:, :, 6] = by_time @ R.T
+        return R_begin_end, J, G[1] & early[1] & late[1]
+
+
+def uncalibrated(gyroscope: Gyroscope) -> GyroscopeCalibration:
+    """Return what is known before the first frame: the mounting that the log states, if it does."""
+    R = gyroscope.R_body_imu
+    return GyroscopeCalibration(
+        np.eye(3) if R is None else R, np.zeros(3), 0.0, 1.0, np.diag(_prior_sigmas(gyroscope) ** 2)
+    )
+
+
+def calibrate(
+    gyroscope: Gyroscope, begins_ns: Stamps, ends_ns: Stamps, R_begin_end: Array
+) -> GyroscopeCalibration:
+    """Return the calibration under which the readings agree best with measured rotations of the body.
+
+    Least squares of the rotations' differences, as LI-Init (Zhu et al. 2022) of angular velocities, under
+    Cauchy's kernel and weak priors: so what the motion does not show keeps its prior variance. The clocks'
+    offset begins at the best of a grid, the mounting at the closed form (Kabsch 1976).
+
+    Args:
+        gyroscope: The readings.
+        begins_ns: (M,) times of frames.
+        ends_ns: (M,) times of the frames after them.
+        R_begin_end: (M, 3, 3) measured rotations of the body between them.
+    """
+    first = uncalibrated(gyroscope)
+    _, _, known = first.turns(gyroscope, begins_ns, ends_ns)
+    begins_ns, ends_ns, R_begin_end = begins_ns[known], ends_ns[known], R_begin_end[known]
+    if not len(begins_ns):
+        return first
+    measured = _logs(R_begin_end)
+    clear = np.linalg.norm(measured, axis=1) > _CLEAR_RAD
+    ratio = 1.0
+    if clear.sum() >= 5:
+        # Of velocities in degrees the integral winds many times around; the mean reading does not.
+        ratio = _speed_ratio(gyroscope, begins_ns[clear], ends_ns[clear], measured[clear])
+    unit = DEGREES if 1.0 / _SAME_UNIT < ratio / DEGREES < _SAME_UNIT else 1.0
+    best: tuple[float, GyroscopeCalibration] | None = None
+    for scale in (unit, -unit):
+        _, offset_s, R = min(
+            (
+                _closed_form(gyroscope, scale, begins_ns, ends_ns, measured, offset_s)
+                for offset_s in _TRIED_OFFSETS_S.tolist()
+            ),
+            key=lambda one: one[0],
+        )
+        begun = GyroscopeCalibration(R, np.zeros(3), offset_s, scale, first.covariance, ratio)
+        found = _refine(begun, gyroscope, begins_ns, ends_ns, R_begin_end)
+        if best is None or found[0] < _LEFT_HANDED_COST * best[0]:
+            best = found
+    assert best is not None
+    return best[1]
+
+
+def _refine(
+    calibration: GyroscopeCalibration, gyroscope: Gyroscope, begins_ns: Stamps, ends_ns: Stamps, R: Array
+) -> tuple[float, GyroscopeCalibration]:
+    """Return the sum of the residuals' lengths and the calibration, by Gauss–Newton."""
+    sigmas = _prior_sigmas(gyroscope)
+    R_stated = gyroscope.R_body_imu
+    found, cost = calibration, np.inf
+    for _ in range(_ITERATIONS):
+        R_turned, J, known = found.turns(gyroscope, begins_ns, ends_ns)
+        residuals = _logs(R_turned.transpose(0, 2, 1) @ R)
+        residuals[~known], J[~known] = 0.0, 0.0
+        lengths = np.linalg.norm(residuals, axis=1)
+        sigma = max(float(np.median(lengths[known])) / 1.538 if known.any() else 0.0, _LEAST_SIGMA_RAD)
+        weights = 1.0 / (1.0 + (lengths / (_KERNEL * sigma)) ** 2) / sigma**2
+        tilt = np.zeros(3) if R_stated is None else _logs((R_stated @ found.R_body_imu.T)[None])[0]
+        off = np.concatenate([tilt, -found.bias, [-found.offset_s]])
+        information = np.einsum("mia,m,mib->ab", J, weights, J) + np.diag(sigmas**-2.0)
+        gradient = np.einsum("mia,m,mi->a", J, weights, residuals) + off / sigmas**2
+        step = np.linalg.solve(information, gradient)
+        cost = float(lengths.sum())
+        found = GyroscopeCalibration(
+            Rotation.from_rotvec(step[:3]).as_matrix() @ found.R_body_imu,
+            found.bias + step[3:6],
+            found.offset_s + float(step[6]),
+            found.scale,
+            np.linalg.inv(information),
+            found.ratio,
+        )
+    return cost, found
+
+
+def _closed_form(
+    gyroscope: Gyroscope, scale: float, begins_ns: Stamps, ends_ns: Stamps, measured: Array, offset_s: float
+) -> tuple[float, float, Array]:
+    """Return the sum of the residuals' lengths, the offset and the mounting by rotation vectors."""
+    shift_ns = round(offset_s * NS_PER_S)
+    R_turned, known = gyroscope.rotations(begins_ns + shift_ns, ends_ns + shift_ns, np.zeros(3), scale)
+    turned = _logs(R_turned)
+    expected = np.eye(3) if gyroscope.R_body_imu is None else gyroscope.R_body_imu
+    sigmas = _prior_sigmas(gyroscope)
+    prior = (_LEAST_SIGMA_RAD / sigmas[0]) ** 2 * expected
+    U, _, Vt = np.linalg.svd(measured[known].T @ turned[known] + prior)
+    R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    lengths = np.linalg.norm(measured - turned @ R.T, axis=1)
+    lengths[~known] = np.linalg.norm(measured[~known], axis=1)
+    return float(lengths.sum()), offset_s, R
+
+
+def _speed_ratio(gyroscope: Gyroscope, begins_ns: Stamps, ends_ns: Stamps, measured: Array) -> float:
+    speeds = np.linalg.norm(gyroscope.rates_radps, axis=1)
+    seconds = (gyroscope.stamps_ns - gyroscope.stamps_ns[0]) / NS_PER_S
+    travelled = np.concatenate([[0.0], np.cumsum(np.diff(seconds) * 0.5 * (speeds[1:] + speeds[:-1]))])
+    begin, end = ((ns - gyroscope.stamps_ns[0]) / NS_PER_S for ns in (begins_ns, ends_ns))
+    turned = np.interp(end, seconds, travelled) - np.interp(begin, seconds, travelled)
+    return float(np.median(np.linalg.norm(measured, axis=1) / np.maximum(turned, 1e-9)))
+
+
+def _prior_sigmas(gyroscope: Gyroscope) -> Array:
+    mounting = _UNSTATED_RAD if gyroscope.R_body_imu is None else _STATED_RAD
+    return np.array([mounting] * 3 + [_BIAS_RADPS] * 3 + [_OFFSET_S])
+
+
+def _logs(R: Array) -> Array:
+    """Return the (M, 3) rotation vectors of (M, 3, 3) rotations."""
+    vectors: Array = Rotation.from_matrix(R).as_rotvec()
+    return vectors

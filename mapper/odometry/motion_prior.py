@@ -1,0 +1,200 @@
+"""Prior of the body's motion: constant velocity, and the rotation by a gyroscope where that is better."""
+
+import math
+from collections import deque
+
+import numpy as np
+
+from mapper.core.deskew import SampledMotion, Twist
+from mapper.core.geometry import Array, Transform, rotation_log
+from mapper.core.timebase import NS_PER_S
+from mapper.odometry.gyroscope_calibration import (
+    DEGREES,
+    calibrate,
+    uncalibrated,
+)
+from mapper.sensing.gyroscope import Gyroscope
+
+_FIRST_FIT, _FITS_GROW, _MOST_BETWEEN_FITS = 8, 1.5, 100
+_KEPT = 400  # intervals that a fit uses: bias drifts over minutes
+_ERRORS, _FEWEST_ERRORS = 30, 5
+_MEDIAN_LENGTH = 1.538  # of a vector of three independent normal errors, in standard deviations
+_LONGEST_TURN_RAD = 2.8
+_ANOTHER_RAD, _CERTAIN_RAD = 0.2, 0.05  # of a mounting that contradicts tf's; of one that is known
+_ANOTHER_UNIT = 1.25
+
+
+class MotionPrior:
+    """Prediction of the body's motion between two times.
+
+    Without a gyroscope it is that of a constant velocity. The gyroscope's calibration is estimated from the
+    rotations that the odometry measures; it is used where its standard deviation, that of the calibration
+    and of its last errors, is below that of constant velocity. So one whose mounting the motion has not
+    shown yet, or whose readings contradict the odometry, is not used.
+    """
+
+    def __init__(self, gyroscope: Gyroscope | None) -> None:
+        """Begin before the first frame."""
+        self._gyroscope = gyroscope
+        self._calibration = None if gyroscope is None else uncalibrated(gyroscope)
+        self._intervals: deque[tuple[int, int, Array]] = deque(maxlen=_KEPT)
+        self._errors: deque[float] = deque(maxlen=_ERRORS)
+        self._errors_without: deque[float] = deque(maxlen=_ERRORS)
+        self._measured = 0
+        self._next_fit = _FIRST_FIT
+        self._used = 0
+
+    def turn(self, begin_ns: int, end_ns: int) -> Array | None:
+        """Return the rotation (3, 3) of the body between two times; None if constant velocity is better."""
+        found = self._turn(begin_ns, end_ns)
+        return None if found is None or not self._is_better(*found) else found[0]
+
+    def predict(self, begin_ns: int, end_ns: int, twist: Twist, velocity_mps: Array) -> Transform:
+        """Return T_begin_end (4, 4).
+
+        Args:
+            begin_ns: Time of the last pose.
+            end_ns: A later time.
+            twist: Mean velocity until then, which stays without a gyroscope.
+            velocity_mps: (3,) mean velocity until then in the world, which stays with one, in the body's axes
+                at the last pose.
+        """
+        elapsed_s = (end_ns - begin_ns) / NS_PER_S
+        R_begin_end = self.turn(begin_ns, end_ns)
+        if R_begin_end is None:
+            return twist.over(elapsed_s)
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = R_begin_end, elapsed_s * velocity_mps
+        return T
+
+    def sweep(self, middle_ns: int, half_s: float, velocity_mps: Array) -> SampledMotion | None:
+        """Return the motion about the middle of a sweep; None if the gyroscope does not know it.
+
+        Args:
+            middle_ns: Time of the middle.
+            half_s: Half of its duration.
+            velocity_mps: (3,) in the body's axes in the middle.
+        """
+        gyroscope, calibration = self._gyroscope, self._calibration
+        half_ns = round(half_s * NS_PER_S)
+        if gyroscope is None or calibration is None or not half_ns:
+            return None
+        if self.turn(middle_ns - half_ns, middle_ns + half_ns) is None:
+            return None
+        shift_ns = round(calibration.offset_s * NS_PER_S)
+        begin_ns, end_ns = middle_ns - half_ns, middle_ns + half_ns
+        first, last = np.searchsorted(gyroscope.stamps_ns, [begin_ns + shift_ns, end_ns + shift_ns])
+        inside = gyroscope.stamps_ns[first:last] - shift_ns
+        knots_ns = np.unique(np.concatenate([inside, [begin_ns, middle_ns, end_ns]]))
+        steps, _, _ = calibration.turns(gyroscope, knots_ns[:-1], knots_ns[1:])
+        R = [np.eye(3)]
+        for step in steps:
+            R.append(R[-1] @ step)
+        R_begin = np.array(R)
+        R_begin_middle = R_begin[int(np.searchsorted(knots_ns, middle_ns))]
+        return SampledMotion((knots_ns - middle_ns) / NS_PER_S, R_begin_middle.T @ R_begin, velocity_mps)
+
+    def spread_radps(self) -> float:
+        """Return the standard deviation of the angular velocity that the gyroscope gives, rad/s."""
+        assert self._calibration is not None
+        return float(np.sqrt(np.diag(self._calibration.covariance)[3:6].max()))
+
+    def learn(self, begin_ns: int, end_ns: int, R_begin_end: Array, R_constant: Array) -> None:
+        """Take over the rotation that the odometry measured between two frames.
+
+        Args:
+            begin_ns: Time of the first frame.
+            end_ns: Time of the second.
+            R_begin_end: (3, 3) measured rotation.
+            R_constant: (3, 3) by constant velocity.
+        """
+        gyroscope = self._gyroscope
+        if gyroscope is None or np.linalg.norm(rotation_log(R_begin_end)) > _LONGEST_TURN_RAD:
+            return
+        found = self._turn(begin_ns, end_ns)
+        if found is None:
+            return
+        self._used += self._is_better(*found)
+        self._errors.append(float(np.linalg.norm(rotation_log(found[0].T @ R_begin_end))))
+        self._errors_without.append(float(np.linalg.norm(rotation_log(R_constant.T @ R_begin_end))))
+        self._intervals.append((begin_ns, end_ns, R_begin_end))
+        self._measured += 1
+        if self._measured >= self._next_fit:
+            self._fit(gyroscope)
+            grown = round(self._measured * _FITS_GROW)
+            self._next_fit = min(grown, self._measured + _MOST_BETWEEN_FITS)
+
+    def notes(self) -> list[str]:
+        """Return how the gyroscope was used and calibrated, and what contradicts it, a sentence each."""
+        gyroscope, found = self._gyroscope, self._calibration
+        if gyroscope is None or found is None:
+            return []
+        name = f"gyroscope {gyroscope.name}, {NS_PER_S / gyroscope.interval_ns:.0f} Hz"
+        unit = DEGREES if abs(found.scale) == DEGREES else 1.0
+        notes = []
+        if unit == DEGREES:
+            notes.append(
+                f"{name}: its angular velocities are in degrees a second, by the turns of the frames"
+            )
+        elif not 1.0 / _ANOTHER_UNIT < found.ratio < _ANOTHER_UNIT:
+            notes.append(
+                f"{name}: the frames turn {found.ratio:.2g} times as much as it says; is its unit rad/s?"
+            )
+        if found.scale < 0.0:
+            notes.append(f"{name}: its axes are left-handed: one of them is flipped; corrected")
+        sigmas = np.sqrt(np.diag(found.covariance))
+        stated = gyroscope.R_body_imu
+        origin = "found from the log"
+        if stated is not None:
+            off = float(np.linalg.norm(rotation_log(stated @ found.R_body_imu.T)))
+            origin = "from tf"
+            if off > _ANOTHER_RAD and sigmas[:3].max() < _CERTAIN_RAD:
+                notes.append(
+                    f"{name}: tf has it {np.degrees(off):.0f}° from where the turns of the frames have it; "
+                    "the latter is used"
+                )
+                origin = "found from the log"
+        if not self._used:
+            notes.append(
+                f"{name}: not used: constant velocity predicts the frames' rotations as well or better"
+            )
+            return notes
+        bias = np.degrees(np.linalg.norm(found.bias))
+        notes.append(
+            f"{name}, predicts {self._used} of {self._measured} frames' rotations: mounting {origin}, offset "
+            f"{1e3 * found.offset_s:.0f} ± {1e3 * sigmas[6]:.0f} ms, bias {bias:.2f}°/s"
+        )
+        return notes
+
+    def _fit(self, gyroscope: Gyroscope) -> None:
+        """Calibrate by all intervals, and compute the last errors again."""
+        begins_ns, ends_ns = (np.array([one[k] for one in self._intervals], np.int64) for k in (0, 1))
+        R_begin_end = np.array([one[2] for one in self._intervals])
+        self._calibration = calibrate(gyroscope, begins_ns, ends_ns, R_begin_end)
+        count = len(self._errors)
+        R_turned, _, _ = self._calibration.turns(gyroscope, begins_ns[-count:], ends_ns[-count:])
+        self._errors.clear()
+        self._errors.extend(
+            float(np.linalg.norm(rotation_log(turned.T @ measured)))
+            for turned, measured in zip(R_turned, R_begin_end[-count:], strict=True)
+        )
+
+    def _turn(self, begin_ns: int, end_ns: int) -> tuple[Array, float] | None:
+        """Return the gyroscope's rotation and its standard deviation by the calibration alone."""
+        if self._gyroscope is None or self._calibration is None:
+            return None
+        R, J, known = self._calibration.turns(
+            self._gyroscope, np.array([begin_ns], np.int64), np.array([end_ns], np.int64)
+        )
+        if not known[0]:
+            return None
+        variance = float(np.trace(J[0] @ self._calibration.covariance @ J[0].T)) / 3.0
+        return R[0], float(np.sqrt(variance))
+
+    def _is_better(self, R: Array, sigma_rad: float) -> bool:
+        """Return whether a rotation of the gyroscope is more certain than constant velocity."""
+        if len(self._errors_without) < _FEWEST_ERRORS:  # it may just have begun to turn
+            return sigma_rad < float(np.linalg.norm(rotation_log(R))) / math.sqrt(3.0)
+        own = float(np.median(self._errors)) / _MEDIAN_LENGTH
+        without = float(np.median(self._errors_without)) / _MEDIAN_LENGTH
+        return math.hypot(sigma_rad, own) < without
