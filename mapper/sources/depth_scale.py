@@ -25,6 +25,10 @@ millimetres taken for TUM's fifths of these."""
 _DESK_M = 1.5
 """Depth of most of a desk or an object; nearer than that a whole room is not."""
 _MM_PER_M = 1000.0
+_USUAL_UNITS_PER_M = (1000.0, 5000.0)
+_CHANGE = 3.0
+"""Ratio of the median depths of two consecutive frames, and of all before to all after them, by which units
+change: usual ones differ by 4 or 5, or by 1000."""
 
 _PAIR_WITHIN_NS = NS_PER_S // 2
 _MAX_POSE_GAP_NS = NS_PER_S // 5
@@ -69,6 +73,8 @@ def depth_warnings(log: Log) -> list[str]:
     measured = float(np.median([(frame.depth_m > 0.0).mean() for frame in frames.values()]))
     if measured < _MIN_MEASURED_SHARE:
         return [f"depth: {1.0 - measured:.1%} of the pixels measured nothing: 0, or the limit of 16 bits"]
+    if changed := _change_warning(log, frames):
+        return changed
     if (scale := _scale_of_log(log, frames)) is None:
         return _range_warning(log, frames.values())
     if 1.0 / _MAX_SCALE_ERROR < scale < _MAX_SCALE_ERROR:
@@ -102,7 +108,51 @@ def _range_warning(log: Log, frames: Collection[RgbdFrame]) -> list[str]:
         return []
     units_per_m = _units_per_m(log)
     setting = "source.camera.depth_factor" + ("" if units_per_m is None else f"={units_per_m:g}")
-    return [f"depth: {found}, but cameras measure {least_m:g} to {_FAR_M:g} m; is {setting} right?"]
+    return [
+        f"depth: {found}, but cameras measure {least_m:g} to {_FAR_M:g} m; is {setting} right?"
+        f"{_fitting_units(units_per_m, median_m, far_m)}"
+    ]
+
+
+def _fitting_units(units_per_m: float | None, median_m: float, far_m: float) -> str:
+    """Return which usual units give depth that cameras measure, and by what factor it differs; or nothing."""
+    for other in _USUAL_UNITS_PER_M:
+        factor = (units_per_m or other) / other
+        if factor != 1.0 and factor * median_m >= _USUALLY_NEAR_M and factor * far_m <= _FAR_M:
+            where = "farther" if factor > 1.0 else "nearer"
+            return f" {other:g} reads it {max(factor, 1.0 / factor):g} times {where}"
+    return ""
+
+
+def _change_warning(log: Log, frames: Mapping[int, RgbdFrame]) -> list[str]:
+    """Return a sentence on the frame from which on depth is in other units than before, if there is one."""
+    found = {index: _median_m(frame) for index, frame in frames.items() if frame.depth_m.any()}
+    indices, medians_m = list(found), np.array(list(found.values()))
+    for k in range(2, len(indices) - 1):
+        before_m, after_m = medians_m[:k], medians_m[k:]
+        is_apart = after_m.min() > _CHANGE * before_m.max() or before_m.min() > _CHANGE * after_m.max()
+        if not is_apart:
+            continue
+        last, first, last_m, first_m = indices[k - 1], indices[k], float(before_m[-1]), float(after_m[0])
+        while first - last > 1:
+            middle = (first + last) // 2
+            frame = read_depth(log.entry_at(middle))
+            middle_m = last_m if frame is None or not frame.depth_m.any() else _median_m(frame)
+            if abs(np.log(middle_m / last_m)) < abs(np.log(middle_m / first_m)):
+                last, last_m = middle, middle_m
+            else:
+                first, first_m = middle, middle_m
+        ratio = first_m / last_m
+        if max(ratio, 1.0 / ratio) > _CHANGE:
+            return [
+                f"depth: from frame {first} on it is {ratio:.2g} times as far as before; did its units "
+                "change? map the parts apart (source.first_frame, source.last_frame)"
+            ]
+    return []
+
+
+def _median_m(frame: RgbdFrame) -> float:
+    return float(np.median(frame.depth_m[frame.depth_m > 0.0]))
 
 
 def _are_whole_millimetres(log: Log, frames: Collection[RgbdFrame]) -> bool:

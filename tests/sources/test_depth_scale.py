@@ -1,6 +1,7 @@
 """Depth in the wrong units is noticed, and the setting named, before and after a build."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -103,6 +104,27 @@ def test_depth_without_any_motion_is_held_against_what_cameras_deliver(depths_m,
     found = depth_warnings(plain(depths_m))
     assert len(found) == (warning is not None)
     assert warning is None or found[0].startswith(warning)
+
+
+@pytest.mark.parametrize(("after", "is_change"), [(0.2, True), (5.0, True), (0.6, False)])
+def test_a_change_of_units_in_the_middle_is_found(after, is_change):
+    depths_m = [1.5 + 0.01 * i for i in range(40)]
+    depths_m[23:] = [depth_m * after for depth_m in depths_m[23:]]
+    found = depth_warnings(plain(depths_m))
+    assert len(found) == is_change
+    assert not is_change or "from frame 23 on" in found[0]
+
+
+def test_a_walk_from_near_to_far_is_no_change_of_units():
+    assert depth_warnings(plain(np.linspace(0.6, 5.0, 60))) == []
+
+
+@pytest.mark.parametrize(
+    ("factor", "fitting"), [(25_000, "5000 reads it 5 times farther"), (1000, "5000 reads it 5 times nearer")]
+)
+def test_units_that_fit_are_named(desk_log, factor, fitting):
+    log = replace(desk(desk_log, factor), truth=None, are_units_assumed=True)
+    assert depth_warnings(log)[0].endswith(fitting)
 
 
 def test_motion_that_no_scale_fits_says_nothing_of_depth(desk_log):
