@@ -15,7 +15,6 @@ from mapper.sensing.wheel_kinematics import pose_at
 
 _NEXT_TO_NOTHING = 1e-6 * np.eye(6)
 """Information of factors that only serve to query the covariance of two nodes relative to each other."""
-_WINDOW_NS = NS_PER_S
 _MOST_WINDOWS = 300  # spread over the log: the covariance of each takes a while
 
 
@@ -39,14 +38,17 @@ def window_nees(
     graph: PoseGraph,
     records: Sequence[FrameRecord],
     truth: Trajectory,
+    *,
+    window_ns: int = NS_PER_S,
 ) -> Nees:
-    """Return the NEES of tracked poses relative to those a second before (Bar-Shalom, Li & Kirubarajan 2001).
+    """Return the NEES of poses relative to those some time before (Bar-Shalom, Li & Kirubarajan 2001).
 
     Args:
         trajectory: Solved poses of the body.
         graph: Solved, with the factors that hold.
         records: Outcome of every frame; frames without sigmas are left out.
         truth: True poses of the body, interpolated to the frames' stamps.
+        window_ns: Least time between the two, a second or, with 1, that of a step from frame to frame.
     """
     pose_of = dict(trajectory.items())
     known = [
@@ -58,7 +60,7 @@ def window_nees(
         and (T_true := _true_pose(truth, record.stamp_ns)) is not None
     ]
     stamps_ns = stamps_of(record for record, _ in known)
-    ends = np.searchsorted(stamps_ns, stamps_ns + _WINDOW_NS)
+    ends = np.searchsorted(stamps_ns, stamps_ns + window_ns)
     begins = np.flatnonzero(ends < len(known))
     begins = begins[:: max(1, len(begins) // _MOST_WINDOWS)]
     windows = [(known[a], known[int(ends[a])]) for a in begins]

@@ -42,13 +42,17 @@ def keyframes(stamps_ns):
 
 @pytest.mark.parametrize("errors_times", [1.0, 3.0])
 def test_it_is_one_where_errors_are_as_large_as_they_are_said_to_be(errors_times):
-    of_factors, of_windows = [], []
+    of_factors, of_windows, of_steps = [], [], []
     for seed in range(4):
         truth, found, graph = chain(errors_times=errors_times, seed=seed)
         of_factors.append(factor_nees(graph.factors, graph, truth).mean)
         of_windows.append(window_nees(found, graph, keyframes(found.stamps_ns), truth).mean)
+        steps = window_nees(found, graph, keyframes(found.stamps_ns), truth, window_ns=1)
+        assert steps.count == NODES - 1
+        of_steps.append(steps.mean)
     assert np.mean(of_factors) == pytest.approx(errors_times**2, rel=0.15)
     assert np.mean(of_windows) == pytest.approx(errors_times**2, rel=0.25)
+    assert np.mean(of_steps) == pytest.approx(errors_times**2, rel=0.15)
 
 
 def test_a_frame_s_own_covariance_takes_part():
