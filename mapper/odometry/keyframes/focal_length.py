@@ -15,8 +15,9 @@ _MIN_WINDOWS, _MAX_WINDOWS = 4, 16
 _MIN_OBSERVERS = 3
 _STEPS, _MAX_STEP = 2, 0.1
 _ROUNDS, _ITERATIONS = 2, 10
-_MIN_ERROR, _MIN_SIGMAS = 0.03, 4.0
-"""Smaller relative errors are usual: lens distortion that is not modelled, and makers' nominal values."""
+_MIN_ERROR, _MIN_SIGMAS = 0.03, 2.0
+"""Relative error, and certainty beyond it, of a doubt. Smaller ones are usual: lens distortion that is not
+modelled, and makers' nominal values."""
 _NO_LINKS = np.empty((0, 2), np.int32), np.empty((0, 4, 4)), np.empty((0, 6, 6))
 
 
@@ -106,7 +107,7 @@ class FocalLengthCheck:
     def contradiction(self, fx_px: float) -> str:
         """Return in words that the images contradict the focal length; empty if they do not."""
         error, sigma = self.estimate()
-        if abs(error) < max(_MIN_ERROR, _MIN_SIGMAS * sigma):
+        if abs(error) < _MIN_ERROR + _MIN_SIGMAS * sigma:
             return ""
         return (
             f"the images fit a focal length of {fx_px * (1.0 + error):.0f} px, not {fx_px:.0f} px "
