@@ -19,6 +19,7 @@ from mapper.loops.verification_log import VerificationLog
 from mapper.odometry.base import FrameResult, GyroscopeUser, Odometry, SensorCheck
 from mapper.odometry.factory import build_odometry, odometry_for
 from mapper.pipeline.components import without_doubtful_ends
+from mapper.pipeline.spikes import with_doubtful_spikes
 from mapper.pipeline.tracking_checkpoints import FrameCheckpoint, TrackingCheckpoints
 from mapper.pipeline.tracking_result import BY_POSES, TrackingResult
 from mapper.run.manifest import RunWarning
@@ -240,7 +241,7 @@ class _FirstPass:
         if conflict := wheel_conflict(graph, self._wheel_factors):
             conflicts = [*conflicts, conflict]
         warnings = [
-            *(RunWarning(kind="frozen", sentence=note, weight="doubt") for note in checks.frozen()),
+            *(RunWarning(kind="frozen", sentence=note) for note in checks.frozen()),
             *(RunWarning(kind="far returns", sentence=note) for note in checks.far_returns()),
             *(RunWarning(kind="log", sentence=note) for note in checks.untimed_returns()),
             *(RunWarning(kind="conflict", sentence=note, weight="doubt") for note in conflicts),
@@ -260,7 +261,7 @@ def _in_hindsight(
     """Return the frames' results with all factors, and with what later frames and the readings add."""
     if tracks:
         tracks = [*tracks[:-1], replace(tracks[-1], factors=(*tracks[-1].factors, *odometry.finish()))]
-    doubts = checks.doubts()
+    tracks, doubts = with_doubtful_spikes(tracks), checks.doubts()
     return [
         replace(track, doubts=track.doubts or tuple(doubts.get(track.stamp_ns, ())))
         if track.node is not None

@@ -1,0 +1,98 @@
+"""Spikes: frames that step off the path around them, which comes back within a few frames."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+from mapper.core.doubts import Doubt
+from mapper.core.geometry import Array, log, transform
+from mapper.odometry.base import FrameResult
+
+_MOST_FRAMES = 5
+_RATIO = 8.0
+"""Steps off the path and back, in the log's median ones over as many frames: as for jumps while tracking."""
+_LEAST_M, _LEAST_RAD = 0.1, np.radians(5.0)
+
+
+class _Spike(NamedTuple):
+    """Frames first … last of a path.
+
+    ``size`` is their step off it, in what would be much; the sigmas are that step, for rotation and
+    translation.
+    """
+
+    size: float
+    first: int
+    last: int
+    sigmas: tuple[float, float]
+    text: str
+
+
+def with_doubtful_spikes(tracks: Sequence[FrameResult]) -> list[FrameResult]:
+    """Return results of which those are doubtful that step off the path and back by far more than is usual.
+
+    While a log is tracked, a jump that all features support is believed. In both directions of time it is
+    measured against the motion around it: no sensor is carried aside and back between a few frames. Such a
+    frame's covariance grows by the square of the step, so that its neighbours place it.
+
+    Args:
+        tracks: Results of a log's frames, in time order.
+    """
+    placed = [k for k, track in enumerate(tracks) if track.node is not None]
+    times_s = 1e-9 * np.array([tracks[k].stamp_ns - tracks[0].stamp_ns for k in placed])
+    T_world_body = [tracks[k].T_world_body for k in placed]
+    positions = np.array([T[:3, 3] for T in T_world_body]).reshape(-1, 3)
+    turns = [
+        np.zeros(3),
+        *(log(transform(b[:3, :3] @ a[:3, :3].T, np.zeros(3)))[0] for a, b in pairwise(T_world_body)),
+    ]
+    found = [
+        *_spikes(positions, times_s, _LEAST_M, is_turn=False),
+        *_spikes(np.cumsum(turns, axis=0), times_s, _LEAST_RAD, is_turn=True),
+    ]
+    changed, taken = list(tracks), np.zeros(len(placed), np.bool_)
+    for spike in sorted(found, reverse=True):
+        if taken[spike.first - 1 : spike.last + 2].any():
+            continue  # next to a spike, right frames stand out too
+        taken[spike.first : spike.last + 1] = True
+        for k in placed[spike.first : spike.last + 1]:
+            if not tracks[k].doubts:
+                changed[k] = _doubted(tracks[k], spike)
+    return changed
+
+
+def _doubted(track: FrameResult, spike: _Spike) -> FrameResult:
+    covariance = track.covariance
+    if covariance is not None and not track.is_keyframe:
+        covariance = covariance + np.diag(np.repeat(np.square(spike.sigmas), 3))
+    return replace(track, doubts=(Doubt("jump", spike.text),), covariance=covariance)
+
+
+def _spikes(path: Array, times_s: Array, least: float, *, is_turn: bool) -> Iterator[_Spike]:
+    """Yield the spikes of an (N, 3) path, of each number of frames."""
+    for frames in range(1, _MOST_FRAMES + 1):
+        a = np.arange(1, len(path) - frames - 2)  # each end has a neighbour outside, which tells the motion
+        b = a + frames + 1
+        if not len(a):
+            return
+        gap_s = (times_s[b] - times_s[a])[:, None]
+        steps = np.diff(path, axis=0) / np.diff(times_s)[:, None]
+        rate = (path[b] - path[a]) / gap_s
+        off = (steps[a] - rate) * (times_s[a + 1] - times_s[a])[:, None]
+        back = (steps[b - 1] - rate) * (times_s[b] - times_s[b - 1])[:, None]
+        size = np.minimum(np.linalg.norm(off, axis=1), np.linalg.norm(back, axis=1))
+        moved = 0.5 * (steps[a - 1] + steps[b]) * gap_s
+        returns = (np.linalg.norm(path[b] - path[a] - moved, axis=1) < size) & (
+            (off * back).sum(axis=1) < 0.0
+        )
+        usual = float(np.median(size))
+        limit = max(_RATIO * usual, least)
+        for k in np.flatnonzero((size > limit) & returns).tolist():
+            step = float(size[k])
+            named = [f"{np.degrees(x):.1f}°" if is_turn else f"{x:.2f} m" for x in (step, usual)]
+            text = f"{named[0]} off the path and back within {frames + 1} frames, {named[1]} is usual"
+            sigmas = (step, 0.0) if is_turn else (0.0, step)
+            yield _Spike(step / limit, k + 2, k + 1 + frames, sigmas, text)

@@ -1,0 +1,61 @@
+"""Spikes of a path: found in both directions of time, and nothing else that moves fast."""
+
+import numpy as np
+import pytest
+
+from mapper.core.geometry import exp
+from mapper.odometry.base import Diagnostics, FrameResult
+from mapper.pipeline.spikes import with_doubtful_spikes
+
+HOW = Diagnostics(100, 50, 40, 0.5, "px", "map")
+STEP_NS = 66_666_667
+
+
+def walk(offs_m=(), offs_rad=(), *, count=120, seed=0):
+    """Results of a shaking walk; frames are off by some metres across it, or turned by some radians."""
+    rng = np.random.default_rng(seed)
+    off_m, off_rad = dict(offs_m), dict(offs_rad)
+    tracks = []
+    for k in range(count):
+        turn = np.array([0.0, 0.0, 0.3 * np.sin(0.2 * k) + off_rad.get(k, 0.0)])
+        place = np.array([0.06 * k, 0.05 * np.sin(0.7 * k) + off_m.get(k, 0.0), 1.0])
+        T = exp(turn + rng.normal(0.0, 1e-3, 3), place + rng.normal(0.0, 2e-3, 3))
+        tracks.append(
+            FrameResult(
+                stamp_ns=k * STEP_NS, node=k // 10, T_node_body=np.eye(4), T_world_body=T,
+                is_keyframe=k % 10 == 0, diagnostics=HOW, covariance=1e-6 * np.eye(6),
+            )
+        )  # fmt: skip
+    return tracks
+
+
+def doubted(tracks):
+    return [k for k, track in enumerate(with_doubtful_spikes(tracks)) if track.doubts]
+
+
+def test_a_walk_has_none():
+    assert doubted(walk()) == []
+    assert doubted(walk(count=4)) == []
+    assert doubted([]) == []
+
+
+@pytest.mark.parametrize("frames", [[50], [59, 60, 61], [70, 71, 72, 73, 74]])
+def test_a_step_aside_and_back_is_a_spike_keyframes_included(frames):
+    tracks = walk(dict.fromkeys(frames, 0.25).items())
+    assert doubted(tracks) == frames
+    changed = with_doubtful_spikes(tracks)
+    assert {track.doubts[0].kind for track in changed if track.doubts} == {"jump"}
+    loose = [k for k in frames if not tracks[k].is_keyframe]
+    assert all(np.sqrt(changed[k].covariance[3, 3]) > 0.2 for k in loose)
+
+
+def test_one_turned_frame_is_a_spike():
+    assert doubted(walk(offs_rad={33: np.radians(9.6)}.items())) == [33]
+
+
+def test_a_step_that_stays_is_none():
+    assert doubted(walk(dict.fromkeys(range(50, 120), 0.25).items())) == []
+
+
+def test_what_the_log_does_all_the_time_is_none():
+    assert doubted(walk(dict.fromkeys(range(0, 120, 2), 0.15).items())) == []
