@@ -145,6 +145,11 @@ class PoseGraph:
         """Return the graph with other poses of the same nodes."""
         return PoseGraph(T_world_node, self.stamps_ns, self.factors, self.fixed)
 
+    @property
+    def has_wheels(self) -> bool:
+        """Whether wheels measured any of its factors."""
+        return any(factor.origin == "wheel" for factor in self.factors)
+
     def with_factors(self, factors: Iterable[BetweenFactor]) -> "PoseGraph":
         """Return the graph with these factors in place of its own."""
         return PoseGraph(self.T_world_node, self.stamps_ns, list(factors), self.fixed)

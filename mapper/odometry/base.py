@@ -106,11 +106,14 @@ class FeatureMatches:
     previous_px: Array
 
 
-SEE_MORE = (
-    "a motion that no surface shows takes wheel odometry (wheels.txt), the poses of another odometry "
-    "(odometry.kind=given), or a sensor that sees farther; loops do not show it"
-)
-"""What to try where ``Diagnostics.unobservable`` names a motion in most frames."""
+def see_more(*, has_wheels: bool) -> str:
+    """Return what to try where ``Diagnostics.unobservable`` names a motion in most frames."""
+    wheels = "" if has_wheels else "wheel odometry (wheels.txt), "
+    return (
+        f"a motion that no surface shows takes {wheels}the poses of another odometry (odometry.kind=given), "
+        "or a sensor that sees farther; loops do not show it"
+    )
+
 
 _MAX_STEADY_NS = NS_PER_S
 

@@ -10,7 +10,7 @@ from mapper.core.trajectory import Trajectory, trajectory_from
 from mapper.graph.model import PoseGraph
 from mapper.loops.closure import LoopClosure
 from mapper.loops.place_file import AnyPlace, write_places
-from mapper.odometry.base import SEE_MORE, FrameResult
+from mapper.odometry.base import FrameResult, see_more
 from mapper.run import files
 from mapper.run.doubtful_frames import placed_by_neighbours
 from mapper.run.frame_outcomes import records_of
@@ -107,7 +107,8 @@ def refuse_a_fragment(tracking: TrackingResult, config: BuildConfig, *, sensor: 
         found += f", {doubtful} more are doubtful"
     unseen = [track for track in tracking.placed if track.doubts and track.diagnostics.unobservable]
     if 2 * len(unseen) > read:
-        found, hint = f"{found} ({unseen[-1].doubts[-1].text})", SEE_MORE
+        found = f"{found} ({unseen[-1].doubts[-1].text})"
+        hint = see_more(has_wheels=tracking.graph.has_wheels)
     raise TrackingError(
         f"{found}, want at least {enough:.0f}; {hint} "
         f"(min_tracked_frames and min_tracked_ratio set the limit){unread}"

@@ -20,8 +20,14 @@ _MAX_SIGMA_M, _MAX_SIGMA_SHARE, _BROKEN_SIGMA_SHARE = 0.1, 0.1, 0.3
 _MAX_STEP_M, _MAX_STEP_RAD = 0.2, np.radians(5.0)
 
 _LOOK_AT_LOOPS = "mapper loops RUN lists them; mapper loops RUN --remove I J takes a wrong one back"
-COME_BACK = "come back to known places, so that loops hold the path"
-"""What to try where a path is uncertain."""
+
+
+def ways_to_hold(results: RunResults) -> str:
+    """Return what to try where a path is uncertain: loops where there are some, else what does without."""
+    if any(loop.verdict == "accepted" for loop in results.loops):
+        return "come back to known places, so that loops hold the path"
+    wheels = "" if results.graph.has_wheels else "wheel odometry (wheels.txt), or "
+    return f"{wheels}the poses of another odometry (odometry.kind=given)"
 
 
 def loop_warnings(results: RunResults) -> Iterator[RunWarning]:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mapper.core.geometry import Points, fit_rigid
+from mapper.core.geometry import fit_rigid
 from mapper.core.timebase import MAX_TRUTH_GAP_NS, nearest
 from mapper.core.trajectory import Trajectory
 from mapper.graph.model import PoseGraph
@@ -52,7 +52,7 @@ def aligned_truth(truth: Trajectory, trajectory: Trajectory) -> Trajectory | Non
     if pairs is None:
         return None
     estimated, known = pairs
-    T_level_truth, _ = fit_rigid(estimated.positions_world, known)
+    T_level_truth, _ = fit_rigid(estimated.positions_world, known.positions_world)
     first_ns, last_ns = trajectory.stamps_ns[[0, -1]]
     meanwhile = slice(
         *np.searchsorted(truth.stamps_ns, [first_ns - MAX_TRUTH_GAP_NS, last_ns + MAX_TRUTH_GAP_NS])
@@ -60,10 +60,10 @@ def aligned_truth(truth: Trajectory, trajectory: Trajectory) -> Trajectory | Non
     return Trajectory(truth.stamps_ns[meanwhile], truth.T_world_body[meanwhile]).moved(T_level_truth)
 
 
-def with_truth(truth: Trajectory, trajectory: Trajectory) -> tuple[Trajectory, Points] | None:
-    """Return the poses whose truth is known, and their (N, 3) true positions; None if fewer than 3 are."""
+def with_truth(truth: Trajectory, trajectory: Trajectory) -> tuple[Trajectory, Trajectory] | None:
+    """Return the poses whose truth is known, and the true ones at their stamps; None if fewer than 3 are."""
     index, gap_ns = nearest(truth.stamps_ns, trajectory.stamps_ns)
     near = gap_ns <= MAX_TRUTH_GAP_NS
     if near.sum() < 3:
         return None
-    return trajectory[near], truth.positions_world[index[near]]
+    return trajectory[near], Trajectory(trajectory.stamps_ns[near], truth.T_world_body[index[near]])

@@ -38,11 +38,17 @@ def test_sentences_say_where_and_what_to_try():
     )
 
 
+def test_what_was_assumed_when_the_log_was_opened_is_named_as_a_cause():
+    assumed = RunWarning(kind="log", sentence="30 frames a second assumed (source.rate_hz)")
+    assert any(assumed.sentence in sentence for sentence in verdict_of([assumed, DOUBT]).sentences)
+    assert verdict_of([assumed, NOTE]).sentences == ()
+
+
 def test_of_results():
     assert verdict_of(find_warnings(results_of(), MANIFEST)).state == "trusted"
     some = results_of(changed={k: doubted() for k in (31, 77, 132)})
     assert verdict_of(find_warnings(some, MANIFEST)).state == "trusted"
-    many = results_of(changed={k: doubted() for k in range(31, 39)})
+    many = results_of(changed={k: doubted() for k in range(31, 43)})
     assert verdict_of(find_warnings(many, MANIFEST)).state == "doubtful"
     gone = results_of(changed={k: lost() for k in range(100, 140)})
     assert verdict_of(find_warnings(gone, MANIFEST)).state == "broken in parts"
