@@ -136,7 +136,7 @@ def test_a_run_without_images_loops_and_truth_can_be_told(desk_log, tmp_path):
     assert not {"/world/path/truth", "/world/body/camera", "/log/loops"} & entities.keys()
 
 
-def test_the_recording_verifies_and_brings_its_blueprint(run):
+def test_the_recording_verifies_and_brings_its_blueprint(run, told):  # noqa: ARG001  which writes it
     path = run.path / "told.rrd"
     subprocess.run([str(RERUN), "rrd", "verify", str(path)], check=True, capture_output=True)
     assert len(rr.chunk.RrdReader(path).blueprints()) == 1
