@@ -42,7 +42,7 @@ class MotionPrior:
         self._errors_without: deque[float] = deque(maxlen=_ERRORS)
         self._measured = 0
         self._next_fit = _FIRST_FIT
-        self._used = 0
+        self._used = self._uncovered = 0
 
     def turn(self, begin_ns: int, end_ns: int) -> Array | None:
         """Return the rotation (3, 3) of the body between two times; None if constant velocity is better."""
@@ -113,6 +113,7 @@ class MotionPrior:
             return
         found = self._turn(begin_ns, end_ns)
         if found is None:
+            self._uncovered += 1
             return
         self._used += self._is_better(*found)
         self._errors.append(float(np.linalg.norm(rotation_log(found[0].T @ R_begin_end))))
@@ -154,10 +155,16 @@ class MotionPrior:
                     "the latter is used"
                 )
                 origin = "found from the log"
-        if not self._used:
+        if self._uncovered > self._measured:
+            notes.append(
+                f"{name}: no readings at the times of {self._uncovered} of "
+                f"{self._uncovered + self._measured} frames; has it another clock?"
+            )
+        if not self._used and self._measured:
             notes.append(
                 f"{name}: not used: constant velocity predicts the frames' rotations as well or better"
             )
+        if not self._used:
             return notes
         bias = np.degrees(np.linalg.norm(found.bias))
         notes.append(

@@ -132,6 +132,13 @@ def test_a_gyroscope_that_contradicts_the_frames_is_not_used():
     assert len(prior.notes()) >= 1
 
 
+def test_a_gyroscope_of_another_clock_is_named():
+    times_s, rates, R = swinging(14)
+    _, used, prior = predictions(readings(times_s, rates, offset_s=1000.0), *frames(times_s, R))
+    assert not used.any()
+    assert [note for note in prior.notes() if "clock" in note] == prior.notes()
+
+
 def test_without_a_gyroscope_the_velocity_stays():
     prior = MotionPrior(None)
     np.testing.assert_array_equal(prior.predict(0, NS_PER_S, STILL, np.ones(3)), np.eye(4))
