@@ -95,8 +95,8 @@ def unused_note(folder: Path, read: Collection[Path]) -> list[str]:
     more = f" and {len(unused) - _MOST_NAMED} more" if len(unused) > _MOST_NAMED else ""
     return [
         f"files that are not used: {', '.join(unused[:_MOST_NAMED])}{more}; truth is read from the file that "
-        "source.truth_file names (of scans) or groundtruth.txt, accelerations from accelerometer.txt, wheels "
-        "from wheels.txt or encoders.txt, the camera from calibration.toml"
+        "source.truth_file names (of scans) or groundtruth.txt, an IMU from imu.csv or accelerometer.txt, "
+        "wheels from wheels.txt or encoders.txt, the camera from calibration.toml"
     ]
 
 

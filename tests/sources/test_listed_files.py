@@ -141,13 +141,13 @@ def test_nothing_but_images_is_copied_into_a_converted_log(tiny_tum_log, tmp_pat
 def test_files_of_sensors_that_are_not_read_are_named(tiny_tum_log):
     log = tiny_tum_log(3)
     before = open_source(log).notes
-    for name in ("imu.csv", "gps_fix.json", "gt_vicon.log", "notes.txt", "gtk.txt"):
+    for name in ("imu_raw.csv", "gps_fix.json", "gt_vicon.log", "notes.txt", "gtk.txt"):
         (log / name).write_text("1 2 3\n")
     (log / "wheels.txt").write_text("1 0 0 0 0 0 0 1\n2 0 0 0 0 0 0 1\n")
     (named,) = [
         note for note in open_source(log).notes if note not in before and "wheel odometry" not in note
     ]
-    assert "imu.csv" in named
+    assert "imu_raw.csv" in named
     assert "gps_fix.json" in named
     assert "gt_vicon.log" not in named  # the truth is read from groundtruth.txt
     assert "notes.txt" not in named
