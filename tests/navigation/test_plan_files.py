@@ -35,6 +35,7 @@ def run(tmp_path, grid):
         log.grid(START_NS, grid)
         log.diagnostics(START_NS, {"inliers": 7})
     manifest = Manifest(status="complete", input=Input(path="log", kind="tum", fingerprint="none"))
+    manifest.save(tmp_path / "manifest.json")
     return Run(tmp_path, BuildConfig(), manifest)
 
 
