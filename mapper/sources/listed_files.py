@@ -2,7 +2,7 @@
 
 import os
 import re
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path, PurePath
 
 from mapper.core.errors import SourceError
@@ -92,12 +92,17 @@ def unused_note(folder: Path, read: Collection[Path]) -> list[str]:
     unused = [name for name in names if any(kind.search(name) for kind in kinds)]
     if not unused:
         return []
-    more = f" and {len(unused) - _MOST_NAMED} more" if len(unused) > _MOST_NAMED else ""
     return [
-        f"files that are not used: {', '.join(unused[:_MOST_NAMED])}{more}; truth is read from the file that "
+        f"files that are not used: {first_names(unused)}; truth is read from the file that "
         "source.truth_file names (of scans) or groundtruth.txt, an IMU from imu.csv or accelerometer.txt, "
         "wheels from wheels.txt or encoders.txt, the camera from calibration.toml"
     ]
+
+
+def first_names(names: Sequence[str]) -> str:
+    """Return the first of some names for a note, and how many more there are."""
+    more = f" and {len(names) - _MOST_NAMED} more" if len(names) > _MOST_NAMED else ""
+    return f"{', '.join(names[:_MOST_NAMED])}{more}"
 
 
 def _entries(folder: Path) -> list[os.DirEntry[str]]:

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from operator import itemgetter
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,7 +47,7 @@ class FrameTree:
                 stays = np.ptp([T for _, T in path], axis=0).max() < _SAME_POSE
                 self._parents[child] = (
                     parent,
-                    trajectory_from(path[:1] if stays else sorted(path, key=_stamp)),
+                    trajectory_from(path[:1] if stays else sorted(path, key=itemgetter(0))),
                 )
 
     @property
@@ -110,7 +111,3 @@ class FrameTree:
             T = T_parent_frame @ T
             found[frame] = T
         return found
-
-
-def _stamp(moment: tuple[int, Transform]) -> int:
-    return moment[0]

@@ -33,7 +33,7 @@ from mapper.sources.ros.messages import (
 from mapper.sources.ros.recording import Recording
 from mapper.sources.wheel_files import mounting
 
-_MAX_READINGS = 20_000  # levelling asks for fewer, and an hour of a fast unit would take minutes to read
+_MAX_READINGS = 20_000  # levelling asks for fewer
 _MAX_TRANSFORMS = 1_000
 _BASES = ("base_link", "base_footprint")
 """Frames of a robot's base (REP 105, REP 120)."""

@@ -10,6 +10,7 @@ import numpy as np
 
 from mapper.core.errors import SourceError
 from mapper.sources.config import TopicsConfig
+from mapper.sources.listed_files import first_names
 from mapper.sources.ros.image_messages import is_depth
 from mapper.sources.ros.index import Series
 from mapper.sources.ros.messages import (
@@ -35,7 +36,6 @@ _BOOKKEEPING = re.compile(
     r"|foxglove\.Log|sensor_msgs/msg/Joy"
 )
 """Beginnings of types of messages about programs, plans and pictures, which no sensor measured."""
-_MOST_LISTED = 8
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -311,12 +311,7 @@ def _unused_notes(
             name, kind = f"{name} ({type_})", "topics of types that are not read"
         if kind is not None:
             kinds.setdefault(kind, []).append(name)
-    return [f"{kind}: {_listed(names)}" for kind, names in kinds.items()]
-
-
-def _listed(names: Sequence[str]) -> str:
-    more = f" and {len(names) - _MOST_LISTED} more" if len(names) > _MOST_LISTED else ""
-    return f"{', '.join(names[:_MOST_LISTED])}{more}"
+    return [f"{kind}: {first_names(names)}" for kind, names in kinds.items()]
 
 
 def _feels_gravity(series: Series) -> bool:
@@ -332,7 +327,7 @@ def _turns(series: Series) -> bool:
 def _what_there_is(color: Series | None, depth: Series | None, series: Iterable[Series]) -> str:
     if color is not None:
         others = [one for one in series if one.topic.type in IMAGES]
-        names = _listed([color.topic.name, *(one.topic.name for one in others if one is not color)])
+        names = first_names([color.topic.name, *(one.topic.name for one in others if one is not color)])
         return f"colour images {names}, but neither depth images nor point clouds"
     if depth is not None:
         return f"depth images {depth.topic.name}, but neither colour images nor point clouds"
