@@ -92,6 +92,7 @@ EXPORTERS = {
     "nav2": Exporter(
         "folder for nav2: map, masks, parameters", "nav2:nav2", "", (), settings="costmap", of_merged=True
     ),
+    "rosbag2": Exporter("folder for ros2 bag play and RViz: paths, maps, images", "rosbag2:rosbag2", "", ()),
     "tum": Exporter("trajectory as TUM text", "", "trajectory.tum", (".tum", ".txt")),
     "kitti": Exporter("trajectory as KITTI text", "exporters:kitti", "trajectory.kitti", (".kitti", ".txt")),
     "foxglove-layout": Exporter(

@@ -1,6 +1,5 @@
 """ROS 2's nav2: the inflated slice as files that map_server loads, and a folder from which nav2 starts."""
 
-import json
 from pathlib import Path
 
 import cv2
@@ -8,13 +7,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.errors import DataError
+from mapper.export.export_folders import export_folder
 from mapper.export.figures import FREE_CELL, OCCUPIED_CELL, UNKNOWN_CELL
 from mapper.export.grid import write_grid, write_values
 from mapper.navigation.config import CostmapConfig
 from mapper.navigation.distance import plane_distances
 from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, overlap_of, with_obstacles
 from mapper.run.folder import MapFolder
-from mapper.runtime.atomic import MANIFEST_NAME, FolderKind, atomic_folder, write_bytes, write_text
+from mapper.runtime.atomic import write_bytes, write_text
 from mapper.runtime.progress import Progress
 
 NO_INFORMATION, LETHAL, INSCRIBED, FREE_SPACE = 255, 254, 253, 0
@@ -102,11 +102,7 @@ def _picture(values: NDArray[np.uint8]) -> bytes:
 
 MAP, KEEPOUT, SPEED = "map", "keepout_mask", "speed_mask"
 PARAMETERS, LAUNCH = "nav2_params.yaml", "map.launch.yaml"
-FOLDER = FolderKind(
-    "a nav2 export",
-    manifest_keys=frozenset({"nav2", "run"}),
-    files=frozenset({PARAMETERS, LAUNCH, *(f"{stem}.*" for stem in (MAP, KEEPOUT, SPEED))}),
-)
+_FILES = (PARAMETERS, LAUNCH, *(f"{stem}.*" for stem in (MAP, KEEPOUT, SPEED)))
 
 _SLOWEST_PERCENT = 30.0
 """Speed allowed where the robot all but touches an obstacle, of its full speed."""
@@ -122,8 +118,7 @@ def nav2(run: MapFolder, path: Path, _progress: Progress) -> None:
     grid, floor = run.slice, run.traversable
     keepout = with_obstacles(keepout_mask(grid, floor), run.keepout)
     slowed = slowed_percent(grid, keepout, run.config.costmap)
-    with atomic_folder(path, FOLDER, overwrite=True) as folder:
-        write_text(folder / MANIFEST_NAME, json.dumps({"nav2": 1, "run": str(run.path.resolve())}) + "\n")
+    with export_folder(run, path, "nav2", files=_FILES) as folder:
         write_grid(folder, MAP, grid)
         write_grid(folder, KEEPOUT, keepout)
         write_values(folder, SPEED, slowed, grid)

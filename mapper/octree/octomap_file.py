@@ -74,18 +74,18 @@ def write_ot(path: Path, octree: "OctreeMap") -> None:
 
 def write_bt(path: Path, octree: "OctreeMap") -> None:
     """Write the maximum-likelihood map (each voxel free or occupied) as an OcTree, pruned; atomic."""
-    words, node_count = _bt_words(octree)
+    words, node_count = bt_words(octree)
     write_tree(path, [words], binary=True, node_count=node_count, resolution_m=octree.resolution_m)
 
 
 def bt_bytes(octree: "OctreeMap") -> int:
     """Return the size of the file that :func:`write_bt` writes."""
-    words, node_count = _bt_words(octree)
+    words, node_count = bt_words(octree)
     return len(_header_bytes(_BINARY, node_count, octree.resolution_m, "OcTree")) + words.nbytes
 
 
-def _bt_words(octree: "OctreeMap") -> tuple[NDArray[np.uint16], int]:
-    """Return the words of a ``.bt`` file and the number of nodes that they describe."""
+def bt_words(octree: "OctreeMap") -> tuple[NDArray[np.uint16], int]:
+    """Return the (W,) words that follow the header of a ``.bt`` file, and how many nodes they describe."""
     if not len(octree.blocks):
         return np.empty(0, "<u2"), 0
     words, _ = words_in_preorder(octree.blocks, octree.occupied_log_odds)

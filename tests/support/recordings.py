@@ -9,9 +9,13 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 
 from mapper.core.frames import PinholeCamera
 from mapper.core.geometry import Transform
-from mapper.sources.ros.encode_ros import SerializedMessage, camera_info_message, image_message
+from mapper.sources.ros.encode_ros import (
+    SerializedMessage,
+    camera_info_message,
+    image_message,
+    transforms_message,
+)
 from mapper.sources.ros.message_writers import message_writer
-from mapper.sources.ros.typestore import make_header, make_message, make_pose, serialize
 from tests.support.tum_logs import FIRST_NS, PERIOD_NS, picture
 
 CAMERA = PinholeCamera(64, 48, 60.0, 61.0, 31.5, 23.5, (0.1, -0.2, 0.001, 0.002, 0.05))
@@ -48,25 +52,7 @@ def transforms(
     *told: tuple[str, str, Transform], topic: str = "/tf_static", stamp_ns: int = 0
 ) -> SerializedMessage:
     """A message of tf of (parent, child, T_parent_child)."""
-    stamped = []
-    for parent, child, T in told:
-        pose = make_pose(T)
-        x, y, z = (getattr(pose.position, axis) for axis in "xyz")
-        stamped.append(
-            make_message(
-                "geometry_msgs/msg/TransformStamped",
-                header=make_header(stamp_ns, parent),
-                child_frame_id=child,
-                transform=make_message(
-                    "geometry_msgs/msg/Transform",
-                    translation=make_message("geometry_msgs/msg/Vector3", x=x, y=y, z=z),
-                    rotation=pose.orientation,
-                ),
-            )
-        )
-    type_ = "tf2_msgs/msg/TFMessage"
-    cdr = serialize(make_message(type_, transforms=stamped))
-    return SerializedMessage(stamp_ns or FIRST_NS, topic, type_, cdr)
+    return transforms_message(stamp_ns, topic, told)._replace(stamp_ns=stamp_ns or FIRST_NS)
 
 
 def write(path: Path, messages: Iterable[SerializedMessage]) -> Path:

@@ -1,5 +1,6 @@
-"""Serialised ROS 2 messages of a log: images, calibrations, clouds, poses and accelerations."""
+"""Serialised ROS 2 messages of logs and maps: images, calibrations, clouds, poses, accelerations, octrees."""
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -7,6 +8,7 @@ from numpy.typing import NDArray
 
 from mapper.core.frames import PinholeCamera, Scan
 from mapper.core.geometry import Array, Transform
+from mapper.core.trajectory import Trajectory
 from mapper.sources.ros.typestore import make_header, make_message, make_pose, serialize
 
 _POINT_FIELD_TYPES = {"f4": 7, "u4": 6}  # PointField's constants
@@ -20,12 +22,14 @@ class SerializedMessage(NamedTuple):
         topic: Topic on which it is published.
         type: E.g. "sensor_msgs/msg/Image".
         cdr: The message as CDR, little-endian.
+        is_latched: Whether those who subscribe later get it too; all messages of a topic are alike in this.
     """
 
     stamp_ns: int
     topic: str
     type: str
     cdr: bytes
+    is_latched: bool = False
 
 
 def image_message(
@@ -126,6 +130,64 @@ def cloud_message(topic: str, scan: Scan, *, frame: str) -> SerializedMessage:
 def pose_message(stamp_ns: int, topic: str, T_frame_body: Transform, *, frame: str) -> SerializedMessage:
     """Return a geometry_msgs/msg/PoseStamped."""
     return _serialized("geometry_msgs/msg/PoseStamped", stamp_ns, topic, frame, pose=make_pose(T_frame_body))
+
+
+def path_message(stamp_ns: int, topic: str, trajectory: Trajectory, *, frame: str) -> SerializedMessage:
+    """Return a nav_msgs/msg/Path of a trajectory, each pose with its own stamp."""
+    poses = [
+        make_message("geometry_msgs/msg/PoseStamped", header=make_header(at_ns, frame), pose=make_pose(T))
+        for at_ns, T in trajectory.items()
+    ]
+    return _serialized("nav_msgs/msg/Path", stamp_ns, topic, frame, poses=poses)
+
+
+def transforms_message(
+    stamp_ns: int, topic: str, transforms: Sequence[tuple[str, str, Transform]]
+) -> SerializedMessage:
+    """Return a tf2_msgs/msg/TFMessage of (parent, child, T_parent_child)."""
+    stamped = []
+    for parent, child, T_parent_child in transforms:
+        pose = make_pose(T_parent_child)
+        transform = make_message(
+            "geometry_msgs/msg/Transform",
+            translation=_vector(*T_parent_child[:3, 3].tolist()),
+            rotation=pose.orientation,
+        )
+        header = make_header(stamp_ns, parent)
+        stamped.append(
+            make_message(
+                "geometry_msgs/msg/TransformStamped",
+                header=header,
+                child_frame_id=child,
+                transform=transform,
+            )
+        )
+    type_ = "tf2_msgs/msg/TFMessage"
+    return SerializedMessage(stamp_ns, topic, type_, serialize(make_message(type_, transforms=stamped)))
+
+
+def octomap_message(
+    stamp_ns: int, topic: str, words: NDArray[np.uint16], *, resolution_m: float, frame: str
+) -> SerializedMessage:
+    """Return an octomap_msgs/msg/Octomap of free and occupied voxels.
+
+    Args:
+        stamp_ns: Time of the message.
+        topic: Topic on which it is published.
+        words: What follows the header of a ``.bt`` file.
+        resolution_m: Edge of a voxel, metres.
+        frame: Frame of the octree.
+    """
+    return _serialized(
+        "octomap_msgs/msg/Octomap",
+        stamp_ns,
+        topic,
+        frame,
+        binary=True,
+        id="OcTree",
+        resolution=resolution_m,
+        data=words.view(np.int8),
+    )
 
 
 def odometry_message(

@@ -1,4 +1,4 @@
-"""Files of ROS messages written one message at a time: MCAP files (ROS 2) and ROS 1 bags."""
+"""Recordings written one message at a time: MCAP files (ROS 2), ROS 1 bags and ROS 2 bags."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -7,13 +7,18 @@ from typing import Any, Literal, Protocol
 
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapFileWriter
+from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 from rosbags.rosbag1 import Writer as BagFileWriter
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
+from rosbags.rosbag2 import Writer as Bag2Writer
 
 from mapper.runtime.atomic import atomic_file
 from mapper.sources.ros.encode_ros import SerializedMessage
 from mapper.sources.ros.typestore import definition, typestore
 
 RecordingKind = Literal["mcap", "bag"]
+
+_DEPTH = 100  # messages that wait for a slow subscriber: tf2's own
 
 
 class MessageWriter(Protocol):
@@ -40,6 +45,21 @@ def message_writer(path: Path, *, kind: RecordingKind) -> Iterator[MessageWriter
                 mcap.start(profile="ros2", library="mapper")
                 yield _McapWriter(mcap)
                 mcap.finish()
+
+
+@contextmanager
+def rosbag2_writer(folder: Path, *, name: str) -> Iterator[MessageWriter]:
+    """Yield a writer of a ROS 2 bag in a folder: NAME.mcap, and ``metadata.yaml`` when it is whole.
+
+    The metadata is of version 8, the last that ROS 2 Humble reads too.
+    """
+    bag = Bag2Writer(folder / name, version=8, storage_plugin=StoragePlugin.MCAP)  # names its file so, too
+    bag.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+    with bag:
+        yield _Bag2Writer(bag)
+    for file in list(bag.path.iterdir()):
+        file.replace(folder / file.name)
+    bag.path.rmdir()
 
 
 class _McapWriter:
@@ -81,3 +101,37 @@ class _BagWriter:
             )
         data = typestore("cdr").cdr_to_ros1(message.cdr, message.type)
         self._writer.write(self._connections[message.topic], message.stamp_ns, data)
+
+
+class _Bag2Writer:
+    """Writer of a ROS 2 bag; see :class:`MessageWriter`."""
+
+    def __init__(self, writer: Bag2Writer) -> None:
+        self._writer = writer
+        self._connections: dict[str, Any] = {}
+
+    def write(self, message: SerializedMessage) -> None:
+        if message.topic not in self._connections:
+            self._connections[message.topic] = self._writer.add_connection(
+                message.topic,
+                message.type,
+                typestore=typestore("cdr"),
+                offered_qos_profiles=[_quality(is_latched=message.is_latched)],
+            )
+        self._writer.write(self._connections[message.topic], message.stamp_ns, message.cdr)
+
+
+def _quality(*, is_latched: bool) -> Qos:
+    """Return the quality of service with which ``ros2 bag play`` publishes a topic."""
+    unlimited = QosTime(0, 0)
+    return Qos(
+        history=QosHistory.KEEP_LAST,
+        depth=1 if is_latched else _DEPTH,
+        reliability=QosReliability.RELIABLE,
+        durability=QosDurability.TRANSIENT_LOCAL if is_latched else QosDurability.VOLATILE,
+        deadline=unlimited,
+        lifespan=unlimited,
+        liveliness=QosLiveliness.AUTOMATIC,
+        liveliness_lease_duration=unlimited,
+        avoid_ros_namespace_conventions=False,
+    )

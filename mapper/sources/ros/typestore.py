@@ -9,15 +9,25 @@ from mapper.core.geometry import Transform
 from mapper.core.rotations import quaternion_from_rotation
 from mapper.core.timebase import NS_PER_S
 
+_OCTOMAP = """\
+std_msgs/Header header
+bool binary
+string id
+float64 resolution
+int8[] data
+"""
+
 
 @cache
 def typestore(encoding: str) -> Any:
-    """Return the standard messages: Noetic's for "ros1", else Humble's.
+    """Return the standard messages: Noetic's for "ros1", else Humble's and OctoMap's.
 
     Those that a map is made from have not changed in later releases.
     """
     if encoding != "ros1":
-        return get_typestore(Stores.ROS2_HUMBLE)
+        store = get_typestore(Stores.ROS2_HUMBLE)
+        store.register(get_types_from_msg(_OCTOMAP, "octomap_msgs/msg/Octomap"))
+        return store
     store = get_typestore(Stores.ROS1_NOETIC)
     for name in ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage"):  # rosbags leaves them out of Noetic's
         store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", name))
