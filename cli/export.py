@@ -32,9 +32,9 @@ def export(
     *,
     output: Output,
 ) -> Answer:
-    """Write a run's map, cloud, surface, slice, trajectory or graph for other programs, and print its path.
+    """Write a run's map, cloud, surface, images, trajectory or graph for other programs, and print its path.
 
-    For a merged map: octomap, grid, costmap, nav2.
+    For a merged map: octomap, grid, costmap, nav2, gis.
 
     Example: mapper export runs/xyz --as octomap --out xyz.ot, or: mapper export runs/xyz --as mesh
     """

@@ -69,6 +69,8 @@ EXPORTERS = {
     ),
     "native": Exporter("octree with all attributes", "", "map.octree", (".octree",)),
     "ply": Exporter("coloured cloud", "", "cloud.ply", (".ply",)),
+    "las": Exporter("coloured cloud for surveys and GIS", "clouds:las", "cloud.laz", (".laz", ".las")),
+    "pcd": Exporter("coloured cloud for PCL", "clouds:pcd", "cloud.pcd", (".pcd",)),
     "voxels": Exporter("occupied voxels' centres", "voxels:centres", "voxels.ply", (".ply",)),
     "voxel-mesh": Exporter("occupied voxels as cubes", "voxels:cubes", "voxel_mesh.ply", _MESH_ENDINGS),
     "mesh": Exporter("coloured surface", "mesh:surface", "mesh.ply", _MESH_ENDINGS, settings="mesh"),
@@ -91,6 +93,14 @@ EXPORTERS = {
     ),
     "nav2": Exporter(
         "folder for nav2: map, masks, parameters", "nav2:nav2", "", (), settings="costmap", of_merged=True
+    ),
+    "gis": Exporter("folder for GIS: 2D maps with world files", "gis:gis", "", (), of_merged=True),
+    "colmap": Exporter(
+        "folder for COLMAP, nerfstudio and splatting: images, poses, points",
+        "colmap:colmap",
+        "",
+        (),
+        settings="cloud",
     ),
     "rosbag2": Exporter("folder for ros2 bag play and RViz: paths, maps, images", "rosbag2:rosbag2", "", ()),
     "tum": Exporter("trajectory as TUM text", "", "trajectory.tum", (".tum", ".txt")),

@@ -87,10 +87,19 @@ def _write_picture(path: Path, grid: OccupancyGrid) -> None:
     enlargement = -(-_PICTURE_PX // max(grid.cells.shape))
     image = grid_image(grid)[::-1].repeat(enlargement, axis=0).repeat(enlargement, axis=1)
     image = np.vstack([image, _scale_and_legend(image.shape[1], grid.resolution_m / enlargement)])
-    encoded, png = cv2.imencode(".png", image[:, :, ::-1])
+    write_bytes(path, encode_png(path, image[:, :, ::-1]))
+
+
+def encode_png(path: Path, pixels: NDArray[np.uint8]) -> bytes:
+    """Return the PNG file of (H, W, 3 or 4) pixels in OpenCV's order.
+
+    Raises:
+        DataError: It has too many pixels for a PNG; the message names the path.
+    """
+    encoded, png = cv2.imencode(".png", pixels)
     if not encoded:
-        raise DataError(f"{path}: a grid of {grid.cells.shape} cells cannot be written as PNG")
-    write_bytes(path, png.tobytes())
+        raise DataError(f"{path}: a grid of {pixels.shape[:2]} cells cannot be written as PNG")
+    return png.tobytes()
 
 
 def _scale_and_legend(width_px: int, pixel_m: float) -> NDArray[np.uint8]:

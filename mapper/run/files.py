@@ -36,6 +36,8 @@ MANIFEST = MANIFEST_NAME
 MESH = "mesh.ply"
 VOXELS = "voxels.ply"
 VOXEL_MESH = "voxel_mesh.ply"
+CLOUD_LAZ = "cloud.laz"
+CLOUD_PCD = "cloud.pcd"
 COSTMAP = "costmap"
 FOXGLOVE_LAYOUT = "foxglove_layout.json"
 PLAN = "plan.json"
@@ -138,6 +140,7 @@ RUN_FILES = (
     RunFiles((KITTI,), "the trajectory as KITTI text, written by `mapper export --as kitti`", "poses"),
     RunFiles((MESH,), "a coloured surface, written by `mapper export --as mesh`", "poses"),
     RunFiles((VOXELS, VOXEL_MESH), "the octree's occupied voxels as points and as cubes", "exported maps"),
+    RunFiles((CLOUD_LAZ, CLOUD_PCD), "the coloured cloud for surveys, and for PCL", "exported maps"),
     RunFiles(_grid(COSTMAP), "the slice inflated for nav2", "exported maps"),
     RunFiles((FOXGLOVE_LAYOUT,), "a layout of `run.mcap` for Foxglove", "exported maps"),
     RunFiles((PLAN, PLAN_VIEW), "the last path that `mapper plan` found", "exported maps"),
@@ -196,6 +199,8 @@ _REMEDIES = {
     MESH: "make it again with mapper export RUN --as mesh",
     VOXELS: "make it again with mapper export RUN --as voxels",
     VOXEL_MESH: "make it again with mapper export RUN --as voxel-mesh",
+    CLOUD_LAZ: "make it again with mapper export RUN --as las",
+    CLOUD_PCD: "make it again with mapper export RUN --as pcd",
     FOXGLOVE_LAYOUT: "make it again with mapper export RUN --as foxglove-layout",
     RERUN: "make it again with mapper view RUN",
     **dict.fromkeys(_grid(COSTMAP), "make it again with mapper export RUN --as costmap"),

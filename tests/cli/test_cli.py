@@ -132,7 +132,7 @@ def test_spelled_out_overrides_win(desk_log, tmp_path):
         (["export", "nowhere", "--as", "ply"], "mapper: nowhere: no such run folder"),
         (
             ["export", "RUN", "--as", "jpeg"],
-            "mapper: no exporter 'jpeg'; want one of octomap, native, ply, voxels",
+            "mapper: no exporter 'jpeg'; want one of octomap, native, ply, las",
         ),
         (["export", "RUN", "--as", "ply", "--out", "a.obj"], "mapper: a.obj: ply files end with .ply"),
         (

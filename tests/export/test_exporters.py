@@ -4,10 +4,12 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import laspy
 import numpy as np
 import pyoctomap
 import pytest
 from plyfile import PlyData
+from pypcd4 import PointCloud
 
 from mapper.config.loading import load_config, overridden
 from mapper.core.errors import ConfigError, DependencyError, MapSizeError, RunError, WriteError
@@ -75,6 +77,18 @@ def check_ply(run, path):
     points, faces = positions_and_faces(path)
     assert len(points) == run.manifest.counts.cloud_points
     assert faces is None
+
+
+def check_las(run, path):
+    cloud = laspy.read(path)
+    np.testing.assert_allclose(cloud.xyz, run.cloud.points, atol=0.51e-4)
+    assert not list(cloud.point_format.extra_dimension_names)
+
+
+def check_pcd(run, path):
+    cloud = PointCloud.from_path(path)
+    assert cloud.fields == ("x", "y", "z", "rgb")
+    np.testing.assert_array_equal(cloud.numpy(("x", "y", "z")), run.cloud.points)
 
 
 def check_voxels(run, path):
@@ -147,6 +161,8 @@ def check_layout(run, path):
 CHECKS = {
     "octomap": check_octomap,
     "ply": check_ply,
+    "las": check_las,
+    "pcd": check_pcd,
     "voxels": check_voxels,
     "voxel-mesh": check_voxel_mesh,
     "mesh": check_mesh,
@@ -250,7 +266,7 @@ def test_a_folder_is_not_a_file(untouched, kind, tmp_path):
 
 
 def test_an_unknown_kind_names_the_known():
-    with pytest.raises(ConfigError, match="no exporter 'jpeg'; want one of octomap, native, ply, voxels"):
+    with pytest.raises(ConfigError, match="no exporter 'jpeg'; want one of octomap, native, ply, las"):
         export(None, "jpeg")
 
 

@@ -125,6 +125,9 @@ def test_a_merged_map_is_driven_on(tmp_path):
     np.testing.assert_allclose(waypoints[[0, -1]], [[8.0, 6.0, 0.0], [2.0, 5.0, 3.1]], atol=0.11)
 
     mapper("export", found.path, "--as", "nav2", "--out", tmp_path / "nav2")
+    mapper("export", found.path, "--as", "gis", "--out", tmp_path / "gis")
+    layers = {path.name for path in (tmp_path / "gis").glob("*.p[gn][wg]")}
+    assert layers >= {"slice.png", "slice.pgw", "traversable.png", "traversable.pgw"}
     loaded = read_grid(tmp_path / "nav2" / "map.yaml")
     np.testing.assert_array_equal(loaded.cells, found.slice.cells)
     mapper("export", found.path, "--as", "costmap", "--set", "costmap.robot_radius_m=0.3")

@@ -1,22 +1,28 @@
 """LAS and LAZ: the ASPRS's exchange format of surveys."""
 
 from functools import partial
+from io import BytesIO
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 
 from mapper.core.errors import FrameError
+from mapper.runtime.atomic import write_bytes
 from mapper.runtime.worker_process import call_isolated
 from mapper.sources.cloud_files.parsing import MOST_BYTES, Columns, refusing_damage
 
-_EXTRAS = ("gps_time", "red", "green", "blue")
+_COLOURS = ("red", "green", "blue")
+_EXTRAS = ("gps_time", *_COLOURS)
+_DATE_AT, _DATE_BYTES = 90, 4  # day and year
 _RECORDS_AT = 100  # a uint32: how many records of variable length follow the header (LAS 1.0 to 1.4)
 _RECORD_BYTES = 54  # of each one's own header
 _COORDINATE_BYTES = 3 * 8  # of a point's x, y and z once they are scaled
 _MOST_POINTS_PER_BYTE = 200  # of LAZ: a million times the same point is packed into 7 kB
 _LAZ_COPIES = 3  # the packed points' layers, all points as records, and their coordinates
 _LAZ_BUFFERS_BYTES = 256 << 20
+_SCALE_M = 1e-4  # of coordinates; wider where 32 bits do not hold them
+_FULL_RANGE = 257  # 255 becomes 65535: LAS has colours of 16 bits
 
 
 def read_las(path: Path) -> Columns:
@@ -67,3 +73,35 @@ def _columns(reader: Any) -> Columns:
     columns = {"x": cloud.x, "y": cloud.y, "z": cloud.z}
     columns |= {name: cloud[name] for name in _EXTRAS if name in cloud.point_format.dimension_names}
     return {name: np.asarray(values) for name, values in columns.items()}
+
+
+def write_las(path: Path, columns: Columns) -> None:
+    """Write points with colours as LAS 1.2, atomically; compressed if the name ends in ".laz".
+
+    Args:
+        path: File to write.
+        columns: x, y, z in metres, which are rounded to 0.1 mm; red, green, blue, uint8; others become extra
+            dimensions.
+    """
+    import laspy
+
+    points = np.column_stack([columns[axis] for axis in "xyz"]).astype(np.float64)
+    low, high = points.min(axis=0, initial=0.0), points.max(axis=0, initial=0.0)
+    header = laspy.LasHeader(point_format=2, version="1.2")
+    header.generating_software = "mapper"
+    header.offsets = np.floor(low)
+    header.scales = np.maximum(_SCALE_M, (high - low + 1.0) / 2**31)
+    extra = [name for name in columns if name not in ("x", "y", "z", *_COLOURS)]
+    header.add_extra_dims([laspy.ExtraBytesParams(name, columns[name].dtype) for name in extra])
+    cloud = laspy.LasData(header)
+    cloud.xyz = points
+    for name in extra:
+        cloud[name] = columns[name]
+    for name in _COLOURS:
+        cloud[name] = columns[name].astype(np.uint16) * _FULL_RANGE
+    data = BytesIO()
+    is_packed = path.suffix.lower() == ".laz"
+    cloud.write(data, do_compress=is_packed, laz_backend=laspy.LazBackend.Lazrs)
+    data.seek(_DATE_AT)
+    data.write(bytes(_DATE_BYTES))  # laspy writes today's; without one the same points are the same bytes
+    write_bytes(path, data.getvalue())

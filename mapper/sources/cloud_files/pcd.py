@@ -2,6 +2,7 @@
 
 import os
 import struct
+from io import BytesIO
 from itertools import islice
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -10,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.errors import FrameError
+from mapper.runtime.atomic import write_bytes
 from mapper.sources.cloud_files.parsing import MOST_BYTES, Columns, parse_rows, refusing_damage
 
 _MOST_LINES = 100
@@ -76,3 +78,23 @@ def _header_lines(stream: BinaryIO) -> list[str]:
         if lines[-1].startswith("DATA"):
             break
     return lines
+
+
+def write_pcd(path: Path, columns: Columns) -> None:
+    """Write points with colours as binary PCD, atomically.
+
+    Args:
+        path: File to write.
+        columns: x, y, z in metres; red, green, blue, uint8, which become PCL's "rgb"; others stay fields.
+    """
+    from pypcd4 import PointCloud
+
+    red, green, blue = (columns[name].astype(np.uint32) for name in ("red", "green", "blue"))
+    fields = {axis: columns[axis] for axis in "xyz"}
+    fields["rgb"] = (red << 16 | green << 8 | blue).view(np.float32)  # a float's bits, as PCL has it
+    fields |= {name: columns[name] for name in columns if name not in ("x", "y", "z", "red", "green", "blue")}
+    data = BytesIO()
+    PointCloud.from_points(
+        list(fields.values()), list(fields), [each.dtype for each in fields.values()]
+    ).save(data)
+    write_bytes(path, data.getvalue())
