@@ -7,8 +7,10 @@ import numpy as np
 
 from mapper.core.errors import SourceError
 from mapper.core.frames import NO_DISTORTION, PinholeCamera
+from mapper.core.geometry import Transform, angle_between
+from mapper.core.rotations import pose_of_row
 from mapper.sources.config import CameraConfig
-from mapper.sources.undistorted import Lens
+from mapper.sources.lens import Lens
 
 _CHECKED = 17
 """Columns and rows of the pixels whose distortion is taken out to check a calibration."""
@@ -38,6 +40,7 @@ class Calibration:
         lens: Distortion of another kind, to be taken out of the images when they are read.
         size_px: (width, height) the numbers hold for, if stated.
         depth_units_per_m: Depth image units per metre, if stated.
+        depth: Depth camera beside this one, if depth images are its own.
     """
 
     origin: str
@@ -49,6 +52,7 @@ class Calibration:
     lens: Lens | None = None
     size_px: tuple[int, int] | None = None
     depth_units_per_m: float | None = None
+    depth: "DepthCamera | None" = None
 
     def with_y_down(self) -> "Calibration":
         """Return the same camera with its y axis mirrored, so that fy is positive."""
@@ -100,11 +104,52 @@ class Calibration:
         )
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class DepthCamera:
+    """Depth camera beside a colour camera.
+
+    Attributes:
+        calibration: Its intrinsics.
+        T_color_depth: (4, 4) its pose in the colour camera's frame.
+        origin: Source of the pose, for messages.
+    """
+
+    calibration: Calibration
+    T_color_depth: Transform
+    origin: str
+
+    @property
+    def note(self) -> str:
+        """Sentence on the pose."""
+        apart_mm = 1e3 * float(np.linalg.norm(self.T_color_depth[:3, 3]))
+        turned_deg = np.degrees(angle_between(np.eye(3), self.T_color_depth[:3, :3]))
+        return (
+            f"depth is registered to colour as it is read: its camera, of focal length "
+            f"{self.calibration.fx_px:.1f} px, is {apart_mm:.1f} mm from colour's and turned by "
+            f"{turned_deg:.2f}° ({self.origin})"
+        )
+
+
 def configured(camera: CameraConfig | None) -> Calibration | None:
     """Return the intrinsics that a configuration sets; None if it sets none."""
     if camera is None or camera.intrinsics_px is None:
         return None
     return Calibration("source.camera", *camera.intrinsics_px, distortion=camera.distortion)
+
+
+def configured_depth_intrinsics(camera: CameraConfig | None) -> Calibration | None:
+    """Return the depth camera's intrinsics that a configuration sets; None if it sets none."""
+    if camera is None or camera.depth_intrinsics_px is None:
+        return None
+    numbers = camera.depth_intrinsics_px
+    return Calibration("source.camera.depth_intrinsics_px", *numbers, distortion=camera.depth_distortion)
+
+
+def configured_depth_pose(camera: CameraConfig | None) -> Transform | None:
+    """Return T_color_depth that a configuration sets; None if it sets none."""
+    if camera is None or camera.depth_in_color is None:
+        return None
+    return pose_of_row(np.array(camera.depth_in_color))
 
 
 _VGA = (640, 480)

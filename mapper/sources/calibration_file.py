@@ -14,7 +14,8 @@ from mapper.core.config import toml_text
 from mapper.core.errors import DataError, SourceError
 from mapper.core.frames import NO_DISTORTION, PinholeCamera
 from mapper.runtime.regular_files import parse_toml, read_text
-from mapper.sources.calibration import Calibration
+from mapper.sources.calibration import Calibration, DepthCamera
+from mapper.sources.text import pose_from_numbers
 
 _FILE_NAMES = (
     "calibration.toml",
@@ -58,8 +59,9 @@ def calibration_file(folder: Path) -> Path | None:
 def read_calibration(path: Path) -> Calibration:
     """Read intrinsics from TOML, JSON, YAML, or text of a matrix or of fx fy cx cy.
 
-    TOML keys: fx_px fy_px cx_px cy_px, and optionally width_px height_px, distortion (k1 k2 p1 p2 k3) and
-    depth_factor (image units per metre).
+    TOML keys: fx_px fy_px cx_px cy_px, and optionally width_px height_px, distortion (k1 k2 p1 p2 k3),
+    depth_factor (image units per metre) and, where depth is not registered to colour, depth_intrinsics_px
+    (fx fy cx cy), depth_distortion and depth_in_color (x y z qx qy qz qw).
 
     Raises:
         SourceError: The file cannot be read, lacks a number, or (TOML) has a key of another meaning.
@@ -120,6 +122,9 @@ _NAMES = {
     "p1": ("p1",),
     "p2": ("p2",),
     "k3": ("k3",),
+    "depth_intrinsics": ("depth_intrinsics_px",),
+    "depth_distortion": ("depth_distortion",),
+    "depth_in_color": ("depth_in_color",),
 }
 _UNITS_PER_M = (1e-3, 1e7)  # of a depth image: kilometres to tenths of a micrometre
 _KEYS = {name for names in _NAMES.values() for name in names}
@@ -155,7 +160,23 @@ def _interpret(numbers: _Numbers, origin: str) -> Calibration:
         distortion=(k1, k2, p1, p2, k3),
         size_px=size,
         depth_units_per_m=one.get("depth_factor"),
+        depth=_depth_camera(found, origin),
     )
+
+
+def _depth_camera(found: _Numbers, origin: str) -> DepthCamera | None:
+    if not any(name.startswith("depth_") and name != "depth_factor" for name in found):
+        return None
+    intrinsics, pose = found.get("depth_intrinsics", ()), found.get("depth_in_color", ())
+    k1, k2, p1, p2, k3 = (*found.get("depth_distortion", ()), *NO_DISTORTION)[:5]
+    T_color_depth = pose_from_numbers(np.array(pose)) if len(pose) == 7 else None
+    if len(intrinsics) != 4 or T_color_depth is None:
+        raise DataError(
+            "want depth_intrinsics_px = [fx, fy, cx, cy] and depth_in_color = [x, y, z, qx, qy, qz, qw]"
+        )
+    fx, fy, cx, cy = intrinsics
+    calibration = Calibration(f"{origin}: depth", fx, fy, cx, cy, distortion=(k1, k2, p1, p2, k3))
+    return DepthCamera(calibration, T_color_depth, origin)
 
 
 def _is_by_axis(first: float, second: float, third: float, _: float) -> bool:

@@ -23,6 +23,14 @@ class CameraConfig(Config):
     """k1, k2, p1, p2, k3 (OpenCV's order)."""
     depth_factor: PositiveFloat | None = None
     """Depth image units per metre; None keeps the log's own (TUM's 5000, 1 of 32-bit depth in recordings)."""
+    depth_intrinsics_px: tuple[PositiveFloat, PositiveFloat, float, float] | None = None
+    """fx, fy, cx, cy of the depth camera, where depth images are not registered to colour: they are as they
+    are read. None keeps the log's own."""
+    depth_distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    """k1, k2, p1, p2, k3 of the depth camera; goes with ``depth_intrinsics_px``."""
+    depth_in_color: tuple[float, float, float, float, float, float, float] | None = None
+    """x y z (metres) qx qy qz qw of the depth camera in the colour camera's optical frame; None is the pose
+    that the log states. 0 0 0 0 0 0 1 says that depth is registered, if its intrinsics are colour's."""
 
     @property
     def intrinsics_px(self) -> tuple[float, float, float, float] | None:
@@ -37,6 +45,10 @@ class CameraConfig(Config):
         given = any(number is not None for number in numbers) or any(self.distortion)
         if given and self.intrinsics_px is None:
             raise ValueError("want fx_px, fy_px, cx_px and cy_px, all four; depth_factor may stand alone")
+        if any(self.depth_distortion) and self.depth_intrinsics_px is None:
+            raise ValueError("depth_distortion is given without depth_intrinsics_px")
+        if self.depth_in_color is not None and not any(self.depth_in_color[3:]):
+            raise ValueError(f"depth_in_color {self.depth_in_color}: its quaternion is zero")
         return self
 
 

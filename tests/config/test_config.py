@@ -117,6 +117,8 @@ def test_a_run_s_own_json_gives_the_same_configuration(tmp_path):
             "source.camera.fx_px=500",
             "source.camera: .*want fx_px, fy_px, cx_px and cy_px, all four; depth_factor",
         ),
+        ("source.camera.depth_in_color=0,0,0,0,0,0,0", "source.camera: .*quaternion is zero"),
+        ("source.camera.depth_distortion=0.1,0,0,0,0", "source.camera: .*without depth_intrinsics_px"),
         ("slice.min_height_m=1.2", "slice: .*max_height_m 1.2 must be above min_height_m 1.2"),
     ],
 )

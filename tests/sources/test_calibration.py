@@ -1,7 +1,9 @@
+import numpy as np
 import pytest
 
 from mapper.core.errors import SourceError
 from mapper.core.frames import PinholeCamera
+from mapper.core.geometry import transform
 from mapper.sources.calibration import FREIBURG, Calibration, freiburg_camera
 from mapper.sources.calibration_file import calibration_text, read_calibration
 
@@ -184,3 +186,34 @@ def test_freiburg_cameras_are_known_by_name(name, camera):
 @pytest.mark.parametrize("name", ["desk", "fr4_desk", "freiburg12", "afr1_x", "frame1"])
 def test_other_names_are_not_mistaken_for_freiburg(name):
     assert freiburg_camera(name) is None
+
+
+def test_a_depth_camera_beside_colour_s_is_read(tmp_path):
+    path = tmp_path / "calibration.toml"
+    own = "fx_px = 517.3\nfy_px = 516.5\ncx_px = 318.6\ncy_px = 255.3\n"
+    lens, pose = (
+        "depth_intrinsics_px = [425.0, 426.0, 423.7, 238.9]\n",
+        "depth_in_color = [0.015, 0, 0, 0, 0, 0, 2]\n",
+    )
+    path.write_text(own + lens + pose + "depth_distortion = [0.1, 0, 0, 0, 0.2]\n")
+    depth = read_calibration(path).depth
+    numbers = (
+        depth.calibration.fx_px,
+        depth.calibration.fy_px,
+        depth.calibration.cx_px,
+        depth.calibration.cy_px,
+    )
+    assert numbers == (425.0, 426.0, 423.7, 238.9)
+    assert depth.calibration.distortion == (0.1, 0.0, 0.0, 0.0, 0.2)
+    np.testing.assert_allclose(depth.T_color_depth, transform(np.eye(3), [0.015, 0.0, 0.0]))
+    path.write_text(own)
+    assert read_calibration(path).depth is None
+    for wrong in (
+        lens,
+        pose,
+        lens + "depth_in_color = [0, 0, 0, 0, 0, 0, 0]\n",
+        "depth_distortion = [0, 0, 0, 0, 0]\n",
+    ):
+        path.write_text(own + wrong)
+        with pytest.raises(SourceError, match="want depth_intrinsics_px"):
+            read_calibration(path)

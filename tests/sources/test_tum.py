@@ -1,11 +1,15 @@
+import cv2
 import numpy as np
 import pytest
 
 from mapper.core.errors import FrameError, SourceError
+from mapper.core.frames import PinholeCamera
+from mapper.core.rotations import row_of_pose
 from mapper.core.timebase import nearest
 from mapper.sources import open_source
 from mapper.sources.calibration import FREIBURG
 from mapper.sources.config import CameraConfig, SourceConfig
+from tests.support.depth_cameras import BESIDE, seen_from
 from tests.support.paths import FR1_XYZ
 from tests.support.tum_logs import DEPTH_LEAD_NS, FIRST_NS, PERIOD_NS, picture, write_picture
 
@@ -225,3 +229,32 @@ def test_the_real_freiburg1_xyz():
     assert frame.camera == FREIBURG["1"].camera(width_px=640, height_px=480)
     assert frame.image.shape == (480, 640, 3)
     assert 0.5 < np.median(frame.depth_m[frame.depth_m > 0]) < 2.0
+
+
+def test_depth_of_a_camera_of_its_own_is_registered_by_the_calibration_or_by_settings(tiny_tum_log):
+    registered = [frame.depth_m for frame in open_source(tiny_tum_log(3, folder="registered"))]
+    log = tiny_tum_log(3)
+    source, wide = open_source(log), PinholeCamera(106, 60, 53.0, 53.0, 52.4, 30.1)
+    for entry in source.entries():
+        depth_m = seen_from(entry.load().depth_m, entry.load().camera, wide, BESIDE)
+        assert cv2.imwrite(str(entry.files.depth), np.rint(depth_m * 5000.0).astype(np.uint16))
+    with pytest.raises(SourceError, match=r"another aspect ratio.*source\.camera\.depth_intrinsics_px"):
+        open_source(log)
+    own, pose = (53.0, 53.0, 52.4, 30.1), tuple(row_of_pose(BESIDE).tolist())
+    by_settings = CameraConfig(depth_intrinsics_px=own, depth_in_color=pose)
+    found = [open_source(log, SourceConfig(camera=by_settings))]
+    for partial in ({"depth_intrinsics_px": own}, {"depth_in_color": pose}):
+        with pytest.raises(SourceError, match="want depth_intrinsics_px and depth_in_color"):
+            open_source(log, SourceConfig(camera=CameraConfig(**partial)))
+    lines = f"depth_intrinsics_px = {list(own)}\ndepth_in_color = {list(pose)}\n"
+    edit(log / "calibration.toml", lambda text: text + lines)
+    found.append(open_source(log))
+    for one in found:
+        assert sum("15.0 mm" in note for note in one.notes) == 1
+        for depth_m, frame in zip(registered, one, strict=True):
+            both = (frame.depth_m > 0.0) & (depth_m > 0.0)
+            assert both.sum() > 0.9 * (depth_m > 0.0).sum()
+            assert np.abs(frame.depth_m - depth_m)[both].max() < 0.005
+    other = CameraConfig(depth_in_color=(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0))
+    (note,) = (one for one in open_source(log, SourceConfig(camera=other)).notes if "registered" in one)
+    assert "(source.camera)" in note

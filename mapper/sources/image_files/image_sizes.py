@@ -1,13 +1,15 @@
-"""Sizes of a log's colour and depth images, and the one size that both are brought to."""
+"""Colour and depth images of a log as those of one camera: of one size, registered, without other lenses."""
 
 from dataclasses import dataclass
 
 import cv2
+import numpy as np
+from numpy.typing import NDArray
 
 from mapper.core.errors import FrameError, SourceError
-from mapper.core.frames import DepthImage, Image, PinholeCamera
-from mapper.sources.calibration import Calibration
-from mapper.sources.undistorted import Lens
+from mapper.core.frames import DepthImage, Image, PinholeCamera, ray_table
+from mapper.sensing.depth_registration import DepthRegistration
+from mapper.sources.calibration import Calibration, DepthCamera
 
 Size = tuple[int, int]
 """Width and height, px."""
@@ -23,24 +25,32 @@ this, not with that of the depth image: logs of 320×240 depth have an ATE of 18
 576×432 and more."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class RecordedCamera:
-    """Camera of a log's frames, and the sizes that its images are recorded in.
+    """Camera of a log's frames, and what makes its images of those that are recorded.
 
     Attributes:
-        camera: Camera of the frames: of both images once they are brought to its size.
+        camera: Camera of the frames: of both images once they are read.
         colour_px: Size of the colour images as recorded.
         depth_px: Size of the depth images as recorded.
-        lens: Distortion that is still in the images.
+        undistortion: (H, W) columns and rows in the resized images of the pixels of the camera, where the
+            lens is none of its model.
+        registration: Projection of depth images of a camera of their own.
     """
 
     camera: PinholeCamera
     colour_px: Size
     depth_px: Size
-    lens: Lens | None = None
+    undistortion: tuple[NDArray[np.float32], NDArray[np.float32]] | None = None
+    registration: DepthRegistration | None = None
+
+    @property
+    def shows_recorded_views(self) -> bool:
+        """Whether frames are the recorded images, at most in another size."""
+        return self.undistortion is None and self.registration is None
 
     def image(self, recorded: Image, where: str) -> Image:
-        """Return a colour or grey image in the camera's size.
+        """Return a colour or grey image as the camera sees it.
 
         Args:
             recorded: (H, W, 3) or (H, W) image as recorded.
@@ -51,15 +61,17 @@ class RecordedCamera:
         """
         _check_size(recorded, self.colour_px, where)
         size_px = (self.camera.width_px, self.camera.height_px)
-        if size_px == self.colour_px:
-            return recorded
-        is_reduced = size_px[0] * size_px[1] < self.colour_px[0] * self.colour_px[1]
-        means = cv2.INTER_AREA if is_reduced else cv2.INTER_LINEAR
-        resized: Image = cv2.resize(recorded, size_px, interpolation=means)
-        return resized
+        image = recorded
+        if size_px != self.colour_px:
+            is_reduced = size_px[0] * size_px[1] < self.colour_px[0] * self.colour_px[1]
+            means = cv2.INTER_AREA if is_reduced else cv2.INTER_LINEAR
+            image = cv2.resize(recorded, size_px, interpolation=means)
+        if self.undistortion is not None:
+            image = cv2.remap(image, *self.undistortion, cv2.INTER_LINEAR)
+        return image
 
     def depth_m(self, recorded: DepthImage, where: str) -> DepthImage:
-        """Return a depth image in the camera's size: of the nearest pixels, for means lie beside edges.
+        """Return a depth image as the camera sees it: of the nearest pixels, for means lie beside edges.
 
         Args:
             recorded: (H, W) depth as recorded.
@@ -69,15 +81,19 @@ class RecordedCamera:
             FrameError: As ``image``.
         """
         _check_size(recorded, self.depth_px, where)
+        if self.registration is not None:
+            return self.registration.register(recorded)
         size_px = (self.camera.width_px, self.camera.height_px)
-        if size_px == self.depth_px:
-            return recorded
-        resized: DepthImage = cv2.resize(recorded, size_px, interpolation=cv2.INTER_NEAREST_EXACT)
-        return resized
+        depth_m = recorded
+        if size_px != self.depth_px:
+            depth_m = cv2.resize(recorded, size_px, interpolation=cv2.INTER_NEAREST_EXACT)
+        if self.undistortion is not None:
+            depth_m = cv2.remap(depth_m, *self.undistortion, cv2.INTER_NEAREST)
+        return depth_m
 
     def notes(self) -> list[str]:
         """Return a sentence on what is resized, if anything is."""
-        if self.colour_px == self.depth_px:
+        if self.colour_px == self.depth_px or self.registration is not None:
             return []
         size_px = (self.camera.width_px, self.camera.height_px)
         recorded_px = {"colour": self.colour_px, "depth": self.depth_px}
@@ -92,11 +108,11 @@ class RecordedCamera:
 def recorded_camera(
     calibration: Calibration, *, colour_px: Size, depth_px: Size, where: str
 ) -> RecordedCamera:
-    """Return the camera of frames whose colour and depth images may differ in size, not in view.
+    """Return the camera of frames whose colour and depth images may differ in size.
 
     Args:
         calibration: Intrinsics of the colour image, or, if they are said to hold for its size, of the depth
-            image.
+            image. Without a depth camera of its own both images show one view.
         colour_px: Size of the colour images.
         depth_px: Size of the depth images.
         where: Name of the log in an error.
@@ -105,22 +121,49 @@ def recorded_camera(
         SourceError: The images show different views by their aspect ratios, or the calibration holds for
             neither.
     """
+    if calibration.depth is not None:
+        camera = calibration.camera(width_px=colour_px[0], height_px=colour_px[1])
+        camera = camera.resized(*_reduced_size(colour_px))
+        registration = _registration(calibration.depth, depth_px, camera)
+        return RecordedCamera(camera, colour_px, depth_px, _undistortion(calibration, camera), registration)
     if not is_same_view(colour_px, depth_px):
         raise SourceError(
             f"{where}: colour has {_text(colour_px)} px and depth {_text(depth_px)}, which is another aspect "
-            "ratio and so another view; export depth that is registered to colour, or crop both to one view"
+            "ratio and so another view; export depth that is registered to colour, crop both to one view, or "
+            "give the depth camera: source.camera.depth_intrinsics_px and depth_in_color"
         )
     is_of_depth = calibration.size_px == depth_px
     width_px, height_px = depth_px if is_of_depth else colour_px
     camera = calibration.camera(width_px=width_px, height_px=height_px)
     resized = camera.resized(*_common_size(colour_px, depth_px))
-    return RecordedCamera(resized, colour_px, depth_px, calibration.lens)
+    return RecordedCamera(resized, colour_px, depth_px, _undistortion(calibration, resized))
 
 
 def is_same_view(colour_px: Size, depth_px: Size) -> bool:
     """Return whether images of these sizes may show the same view: whether their aspect ratios agree."""
     ratio = (colour_px[0] * depth_px[1]) / (colour_px[1] * depth_px[0])
     return abs(ratio - 1.0) <= _SAME_VIEW
+
+
+def _registration(depth: DepthCamera, depth_px: Size, camera: PinholeCamera) -> DepthRegistration:
+    width_px, height_px = depth_px
+    own, lens = depth.calibration.camera(width_px=width_px, height_px=height_px), depth.calibration.lens
+    rays = ray_table(own) if lens is None else lens.rays(own)
+    return DepthRegistration(rays, camera, depth.T_color_depth)
+
+
+def _undistortion(
+    calibration: Calibration, camera: PinholeCamera
+) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
+    return None if calibration.lens is None else calibration.lens.maps(camera)
+
+
+def _reduced_size(colour_px: Size) -> Size:
+    """Return the least size that is large enough, of which colour's is a multiple; else colour's."""
+    width_px, height_px = colour_px
+    factors = range(max(colour_px) // _ENOUGH_PX, 1, -1)
+    factor = next((n for n in factors if width_px % n == 0 and height_px % n == 0), 1)
+    return width_px // factor, height_px // factor
 
 
 def _common_size(colour_px: Size, depth_px: Size) -> Size:

@@ -12,7 +12,13 @@ from mapper.core.frames import DepthImage, Image, RgbdFrame, Scan
 from mapper.core.timebase import NS_PER_S
 from mapper.core.trajectory import Trajectory
 from mapper.sources.base import Accelerations, ImageFiles, Log
-from mapper.sources.calibration import Calibration, configured
+from mapper.sources.calibration import (
+    Calibration,
+    DepthCamera,
+    configured,
+    configured_depth_intrinsics,
+    configured_depth_pose,
+)
 from mapper.sources.calibration_file import calibration_file, read_calibration
 from mapper.sources.config import CameraConfig
 from mapper.sources.image_files.image_sizes import RecordedCamera, Size, recorded_camera
@@ -29,17 +35,22 @@ class RgbdEntry:
 
     Attributes:
         stamp_ns: Time of the colour image, nanoseconds.
-        files: Both images as they are encoded.
+        encoded: Both images as they are encoded.
         recorded: Camera of the frame, and the sizes of both images as recorded.
         read_image: Returns the (H, W, 3) RGB image, or the grey one where its argument is false.
         read_depth_m: Returns (H, W) depth in metres.
     """
 
     stamp_ns: int
-    files: ImageFiles
+    encoded: ImageFiles
     recorded: RecordedCamera
     read_image: Callable[[bool], Image]
     read_depth_m: Callable[[], DepthImage]
+
+    @property
+    def files(self) -> ImageFiles | None:
+        """The encoded images; None where they show other views than the frame."""
+        return self.encoded if self.recorded.shows_recorded_views else None
 
     def load(self, *, colour: bool = True) -> RgbdFrame:
         """Read and decode both images.
@@ -47,8 +58,8 @@ class RgbdEntry:
         Raises:
             FrameError: An image is missing, damaged, of the wrong kind or not as large as the log's first.
         """
-        image = self.recorded.image(self.read_image(colour), f"{self.files.colour}")
-        delay_s = (self.files.depth_stamp_ns - self.stamp_ns) / NS_PER_S
+        image = self.recorded.image(self.read_image(colour), f"{self.encoded.colour}")
+        delay_s = (self.encoded.depth_stamp_ns - self.stamp_ns) / NS_PER_S
         return RgbdFrame(self.stamp_ns, image, self._depth_m(), self.recorded.camera, depth_delay_s=delay_s)
 
     def scan(self) -> Scan:
@@ -60,7 +71,7 @@ class RgbdEntry:
         return scan_of(self._depth_m(), self.recorded.camera, stamp_ns=self.stamp_ns)
 
     def _depth_m(self) -> DepthImage:
-        return self.recorded.depth_m(self.read_depth_m(), f"{self.files.depth}")
+        return self.recorded.depth_m(self.read_depth_m(), f"{self.encoded.depth}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,6 +123,7 @@ def rgbd_log(
     refuse_links_out((file for pair in pairs for file in (pair.colour, pair.depth)), log=folder)
     units_per_m = calibration.depth_units_per_m or depth_units_per_m
     camera = _camera_of(pairs, calibration, depth_units_per_m=units_per_m, path=path)
+    depth_notes = [] if calibration.depth is None else [calibration.depth.note]
     accelerations, acceleration_notes = read_accelerations(folder)
 
     def entry_at(index: int) -> RgbdEntry:
@@ -141,7 +153,7 @@ def rgbd_log(
         entry_at=entry_at,
         truth=poses,
         accelerations=accelerations,
-        notes=[*notes, *camera.notes(), *acceleration_notes],
+        notes=[*notes, *camera.notes(), *depth_notes, *acceleration_notes],
     )
 
 
@@ -161,6 +173,7 @@ def find_calibration(folder: Path, config: CameraConfig | None, *, known: Calibr
     path = calibration_file(folder)
     stated = known if path is None else read_calibration(path)
     units_per_m = None if stated is None else stated.depth_units_per_m
+    depth = _depth_camera(None if stated is None else stated.depth, config)
     if config is not None:
         units_per_m = config.depth_factor or units_per_m
     if chosen := configured(config):
@@ -172,7 +185,22 @@ def find_calibration(folder: Path, config: CameraConfig | None, *, known: Calibr
             f"{folder}: intrinsics unknown; put a calibration.toml with fx_px, fy_px, cx_px and cy_px there, "
             f"or --set source.camera.fx_px=… and so on{_renamed(folder)}"
         )
-    return replace(stated, depth_units_per_m=units_per_m)
+    return replace(stated, depth_units_per_m=units_per_m, depth=depth)
+
+
+def _depth_camera(stated: DepthCamera | None, config: CameraConfig | None) -> DepthCamera | None:
+    """Return the depth camera that is not colour's: the user's numbers before those of a file."""
+    intrinsics, T_color_depth = configured_depth_intrinsics(config), configured_depth_pose(config)
+    if intrinsics is None and T_color_depth is None:
+        return stated
+    if stated is not None:
+        intrinsics = intrinsics or stated.calibration
+        T_color_depth = stated.T_color_depth if T_color_depth is None else T_color_depth
+    if intrinsics is None or T_color_depth is None:
+        raise SourceError(
+            "source.camera: want depth_intrinsics_px and depth_in_color: the log's files state neither"
+        )
+    return DepthCamera(intrinsics, T_color_depth, "source.camera")
 
 
 def assumed_camera_note(camera: Calibration) -> str:

@@ -7,9 +7,12 @@ import numpy as np
 from rosbags.serde import SerdeError
 
 from mapper.core.errors import DataError
+from mapper.core.geometry import transform
+from mapper.core.rotations import row_of_pose
 from mapper.core.timebase import NS_PER_S
 from mapper.sources.ros.cloud_messages import Field, structured
 from mapper.sources.ros.messages import (
+    EXTRINSICS,
     CameraMessage,
     CloudMessage,
     FileMessage,
@@ -24,6 +27,8 @@ from mapper.sources.ros.typestore import typestore
 
 _POINT_FIELD_TYPES = dict(enumerate(("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8"), start=1))
 """Numpy's names of PointField's constants."""
+_EXTRINSICS_NUMBERS = 12
+_ROTATION_TOLERANCE = 1e-3
 
 
 def decode_ros(topic: Topic, data: memoryview) -> Message:
@@ -32,6 +37,8 @@ def decode_ros(topic: Topic, data: memoryview) -> Message:
     Raises:
         DataError: The message is damaged, or of a type that is not read.
     """
+    if topic.type in EXTRINSICS:
+        return _extrinsics(data, is_little_endian=topic.encoding == "ros1" or bool(data[1] & 1))
     read = _READERS.get(topic.type)
     if read is None:
         raise DataError(f"messages of type {topic.type} are not read")
@@ -113,6 +120,22 @@ def _transform_stamped(m: Any) -> list[PoseMessage]:
 
 def _transforms(m: Any) -> list[PoseMessage]:
     return [pose for transform in m.transforms for pose in _transform_stamped(transform)]
+
+
+def _extrinsics(data: memoryview, *, is_little_endian: bool) -> list[PoseMessage]:
+    """Return the pose of the depth stream in another, as the topic's name says, of RealSense's Extrinsics.
+
+    A rotation, column by column, and a translation in metres end the message; a header is before them, or
+    none, by the driver's version.
+    """
+    size_bytes = 8 * _EXTRINSICS_NUMBERS
+    if len(data) < size_bytes:
+        raise DataError(f"a damaged message: {len(data)} bytes, want at least {size_bytes}")
+    numbers = np.frombuffer(data[-size_bytes:], "<f8" if is_little_endian else ">f8").astype(np.float64)
+    R = numbers[:9].reshape(3, 3).T
+    if not (np.isfinite(numbers).all() and np.abs(R @ R.T - np.eye(3)).max() < _ROTATION_TOLERANCE):
+        raise DataError("a damaged message: its rotation is none")
+    return [PoseMessage(0, "", "", row_of_pose(transform(R, numbers[9:])).tolist())]
 
 
 _READERS: Mapping[str, Callable[[Any], Message]] = {

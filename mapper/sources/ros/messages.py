@@ -188,6 +188,7 @@ POSES = frozenset(
 TRANSFORMS = frozenset(
     {"tf2_msgs/msg/TFMessage", "tf/msg/tfMessage", "foxglove.FrameTransform", "foxglove.FrameTransforms"}
 )
+EXTRINSICS = frozenset({"realsense2_camera_msgs/msg/Extrinsics", "realsense2_camera/msg/Extrinsics"})
 WITH_HEADER = IMAGES | CAMERAS | CLOUDS | IMUS | POSES | {"foxglove.FrameTransform"}
-READ = WITH_HEADER | TRANSFORMS
-SMALL = POSES | TRANSFORMS
+READ = WITH_HEADER | TRANSFORMS | EXTRINSICS
+SMALL = POSES | TRANSFORMS | EXTRINSICS

@@ -6,15 +6,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mapper.core.errors import SourceError
-from mapper.core.frames import NO_DISTORTION, Sensor
+from mapper.core.frames import Sensor
 from mapper.core.timebase import NS_PER_S, Stamps
 from mapper.sources.base import FrameRef, Log
-from mapper.sources.calibration import Calibration, configured
 from mapper.sources.config import SourceConfig
-from mapper.sources.image_files.image_sizes import RecordedCamera, Size, recorded_camera
+from mapper.sources.image_files.image_sizes import recorded_camera
 from mapper.sources.image_files.reading import FINE_UNITS_PER_M
 from mapper.sources.image_folders.pairing import depth_offset_ns
 from mapper.sources.point_times import relative_times_s, time_field
+from mapper.sources.ros.cameras import calibrate
 from mapper.sources.ros.entries import CloudEntry, rgbd_entry
 from mapper.sources.ros.frame_tree import is_fixed
 from mapper.sources.ros.image_messages import MILLIMETRES_PER_M, has_float_depth, size_of
@@ -22,20 +22,14 @@ from mapper.sources.ros.index import Series, why_unread
 from mapper.sources.ros.message_order import ordered, paired
 from mapper.sources.ros.messages import (
     READ,
-    CameraMessage,
     CloudMessage,
     FileMessage,
     ImageMessage,
-    Window,
     frame_of,
 )
 from mapper.sources.ros.reader import SAME_CLOCK_NS, RecordingReader
-from mapper.sources.ros.topics import CameraTopics, Choice, choose, is_called_registered
-from mapper.sources.undistorted import FISHEYE_MODELS, POLYNOMIAL_MODELS, Lens, UndistortedEntry
+from mapper.sources.ros.topics import CameraTopics, Choice, choose
 
-_SAME_LENS_RATIO = 0.01
-_SAME_PLACE_M = 0.005
-"""Colour cameras lie farther beside the depth camera, 15 mm at least; frames of one lens may be turned."""
 _JPEG_START = b"\xff\xd8"
 
 
@@ -140,27 +134,30 @@ def _rgbd(reader: RecordingReader, topics: CameraTopics, config: SourceConfig) -
     where = f"{reader.recording.path}"
     i, j, notes = paired(color, depth, max_gap_s=config.max_pair_gap_s, where=where)
     first_color, first_depth = _first_image(reader, color), _first_image(reader, depth)
-    camera = _camera(reader, topics, config)
-    has_other = topics.own_info is not None and topics.own_info is not topics.info
-    own = _camera(reader, replace(topics, info=topics.own_info), config) if has_other else camera
-    _refuse_unregistered(reader, topics, own)
-    notes += camera.notes()
     frame, depth_frame = frame_of(first_color), frame_of(first_depth)
-    if config.topics.depth is None and not is_called_registered(depth.topic.name):
-        _refuse_apart(reader, topics, frame, depth_frame)
-    if frame != depth_frame:
-        notes.append(f"depth in frame {depth_frame} is taken to be registered to colour in {frame}")
+    colour_px, depth_px = (
+        size_of(first, where=f"{where}: {one.topic.name}")
+        for one, first in ((color, first_color), (depth, first_depth))
+    )
+    calibration, camera_notes = calibrate(
+        reader, topics, config.camera, frames=(frame, depth_frame), colour_px=colour_px, depth_px=depth_px
+    )
+    camera = recorded_camera(
+        calibration,
+        colour_px=colour_px,
+        depth_px=depth_px,
+        where=f"{where}: {color.topic.name}, {depth.topic.name}",
+    )
+    notes += [*camera_notes, *camera.notes()]
     factor = None if config.camera is None else config.camera.depth_factor
     float_units_per_m = (factor or 1.0) if has_float_depth(first_depth) else None
     units_per_m = (factor or MILLIMETRES_PER_M) if float_units_per_m is None else FINE_UNITS_PER_M
     is_jpeg = isinstance(first_color, FileMessage) and bytes(first_color.data[:2]) == _JPEG_START
-    maps = None
-    if camera.lens is not None:
-        maps = camera.lens.maps(camera.camera)
-        notes.append(f"the distortion {camera.lens.model} is taken out of the images as they are read")
+    if calibration.lens is not None:
+        notes.append(f"the distortion {calibration.lens.model} is taken out of the images as they are read")
 
     def entry_at(index: int) -> FrameRef:
-        entry = rgbd_entry(
+        return rgbd_entry(
             reader.located(color, int(i[index])),
             reader.located(depth, int(j[index])),
             camera,
@@ -168,7 +165,6 @@ def _rgbd(reader: RecordingReader, topics: CameraTopics, config: SourceConfig) -
             float_units_per_m=float_units_per_m,
             colour_suffix=".jpg" if is_jpeg else ".png",
         )
-        return entry if maps is None else UndistortedEntry(entry, maps)
 
     return _Frames("rgbd", frame, color.stamps_ns[i], entry_at, notes)
 
@@ -231,21 +227,6 @@ def _body_of(
     return body, notes
 
 
-def _refuse_apart(reader: RecordingReader, topics: CameraTopics, frame: str, depth_frame: str) -> None:
-    """Refuse depth that tf places elsewhere than colour: its pixels show other points than colour's."""
-    T_color_depth = reader.tree.find(frame, depth_frame)
-    if T_color_depth is None:
-        return
-    apart_m = float(np.linalg.norm(T_color_depth[:3, 3]))
-    if apart_m > _SAME_PLACE_M:
-        name, color = topics.depth.topic.name, topics.color.topic.name
-        raise SourceError(
-            f"{reader.recording.path}: {name} is not registered to {color}: tf has its frame {depth_frame} "
-            f"{apart_m * 1e3:.0f} mm from {frame}; record depth that is, such as aligned_depth_to_color, or "
-            f"if it is all the same, --set source.topics.depth={name}"
-        )
-
-
 def _first_image(reader: RecordingReader, series: Series) -> ImageMessage:
     first = reader.firsts.get(series.topic.name)
     if not isinstance(first, ImageMessage):
@@ -254,97 +235,3 @@ def _first_image(reader: RecordingReader, series: Series) -> ImageMessage:
             f"{why_unread(reader.recording, series)}"
         )
     return first
-
-
-def _camera(reader: RecordingReader, topics: CameraTopics, config: SourceConfig) -> RecordedCamera:
-    """Return the frames' camera, by the colour camera's calibration: the user's, else the recording's."""
-    name = topics.color.topic.name
-    calibration = configured(config.camera)
-    if calibration is None:
-        info = topics.info and reader.firsts.get(topics.info.topic.name)
-        if topics.info is None or not isinstance(info, CameraMessage):
-            raise SourceError(
-                f"{reader.recording.path}: no camera info for {name}; choose one with "
-                "source.topics.camera_info=… or --set source.camera.fx_px=… and so on"
-            )
-        info = _windowed(info, _size(reader, topics.color))
-        calibration = _calibration(info, is_rectified="rect" in name, name=topics.info.topic.name)
-    return recorded_camera(
-        calibration,
-        colour_px=_size(reader, topics.color),
-        depth_px=_size(reader, topics.depth),
-        where=f"{reader.recording.path}: {name}, {topics.depth.topic.name}",
-    )
-
-
-def _size(reader: RecordingReader, images: Series) -> Size:
-    return size_of(_first_image(reader, images), where=f"{reader.recording.path}: {images.topic.name}")
-
-
-def _windowed(info: CameraMessage, image_px: Size) -> CameraMessage:
-    """Return the calibration of the part of the sensor that images of this size show, binned as they are."""
-    window = info.window
-    shown_px = (
-        (window.width_px or info.width_px) // window.binning_x,
-        (window.height_px or info.height_px) // window.binning_y,
-    )
-    if image_px != shown_px or image_px == (info.width_px, info.height_px):
-        return info
-    # The centre of pixel (0, 0) is at 0, so that of the first bin of n is at (n - 1) / 2.
-    to_image = np.array(
-        [
-            [1.0 / window.binning_x, 0.0, (0.5 - window.x_px) / window.binning_x - 0.5],
-            [0.0, 1.0 / window.binning_y, (0.5 - window.y_px) / window.binning_y - 0.5],
-            [0.0, 0.0, 1.0],
-        ]
-    )
-    return replace(
-        info,
-        width_px=image_px[0],
-        height_px=image_px[1],
-        K=(to_image @ info.K.reshape(3, 3)).ravel() if info.K.size == 9 else info.K,
-        P=(to_image @ info.P.reshape(3, 4)).ravel() if info.P.size == 12 else info.P,
-        window=Window(),
-    )
-
-
-def _calibration(info: CameraMessage, *, is_rectified: bool, name: str) -> Calibration:
-    """Return the intrinsics of raw images with their distortion, or of rectified ones without."""
-    size_px = (info.width_px, info.height_px) if info.width_px and info.height_px else None
-    P, K, D = info.P.tolist(), info.K.tolist(), info.D.tolist()
-    if is_rectified and len(P) == 12 and P[0] > 0.0:
-        return Calibration(name, P[0], P[5], P[2], P[6], size_px=size_px)
-    if len(K) != 9 or not K[0] > 0.0:
-        raise SourceError(
-            f"{name}: the camera is not calibrated, K is {K}; --set source.camera.fx_px=… and so on"
-        )
-    if any(D) and (info.model not in POLYNOMIAL_MODELS or any(D[5:])):
-        lens = Lens(info.model, D)
-        if not lens.is_known:
-            raise SourceError(
-                f"{name}: distortion {info.model} with {len(D)} coefficients is not known; known are "
-                f"{', '.join(sorted(POLYNOMIAL_MODELS | FISHEYE_MODELS))}: rectify the images, or --set "
-                "source.camera.fx_px=… and so on"
-            )
-        return Calibration(name, K[0], K[4], K[2], K[5], lens=lens, size_px=size_px)
-    k1, k2, p1, p2, k3 = (*D[:5], *NO_DISTORTION)[:5]
-    return Calibration(name, K[0], K[4], K[2], K[5], distortion=(k1, k2, p1, p2, k3), size_px=size_px)
-
-
-def _refuse_unregistered(reader: RecordingReader, topics: CameraTopics, recorded: RecordedCamera) -> None:
-    """Refuse depth of another focal length than colour, if both are known: it is not on colour's pixels."""
-    info = topics.depth_info and reader.firsts.get(topics.depth_info.topic.name)
-    if not isinstance(info, CameraMessage) or info.K.shape != (9,) or not info.K[0] > 0.0:
-        return
-    width_px, height_px = recorded.depth_px
-    info = _windowed(info, recorded.depth_px)
-    fx_px = recorded.camera.fx_px
-    if recorded.depth_px != recorded.colour_px:
-        fx_px *= (info.width_px or width_px) / recorded.camera.width_px
-    if abs(info.K[0] / fx_px - 1.0) > _SAME_LENS_RATIO:
-        raise SourceError(
-            f"{reader.recording.path}: {topics.depth.topic.name} ({width_px}×{height_px} px, focal length "
-            f"{info.K[0]:.1f} px) is not registered to {topics.color.topic.name} (focal length {fx_px:.1f} "
-            "px at that size); record depth that is, such as aligned_depth_to_color, or choose it with "
-            "source.topics.depth=…"
-        )

@@ -200,7 +200,7 @@ def _of_one_camera(
     def rank(pair: tuple[Series, Series]) -> tuple[object, ...]:
         color, depth = (one.topic.name for one in pair)
         frames = [frame_of(firsts.get(name)) for name in (color, depth)]
-        apart, shared = frames[0] != frames[1] or not frames[0], _shared_namespaces(color, depth)
+        apart, shared = frames[0] != frames[1] or not frames[0], shared_namespaces(color, depth)
         fewest = min(map(len, pair))
         other = apart and not shared
         return other, _color_rank(color), _depth_rank(depth), apart, -shared, -fewest, color, depth
@@ -215,7 +215,7 @@ def _best(topics: Sequence[Series], rank: Callable[[str], tuple[int, ...]]) -> S
     return min(topics, key=lambda one: (*rank(one.topic.name), -len(one), one.topic.name), default=None)
 
 
-def _shared_namespaces(name: str, other: str) -> int:
+def shared_namespaces(name: str, other: str) -> int:
     """Return how many namespaces two topics begin with in common."""
     parts = zip(name.strip("/").split("/")[:-1], other.strip("/").split("/")[:-1], strict=False)
     return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], parts))
@@ -269,7 +269,7 @@ def _beside(image: Series, infos: Sequence[Series]) -> list[Series]:
     own = [one for one in infos if one.topic.name.rpartition("/")[0] == name.rpartition("/")[0]]
     if own:
         return own
-    shared = [_shared_namespaces(name, one.topic.name) for one in infos]
+    shared = [shared_namespaces(name, one.topic.name) for one in infos]
     most = max(shared, default=0)
     return [infos[shared.index(most)]] if most and shared.count(most) == 1 else []
 

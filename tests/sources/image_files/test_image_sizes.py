@@ -1,10 +1,14 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from mapper.core.errors import FrameError, SourceError
 from mapper.core.frames import ray_table
-from mapper.sources.calibration import Calibration
+from mapper.core.geometry import exp
+from mapper.sources.calibration import Calibration, DepthCamera
 from mapper.sources.image_files.image_sizes import recorded_camera
+from mapper.sources.lens import Lens
 
 SIZES = [  # of colour, of depth, and of frames
     ((640, 480), (640, 480), (640, 480)),
@@ -110,3 +114,58 @@ def test_an_image_unlike_the_first_is_refused():
     sizes = recorded((640, 480), (320, 240))
     with pytest.raises(FrameError, match="depth 7: 640×480 px, but the log has 320×240"):
         sizes.depth_m(np.zeros((480, 640), np.float32), "depth 7")
+
+
+def test_depth_of_a_lens_keeps_its_values_and_colour_is_interpolated():
+    lens = Lens("rational_polynomial", (0.52, -2.6, 0.0006, -0.0002, 1.5, 0.4, -2.42, 1.43))
+    calibration = Calibration("test", 131.0, 130.0, 79.5, 59.5, lens=lens)
+    sizes = recorded_camera(calibration, colour_px=(160, 120), depth_px=(160, 120), where="log")
+    halves = (np.arange(160) < 80)[None].repeat(120, axis=0)
+    depth_m = sizes.depth_m(np.where(halves, np.float32(1.0), np.float32(3.0)), "depth")
+    image = sizes.image(np.where(halves, np.uint8(10), np.uint8(200)), "colour")
+    assert set(np.unique(depth_m)) <= {0.0, 1.0, 3.0}
+    assert ((image > 10) & (image < 200)).any()
+    assert not sizes.shows_recorded_views
+    assert recorded((640, 480), (320, 240)).shows_recorded_views
+
+
+@pytest.mark.parametrize(
+    ("colour_px", "frame_px"),
+    [
+        ((640, 480), (640, 480)),
+        ((1280, 720), (640, 360)),
+        ((1920, 1080), (640, 360)),
+        ((2048, 1536), (1024, 768)),
+        ((3840, 2160), (640, 360)),
+        ((320, 240), (320, 240)),
+        ((720, 1280), (360, 640)),
+    ],
+)
+def test_frames_of_two_cameras_are_colour_s_at_a_whole_fraction_of_its_size(colour_px, frame_px):
+    T = exp(np.array([0.004, -0.007, 0.005]), np.array([0.015, 0.0, 0.0]))
+    calibration = calibration_of(colour_px)
+    own = Calibration("depth", 425.0, 425.0, 423.7, 238.9)
+    both = replace(calibration, depth=DepthCamera(own, T, "test"))
+    sizes = recorded_camera(both, colour_px=colour_px, depth_px=(848, 480), where="log")
+    assert size_of(sizes.camera) == frame_px
+    assert sizes.camera == calibration.camera(width_px=colour_px[0], height_px=colour_px[1]).resized(
+        *frame_px
+    )
+    depth_m = sizes.depth_m(np.full((480, 848), 2.0, np.float32), "depth")
+    assert depth_m.shape == frame_px[::-1]
+    assert np.median(depth_m[depth_m > 0.0]) == pytest.approx(2.0, abs=0.02)
+    assert sizes.image(np.zeros(colour_px[::-1], np.uint8), "colour").shape == frame_px[::-1]
+    assert sizes.notes() == []
+
+
+def test_a_depth_camera_may_have_another_lens():
+    lens = Lens("rational_polynomial", (0.52, -2.6, 0.0006, -0.0002, 1.5, 0.4, -2.42, 1.43))
+    own = Calibration("depth", 252.0, 252.0, 160.2, 119.1, lens=lens)
+    calibration = Calibration("colour", 250.0, 250.0, 159.5, 119.5, depth=DepthCamera(own, np.eye(4), "test"))
+    sizes = recorded_camera(calibration, colour_px=(320, 240), depth_px=(320, 240), where="log")
+    camera = calibration.camera(width_px=320, height_px=240)
+    # Depth images of the directions that their pixels look in, registered: those of colour's pixels.
+    rays = lens.rays(own.camera(width_px=320, height_px=240))
+    for axis in (0, 1):
+        shifted = sizes.depth_m(rays[..., axis] + np.float32(2.0), "depth")[20:-20, 20:-20]
+        assert np.abs(shifted - 2.0 - ray_table(camera)[20:-20, 20:-20, axis]).max() < 0.6 / 250.0

@@ -1,15 +1,13 @@
-"""Frames of lenses that five coefficients do not model, undistorted as they are read."""
+"""Lenses that five coefficients do not model, whose images are undistorted as they are read."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.core.frames import Frame, PinholeCamera, RgbdFrame, Scan
-from mapper.sources.base import ImageFiles, WrappedEntry
-from mapper.sources.image_files.reading import scan_of
+from mapper.core.frames import PinholeCamera
 
 POLYNOMIAL_MODELS = frozenset({"plumb_bob", "brown_conrady", "rational_polynomial"})
 """Names of OpenCV's model of 4, 5, 8 (rational), 12 (thin prism) or 14 (tilted) coefficients."""
@@ -49,44 +47,11 @@ class Lens:
         columns, rows = undistort(camera.matrix, coefficients, unturned, camera.matrix, size_px, cv2.CV_32FC1)
         return columns, rows
 
-
-@dataclass(frozen=True, slots=True)
-class UndistortedEntry(WrappedEntry):
-    """RGB-D frame of another lens as a pinhole camera would have taken it.
-
-    Attributes:
-        maps: Columns and rows in its images, as ``Lens.maps`` returns them.
-    """
-
-    maps: tuple[NDArray[np.float32], NDArray[np.float32]]
-
-    @property
-    def files(self) -> ImageFiles | None:
-        """None: the encoded images are distorted."""
-        return None
-
-    def load(self, *, colour: bool = True) -> Frame:
-        """Read the frame, with the nearest depth for each pixel, for means lie beside edges.
-
-        Raises:
-            FrameError: As the recorded frame.
-        """
-        frame = self.entry.load(colour=colour)
-        if not isinstance(frame, RgbdFrame):
-            return frame
-        return replace(
-            frame,
-            image=cv2.remap(frame.image, *self.maps, cv2.INTER_LINEAR),
-            depth_m=cv2.remap(frame.depth_m, *self.maps, cv2.INTER_NEAREST),
-        )
-
-    def scan(self) -> Scan:
-        """Read the depth alone.
-
-        Raises:
-            FrameError: As ``load``.
-        """
-        frame = self.load(colour=False)
-        if isinstance(frame, RgbdFrame):
-            return scan_of(frame.depth_m, frame.camera, stamp_ns=frame.stamp_ns)
-        return frame
+    def rays(self, camera: PinholeCamera) -> NDArray[np.float32]:
+        """Return the (H, W, 2) undistorted x/z and y/z of every pixel's ray of a camera with the lens."""
+        columns, rows = np.meshgrid(np.arange(camera.width_px), np.arange(camera.height_px))
+        pixels = np.column_stack([columns.ravel(), rows.ravel()]).astype(np.float64)[:, np.newaxis]
+        undistort = cv2.fisheye.undistortPoints if self.is_fisheye else cv2.undistortPoints
+        criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-9)
+        rays = np.asarray(undistort(pixels, camera.matrix, np.array(self.coefficients), criteria=criteria))
+        return rays.astype(np.float32).reshape(camera.height_px, camera.width_px, 2)

@@ -2,8 +2,8 @@ import cv2
 import numpy as np
 import pytest
 
-from mapper.core.frames import PinholeCamera, RgbdFrame
-from mapper.sources.undistorted import Lens, UndistortedEntry
+from mapper.core.frames import PinholeCamera
+from mapper.sources.lens import Lens
 
 CAMERA = PinholeCamera(width_px=160, height_px=120, fx_px=131.0, fy_px=130.0, cx_px=79.5, cy_px=59.5)
 AZURE = (0.52, -2.6, 0.0006, -0.0002, 1.5, 0.4, -2.42, 1.43)
@@ -31,23 +31,13 @@ def test_a_pixel_is_read_where_the_lens_projects_its_ray(lens):
     np.testing.assert_allclose(found, projected(lens, columns.astype(float), rows.astype(float)), atol=0.01)
 
 
-def test_depth_keeps_its_values_and_colour_is_interpolated():
-    lens = Lens("rational_polynomial", AZURE)
-    depth_m = np.where(np.arange(160) < 80, np.float32(1.0), np.float32(3.0))[None].repeat(120, axis=0)
-    image = np.where(np.arange(160) < 80, np.uint8(10), np.uint8(200))[None].repeat(120, axis=0)
-
-    class Recorded:
-        stamp_ns, files = 7, object()
-
-        def load(self, *, colour):
-            return RgbdFrame(7, image if colour else image.copy(), depth_m, CAMERA)
-
-    entry = UndistortedEntry(Recorded(), lens.maps(CAMERA))
-    frame = entry.load()
-    assert set(np.unique(frame.depth_m)) <= {0.0, 1.0, 3.0}
-    assert ((frame.image > 10) & (frame.image < 200)).any()
-    assert entry.files is None
-    assert len(entry.scan().points_body) == (frame.depth_m > 0.0).sum()
+@pytest.mark.parametrize("lens", [Lens("rational_polynomial", AZURE), Lens("equidistant", FISHEYE)])
+def test_a_pixel_s_ray_is_projected_to_the_pixel(lens):
+    columns, rows = np.array([0, 12, 80, 159]), np.array([0, 100, 60, 119])
+    rays = lens.rays(CAMERA)
+    assert rays.shape == (120, 160, 2)
+    ideal = rays[rows, columns] * (131.0, 130.0) + (79.5, 59.5)
+    np.testing.assert_allclose(projected(lens, *ideal.T), np.column_stack([columns, rows]), atol=0.01)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,241 @@
+"""Cameras of a recording's images: the calibration of colour's, and depth's where it is another."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from mapper.core.errors import SourceError
+from mapper.core.frames import NO_DISTORTION
+from mapper.core.geometry import Transform, angle_between
+from mapper.core.rotations import pose_of_row, row_of_pose
+from mapper.sources.calibration import (
+    Calibration,
+    DepthCamera,
+    configured,
+    configured_depth_intrinsics,
+    configured_depth_pose,
+)
+from mapper.sources.config import CameraConfig
+from mapper.sources.image_files.image_sizes import Size, is_same_view
+from mapper.sources.lens import FISHEYE_MODELS, POLYNOMIAL_MODELS, Lens
+from mapper.sources.ros.index import Series
+from mapper.sources.ros.messages import EXTRINSICS, CameraMessage, Window
+from mapper.sources.ros.reader import RecordingReader
+from mapper.sources.ros.topics import CameraTopics, is_called_registered, shared_namespaces
+
+_SAME_LENS_RATIO = 0.01
+_SAME_PLACE_M = 0.005
+"""Colour cameras lie farther beside the depth camera, 14 mm at least; frames of one lens may be turned."""
+_MOST_TURNED_DEG = 30.0
+"""Angle between frames of two cameras that show the same: an Azure Kinect's are 6° apart, but frames of which
+one is no optical frame 90° or 120°."""
+_SAME_POSE_M = 0.001
+_SAME_POSE_DEG = 0.1
+_SETTING = "--set source.camera.depth_in_color=[x,y,z,qx,qy,qz,qw]"
+
+
+def calibrate(
+    reader: RecordingReader,
+    topics: CameraTopics,
+    config: CameraConfig | None,
+    *,
+    frames: tuple[str, str],
+    colour_px: Size,
+    depth_px: Size,
+) -> tuple[Calibration, list[str]]:
+    """Return the colour camera's calibration, with the depth camera if it is another, and notes.
+
+    Args:
+        reader: The recording.
+        topics: Its images and their calibrations.
+        config: The user's settings of both cameras, which go before the recording's.
+        frames: Coordinate frames of the colour and the depth images.
+        colour_px: Size of the colour images.
+        depth_px: Size of the depth images.
+
+    Raises:
+        SourceError: The colour camera's intrinsics are unknown or of an unknown lens, or depth is not
+            registered to colour and its intrinsics or its pose are unknown.
+    """
+    calibration = _colour_calibration(reader, topics, topics.info, config, colour_px)
+    own = calibration
+    if topics.own_info is not None and topics.own_info is not topics.info:
+        own = _colour_calibration(reader, topics, topics.own_info, config, colour_px)
+    depth, notes = _depth_camera(reader, topics, own, config, frames, colour_px, depth_px)
+    if depth is not None:
+        return replace(calibration, depth=depth), [*notes, depth.note]
+    if frames[0] != frames[1]:
+        notes.append(f"depth in frame {frames[1]} is taken to be registered to colour in {frames[0]}")
+    return calibration, notes
+
+
+def _colour_calibration(
+    reader: RecordingReader,
+    topics: CameraTopics,
+    series: Series | None,
+    config: CameraConfig | None,
+    colour_px: Size,
+) -> Calibration:
+    """Return the colour camera's intrinsics: the user's, else the recording's."""
+    chosen = configured(config)
+    if chosen is not None:
+        return chosen
+    name = topics.color.topic.name
+    info = _first_info(reader, series)
+    if series is None or info is None:
+        raise SourceError(
+            f"{reader.recording.path}: no camera info for {name}; choose one with "
+            "source.topics.camera_info=… or --set source.camera.fx_px=… and so on"
+        )
+    return _calibration(_windowed(info, colour_px), is_rectified="rect" in name, name=series.topic.name)
+
+
+def _depth_camera(
+    reader: RecordingReader,
+    topics: CameraTopics,
+    color: Calibration,
+    config: CameraConfig | None,
+    frames: tuple[str, str],
+    colour_px: Size,
+    depth_px: Size,
+) -> tuple[DepthCamera | None, list[str]]:
+    """Return the depth camera, None if depth is registered to colour, and notes."""
+    name, color_name = topics.depth.topic.name, topics.color.topic.name
+    info = _first_info(reader, topics.depth_info)
+    info = _windowed(info, depth_px) if info is not None and info.K.shape == (9,) and info.K[0] > 0 else None
+    intrinsics, T_color_depth = configured_depth_intrinsics(config), configured_depth_pose(config)
+    origin, notes = "source.camera.depth_in_color", list[str]()
+    is_apart = T_color_depth is not None and not _is_same_pose(T_color_depth, np.eye(4))
+    if T_color_depth is None:
+        T_color_depth, origin, notes = _recorded_pose(reader, topics, frames)
+        is_apart = _apart_m(T_color_depth) > _SAME_PLACE_M and not is_called_registered(name)
+    width_px, fx_px = depth_px[0], None if intrinsics is None else intrinsics.fx_px
+    if fx_px is None and info is not None:
+        width_px, fx_px = info.width_px or width_px, float(info.K[0])
+    color_fx_px = color.fx_px * width_px / (color.size_px or colour_px)[0]
+    is_other_view = fx_px is not None and not (
+        abs(fx_px / color_fx_px - 1.0) <= _SAME_LENS_RATIO and is_same_view(colour_px, depth_px)
+    )
+    if not (is_apart or is_other_view):
+        return None, []
+    if intrinsics is None and info is not None and topics.depth_info is not None:
+        intrinsics = _calibration(info, is_rectified="rect" in name, name=topics.depth_info.topic.name)
+    if intrinsics is None:
+        missing = "its intrinsics are not in the log: --set source.camera.depth_intrinsics_px=[fx,fy,cx,cy]"
+    elif T_color_depth is None:
+        missing = f"the log does not say where its camera is: record /tf_static too, or {_SETTING}"
+    elif (turned_deg := _turned_deg(np.eye(4), T_color_depth)) > _MOST_TURNED_DEG:
+        missing = f"{origin} turns it by {turned_deg:.0f}°, so one frame is no optical one: {_SETTING}"
+    else:
+        return DepthCamera(intrinsics, T_color_depth, origin), notes
+    if is_other_view:
+        size = f"{depth_px[0]}×{depth_px[1]} px"
+        why = (
+            f"{name} ({size}, focal length {fx_px:.1f} px) is not registered to {color_name} "
+            f"(focal length {color_fx_px:.1f} px at that size)"
+        )
+    else:
+        apart_mm = _apart_m(T_color_depth) * 1e3
+        why = f"{name} is not registered to {color_name}, {apart_mm:.0f} mm beside it by {origin}"
+    raise SourceError(f"{reader.recording.path}: {why}; {missing}")
+
+
+def _apart_m(T_color_depth: Transform | None) -> float:
+    return 0.0 if T_color_depth is None else float(np.linalg.norm(T_color_depth[:3, 3]))
+
+
+def _recorded_pose(
+    reader: RecordingReader, topics: CameraTopics, frames: tuple[str, str]
+) -> tuple[Transform | None, str, list[str]]:
+    """Return T_color_depth by tf, else by RealSense's own topic, its source, and a note if these differ."""
+    of_topic, topic = _pose_of_topic(reader, topics.color.topic.name)
+    color_frame, depth_frame = frames
+    of_tf = None if color_frame == depth_frame else reader.tree.find(color_frame, depth_frame)
+    if of_tf is None:
+        return of_topic, topic, []
+    notes = []
+    if of_topic is not None and not _is_same_pose(of_tf, of_topic):
+        numbers = ",".join(f"{number:.5g}" for number in row_of_pose(of_topic))
+        notes.append(
+            f"{topic} has another pose of the depth camera than tf, which is used; if colours lie beside the "
+            f"things: --set source.camera.depth_in_color=[{numbers}]"
+        )
+    return of_tf, "tf", notes
+
+
+def _pose_of_topic(reader: RecordingReader, color: str) -> tuple[Transform | None, str]:
+    """Return T_color_depth of the topic …/depth_to_color that is nearest to colour's, and its name."""
+    names = [
+        name
+        for name, series in reader.series.items()
+        if series.topic.type in EXTRINSICS and name.endswith("/depth_to_color")
+    ]
+    name = max(names, key=lambda one: shared_namespaces(one, color), default="")
+    message = reader.firsts.get(name)
+    if not isinstance(message, list):
+        return None, ""
+    return pose_of_row(np.array(message[0].numbers)), name
+
+
+def _is_same_pose(T_a: Transform, T_b: Transform) -> bool:
+    apart_m = np.linalg.norm(T_a[:3, 3] - T_b[:3, 3])
+    return bool(apart_m < _SAME_POSE_M) and _turned_deg(T_a, T_b) < _SAME_POSE_DEG
+
+
+def _turned_deg(T_a: Transform, T_b: Transform) -> float:
+    return float(np.degrees(angle_between(T_a[:3, :3], T_b[:3, :3])))
+
+
+def _first_info(reader: RecordingReader, series: Series | None) -> CameraMessage | None:
+    info = series and reader.firsts.get(series.topic.name)
+    return info if isinstance(info, CameraMessage) else None
+
+
+def _windowed(info: CameraMessage, image_px: Size) -> CameraMessage:
+    """Return the calibration of the part of the sensor that images of this size show, binned as they are."""
+    window = info.window
+    shown_px = (
+        (window.width_px or info.width_px) // window.binning_x,
+        (window.height_px or info.height_px) // window.binning_y,
+    )
+    if image_px != shown_px or image_px == (info.width_px, info.height_px):
+        return info
+    # The centre of pixel (0, 0) is at 0, so that of the first bin of n is at (n - 1) / 2.
+    to_image = np.array(
+        [
+            [1.0 / window.binning_x, 0.0, (0.5 - window.x_px) / window.binning_x - 0.5],
+            [0.0, 1.0 / window.binning_y, (0.5 - window.y_px) / window.binning_y - 0.5],
+            [0.0, 0.0, 1.0],
+        ]
+    )
+    return replace(
+        info,
+        width_px=image_px[0],
+        height_px=image_px[1],
+        K=(to_image @ info.K.reshape(3, 3)).ravel() if info.K.size == 9 else info.K,
+        P=(to_image @ info.P.reshape(3, 4)).ravel() if info.P.size == 12 else info.P,
+        window=Window(),
+    )
+
+
+def _calibration(info: CameraMessage, *, is_rectified: bool, name: str) -> Calibration:
+    """Return the intrinsics of raw images with their distortion, or of rectified ones without."""
+    size_px = (info.width_px, info.height_px) if info.width_px and info.height_px else None
+    P, K, D = info.P.tolist(), info.K.tolist(), info.D.tolist()
+    if is_rectified and len(P) == 12 and P[0] > 0.0:
+        return Calibration(name, P[0], P[5], P[2], P[6], size_px=size_px)
+    if len(K) != 9 or not K[0] > 0.0:
+        raise SourceError(
+            f"{name}: the camera is not calibrated, K is {K}; --set source.camera.fx_px=… and so on"
+        )
+    if any(D) and (info.model not in POLYNOMIAL_MODELS or any(D[5:])):
+        lens = Lens(info.model, D)
+        if not lens.is_known:
+            raise SourceError(
+                f"{name}: distortion {info.model} with {len(D)} coefficients is not known; known are "
+                f"{', '.join(sorted(POLYNOMIAL_MODELS | FISHEYE_MODELS))}: rectify the images, or --set "
+                "source.camera.fx_px=… and so on"
+            )
+        return Calibration(name, K[0], K[4], K[2], K[5], lens=lens, size_px=size_px)
+    k1, k2, p1, p2, k3 = (*D[:5], *NO_DISTORTION)[:5]
+    return Calibration(name, K[0], K[4], K[2], K[5], distortion=(k1, k2, p1, p2, k3), size_px=size_px)

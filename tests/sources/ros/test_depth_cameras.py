@@ -1,0 +1,179 @@
+"""Recordings whose depth comes from a camera of its own: registered as they are read, or refused."""
+
+import numpy as np
+import pytest
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from mapper.core.errors import DataError, SourceError
+from mapper.core.frames import PinholeCamera
+from mapper.core.geometry import exp, inverse
+from mapper.core.rotations import row_of_pose
+from mapper.sources import open_source
+from mapper.sources.config import CameraConfig, SourceConfig, TopicsConfig
+from mapper.sources.inspection import inspect_log
+from mapper.sources.ros.decode import decode
+from mapper.sources.ros.recording import Topic
+from mapper.sources.writers import write_log
+from tests.support.depth_cameras import BESIDE, write_unregistered
+from tests.support.recordings import CAMERA, COLOR, camera_info, image, shots, transforms, write
+from tests.support.tum_logs import FIRST_NS, picture
+
+WIDE = PinholeCamera(106, 60, 53.0, 53.0, 52.4, 30.1)
+IN_TF, IN_TOPIC = True, False
+DEPTH = "/cam/depth/image_rect_raw"
+
+
+@pytest.fixture
+def room(tiny_tum_log):
+    """Frames of a tilted wall, and the same as a depth camera of its own measures them."""
+    return open_source(tiny_tum_log(3))
+
+
+def unregistered(depth_camera=WIDE, T=BESIDE, *, frame="depth_optical", topic=DEPTH, info=True):
+    """RGB-D messages with depth of a wall, 2 m off, of another camera, whose place tf states."""
+    T_color_depth = [transforms(("optical", frame, T))] if T is not None else []
+    wall = np.full((depth_camera.height_px, depth_camera.width_px), 2000, np.uint16)
+    messages = [message for message in shots(3) if "aligned" not in message.topic]
+    messages += [image(one.stamp_ns, topic, wall, "16UC1", frame=frame) for one in shots(3)[1::3]]
+    if info:
+        messages.append(camera_info(FIRST_NS, topic.rpartition("/")[0] + "/camera_info", depth_camera))
+    return [*T_color_depth, *messages]
+
+
+def opened(path, messages, **config):
+    return open_source(write(path, messages), SourceConfig(**config))
+
+
+@pytest.mark.parametrize("source", [IN_TF, IN_TOPIC])
+def test_depth_of_a_camera_beside_is_that_of_the_registered_log(tmp_path, room, source):
+    write_unregistered(tmp_path / "bag", room, WIDE, BESIDE, is_in_tf=source)
+    log = open_source(tmp_path / "bag")
+    assert len(log) == len(room)
+    for found, wanted in zip(log, room, strict=True):
+        np.testing.assert_array_equal(found.image, wanted.image)
+        assert found.camera == wanted.camera
+        both = (found.depth_m > 0.0) & (wanted.depth_m > 0.0)
+        assert both.sum() > 0.9 * (wanted.depth_m > 0.0).sum()
+        # The wall is slanted by 4 mm a pixel of colour, and depth is in millimetres.
+        assert np.abs(found.depth_m - wanted.depth_m)[both].max() < 0.02
+        assert abs((found.depth_m - wanted.depth_m)[both].mean()) < 0.001
+        assert found.depth_delay_s == pytest.approx(wanted.depth_delay_s, abs=1e-9)
+    origin = "(tf)" if source is IN_TF else "(/camera/extrinsics/depth_to_color)"
+    notes = [note for note in inspect_log(tmp_path / "bag", SourceConfig()).log.notes if "registered" in note]
+    assert len(notes) == 1
+    assert "15.0 mm" in notes[0]
+    assert origin in notes[0]
+
+
+def test_scans_are_those_of_the_frames_and_a_converted_log_is_registered(tmp_path, room):
+    write_unregistered(tmp_path / "bag", room, WIDE, BESIDE)
+    log = open_source(tmp_path / "bag")
+    entry = log.entry_at(0)
+    np.testing.assert_array_equal(entry.scan().points_body, entry.load().scan().points_body)
+    assert entry.files is None
+    assert write_log(log, tmp_path / "tum", kind="tum") == []
+    again = open_source(tmp_path / "tum")
+    np.testing.assert_allclose(again[0].depth_m, log[0].depth_m, atol=1.1e-4)
+    assert again[0].camera == log[0].camera
+
+
+@pytest.mark.parametrize(
+    ("kind", "encoding", "type_", "definition"),
+    [
+        (Stores.ROS1_NOETIC, "ros1", "realsense2_camera/msg/Extrinsics", "std_msgs/Header header\n"),
+        (Stores.ROS2_HUMBLE, "cdr", "realsense2_camera_msgs/msg/Extrinsics", "std_msgs/Header header\n"),
+        (Stores.ROS2_HUMBLE, "cdr", "realsense2_camera_msgs/msg/Extrinsics", ""),
+    ],
+)
+def test_extrinsics_of_every_driver_are_read(kind, encoding, type_, definition):
+    store = get_typestore(kind)
+    store.register(get_types_from_msg(f"{definition}float64[9] rotation\nfloat64[3] translation\n", type_))
+    header = []
+    if definition:
+        Header, Time = (store.types[name] for name in ("std_msgs/msg/Header", "builtin_interfaces/msg/Time"))
+        sequence = [1] if encoding == "ros1" else []
+        header = [Header(*sequence, Time(0, 0), "depth_to_color_extrinsics")]
+    message = store.types[type_](*header, BESIDE[:3, :3].ravel(order="F"), BESIDE[:3, 3].copy())
+    serialize = store.serialize_ros1 if encoding == "ros1" else store.serialize_cdr
+    data = memoryview(bytes(serialize(message, type_)))
+    (pose,) = decode(Topic("/camera/extrinsics/depth_to_color", type_, encoding), data)
+    np.testing.assert_allclose(pose.numbers, row_of_pose(BESIDE), atol=1e-12)
+
+
+def test_a_rotation_that_is_none_is_a_damaged_message():
+    numbers = np.array([*np.full(9, 0.5), 0.015, 0.0, 0.0])
+    data = memoryview(b"\0\1\0\0" + numbers.astype("<f8").tobytes())
+    topic = Topic("/camera/extrinsics/depth_to_color", "realsense2_camera_msgs/msg/Extrinsics", "cdr")
+    for damaged in (data, data[:60]):
+        with pytest.raises(DataError):
+            decode(topic, damaged)
+
+
+def test_depth_without_a_pose_or_intrinsics_is_refused_with_the_setting(tmp_path):
+    path = write(tmp_path / "a.mcap", unregistered(T=None))
+    with pytest.raises(
+        SourceError, match=r"\(106×60 px, focal length 53\.0 px\) .*source\.camera\.depth_in_col"
+    ):
+        open_source(path)
+    beside = CameraConfig(depth_in_color=tuple(row_of_pose(BESIDE).tolist()))
+    (note,) = (one for one in open_source(path, SourceConfig(camera=beside)).notes if "registered" in one)
+    assert "source.camera.depth_in_color" in note
+    path = write(tmp_path / "b.mcap", unregistered(CAMERA, info=False))
+    with pytest.raises(SourceError, match=r"15 mm beside it by tf; .*source\.camera\.depth_intrinsics_px"):
+        open_source(path)
+    own = CameraConfig(depth_intrinsics_px=(60.0, 61.0, 31.5, 23.5))
+    assert any("15.0 mm" in note for note in open_source(path, SourceConfig(camera=own)).notes)
+
+
+def test_a_setting_goes_before_tf_and_says_that_depth_is_registered(tmp_path):
+    messages = unregistered(CAMERA)
+    assert any("as it is read" in note for note in opened(tmp_path / "a.mcap", messages).notes)
+    same = CameraConfig(depth_in_color=(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0))
+    log = open_source(tmp_path / "a.mcap", SourceConfig(camera=same))
+    assert log.notes[-1] == "depth in frame depth_optical is taken to be registered to colour in optical"
+    assert (log[0].depth_m == 2.0).all()
+    turned = CameraConfig(
+        depth_in_color=tuple(row_of_pose(exp(np.array([0.0, 0.0, 0.02]), np.zeros(3))).tolist())
+    )
+    log = open_source(tmp_path / "a.mcap", SourceConfig(camera=turned))
+    assert 0.9 < (log[0].depth_m > 0.0).mean() < 1.0
+
+
+def test_frames_that_tf_turns_against_each_other_are_not_optical(tmp_path):
+    forward = exp(np.array([0.0, np.pi / 2, 0.0]), np.array([0.015, 0.0, 0.0]))
+    with pytest.raises(SourceError, match=r"tf turns it by 90°.*depth_in_color"):
+        opened(tmp_path / "a.mcap", unregistered(T=forward))
+
+
+def test_a_pose_of_the_topic_that_contradicts_tf_is_noted(tmp_path, room):
+    write_unregistered(tmp_path / "bag", room, WIDE, inverse(BESIDE), is_in_tf=IN_TF, also_topic=BESIDE)
+    log = open_source(tmp_path / "bag")
+    (note,) = (note for note in log.notes if "another pose" in note)
+    numbers = [float(word) for word in note[note.index("=[") + 2 : -1].split(",")]
+    np.testing.assert_allclose(numbers, row_of_pose(BESIDE), atol=1e-5)
+
+
+def test_colour_of_a_wide_image_is_reduced_and_depth_is_as_large(tmp_path):
+    rgb, _ = picture(0, width_px=1280, height_px=720)
+    color = PinholeCamera(1280, 720, 920.0, 920.0, 639.5, 359.5)
+    wall = np.full((60, 106), 2000, np.uint16)
+    messages = [
+        transforms(("optical", "depth_optical", BESIDE)),
+        image(FIRST_NS, COLOR, rgb, "rgb8"),
+        image(FIRST_NS, DEPTH, wall, "16UC1", frame="depth_optical"),
+        camera_info(FIRST_NS, camera=color),
+        camera_info(FIRST_NS, "/cam/depth/camera_info", WIDE),
+    ]
+    frame = opened(tmp_path / "a.mcap", messages)[0]
+    assert frame.image.shape == (360, 640, 3)
+    assert frame.camera == color.resized(640, 360)
+    assert (frame.depth_m > 0.0).mean() > 0.95
+    np.testing.assert_allclose(frame.depth_m[frame.depth_m > 0.0], 2.0, atol=0.05)
+
+
+def test_depth_called_registered_of_the_same_lens_is_taken_so(tmp_path):
+    messages = unregistered(CAMERA, topic="/cam/depth_registered/image")
+    assert not any("as it is read" in note for note in opened(tmp_path / "a.mcap", messages).notes)
+    chosen = TopicsConfig(depth=DEPTH)
+    log = opened(tmp_path / "b.mcap", unregistered(CAMERA), topics=chosen)
+    assert any("as it is read" in note for note in log.notes)
