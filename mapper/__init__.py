@@ -8,6 +8,7 @@ Names are loaded when they are first used, so that ``import mapper`` takes no ti
     array([0, 0, 0, ..., 0, 0, 0], dtype=int8)
 """
 
+import sys
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -54,7 +55,9 @@ _HOMES = {
 def __getattr__(name: str) -> Any:
     """Load a name when it is first used (PEP 562)."""
     if name not in _HOMES:
-        raise AttributeError(f"module 'mapper' has no attribute {name!r}")
+        raise AttributeError(  # Python adds which name was perhaps meant
+            f"module 'mapper' has no attribute {name!r}", name=name, obj=sys.modules[__name__]
+        )
     value = getattr(import_module(_HOMES[name]), name)
     globals()[name] = value
     return value

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from pydantic import ValidationError
 
 from mapper.config.build import BuildConfig
-from mapper.core.config import Config, drop_unknown, kind_of, members_of
+from mapper.core.config import Config, drop_unknown, flattened, kind_of, members_of
 from mapper.core.errors import ConfigError, MapperWarning
 from mapper.runtime.atomic import MANIFEST_NAME
 from mapper.runtime.regular_files import AnyPath, parse_toml, read_text
@@ -43,7 +43,7 @@ Settings = Mapping[str, Any]
 
 
 def load_config(
-    path: AnyPath | None = None,
+    path: AnyPath | Settings | None = None,
     overrides: Sequence[str] = (),
     *,
     settings: Settings | None = None,
@@ -52,7 +52,7 @@ def load_config(
     """Return the configuration of a TOML file, or a run's JSON, with single settings on top.
 
     Args:
-        path: The file; None begins with the defaults.
+        path: The file, or settings by name; None begins with the defaults.
         overrides: ``key.path=value`` as text, parsed by the model.
         settings: The same as values by dotted name; they come last.
         sensor: Sensor whose defaults hold where nothing else is set.
@@ -61,11 +61,13 @@ def load_config(
         ConfigError: The file cannot be read or parsed, or the model refuses a name or a value.
 
     Example:
-        >>> load_config(settings={"octree.resolution_m": 0.1}).octree.resolution_m
+        >>> load_config({"octree.resolution_m": 0.1}).octree.resolution_m
         0.1
         >>> load_config(overrides=["octree.resolution_m=0.1"]).octree.resolution_m
         0.1
     """
+    if isinstance(path, Mapping):
+        settings, path = {**flattened(path), **flattened(settings or {})}, None
     path = None if path is None else Path(path)
     tree = {} if path is None else _read(path)
     if path is not None:

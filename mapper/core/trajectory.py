@@ -2,13 +2,16 @@
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from importlib import import_module
+from os import PathLike
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.errors import DataError
-from mapper.core.geometry import Array, Transform, inverse, is_rigid, path_length
+from mapper.core.geometry import Array, Transform, interpolate, inverse, is_rigid, path_length
 from mapper.core.timebase import NS_PER_S, Stamps
 
 if TYPE_CHECKING:
@@ -88,6 +91,37 @@ class Trajectory:
     def during(self, first_ns: int, last_ns: int) -> "Trajectory":
         """Return the poses from one time to another, both included."""
         return self[(self.stamps_ns >= first_ns) & (self.stamps_ns <= last_ns)]
+
+    def at(self, stamp_ns: int) -> Transform:
+        """Return the (4, 4) pose at a time, nanoseconds, interpolated between those before and after it.
+
+        Raises:
+            DataError: It is before the first pose or after the last.
+        """
+        after = int(np.searchsorted(self.stamps_ns, stamp_ns))
+        if after < len(self) and self.stamps_ns[after] == stamp_ns:
+            return self[after]
+        if not 0 < after < len(self):
+            begin_ns, end_ns = self.stamps_ns[[0, -1]].tolist() if len(self) else (0, 0)
+            raise DataError(
+                f"trajectory: no pose at {stamp_ns} ns; want {begin_ns} … {end_ns} ns (stamps_ns)"
+            )
+        begin_ns, end_ns = self.stamps_ns[[after - 1, after]].tolist()
+        return interpolate(self[after - 1], self[after], (stamp_ns - begin_ns) / (end_ns - begin_ns))
+
+    def interpolate(self, stamps_ns: Iterable[int]) -> "Trajectory":
+        """Return the poses at other times, as :meth:`at` does, in increasing order.
+
+        Raises:
+            DataError: As :meth:`at`, or the times do not increase.
+        """
+        return trajectory_from((int(stamp_ns), self.at(stamp_ns)) for stamp_ns in stamps_ns)
+
+    def write(self, path: str | PathLike[str]) -> None:
+        """Write the trajectory, atomically: KITTI text if the name ends in ".kitti", else TUM text."""
+        writers = import_module("mapper.sources.trajectory_files")  # which imports this module
+        is_kitti = Path(path).suffix.lower() == ".kitti"
+        (writers.write_kitti if is_kitti else writers.write_tum)(Path(path), self)
 
     @property
     def stamps(self) -> Array:

@@ -86,6 +86,11 @@ class MapView:
         return self.config.resolution_m
 
     @property
+    def resolution(self) -> float:
+        """Edge of a voxel, metres: ``resolution_m``."""
+        return self.resolution_m
+
+    @property
     def occupied_log_odds(self) -> np.float32:
         """Least log-odds of an occupied voxel."""
         return log_odds(self.config.occupied_probability)
@@ -93,6 +98,10 @@ class MapView:
     def __len__(self) -> int:
         """Return the number of known voxels, all at the finest level; counted at every call."""
         return int(count_known(self.blocks.table.values[: len(self.blocks)]))
+
+    def __getitem__(self, points_world: ArrayLike) -> NDArray[np.int8]:
+        """Return what :meth:`query` does: ``octree[x, y, z]`` of one point."""
+        return self.query(points_world)
 
     def count_occupied(self) -> int:
         """Return how many of the known voxels are occupied; the others are free."""
@@ -158,6 +167,10 @@ class MapView:
         """Return the (...) mask of the (..., 3) points, metres, that lie in occupied voxels."""
         return self.log_odds_at(points_world) >= self.occupied_log_odds
 
+    def is_occupied(self, point_world: ArrayLike) -> bool:
+        """Return whether the voxel around one point, (3,) metres, is occupied."""
+        return bool(self.are_occupied(point_world))
+
     def are_near_occupied(
         self, points_world: Points | Points32, *, max_distance_m: float
     ) -> NDArray[np.bool_]:
@@ -215,12 +228,17 @@ class MapView:
         return cut_between(self, z_min, z_max)
 
     def cast_rays(
-        self, origins_world: Points, directions_world: Points, *, max_range_m: float, through_unknown: bool
+        self,
+        origins_world: ArrayLike,
+        directions_world: ArrayLike,
+        *,
+        max_range_m: float = np.inf,
+        through_unknown: bool = False,
     ) -> RayEnds:
         """Return the first occupied voxel along N rays, as OctoMap's ``castRay`` finds it.
 
         Args:
-            origins_world: (N, 3) metres.
+            origins_world: (N, 3) metres, or (3,) of all rays.
             directions_world: (N, 3) of any length but zero.
             max_range_m: Rays end without a hit once a voxel's centre is further away.
             through_unknown: Pass unknown voxels; otherwise a ray ends, without a hit, in the first.
@@ -228,8 +246,11 @@ class MapView:
         Raises:
             DataError: Shapes differ, a direction is zero or not finite, or an origin has no key.
         """
-        origins = np.ascontiguousarray(origins_world, dtype=np.float32)
         directions = np.ascontiguousarray(directions_world, dtype=np.float32)
+        given_world = np.asarray(origins_world)
+        if given_world.shape == (3,):
+            given_world = np.broadcast_to(given_world, directions.shape)
+        origins = np.ascontiguousarray(given_world, dtype=np.float32)
         expect_shape(origins, "N,3", "octree: origins of rays")
         expect_shape(directions, f"{len(origins)},3", "octree: directions of rays")
         if not np.isfinite(directions).all() or not directions.any(axis=1).all():
@@ -246,10 +267,10 @@ class MapView:
             through_unknown,
         )
         centres_world = self._centres_of(keys)
-        distances_m = np.linalg.norm(centres_world - origins_world, axis=1)
+        distances_m = np.linalg.norm(centres_world - given_world, axis=1)
         return RayEnds(centres_world, distances_m, hits)
 
-    def nearest_obstacles(self, points_world: Points | Points32, *, max_range_m: float) -> Nearest:
+    def nearest_obstacles(self, points_world: ArrayLike, *, max_range_m: float = np.inf) -> Nearest:
         """Return the occupied voxel whose centre is nearest to each point, without a distance field.
 
         Args:

@@ -3,6 +3,7 @@
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +38,21 @@ class UncertainPoses:
     trajectory: Trajectory
     is_doubtful: NDArray[np.bool_]
     covariances: Array
+
+    def __len__(self) -> int:
+        return len(self.trajectory)
+
+    def __iter__(self) -> Iterator[dict[str, Any]]:
+        """Yield a row of ``poses.csv`` for each pose, by column, of which pandas makes a table."""
+        for (stamp_ns, T), is_doubtful, covariance in zip(
+            self.trajectory.items(), self.is_doubtful.tolist(), self.covariances, strict=True
+        ):
+            outcome = "doubtful" if is_doubtful else "tracked"
+            row = (stamp_ns, outcome, *row_of_pose(T).tolist(), *covariance[_UPPER].tolist())
+            yield dict(zip(_COLUMNS, row, strict=True))
+
+    def __repr__(self) -> str:
+        return f"UncertainPoses of {len(self)} poses, {np.count_nonzero(self.is_doubtful)} doubtful"
 
     @property
     def position_covariances_world(self) -> Array:
@@ -120,14 +136,14 @@ def read_poses(path: Path) -> UncertainPoses:
 
 
 def _rows(poses: UncertainPoses) -> Iterator[list[object]]:
-    for (stamp_ns, T), is_doubtful, covariance in zip(
-        poses.trajectory.items(), poses.is_doubtful.tolist(), poses.covariances, strict=True
-    ):
+    for row in poses:
+        stamp_ns, outcome, *numbers = row.values()
+        pose, covariance = numbers[: len(_POSE)], numbers[len(_POSE) :]
         yield [
             stamp_ns,
-            "doubtful" if is_doubtful else "tracked",
-            *map(repr, row_of_pose(T).tolist()),
-            *(f"{value:.9g}" if np.isfinite(value) else "" for value in covariance[_UPPER].tolist()),
+            outcome,
+            *map(repr, pose),
+            *(f"{value:.9g}" if np.isfinite(value) else "" for value in covariance),
         ]
 
 

@@ -37,6 +37,12 @@ class RunResults:
     truth: Trajectory | None
     poses: UncertainPoses
 
+    def __repr__(self) -> str:
+        counts = (
+            f"{len(self.trajectory)} poses, {len(self.graph.T_world_node)} nodes, {len(self.loops)} loops"
+        )
+        return f"RunResults of {counts}"
+
     @property
     def tracked(self) -> Trajectory:
         """The poses of the frames that maps are made from: those that are not doubtful."""

@@ -4,7 +4,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from mapper.core.geometry import Array, Transform, exp, interpolate
+from mapper.core.geometry import Array, Transform, exp
 from mapper.core.timebase import Stamps
 from mapper.core.trajectory import Trajectory
 
@@ -35,20 +35,11 @@ def driven(stamps_ns: Stamps, path_m: Array, steering_rad: Array, *, wheelbase_m
 
 def pose_at(wheels: Trajectory, stamp_ns: int, *, max_gap_ns: int) -> Transform | None:
     """Return T_odom_body at a time; None outside the readings, or in a gap of more than ``max_gap_ns``."""
-    after = int(np.searchsorted(wheels.stamps_ns, stamp_ns))
-    if after == len(wheels):
+    stamps_ns = wheels.stamps_ns
+    before, after = np.searchsorted(stamps_ns, stamp_ns, "right") - 1, np.searchsorted(stamps_ns, stamp_ns)
+    if before < 0 or after == len(wheels) or stamps_ns[after] - stamps_ns[before] > max_gap_ns:
         return None
-    end_ns = int(wheels.stamps_ns[after])
-    if end_ns == stamp_ns:
-        exact: Transform = wheels.T_world_body[after]
-        return exact
-    if after == 0:
-        return None
-    begin_ns = int(wheels.stamps_ns[after - 1])
-    if end_ns - begin_ns > max_gap_ns:
-        return None
-    fraction = (stamp_ns - begin_ns) / (end_ns - begin_ns)
-    return interpolate(wheels.T_world_body[after - 1], wheels.T_world_body[after], fraction)
+    return wheels.at(stamp_ns)
 
 
 class Odometer:

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Container, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol, overload
+from typing import Protocol, Self, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -170,6 +170,12 @@ class Log:
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
+
+    def __enter__(self) -> Self:
+        """Return the log itself: nothing stays open between its frames."""
+        return self
+
+    def __exit__(self, *_: object) -> None: ...
 
     def __iter__(self) -> Iterator[Frame]:
         """Yield every frame in time order, read and decoded; ``entries`` reads none by itself.

@@ -9,6 +9,7 @@ import pytest
 
 import mapper
 from mapper.core.frames import RgbdFrame
+from mapper.sources.trajectory_files import read_tum
 
 mpl.use("Agg")
 
@@ -209,3 +210,86 @@ def test_the_picture_is_drawn_and_the_notebook_has_it(run):
     plt.close(figure)
     assert "trusted" in run._repr_html_()
     assert repr(run) == f"Run({str(run.path)!r})"
+
+
+def test_a_trajectory_is_asked_for_other_times_and_written(run, tmp_path):
+    path = run.trajectory
+    begin_ns, end_ns = path.stamps_ns[:2].tolist()
+    np.testing.assert_array_equal(path.at(begin_ns), path[0])
+    middle = path.at((begin_ns + end_ns) // 2)
+    np.testing.assert_allclose(middle[:3, 3], path.positions[:2].mean(axis=0), atol=1e-9)
+    turned = [path[0][:3, :3].T @ middle[:3, :3], middle[:3, :3].T @ path[1][:3, :3]]
+    np.testing.assert_allclose(turned[0], turned[1], atol=1e-6)  # half of the turn each
+    other = path.interpolate([begin_ns + 1000, end_ns])
+    assert other.stamps_ns.tolist() == [begin_ns + 1000, end_ns]
+    np.testing.assert_array_equal(other[1], path[1])
+    for outside in (begin_ns - 1, int(path.stamps_ns[-1]) + 1):
+        with pytest.raises(mapper.MapperError, match="no pose at"):
+            path.at(outside)
+    with pytest.raises(mapper.MapperError, match="no pose at"):
+        path[:0].at(begin_ns)
+    path.write(str(tmp_path / "path.tum"))
+    again = read_tum(tmp_path / "path.tum")
+    np.testing.assert_array_equal(again.stamps_ns, path.stamps_ns)
+    np.testing.assert_allclose(again.poses, path.poses, atol=1e-12)
+    path.write(tmp_path / "path.kitti")
+    assert len((tmp_path / "path.kitti").read_text().splitlines()) == 31
+
+
+def test_the_octree_is_asked_by_coordinates(run):
+    octree = run.octree
+    assert octree.resolution == 0.05
+    x, y, z = octree.occupied()[0]
+    assert octree[x, y, z] == 100
+    assert octree.is_occupied([x, y, z]) is True
+    assert octree.is_occupied((1e4, 0.0, 0.0)) is False
+    assert octree[octree.free()].max() == 0
+    rays = octree.cast_rays(run.trajectory.positions[0], [[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]])
+    assert rays.hits.shape == (2,)
+    above = [[float(x), float(y), float(z) + 100.0]]
+    assert octree.nearest_obstacles(above).distances_m < 110.0
+
+
+def test_a_log_may_be_opened_in_a_block(desk_log):
+    with mapper.open_log(desk_log) as log:
+        assert len(list(log[:2])) == 2
+
+
+def test_settings_are_given_by_name():
+    assert mapper.load_config({"octree.resolution_m": 0.1}).octree.resolution_m == 0.1
+    nested = {"octree": {"resolution_m": 0.1}}
+    assert mapper.load_config(nested, settings={"octree.resolution_m": 0.2}).octree.resolution_m == 0.2
+    assert "resolution_m=0.1" in repr(mapper.load_config(nested))
+    with pytest.raises(mapper.MapperError, match="did you mean octree"):
+        mapper.load_config({"octre.resolution_m": 0.1})
+
+
+def test_poses_become_a_table(run):
+    pandas = pytest.importorskip("pandas")
+    table, written = pandas.DataFrame(run.poses), pandas.read_csv(run.file("poses.csv"))
+    assert list(table.columns) == list(written.columns)
+    pandas.testing.assert_frame_equal(table, written, rtol=1e-8)
+
+
+def test_what_is_printed_fits_a_screen(run, desk_log):
+    parts = (
+        run,
+        run.poses,
+        run.results,
+        run.cloud,
+        run.slice,
+        run.graph,
+        run.verdict,
+        run.config,
+        run.octree,
+    )
+    log = mapper.open_log(desk_log)
+    assert {
+        type(part).__name__: len(repr(part)) for part in (*parts, log, log[0]) if len(repr(part)) > 1500
+    } == {}
+
+
+def test_a_misspelt_name_is_told_to_python():
+    with pytest.raises(AttributeError) as caught:
+        _ = mapper.biuld
+    assert (caught.value.name, caught.value.obj) == ("biuld", mapper)  # of which it makes "Did you mean"

@@ -64,6 +64,11 @@ ASKS_UPWARDS = {
 """Imports against the order, loaded when they are used: ``run.plot()`` and notebooks draw a run, and
 ``mapper.evaluate`` is named beside the library's other functions."""
 
+ASKS_BY_NAME = {
+    ("mapper/core/trajectory.py", "mapper.sources.trajectory_files"),
+}
+"""Modules that import a module of this project that imports them: loaded by name when they are used."""
+
 HOMES = {
     "gtsam": ("mapper/graph/",),
     "mcap": ("mapper/export/mcap_log.py", "mapper/sources/ros/"),
@@ -116,6 +121,16 @@ def test_layers_point_one_way(package):
         if (path, module) in ASKS_UPWARDS:
             continue
         assert root not in OURS or root in MAY_IMPORT[package], f"{path}:{line} imports {root}"
+
+
+def test_few_modules_are_imported_by_name():
+    found = set()
+    for path in sorted((ROOT / "mapper").rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text())):
+            match node:
+                case ast.Call(func=ast.Name(id="import_module"), args=[ast.Constant(value=str(name))]):
+                    found.add((str(path.relative_to(ROOT)), name))
+    assert found == ASKS_BY_NAME
 
 
 def folder_imports() -> Iterator[tuple[str, str, str, str]]:
