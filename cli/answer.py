@@ -14,15 +14,13 @@ import typer
 
 from mapper.cli.console import print_text, progress_for
 from mapper.cli.options import refuse_several
-from mapper.core.errors import MapperError, UntrustedError
+from mapper.core.errors import LINE_WIDTH, MapperError, UntrustedError
 from mapper.runtime.atomic import MANIFEST_NAME
 from mapper.runtime.progress import SILENT, Progress
 from mapper.runtime.result_paths import result_path
 
 if TYPE_CHECKING:
     from mapper.run.manifest import Verdict
-
-_LINE_WIDTH = 110
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,7 +151,7 @@ def rows_text(rows: Sequence[tuple[str, str]], *, width: int | None = None) -> s
     from textwrap import wrap
 
     if width is None:
-        width = min(_LINE_WIDTH, get_terminal_size().columns) if sys.stdout.isatty() else _LINE_WIDTH
+        width = min(LINE_WIDTH, get_terminal_size().columns) if sys.stdout.isatty() else LINE_WIDTH
     indent = 2 + max(len(name) for name, _ in rows)
     lines = []
     for name, text in rows:

@@ -11,8 +11,9 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from mapper.cli.console import escaped, print_help
+from mapper.core.errors import LINE_WIDTH
 
-HELP = {"help_option_names": ["-h", "--help"], "max_content_width": 110}
+HELP = {"help_option_names": ["-h", "--help"], "max_content_width": LINE_WIDTH}
 """Settings of every context."""
 
 PANELS = ("map", "look", "judge", "edit", "study", "tools")

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import cv2
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parent.parent
 MAPPER = [sys.executable, "-c", "from mapper.cli.main import main; main()"]
 PAGE, OUT = ROOT / "docs" / "gallery.md", ROOT / "docs" / "gallery"
 WIDTH_PX = 1000

@@ -30,7 +30,7 @@ import tomllib
 from collections import Counter, defaultdict
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parent.parent
 SPEC = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
 MAPPER = [sys.executable, "-P", "-c", "from mapper.cli.main import main; main()"]  # -P: not from here
 NO_TIMES = ["--set", "mcap.frame_times=false"]

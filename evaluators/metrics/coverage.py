@@ -3,11 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.core.timebase import MAX_TRUTH_GAP_NS, NS_PER_S, Stamps, nearest, stretches
+from mapper.core.timebase import GAP_INTERVALS, MAX_TRUTH_GAP_NS, NS_PER_S, Stamps, nearest, stretches
 from mapper.evaluators.metrics.metric import Metric
-
-_GAP_INTERVALS = 3.0
-"""A pause longer than so many usual intervals is a gap, as in ``mapper inspect``."""
 
 
 def frame_coverage(frames_ns: Stamps, poses_ns: Stamps) -> list[Metric]:
@@ -40,7 +37,7 @@ def time_coverage(poses_ns: Stamps, *, begin_ns: int, end_ns: int) -> list[Metri
     usual_ns = float(np.median(np.diff(poses_ns))) if len(poses_ns) > 1 else 0.0
     inside = poses_ns[(poses_ns >= begin_ns) & (poses_ns <= end_ns)]
     pauses_ns = np.diff(np.concatenate([[begin_ns], inside, [end_ns]])).astype(np.float64)
-    gaps_s = pauses_ns[pauses_ns > _GAP_INTERVALS * usual_ns] / NS_PER_S
+    gaps_s = pauses_ns[pauses_ns > GAP_INTERVALS * usual_ns] / NS_PER_S
     covered = 1.0 - float(gaps_s.sum()) * NS_PER_S / (end_ns - begin_ns)
     return [Metric("coverage", 100.0 * covered, "%", "share of the truth's time"), *_gap_metrics(gaps_s)]
 
@@ -57,7 +54,7 @@ def _pauses_s(frames_ns: Stamps, tracked: NDArray[np.bool_]) -> NDArray[np.float
     pauses_ns = np.diff(frames_ns).astype(np.float64)
     usual_ns = float(np.median(pauses_ns)) if len(pauses_ns) else 0.0
     between = tracked[:-1] & tracked[1:]
-    return pauses_ns[between & (pauses_ns > _GAP_INTERVALS * usual_ns)] / NS_PER_S
+    return pauses_ns[between & (pauses_ns > GAP_INTERVALS * usual_ns)] / NS_PER_S
 
 
 def _untracked_s(frames_ns: Stamps, tracked: NDArray[np.bool_]) -> NDArray[np.float64]:

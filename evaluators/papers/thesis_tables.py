@@ -11,13 +11,13 @@ from mapper.config.build import BuildConfig
 from mapper.config.loading import load_config
 from mapper.core.geometry import inverse, rotation_log
 from mapper.core.trajectory import Trajectory
+from mapper.core.units import MM_PER_M
 from mapper.evaluators.metrics.trajectory import associate, rpe
 from mapper.evaluators.papers.model import PaperCell, PaperTable
 from mapper.evaluators.papers.paper import CONFIGS, Figures, ate_rmse_m, figures, published
 
 POZNAN = "Poznań/trajectory1"
 _OWN_LOG = "the thesis's own log"
-_MM_PER_M = 1000.0
 _AUTO_MIN_ERROR_MM = 5.0  # in all four logs of Table 5.1 "auto" is as good as 7 to 9 iterations: 7.6 to 4 mm
 
 
@@ -186,7 +186,7 @@ def _end_error(estimate: Trajectory, truth: Trajectory) -> list[float]:
     T_start_end, T_true_start_end = (
         inverse(T[0]) @ T[-1] for T in (matched.T_map_body, matched.T_truth_body)
     )
-    offset_mm = (T_start_end - T_true_start_end)[:3, 3] * _MM_PER_M
+    offset_mm = (T_start_end - T_true_start_end)[:3, 3] * MM_PER_M
     pitch, yaw, roll = rotation_log(T_start_end[:3, :3] @ T_true_start_end[:3, :3].T)
     turned_rad = np.array([roll, pitch, yaw])
     return [*offset_mm, *turned_rad, np.abs(offset_mm).mean(), np.abs(turned_rad).mean()]

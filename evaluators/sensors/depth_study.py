@@ -9,6 +9,7 @@ import numpy as np
 
 from mapper.core.errors import DataError
 from mapper.core.geometry import Array
+from mapper.core.units import MM_PER_M
 from mapper.evaluators.sensors.depth_accuracy import DepthLevel, Patch, ResidualMap, check_rgbd
 from mapper.evaluators.sensors.depth_planes import depth_at, depth_of_planes
 from mapper.evaluators.study.table import Column, Record, text_table
@@ -107,9 +108,6 @@ def _fit(form: Form, depth_m: Array, sigma_m: Array) -> tuple[NoiseFit, float]:
         high_m=float(depth_m.max()),
     )
     return fit, squares
-
-
-_MM = 1e3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -239,7 +237,7 @@ def depth_text(study: DepthStudy) -> str:
 
 def _mm(metres: float) -> str:
     digits = 2 if abs(metres) < 0.01 else 1
-    return f"{round(_MM * metres, digits) + 0.0:.{digits}f}"  # no -0.00
+    return f"{round(MM_PER_M * metres, digits) + 0.0:.{digits}f}"  # no -0.00
 
 
 def _uncertainty_text(uncertainty: Array) -> str:

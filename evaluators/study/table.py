@@ -9,6 +9,7 @@ from textwrap import fill
 
 import numpy as np
 
+from mapper.core.errors import LINE_WIDTH
 from mapper.core.geometry import Array
 from mapper.runtime.atomic import atomic_file
 from mapper.runtime.extras import extra
@@ -18,8 +19,6 @@ Record = Mapping[str, Value]
 """One row: name to value, with its unit in the name and every digit in the value; None is not known."""
 
 MISSING = "–"
-
-_LINE_WIDTH = 110
 
 _LATEX = {
     **{character: f"\\{character}" for character in "&%$#_{}"},
@@ -93,7 +92,7 @@ def decimals(count: int, *, times: float = 1.0) -> Callable[[float], str]:
 
 def indented(notes: Sequence[str]) -> list[str]:
     """Return sentences as they stand below a table on a terminal."""
-    return [fill(note, _LINE_WIDTH, initial_indent="  ", subsequent_indent="    ") for note in notes]
+    return [fill(note, LINE_WIDTH, initial_indent="  ", subsequent_indent="    ") for note in notes]
 
 
 def markdown_list(lines: Sequence[str]) -> str:

@@ -9,12 +9,14 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+LINE_WIDTH = 110
+"""Characters of a line that is printed."""
 _LONGEST = 800
 
 
-def listed(names: Sequence[str], *, most: int = 5) -> str:
-    """Return the first of some names for a message, with "…" for the others."""
-    return ", ".join(names[:most]) + (", …" if len(names) > most else "")
+def listed(names: Sequence[str], *, most: int = 8) -> str:
+    """Return the first of some names for a message, and how many others there are."""
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
 class MapperError(Exception):

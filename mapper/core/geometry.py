@@ -19,8 +19,8 @@ Points = NDArray[np.float64]
 """(N, 3) float64 positions in metres; the variable's suffix names the frame."""
 
 _SMALL_ANGLE_RAD = 1e-7
-_FARTHEST_M = 1e12
-"""Beyond any place, and a number that can be squared."""
+FARTHEST_M = 1e9
+"""Beyond any place that a sensor gets to or an octree reaches, and a number that can be squared."""
 
 
 def transform(R_a_b: Array, t_a_b: Array) -> Transform:
@@ -224,11 +224,11 @@ def fit_rigid(target: Points, source: Points, *, with_scale: bool = False) -> tu
 
 
 def is_rigid(T: NDArray[np.float64], *, tolerance: float = 1e-5) -> bool:
-    """Return whether a (4, 4) or (N, 4, 4) array consists of rigid motions, none by 10¹² m or more."""
+    """Return whether a (4, 4) or (N, 4, 4) array consists of rigid motions, none by 10⁹ m or more."""
     T = np.asarray(T)
     if T.shape == (4, 4):
         return _is_rigid_rows(T.tolist(), tolerance)
-    if T.shape[-2:] != (4, 4) or not (np.abs(T) < _FARTHEST_M).all():
+    if T.shape[-2:] != (4, 4) or not (np.abs(T) < FARTHEST_M).all():
         return False
     R = T[..., :3, :3]
     orthogonal = (np.abs(R @ np.swapaxes(R, -1, -2) - np.eye(3)) <= tolerance).all()
@@ -251,7 +251,7 @@ def _is_rigid_rows(rows: list[list[float]], tolerance: float) -> bool:
     orthogonal = all(abs(product) <= tolerance for product in products)
     proper = a * (e * i - f * h) + b * (f * g - d * i) + c * (d * h - e * g) > 0.0
     affine = all(abs(value) <= tolerance for value in (p, q, r, s - 1.0))
-    return orthogonal and proper and affine and all(abs(value) < _FARTHEST_M for value in (x, y, z))
+    return orthogonal and proper and affine and all(abs(value) < FARTHEST_M for value in (x, y, z))
 
 
 def stride_for(count: int, most: int) -> int:

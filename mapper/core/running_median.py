@@ -3,7 +3,8 @@
 from collections import deque
 from statistics import median
 
-_NORMAL = 1.4826  # standard deviations in a median absolute deviation of normal errors
+SIGMAS_PER_MAD = 1.4826
+"""Standard deviations in a median absolute deviation of normal errors."""
 
 
 class RunningMedian:
@@ -38,7 +39,7 @@ class RunningMedian:
         if not self.is_known:
             return 0.0
         middle = self.median
-        return _NORMAL * median(abs(value - middle) for value in self._values)
+        return SIGMAS_PER_MAD * median(abs(value - middle) for value in self._values)
 
     def add(self, value: float) -> None:
         """Add a value."""

@@ -10,8 +10,14 @@ from numpy.typing import ArrayLike, NDArray
 from mapper.core.errors import DataError
 
 NS_PER_S = 1_000_000_000
-_LARGEST_S = (2**63 - 1) // NS_PER_S
-_LAST_SECOND = 2**31  # builtin_interfaces/Time counts seconds in an int32
+UNITS_PER_S = (1, 1_000, 1_000_000, NS_PER_S)
+"""Seconds, milliseconds, microseconds and nanoseconds."""
+LATEST_NS = 1 << 62
+"""In the year 2116; differences of earlier stamps fit into 64 bits."""
+GAP_INTERVALS = 3.0
+"""A pause longer than this number of usual intervals is a gap."""
+_LARGEST_S = np.iinfo(np.int64).max // NS_PER_S
+_LAST_SECOND = np.iinfo(np.int32).max + 1  # builtin_interfaces/Time counts seconds in an int32
 _DATE = re.compile(r"(\d{4}-\d\d-\d\d)[ T](\d\d:\d\d:\d\d)(?:\.(\d{1,9}))?Z?")
 
 MAX_TRUTH_GAP_NS = 20_000_000

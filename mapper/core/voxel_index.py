@@ -17,7 +17,7 @@ AXIS_BITS = 21
 FIBONACCI = -7046029254386353131
 """2⁶⁴/φ as int64: a product with it spreads neighbouring keys (Knuth, TAOCP vol. 3, §6.4)."""
 
-_VACANT = -1
+VACANT = -1
 
 
 class VoxelIndex(NamedTuple):
@@ -35,7 +35,7 @@ class VoxelIndex(NamedTuple):
 
 def voxel_index(capacity: int, keys: NDArray[np.int64] | None = None) -> VoxelIndex:
     """Return an index with room for so many keys, of which (N,) distinct ones get the rows 0 … N − 1."""
-    rows = np.full(1 << (2 * capacity - 1).bit_length(), _VACANT, np.int32)
+    rows = np.full(1 << (2 * capacity - 1).bit_length(), VACANT, np.int32)
     index = VoxelIndex(rows, np.empty(capacity, np.int64))
     if keys is not None:
         _add(index, keys)
@@ -70,7 +70,7 @@ def _slot_of(index, key):  # type: ignore[no-untyped-def]
     mask = len(index.rows) - 1
     # Folded, since the product's middle bits do not depend on the key's highest ones.
     slot = (((key ^ (key >> 32)) * FIBONACCI) >> 32) & mask
-    while index.rows[slot] != _VACANT and index.keys[index.rows[slot]] != key:
+    while index.rows[slot] != VACANT and index.keys[index.rows[slot]] != key:
         slot = (slot + 1) & mask
     return slot
 
@@ -85,7 +85,7 @@ def row_of(index, key):  # type: ignore[no-untyped-def]
 def claim_row(index, key, count):  # type: ignore[no-untyped-def]
     """Return the row of a key; an absent key is added with the row ``count``, the number of keys so far."""
     slot = _slot_of(index, key)
-    if index.rows[slot] == _VACANT:
+    if index.rows[slot] == VACANT:
         index.rows[slot], index.keys[count] = count, key
     return np.int64(index.rows[slot])
 

@@ -12,12 +12,11 @@ from mapper.core.errors import DataError
 from mapper.core.frames import Points32
 from mapper.core.geometry import Array, Points, Transform
 from mapper.features.base import Descriptors
+from mapper.features.hamming import ORB_BYTES
 from mapper.runtime.archived import Archivable
 
 if TYPE_CHECKING:
     from mapper.features.hamming import Bits
-
-_ORB_BYTES = 32
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,7 +47,7 @@ class ImageView(Archivable):
     @property
     def is_orb(self) -> bool:
         """Descriptors are 256 bits each, as ORB's are."""
-        return self.descriptors.dtype == np.uint8 and self.descriptors.shape[1] == _ORB_BYTES
+        return self.descriptors.dtype == np.uint8 and self.descriptors.shape[1] == ORB_BYTES
 
     @property
     def bits(self) -> Bits:

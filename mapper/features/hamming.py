@@ -8,6 +8,9 @@ from numpy.typing import NDArray
 Bits = NDArray[np.uint64]
 """(N, 4) uint64: one 256-bit descriptor per row."""
 
+ORB_BYTES = 32
+ORB_BITS = 8 * ORB_BYTES
+
 
 @intrinsic
 def popcount(_context, x):

@@ -15,7 +15,6 @@ Pairs = NDArray[np.intp]
 """(M, 2) indices into the first and the second image's features."""
 
 _HOMOGRAPHY_POINTS = 4
-_CONFIDENCE = 0.995
 
 
 class Described(Protocol):
@@ -80,9 +79,7 @@ def homography_inliers(
     if len(a) < _HOMOGRAPHY_POINTS:
         return agree
     order = drawing_order(len(a), seed)
-    found, mask = cv2.findHomography(
-        a[order], b[order], cv2.RANSAC, tolerance_px, maxIters=iterations, confidence=_CONFIDENCE
-    )
+    found, mask = cv2.findHomography(a[order], b[order], cv2.RANSAC, tolerance_px, maxIters=iterations)
     if found is not None:
         agree[order] = mask.ravel()
     return agree

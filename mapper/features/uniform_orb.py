@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 from mapper.core.frames import Image
 from mapper.features.base import Descriptors, Features
 from mapper.features.config import UniformOrbConfig
+from mapper.features.hamming import ORB_BYTES
 from mapper.features.opencv import ORB_SCALE_FACTOR
 from mapper.features.uniform_orb_kernels import Pixels, corners, fast_scores, orientations, spread
 
 _MARGIN_PX = 19  # reach of the rotated descriptor's tests
 _PATCH_PX = 31
-_DESCRIPTOR_BYTES = 32
 
 
 class UniformOrb:
@@ -83,7 +83,7 @@ def _descriptors(level: Image, pixels: Pixels, angle_rad: NDArray[np.float32]) -
         )
     ]
     if not keypoints:
-        return np.empty((0, _DESCRIPTOR_BYTES), np.uint8)
+        return np.empty((0, ORB_BYTES), np.uint8)
     # One level at a time, as OpenCV would build the pyramid again.
     orb = cv2.ORB.create(nlevels=1, edgeThreshold=_MARGIN_PX, patchSize=_PATCH_PX)
     return np.asarray(orb.compute(level, keypoints)[1])

@@ -18,6 +18,7 @@ from mapper.line_laser.config import LineLaserCalibration, LineLaserConfig, Line
 from mapper.line_laser.ranging import LineScan, scan_image
 from mapper.octree.blocks import log_odds
 from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+from mapper.octree.slice import SEEN_FREE, SEEN_OCCUPIED
 from mapper.runtime.ordered_map import ordered_map
 from mapper.runtime.progress import SILENT, Progress
 from mapper.sensing.wheel_kinematics import pose_at
@@ -28,7 +29,6 @@ from mapper.sources.wheel_files import read_wheels_file
 _MARGIN_CELLS = 2
 _MAX_CELLS = 200_000_000
 _SUBCELL_BITS = 4
-_SEEN_FREE, _SEEN_OCCUPIED = 1, 2
 
 
 def map_scans(
@@ -95,9 +95,9 @@ def _update(
     for run in _neighbours(scan.columns):
         ray = np.concatenate([local[:1], local[1:][run]]) - 0.5
         fixed = np.rint(ray * (1 << _SUBCELL_BITS)).astype(np.int32)
-        cv2.fillPoly(states, [fixed], _SEEN_FREE, shift=_SUBCELL_BITS)
+        cv2.fillPoly(states, [fixed], SEEN_FREE, shift=_SUBCELL_BITS)
     columns, rows = np.floor(local[1:][~scan.is_floor]).astype(np.int64).T
-    states[rows, columns] = _SEEN_OCCUPIED
+    states[rows, columns] = SEEN_OCCUPIED
     miss, hit = log_odds(config.miss_probability), log_odds(config.hit_probability)
     lowest, highest = log_odds(config.clamp_min_probability), log_odds(config.clamp_max_probability)
     change = np.array([0.0, miss, hit], np.float32)

@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 from mapper.core.geometry import Array, Transform
 from mapper.loops.base import Place, Proposal, Proposer
 
-_FIRST_CAPACITY = 256
-
 
 class NodePoses(Protocol):
     """Source of the current estimates of nodes' poses."""
@@ -52,9 +50,9 @@ class PoseProposer(Generic[Place]):
         self._max_angle_rad = max_angle_rad
         self._drift_ratio = drift_ratio
         self._nodes: list[int] = []
-        self._T_body_sensor = np.empty((_FIRST_CAPACITY, 4, 4))
-        self._T_world_sensor = np.empty((_FIRST_CAPACITY, 4, 4))
-        self._travelled_m = np.empty(_FIRST_CAPACITY)
+        self._T_body_sensor = np.empty((1, 4, 4))
+        self._T_world_sensor = np.empty((1, 4, 4))
+        self._travelled_m = np.empty(1)
         self._placed, self._corrections = 0, estimator.corrections
 
     def within_reach(self, node: int, seen: Place, /, *, before: int) -> NDArray[np.bool_]:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from mapper.core.errors import DataError
 from mapper.core.frames import Points32
 from mapper.core.voxel_index import AXIS_BITS, cell_key, cell_of, claim_row, voxel_index
+from mapper.octree.blocks import GROWTH
 
 Real = TypeVar("Real", bound="np.floating[Any]")
 
@@ -22,7 +23,6 @@ MOST_TO_VIEW = 5_000_000
 _HALF_SPAN = 1 << (AXIS_BITS - 1)  # voxels on either side of the world's origin
 _BATCH = 1 << 16  # points added at once: bounds the memory reserved ahead of need
 _LOWEST_LEVEL = 30.0  # of 255: where the palette of heights begins
-_GROWTH = 1.25
 
 
 class CloudBuilder:
@@ -98,7 +98,7 @@ class CloudBuilder:
     def _reserve(self, more: int) -> None:
         need = self._size + more
         if need > len(self._offsets):
-            rows = max(need, int(_GROWTH * len(self._offsets)))
+            rows = max(need, int(GROWTH * len(self._offsets)))
             for sums in (self._offsets, self._counts):
                 sums.resize((rows, sums.shape[1]), refcheck=False)  # a copy would need both at once
             self._index = voxel_index(rows, self._index.keys[: self._size])

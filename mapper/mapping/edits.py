@@ -11,16 +11,23 @@ from mapper.core.frames import Points32
 from mapper.core.geometry import Array, Points, Transform, apply
 from mapper.mapping.config import AppliedEdit, Edits, Region
 from mapper.navigation.traversable import Storey, TraversableFloor, trim
+from mapper.octree.blocks import BLOCKS_AT_ONCE
 from mapper.octree.columns import NOWHERE, Columns, DrivenGround, nearest_heights
 from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
-from mapper.octree.keys import BLOCK_BITS, BLOCK_VOXELS, KEY_BITS, KEY_MASK, KEY_ZERO, block_keys, gather
+from mapper.octree.keys import (
+    BLOCK_EDGE,
+    BLOCK_VOXELS,
+    KEY_BITS,
+    KEY_MASK,
+    KEY_ZERO,
+    block_keys,
+    gather,
+)
 from mapper.octree.map import OctreeMap
 
 Mask = NDArray[np.bool_]
 
-_EDGE = 1 << BLOCK_BITS
 _X, _Y, _Z = (gather.py_func(np.arange(BLOCK_VOXELS) >> axis) for axis in range(3))
-_CHUNK = 4096  # blocks worked on at a time: 2 million voxels
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -148,14 +155,14 @@ class MapEditor:
         """Yield (B,) slots of blocks that a region may overlap, and the (B, 512) mask of its voxels."""
         keys, layer = block_keys(octree.blocks.codes), np.flatnonzero(_Z == 0)
         low_m, high_m = region.z_range_m
-        z_m = _centres(keys[:, 2:] + np.arange(_EDGE), octree)
+        z_m = _centres(keys[:, 2:] + np.arange(BLOCK_EDGE), octree)
         in_height = (z_m >= low_m) & (z_m <= high_m)
         slots = np.flatnonzero(in_height.any(axis=1))
         columns, column_of = np.unique(keys[slots, 0] << KEY_BITS | keys[slots, 1], return_inverse=True)
         x = (columns >> KEY_BITS)[:, np.newaxis] + _X[layer]
         y = (columns & KEY_MASK)[:, np.newaxis] + _Y[layer]
         centres_world = _centres(np.column_stack([x.ravel(), y.ravel()]), octree)
-        in_plan = np.empty((len(columns), _EDGE, _EDGE), np.bool_)
+        in_plan = np.empty((len(columns), BLOCK_EDGE, BLOCK_EDGE), np.bool_)
         in_plan[:, _X[layer], _Y[layer]] = covered(region, centres_world, self.path_world).reshape(x.shape)
         anywhere: Mask = np.logical_or.reduce(in_plan, axis=(1, 2))
         for some in _chunks(np.flatnonzero(anywhere[column_of])):
@@ -233,5 +240,5 @@ def _centres(keys: NDArray[np.int64], octree: OctreeMap) -> Array:
 
 
 def _chunks(slots: NDArray[np.int64]) -> Iterator[NDArray[np.int64]]:
-    for first in range(0, len(slots), _CHUNK):
-        yield slots[first : first + _CHUNK]
+    for first in range(0, len(slots), BLOCKS_AT_ONCE):
+        yield slots[first : first + BLOCKS_AT_ONCE]

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from mapper.core.errors import DataError, MapSizeError, expect_shape
 from mapper.core.geometry import Array, Points
+from mapper.core.units import MIB
 from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from mapper.octree.keys import BLOCK_EDGE, KEY_ZERO, block_keys
 from mapper.octree.map import OctreeMap
@@ -23,7 +24,7 @@ Distances = NDArray[np.float32]
 Squares = NDArray[np.int32]
 Line = NDArray[np.int64]
 
-LIMIT_BYTES = 2 << 30
+LIMIT_BYTES = 2048 * MIB
 """Limit of the working space of a plan."""
 NONE = np.iinfo(np.int32).max
 """Squared distance where there is no target at all."""

@@ -21,7 +21,7 @@ from mapper.octree.columns import NOWHERE, Columns, DrivenGround, occupied_colum
 from mapper.octree.keys import KEY_ZERO
 from mapper.octree.map import OctreeMap
 
-_MAX_HEIGHT_M = 4.0
+MAX_SENSOR_HEIGHT_M = 4.0
 """Sensors are carried no higher than this above the ground."""
 _CHANGE_PER_M = 10.0
 """A change of the sensor's height by a metre costs as much as this number of samples without ground below."""
@@ -172,7 +172,7 @@ def path_ground(
     """
     cell_m = columns.resolution_m
     points, breaks = _sample(positions_world, cell_m)
-    highest = int(np.ceil(_MAX_HEIGHT_M / cell_m))
+    highest = int(np.ceil(MAX_SENSOR_HEIGHT_M / cell_m))
     low = (points[:, :2] / cell_m - (columns.first - KEY_ZERO)).astype(np.float64)
     votes = _vote_heights(columns, low, points[:, 2] / cell_m, radius_m / cell_m, room_m / cell_m, highest)
     height = _find_steadiest(votes, _CHANGE_PER_M * cell_m)

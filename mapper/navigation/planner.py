@@ -12,6 +12,7 @@ from mapper.core.errors import PlanError
 from mapper.core.geometry import Array, Points, path_length
 from mapper.navigation.config import PlanConfig
 from mapper.navigation.distance import DistanceField, VoxelGrid, dense_voxels, distance_field, layer
+from mapper.navigation.floor_kernels import ALLOWANCE
 from mapper.navigation.path_search import Cell, clearance_of, in_sight, shorten, shortest_path
 from mapper.navigation.traversable import Storey, TraversableFloor
 from mapper.octree.columns import NOWHERE, nearest_heights
@@ -19,7 +20,6 @@ from mapper.octree.grid import OCCUPIED, UNKNOWN, OccupancyGrid
 from mapper.octree.map import OctreeMap
 
 _BYTES_PER_VOXEL = 30  # a distance field's 14, the mask of free voxels, and the search's costs and steps
-_ROUNDING_M = 1e-6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -167,7 +167,7 @@ class Space:
     @property
     def least_m(self) -> float:
         """The radius less an allowance for rounding."""
-        return self.config.radius_m - _ROUNDING_M
+        return self.config.radius_m - ALLOWANCE
 
     def in_cells(self, point_world: Array) -> Array:
         """Return a point's z, y, x in cells."""
@@ -250,7 +250,7 @@ def point_text(point_world: Array) -> str:
 def space_of(voxels: VoxelGrid, config: PlanConfig) -> Space:
     """Return the space that a map leaves to a robot's centre."""
     field = distance_field(voxels, unknown_blocks=config.unknown == "blocked")
-    return Space(voxels, field, field.distances_m >= config.radius_m - _ROUNDING_M, config)
+    return Space(voxels, field, field.distances_m >= config.radius_m - ALLOWANCE, config)
 
 
 def _or_unknown(config: PlanConfig) -> str:

@@ -17,12 +17,11 @@ from numpy import float32
 from numpy.typing import DTypeLike, NDArray
 
 from mapper.core.errors import MapSizeError
-from mapper.core.voxel_index import FIBONACCI
+from mapper.core.units import MIB
+from mapper.core.voxel_index import FIBONACCI, VACANT
 from mapper.octree.config import OctreeConfig
 from mapper.octree.keys import BLOCK_VOXELS
 from mapper.runtime.atomic import writing
-
-_FILLED_BYTES = 1 << 20
 
 
 class FileArray:
@@ -65,17 +64,16 @@ class FileArray:
             return
         at = self._file.seek(0, os.SEEK_END)
         while at < size:
-            at += self._file.write(bytes(min(size - at, _FILLED_BYTES)))
+            at += self._file.write(bytes(min(size - at, MIB)))
         self._file.flush()
 
 
 BLOCK_BYTES = BLOCK_VOXELS * np.dtype(np.float32).itemsize
-BLOCKS_AT_ONCE = 1 << 12
+BLOCKS_AT_ONCE = 4096
 """Blocks whose voxels are listed or copied at once: 70 MB at most."""
 FIRST_BLOCKS = 64
 GROWTH = 1.25
 """A pool that doubles would hold half its memory in reserve."""
-_VACANT = -1
 
 
 class SensorModel(NamedTuple):
@@ -142,7 +140,7 @@ class BlockStore:
         self._folder, self._max_memory_bytes = folder, max_memory_bytes
         self._file: FileArray | None = None
         self._count = 0
-        self._codes = np.full(FIRST_BLOCKS, _VACANT, dtype=np.int64)  # by slot
+        self._codes = np.full(FIRST_BLOCKS, VACANT, dtype=np.int64)  # by slot
         self.table = _table(FIRST_BLOCKS, values=np.empty((FIRST_BLOCKS, BLOCK_VOXELS), np.float32))
 
     def __len__(self) -> int:
@@ -231,7 +229,7 @@ def check_memory(
 def _table(count: int, *, values: NDArray[np.float32]) -> BlockTable:
     """Return an empty hash for up to ``count`` blocks at a load between a quarter and a half."""
     size = 1 << (2 * count - 1).bit_length()
-    return BlockTable(np.full((size, 2), _VACANT, np.int64), values)
+    return BlockTable(np.full((size, 2), VACANT, np.int64), values)
 
 
 @njit(cache=True, nogil=True)
@@ -239,7 +237,7 @@ def _probe(entries, code):
     """Return the number of a code's entry, or of the vacant one where it belongs (linear probing)."""
     mask = len(entries) - 1
     entry = ((code * FIBONACCI) >> 24) & mask
-    while entries[entry, 0] != code and entries[entry, 0] != _VACANT:
+    while entries[entry, 0] != code and entries[entry, 0] != VACANT:
         entry = (entry + 1) & mask
     return entry
 

@@ -11,13 +11,14 @@ from numpy.typing import NDArray
 from mapper.core.errors import DataError, MapSizeError
 from mapper.core.frames import Points32, Scan
 from mapper.core.geometry import Array, Transform, apply
+from mapper.core.units import MIB
 from mapper.octree import casting_kernels as kernels
 from mapper.octree.casting_kernels import Window
 from mapper.octree.config import OctreeConfig
 from mapper.octree.keys import BLOCK_BITS, BLOCK_VOXELS, KEY_BITS, KEY_COUNT, KEY_ZERO
 from mapper.sensing.depth import DepthLimit
 
-_LIMIT_BYTES = 1 << 33
+_LIMIT_BYTES = 8192 * MIB
 """Limit of a window. Address space, not memory: only pages that a ray crosses are ever backed by memory."""
 
 

@@ -34,7 +34,7 @@ from mapper.octree.keys import (
 UNTOUCHED, FREE, OCCUPIED = range(3)
 """States of a cell after a scan, ordered so that occupied wins."""
 
-_CHUNK = 256  # points worked on at a time: their scratch arrays stay in the first-level cache
+CHUNK = 256  # points worked on at a time: their scratch arrays stay in the first-level cache
 _RECENT = 1 << 15  # entries of the table of recent voxels: 256 KiB
 _RAYS = 16  # rays that step together: two vectors of eight float64
 _STEPS = 8  # steps before ended rays are looked for
@@ -132,8 +132,8 @@ def end_voxels(points_body, T_world_body, resolution_m):
     """
     n = len(points_body)
     inverse_resolution = 1.0 / resolution_m
-    x, y, z = np.empty(_CHUNK, float32), np.empty(_CHUNK, float32), np.empty(_CHUNK, float32)
-    packed, runs = np.empty(_CHUNK + 1, int64), np.empty(_CHUNK + 1, int64)
+    x, y, z = np.empty(CHUNK, float32), np.empty(CHUNK, float32), np.empty(CHUNK, float32)
+    packed, runs = np.empty(CHUNK + 1, int64), np.empty(CHUNK + 1, int64)
     recent = np.full(_RECENT, -1, int64)
     found = np.empty(n + 1, int64)
     count, outside = 0, 0
@@ -141,8 +141,8 @@ def end_voxels(points_body, T_world_body, resolution_m):
     r10, r11, r12, t1 = T_world_body[1, 0], T_world_body[1, 1], T_world_body[1, 2], T_world_body[1, 3]
     r20, r21, r22, t2 = T_world_body[2, 0], T_world_body[2, 1], T_world_body[2, 2], T_world_body[2, 3]
     packed[0] = -1
-    for start in range(0, n, _CHUNK):
-        size = min(_CHUNK, n - start)
+    for start in range(0, n, CHUNK):
+        size = min(CHUNK, n - start)
         for j in range(size):
             x[j], y[j], z[j] = points_body[start + j, 0], points_body[start + j, 1], points_body[start + j, 2]
         for j in range(size):  # this loop vectorises: one array per axis, no branch

@@ -12,14 +12,14 @@ from numpy import float64, int64
 from numpy.typing import NDArray
 
 KEY_BITS = 16
-KEY_ZERO = 1 << (KEY_BITS - 1)
 KEY_COUNT = 1 << KEY_BITS
+KEY_ZERO = KEY_COUNT // 2
 KEY_MASK = KEY_COUNT - 1
 
 BLOCK_BITS = 3
 """A block is 8³ voxels: the lowest three levels of the tree."""
 BLOCK_EDGE = 1 << BLOCK_BITS
-BLOCK_VOXELS = 1 << (3 * BLOCK_BITS)
+BLOCK_VOXELS = BLOCK_EDGE**3
 PACKED_BYTES = BLOCK_VOXELS // 8
 """Bytes of one bit per voxel of a block."""
 BLOCK_DEPTH = KEY_BITS - BLOCK_BITS

@@ -15,12 +15,14 @@ from numpy import float32, int64, uint8, uint16
 from numpy.typing import NDArray
 
 from mapper.octree.blocks import BLOCKS_AT_ONCE, BlockStore
-from mapper.octree.keys import BLOCK_DEPTH, BLOCK_VOXELS
+from mapper.octree.keys import BLOCK_DEPTH, BLOCK_EDGE, BLOCK_VOXELS
 
 NODE = np.dtype([("value", "<f4"), ("mask", "u1")])
 """A node as in an ``.ot`` file: log-odds, and a bit for each child that exists."""
 
-_PAIRS, _QUADS, _TOP = BLOCK_VOXELS, BLOCK_VOXELS + 64, BLOCK_VOXELS + 64 + 8
+_PAIRS = BLOCK_VOXELS
+_QUADS = _PAIRS + BLOCK_VOXELS // 8
+_TOP = _QUADS + BLOCK_EDGE
 """Index in the pyramid of a block at which the nodes of edge 2, 4 and 8 voxels begin, after its voxels."""
 _PYRAMID = _TOP + 1
 _WORDS = _PYRAMID - BLOCK_VOXELS

@@ -8,7 +8,7 @@ from numpy import float32, float64, int16, int64
 from numpy.typing import NDArray
 
 from mapper.octree.blocks import slot_of
-from mapper.octree.casting_kernels import NEVER
+from mapper.octree.casting_kernels import CHUNK, NEVER
 from mapper.octree.keys import (
     BLOCK_BITS,
     BLOCK_EDGE,
@@ -23,7 +23,6 @@ from mapper.octree.keys import (
     morton,
 )
 
-_CHUNK = 256  # points worked on at a time: their codes stay in the first-level cache
 _NOT_LISTED = -1
 _OFFSETS: NDArray[np.int64] = keys_of(np.arange(BLOCK_VOXELS))
 """(512, 3) keys of a block's voxels relative to its first, in Morton order."""
@@ -43,10 +42,10 @@ def values_at(table, points_world, resolution_m):
     n = len(points_world)
     inverse_resolution = 1.0 / resolution_m
     found = np.empty(n, float32)
-    x_m, y_m, z_m = np.empty(_CHUNK), np.empty(_CHUNK), np.empty(_CHUNK)
-    codes = np.empty(_CHUNK, int64)
-    for start in range(0, n, _CHUNK):
-        size = min(_CHUNK, n - start)
+    x_m, y_m, z_m = np.empty(CHUNK), np.empty(CHUNK), np.empty(CHUNK)
+    codes = np.empty(CHUNK, int64)
+    for start in range(0, n, CHUNK):
+        size = min(CHUNK, n - start)
         for j in range(size):
             point = points_world[start + j]
             x_m[j], y_m[j], z_m[j] = point[0], point[1], point[2]

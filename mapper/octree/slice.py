@@ -17,7 +17,8 @@ from mapper.octree.keys import BLOCK_EDGE, KEY_ZERO, block_keys
 if TYPE_CHECKING:
     from mapper.octree.queries import MapView
 
-_SEEN_FREE, _SEEN_OCCUPIED = 1, 2
+SEEN_FREE, SEEN_OCCUPIED = 1, 2
+"""States of a column, of which it may have both."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +68,7 @@ class Band:
             z -= bases[rows, columns]
             inside = (z >= lowest) & (z <= highest)
             occupied = known.log_odds >= octree.occupied_log_odds
-            for flag, some in ((_SEEN_FREE, inside & ~occupied), (_SEEN_OCCUPIED, inside & occupied)):
+            for flag, some in ((SEEN_FREE, inside & ~occupied), (SEEN_OCCUPIED, inside & occupied)):
                 seen[rows[some], columns[some]] |= np.uint8(flag)
         return seen
 
@@ -82,7 +83,7 @@ class Band:
         if self.config.above == "floor":
             above_floor_m = driven.heights * self.resolution_m - self.floor_z_m
             swept = swept & (np.abs(above_floor_m) <= self.config.min_height_m)
-        seen[swept] = _SEEN_FREE
+        seen[swept] = SEEN_FREE
 
     def grid_of(self, seen: NDArray[np.uint8], *, first: NDArray[np.int64]) -> OccupancyGrid:
         """Return flags as a grid, cropped to its known cells.
@@ -106,8 +107,8 @@ class Band:
             seen[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1], min_cells=config.min_cluster_cells
         )
         cells = np.full(seen.shape, UNKNOWN, dtype=np.int8)
-        cells[seen & _SEEN_FREE != 0] = FREE
-        cells[seen & _SEEN_OCCUPIED != 0] = OCCUPIED
+        cells[seen & SEEN_FREE != 0] = FREE
+        cells[seen & SEEN_OCCUPIED != 0] = OCCUPIED
         corner = np.array([first[0] + columns[0], first[1] + rows[0]]) - KEY_ZERO
         return OccupancyGrid(cells, corner * self.resolution_m, self.resolution_m)
 
@@ -190,8 +191,8 @@ def _without_speckles(seen: NDArray[np.uint8], *, min_cells: int) -> NDArray[np.
     """Return ``seen`` without the occupied flag of 8-connected groups smaller than ``min_cells``."""
     if min_cells == 1:
         return seen
-    occupied = (seen & _SEEN_OCCUPIED).astype(np.uint8)
+    occupied = (seen & SEEN_OCCUPIED).astype(np.uint8)
     _, labels, stats, _ = cv2.connectedComponentsWithStats(occupied, connectivity=8)
     small = stats[:, cv2.CC_STAT_AREA] < min_cells
     small[0] = False  # label 0 is everything that is not occupied
-    return np.where(small[labels], seen & ~np.uint8(_SEEN_OCCUPIED), seen)
+    return np.where(small[labels], seen & ~np.uint8(SEEN_OCCUPIED), seen)

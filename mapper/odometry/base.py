@@ -35,12 +35,12 @@ class Diagnostics:
         unobservable: Motions that the surfaces do not constrain, e.g. "translation along x"; empty if none.
     """
 
-    features: int
-    matches: int
-    inliers: int
-    residual: float
-    residual_unit: str
-    method: str
+    features: int = 0
+    matches: int = 0
+    inliers: int = 0
+    residual: float = 0.0
+    residual_unit: str = ""
+    method: str = ""
     unobservable: str = ""
 
 

@@ -15,6 +15,7 @@ from mapper.core.frames import Scan
 from mapper.core.timebase import check_stamps
 from mapper.core.trajectory import Trajectory
 from mapper.mapping.levelling import Level, axes_of, find_level
+from mapper.navigation.floor import MAX_SENSOR_HEIGHT_M
 from mapper.odometry.base import Odometry
 from mapper.pipeline.checkpoint_identity import identity_of, kept_from_before
 from mapper.pipeline.checkpoints import (
@@ -39,9 +40,6 @@ from mapper.run.writer import RunWriter, first_manifest, write_run
 from mapper.runtime.progress import SILENT, Progress
 from mapper.sources.base import Log
 from mapper.sources.trajectory_files import write_tum
-
-_MAX_CAMERA_HEIGHT_M = 4.0
-"""Median height above the floor, in a hand, on a robot or upstairs; wrong units of depth multiply it by 5."""
 
 
 def build(
@@ -201,7 +199,7 @@ class _Steps:
 def _height_warning(source: Log, trajectory: Trajectory) -> str:
     """Return a sentence about a camera that is implausibly high above the floor; empty if it is not."""
     height_m = float(np.median(trajectory.positions_world[:, 2]))
-    if source.sensor != "rgbd" or height_m <= _MAX_CAMERA_HEIGHT_M:
+    if source.sensor != "rgbd" or height_m <= MAX_SENSOR_HEIGHT_M:
         return ""
     return f"the camera is {height_m:.1f} m above the floor; is source.camera.depth_factor right?"
 

@@ -4,13 +4,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.errors import DataError
+from mapper.core.running_median import SIGMAS_PER_MAD
 from mapper.features.hamming import Bits
 from mapper.places.kernels import match_sorted, shared_weights
 from mapper.places.vocabulary import ONE, Ids, Vocabulary, WordVector
 
-_FIRST_CAPACITY = 256
 _ENOUGH_TO_COMPARE = 30
-_SIGMA_PER_MAD = 1.4826
 
 
 class PlaceIndex:
@@ -23,7 +22,7 @@ class PlaceIndex:
     def __init__(self, vocabulary: Vocabulary) -> None:
         self._nodes: list[int] = []
         self._known: set[int] = set()
-        self._weights = np.zeros((vocabulary.words, _FIRST_CAPACITY), np.uint16)
+        self._weights = np.zeros((vocabulary.words, 1), np.uint16)
 
     def __len__(self) -> int:
         return len(self._nodes)
@@ -87,7 +86,7 @@ def _outstanding(similarity: NDArray[np.float64], deviations: float) -> float:
     if len(similarity) < _ENOUGH_TO_COMPARE or not np.isfinite(deviations):
         return np.inf
     median = float(np.median(similarity))
-    return median + deviations * _SIGMA_PER_MAD * float(np.median(np.abs(similarity - median)))
+    return median + deviations * SIGMAS_PER_MAD * float(np.median(np.abs(similarity - median)))
 
 
 def match_by_word(

@@ -3,10 +3,9 @@
 import numpy as np
 from numba import njit
 
-from mapper.features.hamming import drop_one_sided, hamming, nearest_among
+from mapper.features.hamming import ORB_BITS, drop_one_sided, hamming, nearest_among
 
-_BITS = 256
-_FARTHER = _BITS + 1
+_FARTHER = ORB_BITS + 1
 
 
 @njit(cache=True, nogil=True)
@@ -93,13 +92,13 @@ def k_majority(bits, seeds, max_iterations):
                 changed = True
         if not changed:
             break
-        excess = np.zeros((len(centres), _BITS), np.int64)  # rows with the bit less rows without
+        excess = np.zeros((len(centres), ORB_BITS), np.int64)  # rows with the bit less rows without
         for i in range(len(bits)):
-            for bit in range(_BITS):
+            for bit in range(ORB_BITS):
                 is_set = (bits[i, bit >> 6] >> np.uint64(bit & 63)) & one
                 excess[cluster[i], bit] += 2 * np.int64(is_set) - 1
         for c in range(len(centres)):
-            for bit in range(_BITS):
+            for bit in range(ORB_BITS):
                 mask = one << np.uint64(bit & 63)
                 if excess[c, bit] > 0:
                     centres[c, bit >> 6] |= mask

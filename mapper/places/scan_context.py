@@ -9,8 +9,6 @@ from mapper.core.errors import DataError
 from mapper.core.geometry import Points
 from mapper.places.config import ScanContextConfig
 
-_FIRST_CAPACITY = 256
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScanContext:
@@ -56,9 +54,9 @@ class ScanContexts:
     def __init__(self, config: ScanContextConfig) -> None:
         self._config = config
         self._nodes: list[int] = []
-        self._keys = np.zeros((_FIRST_CAPACITY, config.rings), np.float32)
+        self._keys = np.zeros((1, config.rings), np.float32)
         frequencies = config.sectors // 2 + 1
-        self._spectra = np.zeros((_FIRST_CAPACITY, config.rings, frequencies), np.complex64)
+        self._spectra = np.zeros((1, config.rings, frequencies), np.complex64)
 
     def __len__(self) -> int:
         return len(self._nodes)

@@ -14,7 +14,7 @@ from pydantic import NonNegativeInt, ValidationError
 
 from mapper.core.config import Config
 from mapper.core.errors import DataError, VocabularyError
-from mapper.features.hamming import Bits
+from mapper.features.hamming import ORB_BYTES, Bits
 from mapper.places.kernels import descend
 from mapper.runtime.checked_file import CheckedFormat
 
@@ -22,7 +22,6 @@ Ids = NDArray[np.int32]
 """(N,) int32: words or nodes."""
 DESCRIPTOR = "orb"
 """Kind of the descriptors: of detectors "orb" and "uniform-orb"."""
-DESCRIPTOR_BYTES = 32
 ONE = 32_768
 """Sum of an image's weights."""
 _FORMAT = CheckedFormat(b"\x89mapper-words\r\n", version=1, remedy="train it again", error=VocabularyError)
@@ -187,7 +186,7 @@ class Vocabulary:
         """Write a file, atomically; the same vocabulary gives the same bytes."""
         header = _Header(
             descriptor=DESCRIPTOR,
-            descriptor_bytes=DESCRIPTOR_BYTES,
+            descriptor_bytes=ORB_BYTES,
             nodes=len(self.tree.children),
             words=self.words,
             trained_on=self.trained_on,
@@ -221,19 +220,19 @@ def _parsed(path: Path, head: bytes, body: memoryview) -> Vocabulary:
         header = _Header.model_validate_json(head)
     except ValidationError:
         raise VocabularyError(f"{path}: its header does not describe a vocabulary; it is damaged") from None
-    if (header.descriptor, header.descriptor_bytes) != (DESCRIPTOR, DESCRIPTOR_BYTES):
+    if (header.descriptor, header.descriptor_bytes) != (DESCRIPTOR, ORB_BYTES):
         raise VocabularyError(
             f"{path}: has words of {header.descriptor} descriptors of {header.descriptor_bytes} bytes; "
-            f"only {DESCRIPTOR}'s of {DESCRIPTOR_BYTES} can be used"
+            f"only {DESCRIPTOR}'s of {ORB_BYTES} can be used"
         )
     nodes, words = header.nodes, header.words
-    if len(body) != nodes * (1 + DESCRIPTOR_BYTES) + 8 * words:
+    if len(body) != nodes * (1 + ORB_BYTES) + 8 * words:
         raise VocabularyError(
             f"{path}: its body does not hold {nodes} nodes and {words} words; it is damaged"
         )
     children = np.frombuffer(body, np.uint8, nodes).copy()
     centres = np.frombuffer(body, "<u8", 4 * nodes, nodes).reshape(nodes, 4).astype(np.uint64)
-    idf = np.frombuffer(body, "<f8", words, nodes * (1 + DESCRIPTOR_BYTES)).astype(np.float64)
+    idf = np.frombuffer(body, "<f8", words, nodes * (1 + ORB_BYTES)).astype(np.float64)
     try:
         return Vocabulary(WordTree(centres, children), idf, header.trained_on)
     except DataError as error:

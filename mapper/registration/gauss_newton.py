@@ -10,7 +10,7 @@ from numba import njit
 from mapper.core.linear import solve_positive, twist_exp
 from mapper.registration.kd_tree import STACK, search
 
-POINT, PLANE, GAUSSIAN = 0, 1, 2
+POINT, PLANE, GAUSSIAN = range(3)
 """Distances that are minimised: between points, to planes (Chen & Medioni 1992), between Gaussians."""
 
 FLATNESS = 1.0 - 1e-3

@@ -11,7 +11,6 @@ from mapper.core.voxel_index import VoxelIndex, cell_key, claim_row, row_of, vox
 from mapper.registration.gauss_newton import FLATNESS, add_pair, gauss_newton_step, inverse_of, moved, turned
 from mapper.registration.surfaces import Prepared
 
-_FIRST_CAPACITY = 1 << 14
 _CLEAR_CYCLE = 10
 
 
@@ -31,7 +30,7 @@ class GaussianCells:
         self.cell_m = cell_m
         self._kept_clouds = kept_clouds
         self._clouds = self._count = 0
-        self._cells = _room_for(_FIRST_CAPACITY)
+        self._cells = _room_for(1)
 
     def __len__(self) -> int:
         """Return the number of cells."""

@@ -10,7 +10,7 @@ from mapper.registration.surfaces import Prepared, prepared
 
 AnyIcp = IcpConfig | PlaneIcpConfig | GicpConfig
 
-_PAIR_DISTANCES_VOXELS = (7.0, 3.5)
+COARSE_TO_FINE_VOXELS = (7.0, 3.5)
 """Largest distance between the points of a pair: 2 m of a street from poor guesses, then 1 m."""
 
 
@@ -60,7 +60,7 @@ def refined(
         source,
         T_target_source,
         kind=kind,
-        pair_distances_m=[voxels * config.voxel_m for voxels in _PAIR_DISTANCES_VOXELS],
+        pair_distances_m=[voxels * config.voxel_m for voxels in COARSE_TO_FINE_VOXELS],
         max_iterations=config.max_iterations,
     )
     if not alignment.converged:

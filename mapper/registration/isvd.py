@@ -6,11 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.geometry import Array, Points, Transform, apply, fit_rigid, transform
+from mapper.core.units import MM_PER_M
 from mapper.registration.base import Alignment, failed
 from mapper.registration.config import IsvdConfig
 from mapper.registration.isvd_kernels import trim
 
-_MM_PER_M = 1000.0
 _MIN_SPREAD_M = 0.01  # about a common line, points nearer to it than this leave the rotation unobservable
 _MIN_SIGMA_M = 1e-3  # trimming must not make the pairs better than the sensor
 _ICP_STEPS = 20
@@ -43,7 +43,7 @@ class Isvd:
         T_target_source, used = self.trim_pairs(target, source)
         residuals = target - apply(T_target_source, source)
         distances = np.linalg.norm(residuals, axis=1)
-        agreeing = distances <= config.agreement_mm / _MM_PER_M
+        agreeing = distances <= config.agreement_mm / MM_PER_M
         ratio = float(agreeing.mean())
         if agreeing.sum() < config.min_agreeing or ratio < config.min_agreement_ratio:
             return failed(
@@ -78,7 +78,7 @@ class Isvd:
             np.ascontiguousarray(target),
             np.ascontiguousarray(source),
             np.array([*self._thresholds_m()]),
-            config.min_error_mm / _MM_PER_M,
+            config.min_error_mm / MM_PER_M,
             enough,
         )
         return transform(R, t), used
@@ -92,7 +92,7 @@ class Isvd:
             T_target_source = _icp(target[used], source[used], T_target_source)
             distances = np.linalg.norm(target[used] - apply(T_target_source, source[used]), axis=1)
             kept = used[distances <= threshold_m]
-            if threshold_m * _MM_PER_M < self._config.min_error_mm or len(kept) < enough:
+            if threshold_m * MM_PER_M < self._config.min_error_mm or len(kept) < enough:
                 break
         return T_target_source, used
 
@@ -101,9 +101,9 @@ class Isvd:
         config = self._config
         for j in range(1, config.max_iterations + 1):
             if config.threshold == "power":
-                yield config.alpha_mm * j**config.beta / _MM_PER_M  # eq. 4.2
+                yield config.alpha_mm * j**config.beta / MM_PER_M  # eq. 4.2
             else:
-                yield config.start_error_mm * 0.5 ** (j - 1) / _MM_PER_M
+                yield config.start_error_mm * 0.5 ** (j - 1) / MM_PER_M
 
 
 def rigid_fit_information(source: Points, distances_m: Array) -> Array:

@@ -13,12 +13,12 @@ from mapper.core.geometry import Transform, is_rigid, transform
 from mapper.registration.base import Alignment, failed
 from mapper.registration.config import KissMatcherConfig
 from mapper.registration.icp import cloud_of, refined
+from mapper.registration.refining import MIN_PAIRS
 from mapper.registration.surfaces import Prepared, prepared
 from mapper.runtime.extras import extra
 
 _CROWD = 5  # points this near together, in feature voxels, are certain to have a normal and a feature
 _CROWD_VOXELS = 1.5
-_MIN_FEATURES = 20
 _MAX_MATCHES = 5000  # of more the library draws this number at random, unseeded
 _GROWTH = 1.25
 _MAX_NOISE_M = 1.0  # the library accepts no more, and prints that
@@ -48,7 +48,7 @@ class KissMatcherAligner:
         cloud = cloud_of(source, config)
         thinned = _thinned(self._target, cloud, config.feature_voxels * config.voxel_m)
         for name, side in zip(("target", "source"), thinned, strict=True):
-            if _crowded(side) < _MIN_FEATURES:
+            if _crowded(side) < MIN_PAIRS:
                 return failed(f"too few points of the {name} lie close enough together to have features")
         found = _matched(*thinned)
         if found is None:

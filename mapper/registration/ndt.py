@@ -10,11 +10,10 @@ from mapper.core.geometry import Points, Transform, is_rigid, nearest_rotation, 
 from mapper.registration.acceptance import assess
 from mapper.registration.base import Alignment, failed
 from mapper.registration.config import NdtConfig
+from mapper.registration.icp import COARSE_TO_FINE_VOXELS
 from mapper.registration.surfaces import Prepared, prepared
 from mapper.runtime.extras import extra
 
-_CELLS_VOXELS = (7.0, 3.5)
-"""Edges of the target's cells, each with one Gaussian: 2 m in a street, then 1 m."""
 _MIN_POINTS = 6
 """Cells with fewer points have no Gaussian: twice as many as span a plane."""
 
@@ -48,7 +47,7 @@ class NdtAligner:
             self._points_target,
             cloud.points,
             T_target_source,
-            cells_m=[cell_voxels * config.voxel_m for cell_voxels in _CELLS_VOXELS],
+            cells_m=[cell_voxels * config.voxel_m for cell_voxels in COARSE_TO_FINE_VOXELS],
             max_iterations=config.max_iterations,
         )
         if isinstance(found, str):

@@ -13,7 +13,7 @@ from mapper.registration.surfaces import Prepared
 
 Refiner = Literal["icp", "plane-icp", "gicp"]
 
-_MIN_PAIRS = 20
+MIN_PAIRS = 20
 _STEP_VOXELS = 0.003  # steps shorter than this end the refinement: 1 mm at 0.3 m
 _STEP_RAD = 3.5e-4
 _MIN_SIGMA_VOXELS = 0.03  # a scan against itself must not be infinitely certain
@@ -85,10 +85,9 @@ def _descended(
     max_iterations: int,
     step: int = 1,
 ) -> Transform | str:
-    if min(len(target.points), len(source.points)) < _MIN_PAIRS or target.tree is None:
+    if min(len(target.points), len(source.points)) < MIN_PAIRS or target.tree is None:
         return (
-            f"{len(target.points)} and {len(source.points)} points after downsampling, "
-            f"fewer than {_MIN_PAIRS}"
+            f"{len(target.points)} and {len(source.points)} points after downsampling, fewer than {MIN_PAIRS}"
         )
     T_refined: Transform = descend_on_points(
         target.tree.points,
@@ -133,10 +132,10 @@ def measured(
     """
     indices, distances_m = target.nearest(apply(T_target_source, source.points))
     near = distances_m <= max_pair_distance_m
-    if near.sum() < _MIN_PAIRS:
+    if near.sum() < MIN_PAIRS:
         return failed(
             f"{near.sum()} of {len(source.points)} points have a partner within {max_pair_distance_m:g} m, "
-            f"fewer than {_MIN_PAIRS}: the clouds do not overlap"
+            f"fewer than {MIN_PAIRS}: the clouds do not overlap"
         )
     jacobian, residuals_m = plane_rows(target, source.points[near], T_target_source, indices[near])
     has_normal = jacobian.any(axis=1)

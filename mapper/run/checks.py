@@ -5,15 +5,13 @@ from functools import partial
 from pathlib import Path
 
 from mapper.run import files
-from mapper.run.digests import fault_of
+from mapper.run.digests import THREADS, fault_of
 from mapper.run.folder import Run, open_run
 from mapper.run.manifest import FileDigest, LocalisedManifest, is_localised_log, read_manifest_of
 from mapper.runtime.atomic import is_temporary
 from mapper.runtime.doctor import Finding
 from mapper.runtime.ordered_map import ordered_map
 from mapper.runtime.progress import SILENT, Progress
-
-_THREADS = 4
 
 
 def check_run(folder: Path, *, progress: Progress = SILENT) -> list[Finding]:
@@ -54,7 +52,7 @@ def _hashed(
             return Finding(name, "warning" if is_gone else "failed", fault, remedy(name))
         return Finding(name, "well", f"{wanted.size_bytes} bytes, SHA-256 {wanted.sha256[:12]}…")
 
-    return ordered_map(check, sorted(digests), workers=_THREADS)
+    return ordered_map(check, sorted(digests), workers=THREADS)
 
 
 def _unrecorded(run: Run) -> Iterator[Finding]:

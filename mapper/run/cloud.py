@@ -9,11 +9,9 @@ from numpy.typing import NDArray
 
 from mapper.core.errors import FrameError
 from mapper.core.frames import Points32
+from mapper.core.geometry import FARTHEST_M
 from mapper.sources.cloud_files.parsing import Columns
 from mapper.sources.cloud_files.ply import read_ply
-
-_FARTHEST_M = 1e9
-"""Farther than any octree reaches: sums and squares of such coordinates overflow."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,8 +44,8 @@ def read_cloud(path: Path) -> Cloud:
     except OSError as error:
         raise FrameError(f"{path}: cannot be read: {error.strerror}") from None
     points = _columns(columns, ("x", "y", "z"), np.float32, path)
-    if not -_FARTHEST_M <= points.min(initial=0.0) <= points.max(initial=0.0) <= _FARTHEST_M:
-        first = np.flatnonzero(~(np.abs(points) <= _FARTHEST_M).all(axis=1))[0]
+    if not -FARTHEST_M <= points.min(initial=0.0) <= points.max(initial=0.0) <= FARTHEST_M:
+        first = np.flatnonzero(~(np.abs(points) <= FARTHEST_M).all(axis=1))[0]
         raise FrameError(f"{path}: point {first} is at {points[first]}, want finite metres")
     return Cloud(points, _columns(columns, ("red", "green", "blue"), np.uint8, path))
 

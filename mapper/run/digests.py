@@ -8,15 +8,16 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from mapper.core.errors import RunError, WriteError
+from mapper.core.units import MIB
 from mapper.run import files
 from mapper.run.manifest import FileDigest, read_manifest
 from mapper.runtime.atomic import flush_to_disk, locked
 from mapper.runtime.ordered_map import ordered_map
 
-MOST_HASHED_BYTES = 128 * 1024 * 1024
+MOST_HASHED_BYTES = 128 * MIB
 """A larger file is compared by its size alone when it is read, as hashing would delay the reader by more than
 0.1 s; ``mapper doctor RUN`` hashes every file."""
-_THREADS = 4
+THREADS = 4
 
 
 def digest_of(path: Path) -> FileDigest:
@@ -41,7 +42,7 @@ def digests_of(folder: Path, names: Iterable[str] | None = None) -> dict[str, Fi
         flush_to_disk(folder / name)
         return digest_of(folder / name)
 
-    return dict(zip(there, ordered_map(work, there, workers=_THREADS), strict=True))
+    return dict(zip(there, ordered_map(work, there, workers=THREADS), strict=True))
 
 
 @contextmanager

@@ -79,7 +79,7 @@ _MS_COLUMNS = ("stamp_ns", "ms")
 DISCONNECTED = "disconnected"
 """``Diagnostics.method`` of a frame that was placed, but in a part of the path that is left out."""
 
-_NOTHING = Diagnostics(features=0, matches=0, inliers=0, residual=0.0, residual_unit="", method="")
+_NOTHING = Diagnostics()
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,14 +9,17 @@ from mapper.core.geometry import distances_along, inverse, log
 from mapper.graph.marginals import marginals_of
 from mapper.graph.model import PoseGraph
 from mapper.loops.closure import SOLVER
+from mapper.loops.drift_gate import MIN_CONFLICTS
 from mapper.run.manifest import RunWarning
 from mapper.run.results import RunResults
 from mapper.run.timeline import TimeLine, counted
 
-_MAX_LOOP_M, _MAX_LOOP_SHARE, _MAX_LOOP_RAD = 0.3, 0.03, np.radians(10.0)
-_LEAST_LOOPS_REFUSED, _MAX_REFUSED_SHARE = 4, 0.5
+MAX_DRIFT_SHARE, HARMLESS_M = 0.03, 0.1
+"""Error of a path as a share of its length, and one that is small on any path."""
+_MAX_LOOP_M, _MAX_LOOP_RAD = 0.3, np.radians(10.0)
+_MAX_REFUSED_SHARE = 0.5
 _MAX_WHEEL_CHI2, _LEAST_WHEEL_FACTORS = 9.0, 5
-_MAX_SIGMA_M, _MAX_SIGMA_SHARE, _BROKEN_SIGMA_SHARE = 0.1, 0.1, 0.3
+_MAX_SIGMA_SHARE, _BROKEN_SIGMA_SHARE = 0.1, 0.3
 _MAX_STEP_M, _MAX_STEP_RAD = 0.2, np.radians(5.0)
 
 _LOOK_AT_LOOPS = "mapper loops RUN lists them; mapper loops RUN --remove I J takes a wrong one back"
@@ -35,7 +38,7 @@ def loop_warnings(results: RunResults) -> Iterator[RunWarning]:
     held = [loop for loop in results.loops if loop.verdict == "accepted" and loop.before is not None]
     contradicting = [loop for loop in results.loops if loop.rejected_by == SOLVER]
     tried = len(held) + len(contradicting)
-    if len(contradicting) >= _LEAST_LOOPS_REFUSED and len(contradicting) > _MAX_REFUSED_SHARE * tried:
+    if len(contradicting) >= MIN_CONFLICTS and len(contradicting) > _MAX_REFUSED_SHARE * tried:
         yield RunWarning(
             kind="loops",
             sentence=f"{len(contradicting)} of {tried} loops contradict the rest of the graph "
@@ -53,7 +56,7 @@ def loop_warnings(results: RunResults) -> Iterator[RunWarning]:
     ends = np.searchsorted(stamps_ns, [[loop.stamp_i_ns, loop.stamp_j_ns] for loop in held])
     ends = np.minimum(ends, len(stamps_ns) - 1)
     path_m = float(np.median(np.abs(np.diff(travelled_m[ends], axis=1))))
-    limit_m = max(_MAX_LOOP_M, _MAX_LOOP_SHARE * path_m)
+    limit_m = max(_MAX_LOOP_M, MAX_DRIFT_SHARE * path_m)
     if miss_m <= limit_m and miss_rad <= _MAX_LOOP_RAD:
         return
     yield RunWarning(
@@ -102,7 +105,7 @@ def uncertainty_warnings(results: RunResults, suggestion: str) -> Iterator[RunWa
     path_m = results.trajectory.path_length_m
     sigma_m = float(poses.position_sigmas_m[known[-1]])
     share = sigma_m / max(path_m, 1e-9)
-    if sigma_m > _MAX_SIGMA_M and share > _MAX_SIGMA_SHARE:
+    if sigma_m > HARMLESS_M and share > _MAX_SIGMA_SHARE:
         yield RunWarning(
             kind="uncertainty",
             sentence=f"the last pose is known to {sigma_m:.2g} m (1 σ) after {path_m:.1f} m of path "

@@ -7,6 +7,7 @@ from itertools import zip_longest
 from pathlib import Path
 
 from mapper.core.errors import RunError
+from mapper.core.units import MIB
 from mapper.run.manifest import Input, InputLog
 from mapper.sources import open_source
 from mapper.sources.base import Log
@@ -14,7 +15,6 @@ from mapper.sources.chained import chained, sessions_of
 from mapper.sources.config import SourceConfig
 
 _TEXT_SUFFIXES = frozenset({".txt", ".csv", ".json", ".toml", ".yaml", ".yml", ".tum", ".log"})
-_SAMPLE_BYTES = 1 << 20
 
 
 def fingerprint(path: Path) -> str:
@@ -38,10 +38,10 @@ def _hash_file(digest: "hashlib._Hash", file: Path, *, name: str, content: bool)
     if not content:
         return
     with file.open("rb") as stream:
-        digest.update(stream.read(_SAMPLE_BYTES))
-        if size > _SAMPLE_BYTES:
-            stream.seek(max(size - _SAMPLE_BYTES, _SAMPLE_BYTES))
-            digest.update(stream.read(_SAMPLE_BYTES))
+        digest.update(stream.read(MIB))
+        if size > MIB:
+            stream.seek(max(size - MIB, MIB))
+            digest.update(stream.read(MIB))
 
 
 def _files(folder: Path) -> Iterator[tuple[str, Path]]:

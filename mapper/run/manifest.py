@@ -15,7 +15,7 @@ from mapper.core.config import Config, drop_unknown
 from mapper.core.errors import DataError, RunError
 from mapper.mapping.config import AppliedEdit
 from mapper.runtime.atomic import MANIFEST_NAME, write_text
-from mapper.runtime.regular_files import MOST_TEXT_BYTES, read_regular, read_text
+from mapper.runtime.regular_files import MOST_BYTES, read_regular, read_text
 from mapper.sensing.config import DepthNoiseConfig
 from mapper.sources.config import SourceConfig
 
@@ -316,7 +316,7 @@ def read_manifest_of(path: Path, kind: type[AnyManifest]) -> AnyManifest:
         RunError: There is none, or it is not one that this version wrote.
     """
     try:
-        tree = from_json(read_regular(path, most_bytes=MOST_TEXT_BYTES))
+        tree = from_json(read_regular(path, most_bytes=MOST_BYTES))
         drop_unknown(kind, tree)  # what another version wrote in addition
         return kind.model_validate(tree)
     except OSError as error:

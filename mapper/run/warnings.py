@@ -6,12 +6,15 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from mapper.core.geometry import angle_between
-from mapper.core.timebase import NS_PER_S, stretches
+from mapper.core.timebase import GAP_INTERVALS, NS_PER_S, stretches
 from mapper.core.trajectory import Trajectory
 from mapper.navigation.config import TraversableConfig
 from mapper.odometry.base import see_more
+from mapper.run.doubtful_frames import MAX_GAP_NS
 from mapper.run.frame_outcomes import DISCONNECTED, FrameRecord
 from mapper.run.graph_warnings import (
+    HARMLESS_M,
+    MAX_DRIFT_SHARE,
     loop_warnings,
     step_warnings,
     uncertainty_warnings,
@@ -29,15 +32,13 @@ INPUT_KINDS = frozenset(
 """Kinds that are found while the log is read or fused; a finished run has them in its manifest alone."""
 
 _ORDER: tuple[Weight, ...] = ("break", "doubt", "note")
-_GAP_INTERVALS, _LEAST_GAP_S = 3.0, 0.5
+_LEAST_GAP_S = 0.5
 _MAX_SHARE, _BROKEN_SHARE, _FEW_FRAMES = 0.05, 0.25, 2
 """Frames that may be without a sure pose: those around them hold the path where they are single ones. Good
 logs have up to 5 %; paths that were wrong had 13 % and more."""
-_LONG_S, _LONG_FRAMES = 2.0, 3
-_REPEATED_FRAMES = 2  # drivers repeat a frame or two when a sensor is late
+_LONG_FRAMES = 3
 _MIN_COUNTED_DEPTH = 0.5
 _LEAST_AGREEMENT, _LEAST_SHARED_VOXELS = 0.15, 1000
-_MAX_ERROR_SHARE, _LEAST_ERROR_M = 0.03, 0.1
 _MAX_TURN_SHARE, _LEAST_TURN_RAD, _NO_TURN_RAD = 0.5, np.radians(2.0), 1e-6
 _REASONS = 3
 
@@ -194,7 +195,7 @@ def _skipped(records: Sequence[FrameRecord], manifest: Manifest) -> Iterator[Run
 
 def _gaps(timeline: TimeLine) -> Iterator[RunWarning]:
     pauses_ns = np.diff(timeline.stamps_ns)
-    limit_ns = max(_GAP_INTERVALS * timeline.usual_ns, _LEAST_GAP_S * NS_PER_S)
+    limit_ns = max(GAP_INTERVALS * timeline.usual_ns, _LEAST_GAP_S * NS_PER_S)
     is_gap = (pauses_ns > limit_ns) & ~np.isin(timeline.stamps_ns[1:], timeline.begins_ns)
     gaps = np.flatnonzero(is_gap)
     if not len(gaps):
@@ -232,7 +233,7 @@ def _lost(results: RunResults, timeline: TimeLine) -> Iterator[RunWarning]:
         kind="lost",
         sentence=f"{lost} of {len(records)} frames were lost, {share:.1%}, for "
         f"{timeline.duration_s(first, last):.1f} s at the longest (at most {_MAX_SHARE:.0%} and "
-        f"{_LONG_S:g} s are harmless)",
+        f"{MAX_GAP_NS / NS_PER_S:g} s are harmless)",
         where=timeline.place(first, last),
         weight="break"
         if share > _BROKEN_SHARE or is_long
@@ -262,7 +263,7 @@ def _doubtful(results: RunResults, timeline: TimeLine) -> Iterator[RunWarning]:
         kind="doubtful",
         sentence=f"{len(doubtful)} of {placed} placed frames are doubtful, {len(doubtful) / placed:.1%}, for "
         f"{timeline.duration_s(first, last):.1f} s at the longest (at most {_MAX_SHARE:.0%} and "
-        f"{_LONG_S:g} s are harmless): {'; '.join(texts)}",
+        f"{MAX_GAP_NS / NS_PER_S:g} s are harmless): {'; '.join(texts)}",
         suggestion=see_more(has_wheels=results.graph.has_wheels) if is_unseen else "",
         where=timeline.place(first, last),
         weight="doubt" if are_too_many else "note",
@@ -275,7 +276,7 @@ def _longest(flags: Sequence[bool], timeline: TimeLine) -> tuple[int, int]:
 
 
 def _is_long(first: int, last: int, timeline: TimeLine) -> bool:
-    return timeline.duration_s(first, last) > _LONG_S and last - first > _LONG_FRAMES
+    return timeline.duration_s(first, last) > MAX_GAP_NS / NS_PER_S and last - first > _LONG_FRAMES
 
 
 def _repeated(records: Sequence[FrameRecord], is_doubtful: Sequence[bool]) -> int:
@@ -283,7 +284,7 @@ def _repeated(records: Sequence[FrameRecord], is_doubtful: Sequence[bool]) -> in
     return sum(
         last + 1 - first
         for first, last in stretches(is_doubtful)
-        if last - first < _REPEATED_FRAMES
+        if last - first < _FEW_FRAMES  # drivers repeat a frame or two when a sensor is late
         and all(doubt.kind == "repeated image" for k in range(first, last + 1) for doubt in records[k].doubts)
     )
 
@@ -326,11 +327,11 @@ def _truth(results: RunResults) -> Iterator[RunWarning]:
     rmse_m = float(np.sqrt(((estimated.positions_world - known.positions_world) ** 2).sum(axis=1).mean()))
     path_m = min(estimated.path_length_m, known.path_length_m)  # errors make a path longer
     suggestion = "mapper report, to see where; check that the truth is of this log and in its clock"
-    if rmse_m > max(_MAX_ERROR_SHARE * path_m, _LEAST_ERROR_M):
+    if rmse_m > max(MAX_DRIFT_SHARE * path_m, HARMLESS_M):
         yield RunWarning(
             kind="truth",
             sentence=f"frames without doubt are {rmse_m:.2f} m (RMSE) from the true poses, on {path_m:.1f} m "
-            f"of path (doubt from {_MAX_ERROR_SHARE:.0%} and {_LEAST_ERROR_M:g} m on): one of both is wrong",
+            f"of path (doubt from {MAX_DRIFT_SHARE:.0%} and {HARMLESS_M:g} m on): one of both is wrong",
             suggestion=suggestion,
             weight="doubt",
         )

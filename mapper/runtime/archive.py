@@ -12,11 +12,12 @@ from typing import Any
 import numpy as np
 from isal import isal_zlib
 
+from mapper.core.units import MIB
 from mapper.runtime.archived import Archivable, Archived, refer
 from mapper.runtime.journal import Journal
 from mapper.runtime.state_file import dumps, loads
 
-RECENT_BYTES = 128 << 20
+RECENT_BYTES = 128 * MIB
 """Size of the data in memory that is on the disk as well: some 500 keyframes of 1000 features."""
 
 

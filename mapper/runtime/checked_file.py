@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import BinaryIO
 
 from mapper.core.errors import MapperError
+from mapper.core.units import MIB
 from mapper.runtime import atomic
 
 _FIXED = struct.Struct("<III")
-_PIECE = 1 << 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,12 +40,12 @@ class CheckedFormat:
         """Write a header and a body that another file has, which is never in memory as a whole; atomic."""
         checksum = zlib.crc32(head)
         body.seek(0)
-        for piece in iter(partial(body.read, _PIECE), b""):
+        for piece in iter(partial(body.read, MIB), b""):
             checksum = zlib.crc32(piece, checksum)
         body.seek(0)
         with atomic.atomic_file(path) as part, part.open("wb") as file:
             file.write(self.magic + _FIXED.pack(self.version, len(head), checksum) + head)
-            shutil.copyfileobj(body, file, _PIECE)
+            shutil.copyfileobj(body, file, MIB)
 
     def split(self, path: Path, data: bytes) -> tuple[bytes, memoryview]:
         """Return header and body of a file's bytes, which begin with the magic.

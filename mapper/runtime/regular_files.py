@@ -11,12 +11,18 @@ from pathlib import Path
 from typing import Any
 
 from mapper.core.errors import DataError, MapperError
+from mapper.core.units import MIB
 
-MOST_TEXT_BYTES = 256 << 20
-"""Size of a text file, beyond which it is taken for something else: the true poses of ten hours at 100 Hz
-fill it, and as lines it takes a few gigabytes of memory."""
+MOST_BYTES = 512 * MIB
+"""Size of a text, an image or a block of a recording, beyond which it is taken for something else: the true
+poses of twenty hours at 100 Hz fill it, and as lines they take gigabytes of memory."""
+MOST_UNPACKED_RATIO = 255
+"""Times the size of what is stored that it may unpack to: of LZ4 a byte expands to no more, of LZF to 88;
+logs unpack to less than ten times their size, and a hostile file could keep its reader busy for days."""
+HEAD_BYTES = 65_536
+"""Bytes of a file that are read to tell what it is."""
 
-_MOST_TOML_CHARACTERS = 1 << 20
+_MOST_TOML_CHARACTERS = MIB
 _MOST_KEY_PARTS = 32
 
 _reads: ContextVar[set[Path] | None] = ContextVar("reads", default=None)
@@ -98,7 +104,7 @@ def read_text(
     if (paths := _reads.get()) is not None:
         paths.add(path)
     try:
-        return read_regular(path, most_bytes=MOST_TEXT_BYTES, may_be_pipe=may_be_pipe).decode(encoding)
+        return read_regular(path, most_bytes=MOST_BYTES, may_be_pipe=may_be_pipe).decode(encoding)
     except OSError as why:
         raise error(f"{path}: cannot be read: {why.strerror}") from None
     except UnicodeDecodeError as why:

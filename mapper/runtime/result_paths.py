@@ -12,7 +12,6 @@ RUNS, LOGS, MAPS, DIFFS = Path("runs"), Path("logs"), Path("maps"), Path("diffs"
 _MOST_NAMED = 3
 _LONGEST_NAME_BYTES = 255 - len(".partial")
 """Longest name on Linux's file systems, less what is added to it while a folder is filled."""
-_SHOWN = 40
 
 
 def place_of(out: Path | None, usual: Path, *, overwrite: bool = False) -> Path:
@@ -40,7 +39,7 @@ def result_path(path: Path) -> Path:
         raise RunError(f"{path}: has no name of its own; name a file or folder in it")
     if longest := next((part for part in path.parts if len(os.fsencode(part)) > _LONGEST_NAME_BYTES), None):
         raise RunError(
-            f"{longest[:_SHOWN]}…: a name of {len(os.fsencode(longest))} bytes, at most "
+            f"{longest}: a name of {len(os.fsencode(longest))} bytes, at most "
             f"{_LONGEST_NAME_BYTES} can be written; choose a shorter one"
         )
     return path

@@ -6,10 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.geometry import Array
-from mapper.core.timebase import NS_PER_S, Stamps
+from mapper.core.timebase import GAP_INTERVALS, NS_PER_S, Stamps
 
-_GAP_INTERVALS, _LEAST_GAP_NS = 5, 20_000_000
-"""Readings farther apart than this number of their usual intervals, and this time, have a gap between."""
+_LEAST_GAP_NS = 20_000_000
+"""Readings farther apart than this, and than ``GAP_INTERVALS`` of their usual ones, have a gap between."""
 _SATURATED_READINGS, _LEAST_SATURATED = 5, 1.0
 """Readings that have exactly the largest number of the log, beyond 1 rad/s, are at the end of their range."""
 
@@ -42,7 +42,7 @@ class Gyroscope:
     @property
     def gap_ns(self) -> int:
         """Time between two readings beyond which the rotation between them is unknown."""
-        return max(_GAP_INTERVALS * self.interval_ns, _LEAST_GAP_NS)
+        return max(round(GAP_INTERVALS * self.interval_ns), _LEAST_GAP_NS)
 
     def without_saturation(self) -> tuple["Gyroscope | None", list[str]]:
         """Return the readings within the unit's range, None if there are none, and notes on them and on gaps.

@@ -105,9 +105,9 @@ class Skin:
 class Place:
     """Frame of a piece of furniture: its middle on the floor, and its turn."""
 
-    x_m: float
-    y_m: float
-    yaw_rad: float
+    x_m: float = 0.0
+    y_m: float = 0.0
+    yaw_rad: float = 0.0
 
     def world(self, x_m: float, y_m: float) -> tuple[float, float]:
         """Return the world x and y of a point of the piece's frame."""
@@ -115,7 +115,7 @@ class Place:
         return self.x_m + cosine * x_m - sine * y_m, self.y_m + sine * x_m + cosine * y_m
 
 
-ORIGIN = Place(0.0, 0.0, 0.0)
+ORIGIN = Place()
 
 
 @dataclass(slots=True)

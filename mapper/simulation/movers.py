@@ -13,7 +13,7 @@ from mapper.simulation.config import SynthConfig
 from mapper.simulation.path import Motion
 from mapper.simulation.plan import closed_spline
 from mapper.simulation.scene import Scene
-from mapper.simulation.streams import Stream, rng_of
+from mapper.simulation.streams import TRIES, Stream, rng_of
 
 _PARTS: tuple[tuple[tuple[float, float, float], tuple[float, float, float]], ...] = (
     ((-0.16, -0.14, 0.02), (0.32, 0.28, 0.80)),
@@ -25,7 +25,6 @@ PARTS = len(_PARTS)
 _PASSING_M = (0.9, 2.0)
 _WALKING_MPS = (0.7, 1.5)
 _APART_M = 0.6
-_TRIES = 50
 _SMALLEST_M, _LARGEST_M = (0.35, 0.35, 0.5), (0.55, 0.55, 0.75)
 _ROLLING_MPS = (0.3, 0.7)
 _CLEARANCE_M = 0.03
@@ -68,7 +67,7 @@ def make_walkers(config: SynthConfig, motion: Motion) -> Walkers:
     positions, velocities = np.empty((count, 2)), np.empty((count, 2))
     for i, T_world_camera in enumerate(motion.poses(times_s)):
         ahead = T_world_camera[:2, 2] / np.linalg.norm(T_world_camera[:2, 2])
-        for _ in range(_TRIES):
+        for _ in range(TRIES):
             turn = float(rng.choice([-1.0, 1.0]) * np.pi / 2 + rng.uniform(-0.4, 0.4))
             across = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]) @ ahead
             crossing = T_world_camera[:2, 3] + rng.uniform(*_PASSING_M) * ahead

@@ -25,12 +25,11 @@ from mapper.simulation.plan import (
     make_plan,
     route_points,
 )
-from mapper.simulation.streams import Stream, rng_of
+from mapper.simulation.streams import TRIES, Stream, rng_of
 
 _SLAB_M = 0.2
 _WHITE = np.array([232.0, 230.0, 226.0])
 _ROUTE_CLEARANCE_M = 0.5
-_TRIES = 40
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -267,7 +266,7 @@ def _furnish(
         piece = PIECES[order[i % len(PIECES)]]
         size_array = rng.uniform(piece.smallest, piece.largest)
         size = (float(size_array[0]), float(size_array[1]), float(size_array[2]))
-        for _ in range(_TRIES):
+        for _ in range(TRIES):
             place = _at_a_wall(rng, room, size) if piece.at_wall else _anywhere(rng, room, size)
             footprint = _footprint(place, size)
             in_the_way = footprint.distance_m(keep_free) < _ROUTE_CLEARANCE_M
@@ -292,7 +291,7 @@ def _moved(
     footprints: Sequence[_Footprint],
 ) -> Place:
     """Return where a piece stands on another day: at a free spot of the room, or where it was."""
-    for _ in range(_TRIES):
+    for _ in range(TRIES):
         other = _anywhere(rng, room, size)
         footprint = _footprint(other, size)
         free = not any(map(footprint.overlaps, footprints))
@@ -336,7 +335,7 @@ def _hang_pictures(
     taken = [*doors, *(footprint for footprint in footprints if footprint.height_m > 1.2)]
     for _ in range(config.posters_per_room):
         size = (float(rng.uniform(0.35, 0.9)), 0.02, float(rng.uniform(0.35, 0.9)))
-        for _ in range(_TRIES):
+        for _ in range(TRIES):
             place = _at_a_wall(rng, room, size)
             footprint = _footprint(place, (size[0] + 0.06, 0.1, size[2]))
             if any(map(footprint.overlaps, taken)):

@@ -22,7 +22,7 @@ _PATCH_PX_AT_640 = 9.0
 _GRAZING_COSINE, _GRAZING_SPREAD = 0.16, 0.06
 _EDGE_RATIO, _EDGE_CHANCE = 0.04, 0.35
 _SPECKLE_CHANCE = 0.001
-_TINY_M, _ONE = np.float32(1e-3), np.float32(1.0)
+_TINY_M = np.float32(1e-3)
 
 
 def observe(
@@ -106,7 +106,7 @@ def _noisy_depth(depth_m: DepthImage, sensor: SensorConfig, rng: np.random.Gener
         measured = _warped(measured, np.float32(math.sqrt(0.5) * sensor.disparity_noise_px) * noise)
     if sensor.disparity_step_px > 0.0:
         one_step_m = np.float32(BASELINE_M * DISPARITY_FOCAL_PX / sensor.disparity_step_px)
-        steps = np.maximum(np.rint(one_step_m / np.maximum(measured, _TINY_M)), _ONE)
+        steps = np.maximum(np.rint(one_step_m / np.maximum(measured, _TINY_M)), np.float32(1.0))
         measured = np.asarray(one_step_m / steps, dtype=np.float32)
     return measured.copy()
 

@@ -32,12 +32,10 @@ from mapper.simulation.streams import Stream, noise_index, rng_of
 from mapper.simulation.wheel_readings import counted
 from mapper.sources.base import ImageFiles, Log
 from mapper.sources.calibration_file import calibration_text
+from mapper.sources.image_files.reading import TUM_UNITS_PER_M
 from mapper.sources.imu_files import write_imu
 from mapper.sources.trajectory_files import write_tum
 from mapper.sources.wheel_files import write_wheels
-
-DEPTH_FACTOR = 5000.0
-"""Units of a depth image per metre, as TUM writes them (Sturm et al. 2012)."""
 
 # One filter and no search for repeats: noise has none, and it takes a third of the time.
 _COLOUR_PNG = (
@@ -262,7 +260,7 @@ def _write(folder: Path, simulator: CameraSimulator, on_progress: Callable[[int,
     for kind, lines in lists.items():
         (folder / f"{kind}.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
     write_tum(folder / "groundtruth.txt", simulator.truth)
-    calibration = calibration_text(simulator.camera, depth_units_per_m=DEPTH_FACTOR)
+    calibration = calibration_text(simulator.camera, depth_units_per_m=TUM_UNITS_PER_M)
     (folder / "calibration.toml").write_text(calibration, encoding="utf-8")
     if log.wheels is not None:
         write_wheels(folder, log.wheels, sensor=log.sensor)
@@ -275,7 +273,7 @@ def _write(folder: Path, simulator: CameraSimulator, on_progress: Callable[[int,
 
 
 def _save_images(folder: Path, name: str, frame: RgbdFrame, *, image_format: str) -> None:
-    units = np.rint(frame.depth_m * np.float32(DEPTH_FACTOR))
+    units = np.rint(frame.depth_m * np.float32(TUM_UNITS_PER_M))
     units[units > np.iinfo(np.uint16).max] = 0.0  # deeper than 13.1 m does not fit: no measurement
     bgr = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2BGR)
     options = _COLOUR_PNG if image_format == "png" else _GOOD_JPG

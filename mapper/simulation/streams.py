@@ -4,6 +4,9 @@ from enum import IntEnum
 
 import numpy as np
 
+TRIES = 40
+"""Random places that are tried for a thing before it is left out."""
+
 
 class Stream(IntEnum):
     """Purpose of a stream; a seed's results depend on these numbers."""

@@ -13,7 +13,7 @@ import numpy as np
 from mapper.core.config import toml_text
 from mapper.core.errors import DataError, SourceError
 from mapper.core.frames import NO_DISTORTION, PinholeCamera
-from mapper.runtime.regular_files import parse_toml, read_text
+from mapper.runtime.regular_files import HEAD_BYTES, parse_toml, read_text
 from mapper.sources.calibration import Calibration, DepthCamera
 from mapper.sources.text import pose_from_numbers
 
@@ -181,7 +181,7 @@ def _depth_camera(found: _Numbers, origin: str) -> DepthCamera | None:
 
 def _is_by_axis(first: float, second: float, third: float, _: float) -> bool:
     """Return whether four intrinsics are OpenLORIS' fx cx fy cy: the focal lengths of a camera are alike."""
-    return abs(second - first) > _ALIKE * abs(first) >= abs(third - first)
+    return abs(third - first) < abs(abs(second) - abs(first))
 
 
 def _toml_numbers(table: Mapping[str, Any]) -> dict[str, Sequence[float]]:
@@ -197,12 +197,10 @@ def _toml_numbers(table: Mapping[str, Any]) -> dict[str, Sequence[float]]:
     return numbers
 
 
-_HEAD_BYTES = 1 << 16
 _ANY_LINE = re.IGNORECASE | re.MULTILINE
 _INFO_KEY = "m_calibrationColorIntrinsic"
 _MAY_BE_OTHER = ("info.txt", "metadata.json", "transforms.json")
 _KEY_AND_NUMBER = re.compile(r"(?:fl?_?x(?:_px)?|camera_matrix|\bk)\"?\s*[:=]", re.IGNORECASE)
-_ALIKE = 0.05
 _COLOUR_SECTION = re.compile(r"^\w*(?:color|colour|rgb)\w*:[ \t]*\n(?:[ \t]+.*\n?|\s*\n)+", _ANY_LINE)
 _YAML_ENTRY = re.compile(
     r"^[ \t]*(?:\w+\.)?(?P<key>\w+)[ \t]*:[ \t]*(?P<value>\[[^\]]*\]|(?:\n[ \t]*-[ \t][^\n]*)+|[^\n#]*)",
@@ -281,7 +279,7 @@ def _text_numbers(text: str) -> _Numbers:
 
 def _has_camera(path: Path) -> bool:
     with suppress(OSError), path.open("rb") as file:
-        head = file.read(_HEAD_BYTES).decode(errors="replace")
+        head = file.read(HEAD_BYTES).decode(errors="replace")
         return _INFO_KEY in head or _KEY_AND_NUMBER.search(head) is not None
     return False
 

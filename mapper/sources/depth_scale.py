@@ -10,10 +10,12 @@ from mapper.core.frames import RgbdFrame
 from mapper.core.geometry import Array, Transform, angle_between, apply, inverse
 from mapper.core.timebase import NS_PER_S
 from mapper.core.trajectory import Trajectory
+from mapper.core.units import MM_PER_M
 from mapper.sensing.wheel_kinematics import pose_at
 from mapper.sources.base import Log, read_depth
+from mapper.sources.image_files.reading import TUM_UNITS_PER_M
 
-_FRAMES = 8
+LOOKED_AT = 8
 """Frames, spread over the log, whose depth is looked at, and from which pairs begin."""
 
 _MIN_MEASURED_SHARE = 0.05
@@ -24,27 +26,21 @@ _USUALLY_NEAR_M = 0.3
 millimetres taken for TUM's fifths of these."""
 _DESK_M = 1.5
 """Depth of most of a desk or an object; nearer than that a whole room is not."""
-_MM_PER_M = 1000.0
-_USUAL_UNITS_PER_M = (1000.0, 5000.0)
+_USUAL_UNITS_PER_M = (MM_PER_M, TUM_UNITS_PER_M)
 _CHANGE = 3.0
 """Ratio of the median depths of two consecutive frames, and of all before to all after them, by which units
 change: usual ones differ by 4 or 5, or by 1000."""
 
 _PAIR_WITHIN_NS = NS_PER_S // 2
-_MAX_POSE_GAP_NS = NS_PER_S // 5
 _MIN_MOTION_M = 0.03
 _MAX_TURN_RAD = 0.2
 """A pair's motion: far enough for the noise of depth, and little turned, for mountings are not exact."""
 
-_FEATURES = 500
-_MAX_DESCRIPTOR_RATIO = 0.8
-_MIN_MATCHES = 25
-_MIN_AGREEING_SHARE = 0.4
+_MIN_AGREEING = 20
 _MAX_RESIDUAL_SHARE = 0.25
 """A match agrees with a scale if its points then lie within this share of the motion from each other."""
 
 _MIN_PAIRS = 3
-_MAX_SPREAD = 1.15
 _MAX_SCALE_ERROR = 1.25
 """Depth cameras, truth and wheels err by a few per cent; wrong units by a factor of 4 or 5, or of 1000."""
 
@@ -66,7 +62,7 @@ def depth_warnings(log: Log) -> list[str]:
     """
     if log.sensor != "rgbd":
         return []
-    spread = np.unique(np.linspace(0, len(log) - 1, _FRAMES).astype(int)).tolist()
+    spread = np.unique(np.linspace(0, len(log) - 1, LOOKED_AT).astype(int)).tolist()
     frames = {index: frame for index in spread if (frame := read_depth(log.entry_at(index))) is not None}
     if not frames:
         return []
@@ -157,8 +153,8 @@ def _median_m(frame: RgbdFrame) -> float:
 
 def _are_whole_millimetres(log: Log, frames: Collection[RgbdFrame]) -> bool:
     """Return whether depth was recorded in whole millimetres, as cameras deliver it, and scaled since."""
-    units_per_mm = (_units_per_m(log) or _MM_PER_M) / _MM_PER_M
-    units = np.concatenate([np.rint(frame.depth_m * units_per_mm * _MM_PER_M) for frame in frames])
+    units_per_mm = (_units_per_m(log) or MM_PER_M) / MM_PER_M
+    units = np.concatenate([np.rint(frame.depth_m * units_per_mm * MM_PER_M) for frame in frames])
     return bool((np.remainder(units, units_per_mm) == 0.0).all())
 
 
@@ -173,7 +169,7 @@ def _scale_of_log(log: Log, frames: Mapping[int, RgbdFrame]) -> float | None:
         if frame is not None and (scale := _scale(frames[first], frame, T_first_second)) is not None:
             scales.append(scale)
     median = float(np.median(scales)) if scales else 1.0
-    agreeing = [scale for scale in scales if 1.0 / _MAX_SPREAD < scale / median < _MAX_SPREAD]
+    agreeing = [scale for scale in scales if 1.0 / _MAX_SCALE_ERROR < scale / median < _MAX_SCALE_ERROR]
     return median if len(agreeing) >= _MIN_PAIRS else None
 
 
@@ -181,7 +177,7 @@ def _pairs(log: Log, motion: Trajectory, anchors: Collection[int]) -> Iterator[t
     """Yield each anchor, the frame soon after it that moved farthest, and T_first_second."""
 
     def pose(index: int) -> Transform | None:
-        return pose_at(motion, int(log.stamps_ns[index]), max_gap_ns=_MAX_POSE_GAP_NS)
+        return pose_at(motion, int(log.stamps_ns[index]), max_gap_ns=_PAIR_WITHIN_NS)
 
     for first in anchors:
         T_world_first = pose(first)
@@ -210,8 +206,6 @@ def _scale(first: RgbdFrame, second: RgbdFrame, T_first_second: Transform) -> fl
     """
     one, other = _features(first), _features(second)
     pairs = _matched(one, other)
-    if len(pairs) < _MIN_MATCHES:
-        return None
     R = T_first_second.copy()
     R[:3, 3] = 0.0
     t = T_first_second[:3, 3]
@@ -224,13 +218,11 @@ def _scale(first: RgbdFrame, second: RgbdFrame, T_first_second: Transform) -> fl
     residuals_m = np.linalg.norm(candidates[:, None, None] * moved - t, axis=2)
     agreeing = residuals_m < _MAX_RESIDUAL_SHARE * distance_m
     best = agreeing[int(agreeing.sum(axis=1).argmax())]
-    if best.mean() < _MIN_AGREEING_SHARE:
-        return None
-    return float(distance_m / np.median(along_m[best]))
+    return float(distance_m / np.median(along_m[best])) if best.sum() >= _MIN_AGREEING else None
 
 
 def _features(frame: RgbdFrame) -> _Features:
-    keypoints, descriptors = cv2.ORB.create(_FEATURES).detectAndCompute(frame.gray, None)
+    keypoints, descriptors = cv2.ORB.create().detectAndCompute(frame.gray, None)
     pixels = np.array([keypoint.pt for keypoint in keypoints]).reshape(-1, 2)
     columns, rows = np.rint(pixels).astype(int).T
     depth_m = frame.depth_m[rows, columns].astype(np.float64)
@@ -242,18 +234,11 @@ def _features(frame: RgbdFrame) -> _Features:
 
 
 def _matched(one: _Features, other: _Features) -> Array:
-    """Return (N, 2) indices of features that are each other's nearest, and clearly so."""
-    if len(one.descriptors) < 2 or len(other.descriptors) < 2:
-        return np.zeros((0, 2), dtype=int)
-    matcher = cv2.BFMatcher.create(cv2.NORM_HAMMING)
-    back = {m.trainIdx: m.queryIdx for m in matcher.match(other.descriptors, one.descriptors)}
-    found = [
-        (best.queryIdx, best.trainIdx)
-        for best, next_best in matcher.knnMatch(one.descriptors, other.descriptors, k=2)
-        if best.distance < _MAX_DESCRIPTOR_RATIO * next_best.distance
-        and back.get(best.queryIdx) == best.trainIdx
-    ]
-    return np.array(found, dtype=int).reshape(-1, 2)
+    """Return (N, 2) indices of features that are each other's nearest."""
+    matches = cv2.BFMatcher.create(cv2.NORM_HAMMING, crossCheck=True).match(
+        one.descriptors, other.descriptors
+    )
+    return np.array([(match.queryIdx, match.trainIdx) for match in matches], dtype=int).reshape(-1, 2)
 
 
 def _units_per_m(log: Log) -> float | None:

@@ -8,13 +8,13 @@ import numpy as np
 
 from mapper.core.errors import DataError, FrameError, SourceError
 from mapper.core.frames import Frame, PinholeCamera, RgbdFrame, Scan, Sensor
-from mapper.core.timebase import MAX_TRUTH_GAP_NS, NS_PER_S, Stamps, check_stamps, nearest
+from mapper.core.timebase import GAP_INTERVALS, MAX_TRUTH_GAP_NS, NS_PER_S, Stamps, check_stamps, nearest
 from mapper.core.trajectory import Trajectory
 from mapper.runtime.ordered_map import ordered_map
 from mapper.sources import RECORDING, format_of, open_source
 from mapper.sources.base import Log, read_depth
 from mapper.sources.config import SourceConfig
-from mapper.sources.depth_scale import depth_warnings
+from mapper.sources.depth_scale import LOOKED_AT, depth_warnings
 from mapper.sources.reading_checks import ReadingChecks
 from mapper.sources.ros import files as recordings
 from mapper.sources.ros.index import Series
@@ -24,11 +24,8 @@ from mapper.sources.selection import selected
 from mapper.sources.valid_returns import FARTHEST_M
 from mapper.sources.vehicle_box import Box, vehicle_box
 
-_GAP_PERIODS = 3.0
-"""Median periods that a pause must exceed to be a gap."""
 _MOST_LOADED = 200
 """Frames of an RGB-D log that are loaded, evenly spread: a second or two of reading, whatever its length."""
-_FEW = 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,7 +141,7 @@ def timing_of(stamps_ns: Stamps) -> Timing:
         first_ns=int(ordered_ns[0]),
         duration_s=int(ordered_ns[-1] - ordered_ns[0]) / NS_PER_S,
         rate_hz=1.0 / usual_s if usual_s > 0.0 else 0.0,
-        gaps=int((apart_s > _GAP_PERIODS * usual_s).sum()) if usual_s > 0.0 else 0,
+        gaps=int((apart_s > GAP_INTERVALS * usual_s).sum()) if usual_s > 0.0 else 0,
         longest_gap_s=float(apart_s.max(initial=0.0)),
     )
 
@@ -179,7 +176,7 @@ def _inspected(path: Path, topics: Sequence[TopicFacts], source: Log) -> Inspect
 
 def _without_depth(source: Log) -> str | None:
     """Return that an RGB-D log has no depth; None if it has."""
-    frames = [frame for entry in source.spread_entries(_FEW) if (frame := read_depth(entry)) is not None]
+    frames = [frame for entry in source.spread_entries(LOOKED_AT) if (frame := read_depth(entry)) is not None]
     if not frames or any((frame.depth_m > 0.0).any() for frame in frames):
         return None
     return f"no depth in any of {len(frames)} frames looked at: all of it is 0, or the limit of 16 bits"

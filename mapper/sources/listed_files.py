@@ -2,12 +2,11 @@
 
 import os
 import re
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable
 from pathlib import Path, PurePath
 
-from mapper.core.errors import SourceError
+from mapper.core.errors import SourceError, listed
 
-_MOST_NAMED = 8
 _SENSOR_FILES = [
     re.compile(
         rf"(?:^|[^a-z])(?:{words}).*\.(?:txt|csv|tsv|json|ya?ml|toml|log|np[yz]|tum|bag|mcap|db3)$", re.I
@@ -93,16 +92,10 @@ def unused_note(folder: Path, read: Collection[Path]) -> list[str]:
     if not unused:
         return []
     return [
-        f"files that are not used: {first_names(unused)}; truth is read from the file that "
+        f"files that are not used: {listed(unused)}; truth is read from the file that "
         "source.truth_file names (of scans) or groundtruth.txt, an IMU from imu.csv or accelerometer.txt, "
         "wheels from wheels.txt or encoders.txt, the camera from calibration.toml"
     ]
-
-
-def first_names(names: Sequence[str]) -> str:
-    """Return the first of some names for a note, and how many more there are."""
-    more = f" and {len(names) - _MOST_NAMED} more" if len(names) > _MOST_NAMED else ""
-    return f"{', '.join(names[:_MOST_NAMED])}{more}"
 
 
 def _entries(folder: Path) -> list[os.DirEntry[str]]:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from mapper.core.frames import Scan
 from mapper.core.geometry import Array
-from mapper.core.timebase import NS_PER_S
+from mapper.core.timebase import NS_PER_S, UNITS_PER_S
 
 TIME_FIELDS = (
     "t",  # Ouster: uint32 nanoseconds after the stamp
@@ -27,11 +27,10 @@ TIME_FIELDS = (
 MAX_SWEEP_S = 2.0
 """No sensor turns slower; points farther apart in time were put together from several sweeps."""
 
-_UNITS_PER_S = (1, 1_000, 1_000_000, NS_PER_S)
 _MAX_WRONG_SHARE = 0.05
 """Share of the points whose times may be damaged; with more of them nothing tells which times are right."""
 _SAMPLED = 1000
-_PERIODS = (float(1 << 32), *(s * unit for s in (1, 3600, 86_400, 604_800) for unit in _UNITS_PER_S))
+_PERIODS = (float(1 << 32), *(s * unit for s in (1, 3600, 86_400, 604_800) for unit in UNITS_PER_S))
 """Counts after which times begin anew: 32 bits; a second, an hour, a day and a week in every unit."""
 _NEARLY_ALL = 0.99
 """Share of a period that times span which began anew during a sweep."""
@@ -121,7 +120,7 @@ def _middle_and_unit(values: NDArray[np.number]) -> tuple[np.number, int | None]
     if not (np.isfinite(most[0]) and np.isfinite(most[-1])):
         return middle, None
     span = float(_less(most[-1], most[0]))
-    return middle, next((unit for unit in _UNITS_PER_S if span <= MAX_SWEEP_S * unit), None)
+    return middle, next((unit for unit in UNITS_PER_S if span <= MAX_SWEEP_S * unit), None)
 
 
 def _without_damage(

@@ -12,23 +12,19 @@ from mapper.sources.base import Log, WrappedEntry
 from mapper.sources.point_times import MAX_SWEEP_S
 from mapper.sources.valid_returns import FARTHEST_M
 
-FROZEN_FRAMES = 10
-"""So many frames with the very same pixels are noted: a camera's noise makes even two of them differ, and
-drivers repeat a frame or two when a sensor is late."""
-FROZEN_DEPTHS = 5
-"""As ``FROZEN_FRAMES``, of depth images, whose noise is stronger."""
+FROZEN_IMAGES = 5
+"""Number of frames with the very same pixels that is noted: a camera's noise makes even two of them differ,
+and drivers repeat a frame or two when a sensor is late."""
 FROZEN_SCANS = 3
-"""As ``FROZEN_FRAMES``, of scans, of whose thousands of ranges even two never agree."""
+"""As ``FROZEN_IMAGES``, of scans, of whose thousands of ranges even two never agree, or over a second."""
 
 _Repeating = Literal["image", "depth", "scan"]
 _FROZEN: tuple[tuple[_Repeating, str, str, int], ...] = (
-    ("image", "show the same image; was the camera frozen?", "same image", FROZEN_FRAMES),
-    ("depth", "have the same depth image; was the depth camera frozen?", "same depth image", FROZEN_DEPTHS),
+    ("image", "show the same image; was the camera frozen?", "same image", FROZEN_IMAGES),
+    ("depth", "have the same depth image; was the depth camera frozen?", "same depth image", FROZEN_IMAGES),
     ("scan", "have the same points; was the LiDAR or its driver frozen?", "same points", FROZEN_SCANS),
 )
 """Data that may repeat, what is said of a run and of one frame of it, and its least length."""
-
-_FEWEST_FRAMES, _LONG_NS = 3, NS_PER_S
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +81,7 @@ class ReadingChecks:
 
     def _lasts(self, run: range) -> bool:
         lasted_ns = int(self._stamps_ns[run[-1]] - self._stamps_ns[run[0]])
-        return len(run) >= _FEWEST_FRAMES and lasted_ns >= _LONG_NS
+        return len(run) >= FROZEN_SCANS and lasted_ns >= NS_PER_S
 
     def notes(self) -> list[str]:
         """Return what is suspicious about the frames loaded so far, a sentence each."""

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.errors import SourceError
-from mapper.core.timebase import NS_PER_S, Stamps, ns_from_seconds_text
+from mapper.core.timebase import NS_PER_S, UNITS_PER_S, Stamps, ns_from_seconds_text
 from mapper.sources.image_folders.numbered import stamp_at
 from mapper.sources.text import parse_date, parse_stamp, rows
 
@@ -19,8 +19,7 @@ _DECIMAL = re.compile(r"(?<!\d)\d{1,10}\.\d+$")
 _TWO_PARTS = re.compile(r"(?<!\d)(\d{10})_(\d{1,9})$")
 _WHOLE = re.compile(r"(?<!\d)\d+$")
 _NUMBER = re.compile(r"\d+(?=\D*$)")
-_EPOCH_S = range(10**9, 10**10)  # the years 2001 to 2286
-_UNITS_PER_S = (1, 1_000, 1_000_000, NS_PER_S)
+_EPOCH_DIGITS = 10  # of seconds, in the years 2001 to 2286
 _NANOSECOND_DIGITS = 9
 
 
@@ -166,7 +165,7 @@ def _stamp_in(stem: str) -> int | None:
 def _epoch_ns(text: str) -> int | None:
     """Return a whole number of s, ms, µs or ns since the epoch, by its size, as nanoseconds."""
     value = int(text) if text.isdecimal() and len(text) < 20 else 0
-    units = (unit for unit in _UNITS_PER_S if value // unit in _EPOCH_S)
+    units = (unit for unit in UNITS_PER_S if len(str(value // unit)) == _EPOCH_DIGITS)
     return next((value * (NS_PER_S // unit) for unit in units), None)
 
 

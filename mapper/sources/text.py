@@ -13,7 +13,8 @@ from mapper.core.timebase import Stamps, ns_from_date_text, ns_from_seconds_text
 from mapper.core.trajectory import Trajectory
 from mapper.runtime.regular_files import read_text
 
-_LONGEST_QUATERNION = 1e150  # whose square is finite
+ROUNDING = 0.01
+"""Error of a rotation in text of few digits; what is farther off is none."""
 _MOST_DIGITS = 9  # a year of frames at 30 Hz
 
 
@@ -120,7 +121,7 @@ def poses_from_numbers(numbers: Array) -> list[Transform | None]:
     """Return the same of each row of (N, 7) numbers."""
     with np.errstate(over="ignore"):
         lengths = np.sqrt(np.square(numbers[:, 3:]).sum(axis=1))
-    usable = np.isfinite(numbers).all(axis=1) & (lengths >= 1e-9) & (lengths < _LONGEST_QUATERNION)
+    usable = np.isfinite(numbers).all(axis=1) & (lengths >= 1e-9) & np.isfinite(lengths)
     kept = numbers[usable]
     poses = iter(pose_of_row(kept))
     return [next(poses) if is_usable else None for is_usable in usable]

@@ -14,12 +14,10 @@ from mapper.core.timebase import Stamps, ns_from_seconds_text, seconds_text_from
 from mapper.core.trajectory import Trajectory
 from mapper.runtime.atomic import write_text
 from mapper.runtime.regular_files import read_text
-from mapper.sources.text import poses_from_numbers
+from mapper.sources.text import ROUNDING, poses_from_numbers
 
 _EUROC = re.compile(r"\s*\d{16,19}\s*,")
 _W_FIRST = re.compile(r"\bq\w*w\b.*\bq\w*x\b")
-_QUATERNION_ERROR = 0.01
-"""Deviation from the length 1 beyond which four numbers are no quaternion: text has three digits or more."""
 _MULRAN_COLUMNS = 13
 _NUMBER = re.compile(r"[-+.]?\d|nan|inf", re.IGNORECASE)
 
@@ -174,7 +172,7 @@ def _refuse_another_csv(place: str, words: list[str]) -> None:
         length = math.hypot(*map(float, words[4:8]))
     except ValueError:
         return  # the caller names the word that is no number
-    if abs(length - 1.0) > _QUATERNION_ERROR:
+    if abs(length - 1.0) > ROUNDING:
         raise DataError(
             f"{place}: columns 5 to 8 have length {length:.4g}; want EuRoC's unit quaternion, w first"
         )

@@ -23,10 +23,9 @@ _MAX_STILL_WORLD_RATIO = 0.5
 """If more of the far cells stand still, so does the sensor, or it moves along a tunnel."""
 _MAX_STEP_CELLS = 2
 """At most one empty cell lies between two members of a group."""
-_MAX_RETURNS_RATIO = 1.0 / 3.0
+_MAX_RETURNS_RATIO = 0.3
 """What takes up more of the view is no vehicle: it is the object that is scanned."""
-_STEP_M = 0.05
-_POINTS = 60_000
+_MARGIN_M = 0.05
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,8 +82,8 @@ def vehicle_box(log: Log) -> Box | None:
     own_cells = cells[still][own[joined]] if len(own) else cells[:0]
     if not len(own_cells):
         return None
-    lower = np.floor(own_cells.min(axis=0) * scale.cell_m / _STEP_M + 1e-6) * _STEP_M - _STEP_M
-    upper = np.ceil((own_cells.max(axis=0) + 1) * scale.cell_m / _STEP_M - 1e-6) * _STEP_M + _STEP_M
+    lower = own_cells.min(axis=0) * scale.cell_m - _MARGIN_M
+    upper = (own_cells.max(axis=0) + 1) * scale.cell_m + _MARGIN_M
     inside = sum(int(((points >= lower) & (points <= upper)).all(axis=1).sum()) for points in clouds)
     if inside > _MAX_RETURNS_RATIO * returns:
         return None
@@ -101,7 +100,7 @@ def _clouds(log: Log, scale: _Scale) -> tuple[list[Points], int]:
             points = entry.scan().points_body
         except FrameError:
             continue
-        points = points[:: max(1, len(points) // _POINTS)].astype(np.float64)
+        points = points.astype(np.float64)
         returns += len(points)
         clouds.append(points[np.linalg.norm(points, axis=1) <= scale.around_m])
     if scale.ground_m is not None and clouds:

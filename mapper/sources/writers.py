@@ -16,7 +16,7 @@ from mapper.core.trajectory import Trajectory
 from mapper.runtime.atomic import new_folder, write_bytes, write_text
 from mapper.sources.base import Accelerations, FrameRef, Log, Skipped
 from mapper.sources.calibration_file import calibration_text
-from mapper.sources.image_files.reading import FINE_UNITS_PER_M, encode_colour, encode_depth, image_bytes
+from mapper.sources.image_files.reading import TUM_UNITS_PER_M, encode_colour, encode_depth, image_bytes
 from mapper.sources.image_folders.mbag import HEADER
 from mapper.sources.imu_files import write_gyroscope
 from mapper.sources.scan_folders.kitti_writing import write_kitti_log
@@ -166,8 +166,8 @@ def _write_images(entry: FrameRef, out: Path) -> _Written:
     frame = _load(entry)
     colour, depth = Path("rgb", f"{stamp}.png"), Path("depth", f"{stamp}.png")
     write_bytes(out / colour, encode_colour(frame.image))
-    write_bytes(out / depth, encode_depth(frame.depth_m, FINE_UNITS_PER_M))
-    return _Written(entry.stamp_ns, colour, depth, entry.stamp_ns, FINE_UNITS_PER_M)
+    write_bytes(out / depth, encode_depth(frame.depth_m, TUM_UNITS_PER_M))
+    return _Written(entry.stamp_ns, colour, depth, entry.stamp_ns, TUM_UNITS_PER_M)
 
 
 def _list_text(title: str, name: str, files: dict[int, Path]) -> str:

@@ -118,8 +118,8 @@ def test_a_pipe_is_no_list_and_no_log(tiny_tum_log, tmp_path):
 def test_a_list_without_end_is_refused_before_it_is_read(tiny_tum_log):
     log = tiny_tum_log(3)
     with (log / "depth.txt").open("r+b") as file:
-        file.truncate(regular_files.MOST_TEXT_BYTES + 1)  # a hole, which takes no room
-    with pytest.raises(SourceError, match=r"depth\.txt: 268435457 bytes, want 268435456 at most"):
+        file.truncate(regular_files.MOST_BYTES + 1)  # a hole, which takes no room
+    with pytest.raises(SourceError, match=r"depth\.txt: 536870913 bytes, want 536870912 at most"):
         open_source(log)
 
 

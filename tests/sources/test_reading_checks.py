@@ -16,7 +16,7 @@ from mapper.pipeline.build import build
 from mapper.sources import inspection, open_source
 from mapper.sources.config import SourceConfig
 from mapper.sources.inspection import inspect_log
-from mapper.sources.reading_checks import FROZEN_DEPTHS, FROZEN_FRAMES, FROZEN_SCANS, ReadingChecks
+from mapper.sources.reading_checks import FROZEN_IMAGES, FROZEN_SCANS, ReadingChecks
 from tests.support.logs import MemoryEntry, log_in_memory
 
 CAMERA = PinholeCamera(8, 6, 6.0, 6.0, 3.5, 2.5)
@@ -45,20 +45,20 @@ def frozen(n, first, count):
 
 
 def test_a_frozen_camera_is_noted_with_its_frames_and_times():
-    log = log_of(frozen(40, 7, FROZEN_FRAMES + 2), range(100, 140))
-    noted = ["frames 7 … 18, 0.7 … 1.8 s after the first, show the same image; was the camera frozen?"]
+    log = log_of(frozen(40, 7, FROZEN_IMAGES + 2), range(100, 140))
+    noted = ["frames 7 … 13, 0.7 … 1.3 s after the first, show the same image; was the camera frozen?"]
     assert notes_on(log) == noted
     assert notes_on(log, np.random.default_rng(0).permutation(40).tolist()) == noted
-    assert notes_on(log_of(frozen(40, 7, FROZEN_FRAMES - 1), range(100, 140))) == []
+    assert notes_on(log_of(frozen(40, 7, FROZEN_IMAGES - 1), range(100, 140))) == []
 
 
 def test_frames_that_repeat_earlier_ones_are_doubted():
-    log = log_of(frozen(40, 7, FROZEN_FRAMES), frozen(40, 30, FROZEN_DEPTHS))
+    log = log_of(frozen(40, 7, FROZEN_IMAGES), frozen(40, 30, FROZEN_IMAGES))
     checks = ReadingChecks(log)
     for entry in checks.log.entries():
         entry.load()
     doubts = checks.doubts()
-    assert sorted(doubts) == log.stamps_ns[[*range(8, 17), *range(31, 35)]].tolist()
+    assert sorted(doubts) == log.stamps_ns[[*range(8, 12), *range(31, 35)]].tolist()
     assert doubts[log.stamps_ns[9]] == [Doubt("repeated image", "same image as 2 frames before")]
     assert doubts[log.stamps_ns[31]] == [Doubt("repeated image", "same depth image as 1 frames before")]
 
@@ -94,11 +94,11 @@ def test_a_second_of_the_same_image_is_long_whatever_the_frame_rate():
 
 
 def test_depth_that_repeats_is_noted():
-    noted = notes_on(log_of(range(20), frozen(20, 12, FROZEN_DEPTHS)))
+    noted = notes_on(log_of(range(20), frozen(20, 12, FROZEN_IMAGES)))
     assert noted == [
         "frames 12 … 16, 1.2 … 1.6 s after the first, have the same depth image; was the depth camera frozen?"
     ]
-    assert notes_on(log_of(range(20), frozen(20, 12, FROZEN_DEPTHS - 1))) == []
+    assert notes_on(log_of(range(20), frozen(20, 12, FROZEN_IMAGES - 1))) == []
 
 
 def test_a_damaged_frame_among_the_same_ones_hides_nothing():

@@ -17,7 +17,7 @@ from mapper.simulation.lidar.route import Route, flat_of, make_route
 from mapper.simulation.lidar.solids import Ground, Shape, Site, Solids, make_ground
 from mapper.simulation.lidar.things import build_staircase, storeys_of
 from mapper.simulation.scene import make_scene
-from mapper.simulation.streams import Stream, rng_of
+from mapper.simulation.streams import TRIES, Stream, rng_of
 
 _FACADE_M = 8.0
 """From the middle of the road to the houses."""
@@ -26,7 +26,6 @@ _CLEARANCE_M, _YARD_CLEARANCE_M = 1.5, 2.0
 _YARD_MARGIN_M = 5.0
 _FIELD_MARGIN_M = 25.0
 _TUNNEL_END_M, _TUNNEL_SIDE_M, _TUNNEL_HEIGHT_M = 3.0, 2.5, 4.5
-_TRIES = 40
 _STAYING_SHARE = 0.4
 """Share of the movable things that are there on another day too, if at another spot."""
 
@@ -134,7 +133,7 @@ def _scatter(
     free, taken = _free_points(route), np.empty((0, 2))
     for build, fewest, most in counts:
         for _ in range(int(rng.integers(fewest, most + 1))):
-            spots = rng.uniform(-0.5, 0.5, (_TRIES, 2)) * (width, depth)
+            spots = rng.uniform(-0.5, 0.5, (TRIES, 2)) * (width, depth)
             fits = (_distance_m(s, free) > _YARD_CLEARANCE_M and _distance_m(s, taken) > 2.5 for s in spots)
             spot = next(compress(spots, fits), None)
             if spot is not None:

@@ -22,7 +22,7 @@ STOREY_M = 3.0
 ROUTE_SIZE_M = (4.0, 1.3)
 """Width and depth of the rectangle that one walks, up both flights, once a storey."""
 _FLIGHT_M, _STEPS = 3.0, 9
-_HALF_LENGTH_M, _HALF_WIDTH_M, _WALL_M, _SLAB_M = 2.7, 1.35, 0.2, 0.2
+_HALF_LENGTH_M, _HALF_WIDTH_M, _THICK_M = 2.7, 1.35, 0.2
 _WELL_M = 0.1
 """Half the gap between the flights."""
 
@@ -245,11 +245,11 @@ def build_staircase(site: Site, *, storeys: int) -> None:
         center = (low[0] + size[0] / 2.0, low[1] + size[1] / 2.0, low[2] + size[2] / 2.0)
         site.add(name, ORIGIN, center=center, size=size, shape=shape)
 
-    for y in (-_HALF_WIDTH_M - _WALL_M, _HALF_WIDTH_M):
-        block("wall", (-_HALF_LENGTH_M, y, -0.5), (length_m, _WALL_M, top_m + 0.5))
-    for x in (-_HALF_LENGTH_M - _WALL_M, _HALF_LENGTH_M):
-        block("wall", (x, -_HALF_WIDTH_M, -0.5), (_WALL_M, width_m, top_m + 0.5))
-    block("roof", (-_HALF_LENGTH_M, -_HALF_WIDTH_M, top_m), (length_m, width_m, _SLAB_M))
+    for y in (-_HALF_WIDTH_M - _THICK_M, _HALF_WIDTH_M):
+        block("wall", (-_HALF_LENGTH_M, y, -0.5), (length_m, _THICK_M, top_m + 0.5))
+    for x in (-_HALF_LENGTH_M - _THICK_M, _HALF_LENGTH_M):
+        block("wall", (x, -_HALF_WIDTH_M, -0.5), (_THICK_M, width_m, top_m + 0.5))
+    block("roof", (-_HALF_LENGTH_M, -_HALF_WIDTH_M, top_m), (length_m, width_m, _THICK_M))
     landing_m = _HALF_LENGTH_M - _FLIGHT_M / 2.0
     run_m, rise_m = _FLIGHT_M / _STEPS, STOREY_M / 2.0 / _STEPS
     for storey in range(storeys):
@@ -259,13 +259,13 @@ def build_staircase(site: Site, *, storeys: int) -> None:
             for step in range(_STEPS):
                 middle = ahead * (-_FLIGHT_M / 2.0 + (step + 0.5) * run_m)
                 z = begin + (step + 1) * rise_m
-                tread = (run_m, _HALF_WIDTH_M - _WELL_M, _SLAB_M)
-                block("step", (middle - run_m / 2.0, y, z - _SLAB_M), tread)
+                tread = (run_m, _HALF_WIDTH_M - _WELL_M, _THICK_M)
+                block("step", (middle - run_m / 2.0, y, z - _THICK_M), tread)
                 if step % 2 == 0:
                     post = (middle - 0.02, -ahead * _WELL_M - 0.02, z)
                     block("railing", post, (0.04, 0.04, 0.95), Shape.CYLINDER)
         for x, z in ((_FLIGHT_M / 2.0, base_m + STOREY_M / 2.0), (-_HALF_LENGTH_M, base_m + STOREY_M)):
-            block("landing", (x, -_HALF_WIDTH_M, z - _SLAB_M), (landing_m, width_m, _SLAB_M))
+            block("landing", (x, -_HALF_WIDTH_M, z - _THICK_M), (landing_m, width_m, _THICK_M))
         block("door", (-_HALF_LENGTH_M, -0.3, base_m), (0.08, 1.0, 2.1))
         block("radiator", (_HALF_LENGTH_M - 0.15, -0.5, base_m + 1.6), (0.15, 0.9, 0.6))
 

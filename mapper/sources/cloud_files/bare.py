@@ -8,14 +8,12 @@ from threading import Lock
 import numpy as np
 
 from mapper.core.errors import FrameError
-from mapper.sources.cloud_files.parsing import MIN_POINTS, Column, Columns, refusing_damage
+from mapper.runtime.regular_files import HEAD_BYTES
+from mapper.sources.cloud_files.parsing import HEADER_LINES, MIN_POINTS, Column, Columns, refusing_damage
 from mapper.sources.cloud_files.records import KITTIS, other_width
 
-_HEADER_LINES = 100
-_HEAD_BYTES = 1 << 16
-_NUMBER_BYTES = 4
+_FLOAT32 = np.dtype("<f4")
 _MAX_CLASS = 1000
-_QUOTED = 60
 _ONE_HEADER = Lock()
 """NumPy parses an array's header with ``ast``, which counts its recursion for all threads together in Python
 3.11 and may find it wrong."""
@@ -34,7 +32,7 @@ def read_bin(path: Path, columns: int | None = None) -> Columns:
         FrameError: The file is not a whole number of records, or of other ones.
     """
     size = path.stat().st_size
-    numbers = np.fromfile(path, dtype="<f4") if size % _NUMBER_BYTES == 0 else np.empty(0, "<f4")
+    numbers = np.fromfile(path, _FLOAT32) if size % _FLOAT32.itemsize == 0 else np.empty(0, _FLOAT32)
     if columns is None and (other := other_width(numbers)):
         width, is_certain = other
         if is_certain:
@@ -47,7 +45,7 @@ def read_bin(path: Path, columns: int | None = None) -> Columns:
             f"{path}: every fourth float32 is negative as coordinates are, not as KITTI's intensities; "
             f"--set source.bin_columns={width} if records have {width}, or {KITTIS} if they have 4"
         )
-    record_bytes = (columns or KITTIS) * _NUMBER_BYTES
+    record_bytes = (columns or KITTIS) * _FLOAT32.itemsize
     if size % record_bytes:
         what = "KITTI's float32 x y z intensity" if columns is None else f"{columns} float32"
         raise FrameError(
@@ -86,7 +84,7 @@ def read_text(path: Path) -> Columns:
         raise FrameError(f"{path}: not a text file") from None
     names, skipped = _header(text)
     if skipped is None:
-        raise FrameError(f"{path}: none of the first {_HEADER_LINES} lines is three or more numbers: x y z")
+        raise FrameError(f"{path}: none of the first {HEADER_LINES} lines is three or more numbers: x y z")
     with refusing_damage(path, what="text"):
         values = np.loadtxt(StringIO(text), skiprows=skipped, ndmin=2)
     if len(names) == values.shape[1]:
@@ -102,7 +100,7 @@ def why_no_points(path: Path) -> str | None:
     """
     try:
         with path.open("rb") as stream:
-            head, is_cut = stream.read(_HEAD_BYTES), bool(stream.read(1))
+            head, is_cut = stream.read(HEAD_BYTES), bool(stream.read(1))
     except OSError as error:
         return f"cannot be read: {error.strerror}"
     text = head.decode("utf-8-sig", errors="replace").replace(",", " ").replace(";", " ")
@@ -111,10 +109,10 @@ def why_no_points(path: Path) -> str | None:
     names, skipped = _header(text)
     if skipped is None:
         first = next((line.strip() for line in lines if line.strip()), "")
-        return f"{first[:_QUOTED]!r} is not three or more numbers" if first else EMPTY
+        return f"{first!r} is not three or more numbers" if first else EMPTY
     rows = [line.split() for line in lines[skipped:] if line.strip()]
     if wrong := next((row for row in rows if len(row) < 3 or not all(map(_NUMBER.fullmatch, row))), None):
-        return f"{' '.join(wrong)[:_QUOTED]!r} is not three or more numbers"
+        return f"{' '.join(wrong)!r} is not three or more numbers"
     if len(rows) < MIN_POINTS and not is_cut:
         return f"{len(rows)} lines, want {MIN_POINTS} points or more"
     if {"x", "y", "z"} <= set(names):
@@ -129,7 +127,7 @@ def why_no_points(path: Path) -> str | None:
 def _header(text: str) -> tuple[list[str], int | None]:
     """Return the columns' names, if a header has them, and the number of lines before the first point."""
     names: list[str] = []
-    for number, line in enumerate(text.split("\n", _HEADER_LINES)[:_HEADER_LINES]):
+    for number, line in enumerate(text.split("\n", HEADER_LINES)[:HEADER_LINES]):
         words = line.split()
         if len(words) >= 3 and all(_NUMBER.fullmatch(word) for word in words):
             return names, number

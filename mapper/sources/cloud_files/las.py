@@ -1,5 +1,6 @@
 """LAS and LAZ: the ASPRS's exchange format of surveys."""
 
+import struct
 from functools import partial
 from io import BytesIO
 from pathlib import Path
@@ -8,19 +9,20 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from mapper.core.errors import FrameError
+from mapper.core.units import MIB
 from mapper.runtime.atomic import write_bytes
+from mapper.runtime.regular_files import MOST_UNPACKED_RATIO
 from mapper.runtime.worker_process import call_isolated
 from mapper.sources.cloud_files.parsing import MOST_BYTES, Columns, refusing_damage
 
 _COLOURS = ("red", "green", "blue")
 _EXTRAS = ("gps_time", *_COLOURS)
 _DATE_AT, _DATE_BYTES = 90, 4  # day and year
-_RECORDS_AT = 100  # a uint32: how many records of variable length follow the header (LAS 1.0 to 1.4)
+_RECORDS = struct.Struct("<100xI")  # how many records of variable length follow the header (LAS 1.0 to 1.4)
 _RECORD_BYTES = 54  # of each one's own header
-_COORDINATE_BYTES = 3 * 8  # of a point's x, y and z once they are scaled
-_MOST_POINTS_PER_BYTE = 200  # of LAZ: a million times the same point is packed into 7 kB
+_COORDINATES = struct.Struct("<3d")  # a point's x, y and z once they are scaled
 _LAZ_COPIES = 3  # the packed points' layers, all points as records, and their coordinates
-_LAZ_BUFFERS_BYTES = 256 << 20
+_LAZ_BUFFERS_BYTES = 256 * MIB
 _SCALE_M = 1e-4  # of coordinates; wider where 32 bits do not hold them
 _FULL_RANGE = 257  # 255 becomes 65535: LAS has colours of 16 bits
 
@@ -36,16 +38,16 @@ def read_las(path: Path) -> Columns:
     """
     size = path.stat().st_size
     with path.open("rb") as stream, refusing_damage(path, what="LAS"):
-        records = int.from_bytes(stream.read(_RECORDS_AT + 4)[_RECORDS_AT:], "little")
+        (records,) = _RECORDS.unpack(stream.read(_RECORDS.size))
         if records * _RECORD_BYTES > size:  # laspy would make as many empty ones
             raise FrameError(f"{path}: {size} bytes, but the header says {records} VLRs; is it damaged?")
         reader = _opened(stream)
         points, point_bytes = reader.header.point_count, reader.header.point_format.size
-        unpacked_bytes = points * (point_bytes + _COORDINATE_BYTES)
+        unpacked_bytes = points * (point_bytes + _COORDINATES.size)
         if unpacked_bytes > MOST_BYTES:
             raise FrameError(f"{path}: {points} points, which take more than {MOST_BYTES} bytes; split it")
         if reader.header.are_points_compressed:
-            if points > _MOST_POINTS_PER_BYTE * size:
+            if points > MOST_UNPACKED_RATIO * size:  # a million times the same point takes 7 kB
                 raise FrameError(f"{path}: {size} bytes, but the header says {points} points")
             memory_bytes = size + _LAZ_COPIES * unpacked_bytes + _LAZ_BUFFERS_BYTES
             return call_isolated(partial(_read_laz, path), memory_bytes=memory_bytes)

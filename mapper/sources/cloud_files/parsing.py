@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.errors import FrameError
+from mapper.core.units import MIB
 
 Column = NDArray[np.number[Any]]
 Columns = Mapping[str, Column]
@@ -16,10 +17,14 @@ Columns = Mapping[str, Column]
 
 MIN_POINTS = 10
 """Fewer points show no surface that anything could be aligned to."""
-MOST_BYTES = 1 << 30
+MOST_BYTES = 1024 * MIB
 """Size of a cloud, in its file and unpacked: what is made of it takes up to twice as much memory again."""
 
-_LONGEST_REASON = 150
+HEADER_LINES = 1000
+SAMPLES = 5000
+"""Points by which a cloud is judged."""
+MAX_RANGE_M = 1000.0
+"""The longest automotive sensors see 0.5 km, depth cameras less; a room in millimetres is beyond it."""
 _RUST_PANIC = "PanicException"
 """Name of the exception that a panic in a Rust library becomes; it derives from ``BaseException``."""
 
@@ -39,7 +44,7 @@ def refusing_damage(path: Path, *, what: str) -> Iterator[None]:
         if not (isinstance(error, Exception) or type(error).__name__ == _RUST_PANIC):
             raise
         reason = " ".join(str(error).split()) or type(error).__name__
-        raise FrameError(f"{path}: not a sound {what} file: {reason[:_LONGEST_REASON]}") from None
+        raise FrameError(f"{path}: not a sound {what} file: {reason}") from None
 
 
 def parse_rows(lines: Iterable[bytes], dtype: np.dtype[np.void]) -> NDArray[np.void]:

@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 
 from mapper.core.errors import FrameError
 from mapper.runtime.atomic import write_bytes
-from mapper.sources.cloud_files.parsing import MOST_BYTES, Columns, parse_rows, refusing_damage
+from mapper.runtime.regular_files import MOST_UNPACKED_RATIO
+from mapper.sources.cloud_files.parsing import HEADER_LINES, MOST_BYTES, Columns, parse_rows, refusing_damage
 
-_MOST_LINES = 100
 _MOST_VALUES = 10_000  # of a point: histograms of features have some hundreds
-_MOST_LZF_RATIO = 100  # three bytes of LZF expand to 264, no more
 _SIZES = struct.Struct("<II")  # of compressed points, before they are unpacked and after
 
 
@@ -63,7 +62,7 @@ def _check_size(stream: BinaryIO, header: Any, *, is_compressed: bool) -> None:
                 f"{left} bytes, of which {packed} unpack to {unpacked}, but the header says {header.points} "
                 f"points of {want} bytes; was it cut?"
             )
-        if unpacked > min(_MOST_LZF_RATIO * packed, MOST_BYTES):
+        if unpacked > min(MOST_UNPACKED_RATIO * packed, MOST_BYTES):
             raise ValueError(f"{packed} bytes that unpack to {unpacked}, which they cannot or must not")
     elif want > left:
         raise ValueError(
@@ -73,7 +72,7 @@ def _check_size(stream: BinaryIO, header: Any, *, is_compressed: bool) -> None:
 
 def _header_lines(stream: BinaryIO) -> list[str]:
     lines: list[str] = []
-    for line in islice(stream, _MOST_LINES):
+    for line in islice(stream, HEADER_LINES):
         lines.append(line.decode(errors="replace").strip())
         if lines[-1].startswith("DATA"):
             break

@@ -10,7 +10,8 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.sources.cloud_files.parsing import Columns, parse_rows, refusing_damage
+from mapper.runtime.regular_files import HEAD_BYTES
+from mapper.sources.cloud_files.parsing import HEADER_LINES, Columns, parse_rows, refusing_damage
 
 _NAMES = {
     "i1": ("char", "int8"),
@@ -24,8 +25,6 @@ _NAMES = {
 }
 _TYPES = {name: kind for kind, names in _NAMES.items() for name in names}
 _BYTE_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
-_LONGEST_LINE = 4096
-_MOST_LINES = 1000
 
 
 @dataclass(slots=True)
@@ -59,7 +58,7 @@ def _read_header(stream: BinaryIO) -> tuple[str, list[_Element]]:
     if _words(stream) != ["ply"]:
         raise ValueError("the first line is not 'ply'")
     encoding, elements = "", list[_Element]()
-    for _ in range(_MOST_LINES):
+    for _ in range(HEADER_LINES):
         match _words(stream):
             case ["end_header"] if encoding:
                 return encoding, elements
@@ -74,12 +73,12 @@ def _read_header(stream: BinaryIO) -> tuple[str, list[_Element]]:
             case [] | ["comment" | "obj_info", *_]:
                 pass
             case words:
-                raise ValueError(f"header line {' '.join(words)[:60]!r}")
+                raise ValueError(f"header line {' '.join(words)!r}")
     raise ValueError("the header does not end")
 
 
 def _words(stream: BinaryIO) -> list[str]:
-    return stream.readline(_LONGEST_LINE).decode("ascii", errors="replace").split()
+    return stream.readline(HEAD_BYTES).decode("ascii", errors="replace").split()
 
 
 def _read_vertices(stream: BinaryIO, encoding: str, elements: Sequence[_Element]) -> NDArray[np.void]:

@@ -9,12 +9,10 @@ from numpy.typing import NDArray
 
 from mapper.core.errors import FrameError
 from mapper.core.frames import Points32
-from mapper.sources.cloud_files.parsing import MIN_POINTS, Column, Columns
+from mapper.sources.cloud_files.parsing import MAX_RANGE_M, MIN_POINTS, SAMPLES, Column, Columns
 from mapper.sources.point_times import time_field
 
-_MAX_RANGE_M = 1000.0  # the longest automotive sensors see 0.5 km; a room in millimetres is beyond it
 _AWAY_RATIO = 10.0  # times the cloud's own size, and it cannot be a sweep around its origin
-_SAMPLES = 4096
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,9 +84,9 @@ def check_range(points: Points32, *, where: str, is_scaled: bool) -> None:
     """
     if not len(points):
         return
-    sample = points[:: 1 + len(points) // _SAMPLES].astype(np.float64)
+    sample = points[:: 1 + len(points) // SAMPLES].astype(np.float64)
     range_m = np.percentile(np.linalg.norm(sample, axis=1), 95)
-    if range_m <= _MAX_RANGE_M:
+    if range_m <= MAX_RANGE_M:
         return
     size_m = np.percentile(np.linalg.norm(sample - np.median(sample, axis=0), axis=1), 95)
     if range_m > _AWAY_RATIO * size_m:

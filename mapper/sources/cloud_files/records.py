@@ -3,6 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from mapper.sources.cloud_files.parsing import MAX_RANGE_M, SAMPLES
+
 KITTIS = 4
 """x y z intensity."""
 _WIDTHS = (3, 5, 6, 7, 8)  # x y z; with intensity and ring (nuScenes); with a time; with padding (PCL)
@@ -12,9 +14,7 @@ _BETTER, _BETTER_OF_EIGHT = 0.2, 1.2
 """Difference of logarithms of steps that shows other records: those of the right width were smaller by 0.3 in
 shuffled clouds and by 1.5 to 4 in sweeps; where upper and lower rings take turns, those of eight
 by 0.6, of padded ones by 2.5."""
-_ALIKE_RATIO, _SAMPLES = 2.0, 5000
-_MOST = 1e3
-"""Larger numbers, and what is none, count as this: constant columns of them take no steps."""
+_ALIKE_RATIO = 2.0
 _LEAST_INTENSITY, _MAX_NEGATIVE_RATIO = -1.0, 0.01
 """Coordinates are below it; times before the end of the sweep, in seconds, are not."""
 
@@ -50,9 +50,14 @@ def other_width(numbers: NDArray[np.float32]) -> tuple[int, bool] | None:
 
 def _are_halves_alike(records: NDArray[np.float32]) -> bool:
     """Return whether records of six are two of x y z: their columns spread as far as those three later."""
-    sample = np.nan_to_num(records[:: 1 + len(records) // _SAMPLES], nan=_MOST).clip(-_MOST, _MOST)
+    sample = _within_range(records[:: 1 + len(records) // SAMPLES])
     spreads = _LEAST_STEP + sample.std(axis=0)
     return bool(np.abs(np.log(spreads[:3] / spreads[3:])).max() < np.log(_ALIKE_RATIO))
+
+
+def _within_range(numbers: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return numbers that are no ranges, or none, as the largest range: constant columns take no steps."""
+    return np.nan_to_num(numbers, nan=MAX_RANGE_M).clip(-MAX_RANGE_M, MAX_RANGE_M)
 
 
 def _usual_step(numbers: NDArray[np.float32], width: int) -> float:
@@ -60,7 +65,7 @@ def _usual_step(numbers: NDArray[np.float32], width: int) -> float:
     starts = np.linspace(0, max(len(numbers) - _BLOCK_NUMBERS, 0), _BLOCKS) // _BLOCK_NUMBERS * _BLOCK_NUMBERS
     total, count = np.zeros(width), 0
     for start in np.unique(starts.astype(int)):
-        block = np.nan_to_num(numbers[start : start + _BLOCK_NUMBERS], nan=_MOST).clip(-_MOST, _MOST)
+        block = _within_range(numbers[start : start + _BLOCK_NUMBERS])
         rows = block[: len(block) // width * width].reshape(-1, width).astype(np.float64)
         total += np.abs(np.diff(rows, axis=0)).sum(axis=0)
         count += len(rows) - 1

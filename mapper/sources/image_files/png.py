@@ -17,8 +17,7 @@ from mapper.core.errors import DataError
 _InflateError: type[Exception] = isal_zlib.error  # type: ignore[assignment]  # its stub says: an instance
 
 SIGNATURE = b"\x89PNG\r\n\x1a\n"
-_HEADER = struct.Struct(">IIBBBBB")  # width, height, depth, colour type, compression, filter, interlace
-_HEADER_START, _HEADER_END = 16, 33
+_HEADER = struct.Struct(">16xIIBBBBB4x")  # width, height, depth, colour type, compression, filter, interlace
 _BYTES_PER_PIXEL = {(8, 2): 3, (16, 0): 2}  # by (bits, colour type): RGB and grey
 
 
@@ -28,18 +27,25 @@ def size_of(data: bytes) -> tuple[int, int]:
     Raises:
         DataError: The file ends within it.
     """
-    if len(data) < _HEADER_END:
+    if len(data) < _HEADER.size:
         raise DataError("truncated PNG: it ends within its header")
-    width_px, height_px, *_ = _HEADER.unpack_from(data, _HEADER_START)
+    width_px, height_px, *_ = _HEADER.unpack_from(data)
     return width_px, height_px
 
 
 def is_plain(data: bytes) -> bool:
     """Return whether ``data`` starts a PNG for :func:`decode`: RGB 8 or grey 16 bit, not interlaced."""
-    if not data.startswith(SIGNATURE + b"\x00\x00\x00\x0dIHDR") or len(data) < _HEADER_END:
+    if not data.startswith(SIGNATURE + b"\x00\x00\x00\x0dIHDR") or len(data) < _HEADER.size:
         return False
-    _, _, *layout = _HEADER.unpack_from(data, _HEADER_START)
-    return (layout[0], layout[1]) in _BYTES_PER_PIXEL and layout[2:] == [0, 0, 0]
+    _, _, bits, colour_type, *layout = _HEADER.unpack_from(data)
+    return (bits, colour_type) in _BYTES_PER_PIXEL and layout == [0, 0, 0]
+
+
+def is_grey16(data: bytes) -> bool:
+    """Return whether ``data`` starts a PNG of one channel of 16 bits."""
+    return (
+        data.startswith(SIGNATURE) and len(data) >= _HEADER.size and _HEADER.unpack_from(data)[2:4] == (16, 0)
+    )
 
 
 def decode(data: bytes) -> NDArray[np.uint8] | NDArray[np.uint16]:
@@ -48,7 +54,7 @@ def decode(data: bytes) -> NDArray[np.uint8] | NDArray[np.uint16]:
     Raises:
         DataError: The file is cut short or damaged.
     """
-    width, height, bits, colour_type, *_ = _HEADER.unpack_from(data, _HEADER_START)
+    width, height, bits, colour_type, *_ = _HEADER.unpack_from(data)
     bytes_per_pixel = _BYTES_PER_PIXEL[bits, colour_type]
     row = width * bytes_per_pixel
     size = height * (row + 1)
@@ -71,7 +77,7 @@ def decode(data: bytes) -> NDArray[np.uint8] | NDArray[np.uint16]:
 def _compressed(data: bytes) -> bytes:
     """Join the IDAT chunks; only a file that reaches its IEND chunk is whole."""
     parts: list[bytes] = []
-    at = _HEADER_END
+    at = _HEADER.size
     while at + 8 <= len(data):
         length, kind = struct.unpack_from(">I4s", data, at)
         if kind == b"IEND":

@@ -11,23 +11,21 @@ from numpy.typing import NDArray
 
 from mapper.core.errors import DataError, FrameError
 from mapper.core.frames import DepthImage, Image, PinholeCamera, RgbdFrame, Scan
-from mapper.runtime.regular_files import read_regular
+from mapper.runtime.regular_files import MOST_BYTES, read_regular
 from mapper.sources.base import ImageFile
 from mapper.sources.image_files import jpeg, png
 from mapper.sources.image_files.size import check_pixels
 
-SATURATED = 65535
+SATURATED = np.iinfo(np.uint16).max
 """The largest 16-bit depth is a sensor's way to say "nothing" (7-Scenes) or "too far": no measurement."""
 
-FINE_UNITS_PER_M = 5000.0
-"""16-bit units of a metre in which depth in metres goes into files: 0.2 mm, as TUM's."""
+TUM_UNITS_PER_M = 5000.0
+"""16-bit units of a metre in which depth in metres goes into files: 0.2 mm (Sturm et al. 2012)."""
 
 # A camera's calibration holds for the pixels as stored, so a rotation tag must not turn them.
 _RGB = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION
 _GREY = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
 _PNG_END = b"IEND\xae\x42\x60\x82"
-_MOST_FILE_BYTES = 512 << 20
-"""Size of an image file, beyond which it is none: more than 100 megapixels take without compression."""
 
 
 def read_colour(path: ImageFile) -> Image:
@@ -139,7 +137,7 @@ def bytes_of(path: ImageFile) -> bytes:
     """
     try:
         if isinstance(path, Path):
-            return read_regular(path, most_bytes=_MOST_FILE_BYTES)
+            return read_regular(path, most_bytes=MOST_BYTES)
         return path.read_bytes()
     except OSError as error:
         raise FrameError(f"{path}: cannot be read: {error.strerror}") from None

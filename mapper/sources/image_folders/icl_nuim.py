@@ -15,6 +15,7 @@ from mapper.core.trajectory import Trajectory
 from mapper.sources.base import Log
 from mapper.sources.calibration import ICL_NUIM
 from mapper.sources.config import SourceConfig
+from mapper.sources.image_files.reading import TUM_UNITS_PER_M
 from mapper.sources.image_folders.numbered import RATE_HZ, find_images, stamp_at
 from mapper.sources.image_folders.pairing import ordered_pairs, usable_pairs
 from mapper.sources.image_folders.rgbd import FramePair, assumed_camera_note, find_calibration, rgbd_log
@@ -28,7 +29,6 @@ from mapper.sources.text import (
     truth_from,
 )
 
-DEPTH_UNITS_PER_M = 5000.0
 LOOKED_FOR = "associations.txt of N depth/N.png N rgb/N.png (ICL-NUIM)"
 
 _LIST = "associations.txt"
@@ -57,7 +57,7 @@ def read_log(path: Path, config: SourceConfig) -> Log:
     return rgbd_log(
         pairs,
         calibration,
-        depth_units_per_m=DEPTH_UNITS_PER_M,
+        depth_units_per_m=TUM_UNITS_PER_M,
         path=path,
         name=path.resolve().name,
         kind="icl-nuim",

@@ -14,6 +14,7 @@ from mapper.core.timebase import ns_from_seconds_text
 from mapper.sources.base import Log
 from mapper.sources.calibration import freiburg_camera
 from mapper.sources.config import SourceConfig
+from mapper.sources.image_files.reading import TUM_UNITS_PER_M
 from mapper.sources.image_folders.pairing import usable_pairs
 from mapper.sources.image_folders.rgbd import FramePair, find_calibration, rgbd_log
 from mapper.sources.listed_files import within
@@ -26,7 +27,6 @@ from mapper.sources.text import (
     truth_from,
 )
 
-DEPTH_UNITS_PER_M = 5000.0
 HEADER = "!RAWLOG FB1"
 LOOKED_FOR = "one .mbag file"
 
@@ -65,7 +65,7 @@ def read_log(path: Path, config: SourceConfig) -> Log:
     return rgbd_log(
         found,
         find_calibration(file.parent, config.camera, known=known),
-        depth_units_per_m=DEPTH_UNITS_PER_M,
+        depth_units_per_m=TUM_UNITS_PER_M,
         path=path,
         name=name,
         kind="mbag",

@@ -18,15 +18,15 @@ from mapper.core.errors import SourceError
 from mapper.core.geometry import Transform, nearest_rotation, transform
 from mapper.core.timebase import NS_PER_S
 from mapper.core.trajectory import Trajectory
+from mapper.core.units import MM_PER_M
 from mapper.sources.base import Log
 from mapper.sources.calibration import PRIMESENSE, SEVEN_SCENES
 from mapper.sources.calibration_file import calibration_file
 from mapper.sources.config import SourceConfig
 from mapper.sources.image_folders.pairing import ordered_pairs
 from mapper.sources.image_folders.rgbd import FramePair, assumed_camera_note, find_calibration, rgbd_log
-from mapper.sources.text import parse_count, parse_numbers, rows, truth_from
+from mapper.sources.text import ROUNDING, parse_count, parse_numbers, rows, truth_from
 
-DEPTH_UNITS_PER_M = 1000.0
 RATE_HZ = 30.0
 LOOKED_FOR = "frame-000000.color.png and .depth.png (7-Scenes), numbered images in rgb/ and depth/ (Redwood)"
 
@@ -37,7 +37,6 @@ _NUMBERED = re.compile(r"\D*(?P<number>\d{1,18})(?:-(?P<microseconds>\d+))?\D*")
 _SEVEN_SCENES = re.compile(r"frame-\d+\.color\.\w+")
 _LEAST_STEP_US = 2000
 """Numbers that advance by less count images: 500 images a second are the most that cameras take."""
-_ROUGHLY_RIGID = 1e-2  # text of a few digits; anything further off is no rotation
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,7 +109,7 @@ def read_log(path: Path, config: SourceConfig) -> Log:
     return rgbd_log(
         ordered,
         calibration,
-        depth_units_per_m=DEPTH_UNITS_PER_M,
+        depth_units_per_m=MM_PER_M,
         path=path,
         name=path.resolve().name,
         kind="7-scenes" if is_seven_scenes else "redwood",
@@ -282,4 +281,4 @@ def _pose_of(matrix: list[list[float]], path: Path) -> Transform | None:
     if not np.isfinite(T).all():
         return None
     R = nearest_rotation(T[:3, :3])
-    return transform(R, T[:3, 3]) if np.abs(R - T[:3, :3]).max() < _ROUGHLY_RIGID else None
+    return transform(R, T[:3, 3]) if np.abs(R - T[:3, :3]).max() < ROUNDING else None

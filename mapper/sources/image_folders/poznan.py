@@ -16,6 +16,7 @@ from mapper.core.errors import SourceError
 from mapper.core.geometry import Transform, transform
 from mapper.core.rotations import rotation_from_euler
 from mapper.core.trajectory import Trajectory
+from mapper.core.units import MM_PER_M
 from mapper.sources.base import Log
 from mapper.sources.config import SourceConfig
 from mapper.sources.image_folders.numbered import find_images, stamp_at, stamped
@@ -23,7 +24,6 @@ from mapper.sources.image_folders.pairing import ordered_pairs
 from mapper.sources.image_folders.rgbd import find_calibration, rgbd_log
 from mapper.sources.text import parse_count, parse_numbers, read_lines, rows, truth_from
 
-DEPTH_UNITS_PER_M = 1000.0
 RATE_HZ = 10.0  # "every 100 ms", Somlyai (PhD thesis), §5.6
 LOOKED_FOR = "groundtruth.txt of number x y z roll pitch yaw with numbered images (Poznań)"
 
@@ -51,7 +51,7 @@ def read_log(path: Path, config: SourceConfig) -> Log:
     return rgbd_log(
         ordered,
         find_calibration(path, config.camera, known=None),
-        depth_units_per_m=DEPTH_UNITS_PER_M,
+        depth_units_per_m=MM_PER_M,
         path=path,
         name=path.resolve().name,
         kind="poznan",

@@ -13,11 +13,13 @@ import numpy as np
 
 from mapper.core.errors import SourceError
 from mapper.core.timebase import Stamps
+from mapper.core.units import MM_PER_M
 from mapper.sources.base import Log
 from mapper.sources.config import SourceConfig
+from mapper.sources.image_files.reading import TUM_UNITS_PER_M
 from mapper.sources.image_folders.numbered import image_places
 from mapper.sources.image_folders.pairing import ImageList
-from mapper.sources.image_folders.tum import DEPTH_UNITS_PER_M, MILLIMETRES_PER_M, log_of_images
+from mapper.sources.image_folders.tum import log_of_images
 from mapper.sources.scan_stamps import stamps_in
 
 _AFTER = re.compile(r"\D+$")
@@ -38,7 +40,7 @@ def read_log(path: Path, config: SourceConfig) -> Log:
     if images is None:
         raise SourceError(f"{path}: no colour and depth images named by their stamps")
     is_tums = (path / "depth.txt").is_file()  # a folder of TUM's that lost its other list
-    units_per_m = DEPTH_UNITS_PER_M if is_tums else MILLIMETRES_PER_M
+    units_per_m = TUM_UNITS_PER_M if is_tums else MM_PER_M
     name = path.resolve().name
     return log_of_images(path, *images, config, depth_units_per_m=units_per_m, name=name, notes=[])
 

@@ -13,9 +13,11 @@ import numpy as np
 
 from mapper.core.errors import SourceError
 from mapper.core.trajectory import Trajectory
+from mapper.core.units import MM_PER_M
 from mapper.sources.base import Log
 from mapper.sources.calibration import freiburg_camera
 from mapper.sources.config import SourceConfig
+from mapper.sources.image_files.reading import TUM_UNITS_PER_M
 from mapper.sources.image_folders.pairing import ImageList, pair_images
 from mapper.sources.image_folders.rgbd import find_calibration, rgbd_log
 from mapper.sources.listed_files import present, within
@@ -28,9 +30,6 @@ from mapper.sources.text import (
     time_order,
     truth_from,
 )
-
-DEPTH_UNITS_PER_M = 5000.0
-MILLIMETRES_PER_M = 1000.0
 
 MILLIMETRES_NOTE = "depth taken to be in millimetres; if not, source.camera.depth_factor (TUM's is 5000)"
 UNITS_NOTE = "depth taken as TUM's 5000 units a metre; source.camera.depth_factor=1000 reads millimetres"
@@ -58,7 +57,7 @@ def read_log(path: Path, config: SourceConfig) -> Log:
         colour, depth = (_read_list(path, one, notes) for one in (_LIST, "depth.txt"))
         name = _name_of(path)
     return log_of_images(
-        path, colour, depth, config, depth_units_per_m=DEPTH_UNITS_PER_M, name=name, notes=notes
+        path, colour, depth, config, depth_units_per_m=TUM_UNITS_PER_M, name=name, notes=notes
     )
 
 
@@ -91,11 +90,11 @@ def log_of_images(
     calibration = find_calibration(path, config.camera, known=known)
     are_units_assumed = known is None and calibration.depth_units_per_m is None
     if are_units_assumed:
-        pair_notes.append(MILLIMETRES_NOTE if depth_units_per_m == MILLIMETRES_PER_M else UNITS_NOTE)
+        pair_notes.append(MILLIMETRES_NOTE if depth_units_per_m == MM_PER_M else UNITS_NOTE)
     log = rgbd_log(
         pairs,
         calibration,
-        depth_units_per_m=depth_units_per_m if known is None else DEPTH_UNITS_PER_M,
+        depth_units_per_m=depth_units_per_m if known is None else TUM_UNITS_PER_M,
         path=path,
         name=name,
         kind="tum",

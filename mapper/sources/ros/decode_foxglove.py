@@ -34,7 +34,7 @@ from mapper.sources.text import pose_from_numbers
 
 _NUMERIC_TYPES = dict(enumerate(("u1", "i1", "u2", "i2", "u4", "i4", "f4", "f8"), start=1))
 """Numpy's names of PackedElementField.NumericType."""
-_TIMESTAMP_TAG = 1 << 3 | 2
+_TIMESTAMP_TAG = 0x0A
 """The byte before the timestamp of a message: field 1, a nested message. The next is its length."""
 _LONGEST_TIMESTAMP = 22  # bytes: seconds and nanoseconds are a tag and at most ten bytes each
 

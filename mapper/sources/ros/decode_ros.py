@@ -25,7 +25,7 @@ from mapper.sources.ros.messages import (
 from mapper.sources.ros.recording import Topic
 from mapper.sources.ros.typestore import typestore
 
-_POINT_FIELD_TYPES = dict(enumerate(("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8"), start=1))
+POINT_FIELD_TYPES = dict(enumerate(("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8"), start=1))
 """Numpy's names of PointField's constants."""
 _EXTRINSICS_NUMBERS = 12
 _ROTATION_TOLERANCE = 1e-3
@@ -82,14 +82,14 @@ def _camera(m: Any) -> CameraMessage:
 def _cloud(m: Any) -> CloudMessage:
     order = ">" if m.is_bigendian else "<"
     fields: list[Field] = [
-        (f.name, f.offset, order + _POINT_FIELD_TYPES[f.datatype], max(f.count, 1))
+        (f.name, f.offset, order + POINT_FIELD_TYPES[f.datatype], max(f.count, 1))
         for f in m.fields
-        if f.datatype in _POINT_FIELD_TYPES
+        if f.datatype in POINT_FIELD_TYPES
     ]
     notes = [
         f"field {f.name} is left out: its datatype {f.datatype} is none of PointField's"
         for f in m.fields
-        if f.datatype not in _POINT_FIELD_TYPES
+        if f.datatype not in POINT_FIELD_TYPES
     ]
     packed_bytes = m.width * m.point_step
     if m.height > 1 and m.row_step not in (0, packed_bytes) and len(m.data) == m.height * packed_bytes:

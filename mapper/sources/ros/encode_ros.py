@@ -9,9 +9,10 @@ from numpy.typing import NDArray
 from mapper.core.frames import PinholeCamera, Scan
 from mapper.core.geometry import Array, Transform
 from mapper.core.trajectory import Trajectory
+from mapper.sources.ros.decode_ros import POINT_FIELD_TYPES
 from mapper.sources.ros.typestore import make_header, make_message, make_pose, serialize
 
-_POINT_FIELD_TYPES = {"f4": 7, "u4": 6}  # PointField's constants
+_POINT_FIELD_TYPES = {kind: number for number, kind in POINT_FIELD_TYPES.items()}
 
 
 class SerializedMessage(NamedTuple):

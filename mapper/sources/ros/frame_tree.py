@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.geometry import Array, Transform, inverse
-from mapper.core.timebase import NS_PER_S, Stamps
+from mapper.core.timebase import LATEST_NS, NS_PER_S, Stamps
 from mapper.core.trajectory import Trajectory, trajectory_from
 from mapper.sensing.wheel_kinematics import pose_at
 from mapper.sources.ros.messages import PoseMessage
@@ -22,7 +22,6 @@ camera_init of LOAM (Zhang & Singh 2014), local_origin of mavros."""
 _MAX_GAP_NS = NS_PER_S
 """Longer than any publisher of a moving frame pauses; tf2 keeps 10 s and interpolates over any gap."""
 _SAME_POSE = 1e-6
-_LATEST_NS = 1 << 62
 
 
 def is_fixed(frame: str) -> bool:
@@ -38,7 +37,7 @@ class FrameTree:
         links: dict[tuple[str, str], dict[int, Sequence[float]]] = {}
         for pose in poses:
             link = links.setdefault((pose.child.lstrip("/"), pose.parent.lstrip("/")), {})
-            link.setdefault(min(max(pose.stamp_ns, 0), _LATEST_NS), pose.numbers)
+            link.setdefault(min(max(pose.stamp_ns, 0), LATEST_NS), pose.numbers)
         self._parents: dict[str, tuple[str, Trajectory]] = {}
         for (child, parent), numbers in links.items():
             found = zip(numbers, poses_from_numbers(np.array(list(numbers.values()))), strict=True)

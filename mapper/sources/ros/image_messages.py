@@ -11,12 +11,11 @@ from numpy.typing import NDArray
 
 from mapper.core.errors import FrameError
 from mapper.core.frames import DepthImage, Image
+from mapper.core.units import MM_PER_M
+from mapper.sources.cloud_files.parsing import MAX_RANGE_M
 from mapper.sources.image_files import png
 from mapper.sources.image_files.reading import decode_colour, decode_depth, decode_grey, depth_m_from
 from mapper.sources.ros.messages import FileMessage, ImageMessage, PixelsMessage
-
-MILLIMETRES_PER_M = 1000.0
-"""Units of 16-bit depth images in ROS (REP 118)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,21 +45,18 @@ _COLOUR = {
     "bayer_grbg8": _Encoding(1, cv2.COLOR_BayerGB2RGB, cv2.COLOR_BayerGB2GRAY),
 }
 _DEPTH = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
-_FARTHEST_M = 1000.0  # no depth camera reaches as far: a damaged message, or a simulator's sky
-_PNG_KIND, _SIXTEEN_BIT_GREY = slice(24, 26), b"\x10\x00"
-"""Place of the bit depth and colour type in a PNG, and their values of one channel of 16 bits (RFC 2083)."""
 _TIFF_STARTS = (b"II*\x00", b"MM\x00*")
 _IMAGE_STARTS = (b"\xff\xd8", b"\x89PNG", b"BM", *_TIFF_STARTS, b"RIFF", b"P")
-_DEPTH_HEADER = struct.Struct("<iff")  # compressedDepth's: how it is stored, and two parameters of that
+DEPTH_HEADER = struct.Struct("<iff")  # compressedDepth's: how it is stored, and two parameters of that
 
 
 def is_depth(message: ImageMessage) -> bool:
     """Return whether an image is of depth: by its bytes, else by what its encoding or format says."""
     if isinstance(message, PixelsMessage):
         return message.encoding in _DEPTH
-    data = bytes(_without_header(message)[: _PNG_KIND.stop])
+    head = bytes(_without_header(message)[:64])
     is_called_depth = "compressedDepth" in message.format or message.format.startswith(tuple(_DEPTH))
-    return is_called_depth or data[_PNG_KIND] == _SIXTEEN_BIT_GREY or _is_float_tiff(message)
+    return is_called_depth or png.is_grey16(head) or _is_float_tiff(message)
 
 
 def size_of(message: ImageMessage, *, where: str) -> tuple[int, int]:
@@ -74,7 +70,7 @@ def size_of(message: ImageMessage, *, where: str) -> tuple[int, int]:
             raise FrameError(f"{where}: an image of {message.width_px}×{message.height_px} px")
         return message.width_px, message.height_px
     if is_depth(message):
-        height_px, width_px = depth_m_of(message, units_per_m=MILLIMETRES_PER_M, where=where).shape
+        height_px, width_px = depth_m_of(message, units_per_m=MM_PER_M, where=where).shape
     else:
         height_px, width_px = image_of(message, colour=False, where=where).shape
     return width_px, height_px
@@ -146,8 +142,8 @@ def has_float_depth(message: ImageMessage) -> bool:
 
 def _without_header(message: FileMessage) -> memoryview:
     """Return the image file, which in compressedDepth follows a header."""
-    begins_late = message.data[_DEPTH_HEADER.size :][: len(png.SIGNATURE)] == png.SIGNATURE
-    return message.data[_DEPTH_HEADER.size if begins_late else 0 :]
+    begins_late = message.data[DEPTH_HEADER.size :][: len(png.SIGNATURE)] == png.SIGNATURE
+    return message.data[DEPTH_HEADER.size if begins_late else 0 :]
 
 
 def _is_float_tiff(message: FileMessage) -> bool:
@@ -166,7 +162,7 @@ def _depth_m_of_file(
     """
     if "compressedDepth" in message.format and "rvl" in message.format:
         raise FrameError(f"{where}: depth compressed as RVL is not read; record it as PNG or raw")
-    if "compressedDepth" in message.format and len(message.data) < _DEPTH_HEADER.size:
+    if "compressedDepth" in message.format and len(message.data) < DEPTH_HEADER.size:
         raise FrameError(f"{where}: compressedDepth of {len(message.data)} bytes")
     file = _without_header(message)
     units = decode_depth(bytes(file), where)
@@ -174,7 +170,7 @@ def _depth_m_of_file(
         return _valid_depth(units.astype(np.float32), float_units_per_m, where=where)
     if not message.format.startswith("32FC1") or len(file) == len(message.data):
         return depth_m_from(units.astype(np.uint16, copy=False), units_per_m)
-    _, a, b = _DEPTH_HEADER.unpack_from(message.data)
+    _, a, b = DEPTH_HEADER.unpack_from(message.data)
     with np.errstate(divide="ignore"):
         depth_m = np.float32(a) / (units.astype(np.float32) - np.float32(b))
     return _valid_depth(np.where(units > 0, depth_m, np.float32(0.0)), float_units_per_m, where=where)
@@ -199,10 +195,10 @@ def _valid_depth(depth: DepthImage, units_per_m: float, *, where: str) -> DepthI
     valid: DepthImage = np.array(depth, dtype=np.float32)  # aligned, which a message need not be
     valid /= np.float32(units_per_m)
     is_measured = valid > 0.0
-    is_near = is_measured & (valid < _FARTHEST_M)
+    is_near = is_measured & (valid < MAX_RANGE_M)
     if not is_near.any() and (is_far := is_measured & np.isfinite(valid)).any():
         raise FrameError(
-            f"{where}: the median depth is {np.median(valid[is_far]):.0f} m, at most {_FARTHEST_M:.0f} m can "
+            f"{where}: the median depth is {np.median(valid[is_far]):.0f} m, at most {MAX_RANGE_M:.0f} m can "
             "be measured; millimetres? --set source.camera.depth_factor=1000 reads them"
         )
     np.copyto(valid, 0.0, where=~is_near)

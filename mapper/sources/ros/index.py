@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from mapper.core.errors import DataError, FrameError
 from mapper.core.geometry import Array
-from mapper.core.timebase import NS_PER_S, Stamps
+from mapper.core.timebase import LATEST_NS, NS_PER_S, Stamps
+from mapper.core.units import MIB
 from mapper.sources.ros import decode_foxglove
 from mapper.sources.ros.decode import decode, decompressed
 from mapper.sources.ros.image_messages import size_of
@@ -19,9 +20,8 @@ from mapper.sources.ros.imu_messages import readings_of
 from mapper.sources.ros.messages import IMUS, READ, SMALL, WITH_HEADER, ImageMessage, Message
 from mapper.sources.ros.recording import Place, Recording, Topic
 
-_NO_STAMP = 1 << 62  # in the year 2116; differences of smaller ones fit into 64 bits
 _TRIED = 10
-_KEPT_BYTES = 32 << 20
+_KEPT_BYTES = 32 * MIB
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -85,8 +85,8 @@ def index_of(recording: Recording) -> Mapping[str, Series]:
         try:
             stamp_ns = stamp_of(topic, data) if topic.type in WITH_HEADER else log_ns
         except DataError:
-            stamp_ns = _NO_STAMP
-        if not (0 <= stamp_ns < _NO_STAMP and 0 <= log_ns < _NO_STAMP):
+            stamp_ns = LATEST_NS
+        if not (0 <= stamp_ns < LATEST_NS and 0 <= log_ns < LATEST_NS):
             series.undated += 1
             continue
         if topic.type in IMUS:

@@ -9,6 +9,7 @@ import numpy as np
 
 from mapper.core.errors import FrameError, SourceError
 from mapper.core.frames import PinholeCamera, RgbdFrame, Scan
+from mapper.core.units import MM_PER_M
 from mapper.sources.base import FrameRef, ImageFiles, Log, Skipped
 from mapper.sources.image_files.reading import image_bytes, read_colour, read_depth_m
 from mapper.sources.ros.encode_ros import (
@@ -21,7 +22,7 @@ from mapper.sources.ros.encode_ros import (
     odometry_message,
     pose_message,
 )
-from mapper.sources.ros.image_messages import MILLIMETRES_PER_M
+from mapper.sources.ros.image_messages import DEPTH_HEADER
 from mapper.sources.ros.message_writers import RecordingKind, message_writer
 from mapper.sources.ros.topics import TRUTH, WHEELS
 
@@ -31,7 +32,6 @@ POINTS, IMU, GYROSCOPE = "/points", "/imu", "/gyroscope"
 _CAMERA_FRAME, _LIDAR_FRAME, _IMU_FRAME = "camera_color_optical_frame", "lidar", "imu"
 _WORLD, _ODOM = "world", "odom"
 _FORMATS = {".jpg": "jpeg", ".jpeg": "jpeg", ".png": "png"}
-_DEPTH_HEADER = bytes(12)  # compressedDepth's: no parameters are needed for 16 bits
 
 
 def write_recording(
@@ -161,13 +161,13 @@ def _colour_of_files(stamp_ns: int, files: ImageFiles) -> SerializedMessage:
 
 def _depth_of_files(files: ImageFiles) -> SerializedMessage:
     stamp_ns, topic = files.depth_stamp_ns, f"{DEPTH}/image_raw"
-    if files.depth_units_per_m != MILLIMETRES_PER_M or files.depth.suffix.lower() != ".png":
+    if files.depth_units_per_m != MM_PER_M or files.depth.suffix.lower() != ".png":
         depth_m = read_depth_m(files.depth, files.depth_units_per_m)
         return image_message(stamp_ns, topic, depth_m, encoding="32FC1", frame=_CAMERA_FRAME)
     return compressed_image_message(
         stamp_ns,
         f"{topic}/compressedDepth",
-        _DEPTH_HEADER + image_bytes(files.depth),
+        bytes(DEPTH_HEADER.size) + image_bytes(files.depth),
         format_="16UC1; compressedDepth png",
         frame=_CAMERA_FRAME,
     )

@@ -20,8 +20,8 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 
 from mapper.core.errors import DataError
+from mapper.runtime.regular_files import MOST_BYTES, MOST_UNPACKED_RATIO
 from mapper.sources.ros.recording import (
-    MOST_BLOCK_BYTES,
     BlockRecording,
     Contents,
     Part,
@@ -39,8 +39,6 @@ _CHUNK = struct.Struct("<QQQII")  # first, last time, unpacked size and CRC, len
 _CHUNK_INDEX = struct.Struct("<QQQQ")  # first, last time, place and length of the chunk's record
 _STATISTICS = struct.Struct("<Q2x4x4x4xI")  # messages, of the counts of other records that of chunks
 _FOOTER = struct.Struct("<BQQQI")  # a whole record: opcode, length, places of summary and its offsets, CRC
-_CRC_BYTES = 4
-_MAX_LZ4_RATIO = 255  # one byte of LZ4 expands to no more
 
 
 def open_mcap(path: Path) -> BlockRecording:
@@ -144,11 +142,11 @@ def _summary(file: BinaryIO) -> tuple[memoryview, int]:
     opcode, length, start, _, crc = _FOOTER.unpack(footer)
     if (opcode, length) != (Opcode.FOOTER, _FOOTER.size - _RECORD.size):
         raise DataError("a file whose footer is damaged")
-    if not (len(_MAGIC) <= start < end and end - start <= MOST_BLOCK_BYTES):
+    if not (len(_MAGIC) <= start < end and end - start <= MOST_BYTES):
         raise DataError("a file without a summary")
     file.seek(start)
     summary = file.read(end - start)
-    if crc and isal_zlib.crc32(footer[:-_CRC_BYTES], isal_zlib.crc32(summary)) != crc:
+    if crc and isal_zlib.crc32(footer[:-4], isal_zlib.crc32(summary)) != crc:
         raise DataError("a summary whose checksum is wrong")
     return memoryview(summary), start
 
@@ -217,7 +215,7 @@ def _decompressed(packed: memoryview, compression: bytes, size: int) -> memoryvi
                 raise DataError(f"a chunk of {size} bytes whose content states another size")
             return memoryview(zstandard.decompress(packed, max_output_size=size))
         if compression == b"lz4":
-            if size > _MAX_LZ4_RATIO * len(packed):
+            if size > MOST_UNPACKED_RATIO * len(packed):
                 raise DataError(f"a chunk of {len(packed)} bytes that LZ4 cannot have made of {size}")
             return memoryview(lz4.frame.LZ4FrameDecompressor().decompress(packed, max_length=size + 1))
     except (zstandard.ZstdError, RuntimeError, MemoryError) as error:  # RuntimeError is lz4's

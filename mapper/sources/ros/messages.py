@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.geometry import Array, Transform
+from mapper.core.units import GRAVITY_MPS2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -146,9 +147,6 @@ class ImuMessage:
     stamp_ns: int
     frame: str
     acceleration_mps2: Array
-
-
-GRAVITY_MPS2 = 9.80665
 
 
 def unit_mps2(acceleration: Array) -> float | None:

@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 
 from mapper.core.errors import DataError, FrameError
 from mapper.core.frames import Sensor
-from mapper.core.geometry import Transform
+from mapper.core.geometry import FARTHEST_M, Transform
 from mapper.core.rotations import pose_of_row
 from mapper.core.timebase import NS_PER_S
 from mapper.core.trajectory import Trajectory
+from mapper.core.units import GRAVITY_MPS2
 from mapper.sensing.gyroscope import Gyroscope
 from mapper.sources.base import Accelerations
 from mapper.sources.config import WheelsConfig
@@ -23,7 +24,6 @@ from mapper.sources.ros.frame_tree import FrameTree
 from mapper.sources.ros.index import Series, first_messages, index_of
 from mapper.sources.ros.message_order import ordered
 from mapper.sources.ros.messages import (
-    GRAVITY_MPS2,
     TRANSFORMS,
     Message,
     PoseMessage,
@@ -31,6 +31,7 @@ from mapper.sources.ros.messages import (
     unit_mps2,
 )
 from mapper.sources.ros.recording import Recording
+from mapper.sources.text import ROUNDING
 from mapper.sources.wheel_files import mounting
 
 _MAX_READINGS = 20_000  # levelling asks for fewer
@@ -39,8 +40,6 @@ _BASES = ("base_link", "base_footprint")
 """Frames of a robot's base (REP 105, REP 120)."""
 SAME_CLOCK_NS = 60 * NS_PER_S
 """Messages are recorded within seconds of their stamps."""
-_UNIT_TOLERANCE = 0.01
-_FARTHEST_M = 1e8  # farther than anything drives: a damaged message
 
 
 class RecordingReader:
@@ -211,8 +210,8 @@ def _trajectory(poses: Sequence[PoseMessage], *, what: str) -> tuple[Trajectory 
     """Return poses that are in time order, and notes on those that had to go."""
     numbers = np.array([pose.numbers for pose in poses], dtype=np.float64).reshape(-1, 7)
     with np.errstate(invalid="ignore", over="ignore"):
-        is_rotation = np.abs((numbers[:, 3:] ** 2).sum(axis=1) - 1.0) < _UNIT_TOLERANCE
-        usable = is_rotation & (np.abs(numbers[:, :3]) < _FARTHEST_M).all(axis=1)
+        is_rotation = np.abs((numbers[:, 3:] ** 2).sum(axis=1) - 1.0) < ROUNDING
+        usable = is_rotation & (np.abs(numbers[:, :3]) < FARTHEST_M).all(axis=1)
     notes = []
     if dropped := int((~usable).sum()):
         notes.append(f"{what}: {dropped} of {len(poses)} poses are not finite rigid motions; dropped")

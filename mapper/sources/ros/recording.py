@@ -10,14 +10,10 @@ from pathlib import Path
 from typing import BinaryIO, NamedTuple, Protocol
 
 from mapper.core.errors import DataError, FrameError, SourceError
+from mapper.core.units import MIB
+from mapper.runtime.regular_files import MOST_BYTES, MOST_UNPACKED_RATIO
 
-MOST_BLOCK_BYTES = 512 << 20
-"""Size of a block, stored or unpacked, beyond which it is taken for damage: recorders write blocks of a few
-megabytes, or of one message."""
-_MOST_UNPACKED_RATIO = 200
-"""Times a file's own size that its blocks may unpack to: logs unpack to less than ten times their size, and a
-hostile file could keep its reader busy for days."""
-_CACHE_BYTES = 64 << 20
+_CACHE_BYTES = 64 * MIB
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,12 +161,12 @@ class BlockRecording:
         """Yield every message that can be read, in the order of the file."""
         count = damaged = damaged_bytes = unpacked_bytes = 0
         blocks, expected = self._contents.blocks, self._contents.expected
-        most_bytes = max(_MOST_UNPACKED_RATIO * self.path.stat().st_size, MOST_BLOCK_BYTES)
+        most_bytes = max(MOST_UNPACKED_RATIO * self.path.stat().st_size, MOST_BYTES)
         for number, span in enumerate(blocks):
             if unpacked_bytes > most_bytes:
                 self.notes.append(
                     f"{self.path.name}: {number} of {len(blocks)} chunks unpack to {unpacked_bytes} bytes, "
-                    f"more than {_MOST_UNPACKED_RATIO} times the file's size; read no further"
+                    f"more than {MOST_UNPACKED_RATIO} times the file's size; read no further"
                 )
                 break
             try:
@@ -228,10 +224,10 @@ def check_block_size(size: int) -> None:
     """Refuse a block that is stored in, or announces, too many bytes.
 
     Raises:
-        DataError: They are more than ``MOST_BLOCK_BYTES``.
+        DataError: They are more than ``MOST_BYTES``.
     """
-    if size > MOST_BLOCK_BYTES:
-        raise DataError(f"a chunk of {size} bytes; more than {MOST_BLOCK_BYTES} are taken for damage")
+    if size > MOST_BYTES:
+        raise DataError(f"a chunk of {size} bytes; more than {MOST_BYTES} are taken for damage")
 
 
 def open_blocks(

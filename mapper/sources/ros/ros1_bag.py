@@ -16,6 +16,7 @@ import lz4.frame
 
 from mapper.core.errors import DataError
 from mapper.core.timebase import NS_PER_S
+from mapper.core.units import MIB
 from mapper.sources.ros.recording import (
     BlockRecording,
     Contents,
@@ -30,7 +31,6 @@ from mapper.sources.ros.recording import (
 _MAGIC = b"#ROSBAG V2.0\n"
 _LENGTH = struct.Struct("<I")
 _MESSAGE, _CHUNK, _CHUNK_INFO, _CONNECTION = 2, 5, 6, 7  # the values of a header's op
-_MOST_HEADER_BYTES = 1 << 20  # a header holds a few names and numbers
 _Fields = Mapping[bytes, bytes]
 
 
@@ -160,7 +160,7 @@ def _record_at(file: BinaryIO, at: int, size: int) -> _Record:
     file.seek(at)
     (header_length,) = _LENGTH.unpack(file.read(_LENGTH.size).ljust(_LENGTH.size, b"\xff"))
     start = at + _LENGTH.size + header_length + _LENGTH.size
-    if start > size or header_length > _MOST_HEADER_BYTES:
+    if start > size or header_length > MIB:  # it holds a few names and numbers
         raise DataError("a record that ends after the file, or whose header is damaged")
     fields = _fields(file.read(header_length))
     (length,) = _LENGTH.unpack(file.read(_LENGTH.size))

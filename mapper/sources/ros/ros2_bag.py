@@ -7,7 +7,8 @@ from contextlib import closing
 from pathlib import Path
 
 from mapper.core.errors import DataError, FrameError, SourceError
-from mapper.sources.ros.recording import MOST_BLOCK_BYTES, Place, Recorded, Recording, Topic
+from mapper.runtime.regular_files import MOST_BYTES
+from mapper.sources.ros.recording import Place, Recorded, Recording, Topic
 
 
 class DatabaseRecording:
@@ -72,7 +73,7 @@ class DatabaseRecording:
         has_journal = self.path.with_name(f"{self.path.name}-wal").exists()
         how = "mode=ro" if has_journal else "mode=ro&immutable=1"
         database = sqlite3.connect(f"{self.path.resolve().as_uri()}?{how}", uri=True)
-        database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MOST_BLOCK_BYTES)
+        database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MOST_BYTES)
         return database
 
 

@@ -8,16 +8,17 @@ import numpy as np
 from mapper.core.errors import SourceError
 from mapper.core.frames import Sensor
 from mapper.core.timebase import NS_PER_S, Stamps
+from mapper.core.units import MM_PER_M
 from mapper.sources.base import FrameRef, Log
 from mapper.sources.config import SourceConfig
 from mapper.sources.image_files.image_sizes import recorded_camera
-from mapper.sources.image_files.reading import FINE_UNITS_PER_M
+from mapper.sources.image_files.reading import TUM_UNITS_PER_M
 from mapper.sources.image_folders.pairing import depth_offset_ns
 from mapper.sources.point_times import relative_times_s, time_field
 from mapper.sources.ros.cameras import calibrate
 from mapper.sources.ros.entries import CloudEntry, rgbd_entry
 from mapper.sources.ros.frame_tree import is_fixed
-from mapper.sources.ros.image_messages import MILLIMETRES_PER_M, has_float_depth, size_of
+from mapper.sources.ros.image_messages import has_float_depth, size_of
 from mapper.sources.ros.index import Series, why_unread
 from mapper.sources.ros.message_order import ordered, paired
 from mapper.sources.ros.messages import (
@@ -151,7 +152,7 @@ def _rgbd(reader: RecordingReader, topics: CameraTopics, config: SourceConfig) -
     notes += [*camera_notes, *camera.notes()]
     factor = None if config.camera is None else config.camera.depth_factor
     float_units_per_m = (factor or 1.0) if has_float_depth(first_depth) else None
-    units_per_m = (factor or MILLIMETRES_PER_M) if float_units_per_m is None else FINE_UNITS_PER_M
+    units_per_m = (factor or MM_PER_M) if float_units_per_m is None else TUM_UNITS_PER_M
     is_jpeg = isinstance(first_color, FileMessage) and bytes(first_color.data[:2]) == _JPEG_START
     if calibration.lens is not None:
         notes.append(f"the distortion {calibration.lens.model} is taken out of the images as they are read")

@@ -8,9 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from mapper.core.errors import SourceError
+from mapper.core.errors import SourceError, listed
 from mapper.sources.config import TopicsConfig
-from mapper.sources.listed_files import first_names
 from mapper.sources.ros.image_messages import is_depth
 from mapper.sources.ros.index import Series
 from mapper.sources.ros.messages import (
@@ -311,7 +310,7 @@ def _unused_notes(
             name, kind = f"{name} ({type_})", "topics of types that are not read"
         if kind is not None:
             kinds.setdefault(kind, []).append(name)
-    return [f"{kind}: {first_names(names)}" for kind, names in kinds.items()]
+    return [f"{kind}: {listed(names)}" for kind, names in kinds.items()]
 
 
 def _feels_gravity(series: Series) -> bool:
@@ -327,7 +326,7 @@ def _turns(series: Series) -> bool:
 def _what_there_is(color: Series | None, depth: Series | None, series: Iterable[Series]) -> str:
     if color is not None:
         others = [one for one in series if one.topic.type in IMAGES]
-        names = first_names([color.topic.name, *(one.topic.name for one in others if one is not color)])
+        names = listed([color.topic.name, *(one.topic.name for one in others if one is not color)])
         return f"colour images {names}, but neither depth images nor point clouds"
     if depth is not None:
         return f"depth images {depth.topic.name}, but neither colour images nor point clouds"

@@ -17,13 +17,12 @@ from mapper.core.trajectory import Trajectory
 from mapper.sources.base import Log
 from mapper.sources.config import SourceConfig
 from mapper.sources.scan_folders.scan_folder import STAMP_FILES, clouds_in, first_of, most_clouds, scan_log
-from mapper.sources.text import parse_numbers, rows
+from mapper.sources.text import ROUNDING, parse_numbers, rows
 
 _ALONG_Z_RATIO = 0.9
 _CAMERAS_NOTE = (
     "the true poses move along their z, as a camera's do; without calib.txt they count as the LiDAR's"
 )
-_ROUGHLY_RIGID = 1e-3  # calib.txt has 12 digits; anything further off is no rotation
 
 
 def recognise(path: Path) -> bool:
@@ -99,7 +98,7 @@ def _read_calibration(path: Path) -> Transform | None:
             )
         T = parse_numbers(words[1:], where=where).reshape(3, 4)
         R = nearest_rotation(T[:, :3]) if np.isfinite(T).all() else np.full((3, 3), np.nan)
-        if not np.abs(R - T[:, :3]).max() < _ROUGHLY_RIGID:
+        if not np.abs(R - T[:, :3]).max() < ROUNDING:
             raise SourceError(f"{where}: not a rigid motion; want the LiDAR's 3×4 pose in the camera")
         return transform(R, T[:, 3])
     return None

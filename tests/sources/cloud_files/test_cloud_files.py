@@ -304,7 +304,7 @@ def test_text_that_is_no_cloud(tmp_path):
     path.write_text("1 2 3\n" * 20 + "4 5\n")
     assert "number of columns changed from 3 to 2 at row 21" in refusal_of(path)
     path.write_text("once upon a time\n" * 20)
-    assert refusal_of(path) == "none of the first 100 lines is three or more numbers: x y z"
+    assert refusal_of(path) == "none of the first 1000 lines is three or more numbers: x y z"
 
 
 def test_missing_returns_are_dropped_with_their_times_and_colours(tmp_path):

@@ -62,7 +62,7 @@ def test_a_bag_s_chunk_is_unpacked_no_further_than_it_announces(compression):
 
 
 def test_no_chunk_is_unpacked_that_announces_too_much(monkeypatch):
-    monkeypatch.setattr(recording, "MOST_BLOCK_BYTES", 1 << 20)
+    monkeypatch.setattr(recording, "MOST_BYTES", 1 << 20)
     content = bytes((1 << 20) + 1)
     too_much = "a chunk of 1048577 bytes; more than 1048576 are taken for damage"
     for unpack, chunk in (
@@ -79,11 +79,11 @@ def test_no_chunk_is_unpacked_that_announces_too_much(monkeypatch):
 def test_reading_ends_where_a_file_unpacks_to_many_times_its_size(tmp_path, monkeypatch):
     path = tmp_path / "log.mcap"
     path.write_bytes(b"\x89MCAP0\r\n" + 50 * mcap_chunk(bytes(1 << 20)))
-    monkeypatch.setattr(recording, "MOST_BLOCK_BYTES", 1 << 20)
+    monkeypatch.setattr(recording, "MOST_BYTES", 1 << 20)
     opened = open_mcap(path)
     assert list(opened.messages()) == []
     assert (
-        "log.mcap: 2 of 50 chunks unpack to 2097152 bytes, more than 200 times the file's size"
+        "log.mcap: 2 of 50 chunks unpack to 2097152 bytes, more than 255 times the file's size"
         in opened.notes[1]
     )
 
