@@ -39,7 +39,19 @@ from mapper.evaluators.study.table import (
     markdown_list,
     shown_cells,
 )
-from mapper.export.figures import ESTIMATE, LINE, TEXT, TRUTH, caption, draw_boxes, hex_of, page, panel, save
+from mapper.export.figures import (
+    ESTIMATE,
+    LINE,
+    TEXT,
+    TRUTH,
+    WIDE_IN,
+    caption,
+    draw_boxes,
+    hex_of,
+    panel,
+    save,
+    sheet,
+)
 from mapper.export.html import bullets, document, section
 from mapper.export.html import table as html_table
 from mapper.runtime.atomic import write_text
@@ -47,7 +59,6 @@ from mapper.sources.trajectory_files import read_tum
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 MARKDOWN, CSV, LATEX, PAGE = "tables.md", "tables.csv", "tables.tex", "index.html"
 _FAILURES_SHOWN = 8
@@ -153,9 +164,6 @@ def _image(path: Path) -> str:
 
 
 TRAJECTORIES, SCENES = "trajectories.png", "scenes.png"
-_COLUMNS = 3
-_WIDTH_IN, _HEIGHT_IN = 4.6, 3.4
-_PATH_IN = 4.6
 _BOX_IN = 0.3
 _LETTER_IN = 0.062
 _NUMBER = re.compile(r"\d+")
@@ -198,7 +206,7 @@ def write_plots(folder: Path, reproduction: Reproduction) -> dict[str, Path]:
 def _write_curves(path: Path, table: PaperTable) -> None:
     """Draw each row's figures over what the columns count; a column without a number is a level."""
     rows = _by_row(table)
-    figure, across, down = _sheet(_title(table), len(rows))
+    figure, across, down = sheet(_title(table), len(rows), width_in=WIDE_IN)
     for number, (row, cells) in enumerate(rows.items()):
         axes = panel(figure, number, columns=across, rows=down)
         printed = {cell.column: [cell.published] for cell in cells if cell.published is not None}
@@ -228,7 +236,7 @@ def _write_boxes(path: Path, table: PaperTable) -> None:
     """Draw each row's figures over the seeds, a box for each column, with the printed one as a mark."""
     rows = _by_row(table)
     most = max(len(cells) for cells in rows.values())
-    figure, across, down = _sheet(_title(table), len(rows), height_in=0.9 + _BOX_IN * most)
+    figure, across, down = sheet(_title(table), len(rows), width_in=WIDE_IN, height_in=0.9 + _BOX_IN * most)
     left_in = _label_in(_columns(table))
     for number, (row, cells) in enumerate(rows.items()):
         axes = panel(figure, number, columns=across, rows=down, left_in=left_in)
@@ -246,7 +254,7 @@ def _write_boxes(path: Path, table: PaperTable) -> None:
 
 def _write_scenes(path: Path, tables: Sequence[PaperTable], *, title: str) -> None:
     columns = _columns(tables[0])
-    figure, across, down = _sheet(title, len(columns), height_in=0.9 + _BOX_IN * len(tables))
+    figure, across, down = sheet(title, len(columns), width_in=WIDE_IN, height_in=0.9 + _BOX_IN * len(tables))
     left_in = _label_in([_short(table) for table in tables])
     for number, column in enumerate(columns):
         axes = panel(figure, number, columns=across, rows=down, left_in=left_in)
@@ -272,18 +280,12 @@ def _write_paths(path: Path, paths: Sequence[PaperPath]) -> None:
     for each, errors in zip(paths, errors_m, strict=True):
         most_m[each.row] = max(most_m.get(each.row, 0.0), float(errors.max()))
     title = "Paths over the truth, coloured by their error"
-    figure, across, down = _sheet(title, len(paths), height_in=_PATH_IN)
+    figure, across, down = sheet(title, len(paths), width_in=WIDE_IN, height_in=WIDE_IN)
     for number, (each, pairs, errors) in enumerate(zip(paths, matched, errors_m, strict=True)):
         axes = panel(figure, number, columns=across, rows=down)
         add_color_bar(axes, draw_path(axes, pairs, errors, most_m=most_m[each.row]))
         caption(axes, title=f"{each.row}, {each.method}: ATE {each.ate_m:.4f} m")
     save(figure, path)
-
-
-def _sheet(title: str, panels: int, *, height_in: float = _HEIGHT_IN) -> tuple["Figure", int, int]:
-    across = min(_COLUMNS, panels)
-    down = -(-panels // across)
-    return page(title, columns=across, rows=down, width_in=_WIDTH_IN, height_in=height_in), across, down
 
 
 def _title(table: PaperTable) -> str:

@@ -15,6 +15,7 @@ from mapper.export.figures import (
     LINE,
     START,
     TRUTH,
+    WIDE_IN,
     by_logarithm,
     caption,
     color_of,
@@ -25,6 +26,7 @@ from mapper.export.figures import (
     page,
     panel,
     save,
+    sheet,
     widest_axes,
 )
 from mapper.export.mcap_log import McapLog
@@ -32,7 +34,6 @@ from mapper.export.mcap_log import McapLog
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-_COLUMNS = 4
 _LEGEND_IN = 1.3
 
 
@@ -55,13 +56,12 @@ def write_paths(
         captions: A few words for each name.
         title: Headline.
     """
-    rows = -(-len(paths) // _COLUMNS)
-    figure = page(title, columns=min(len(paths), _COLUMNS), rows=rows)
+    figure, columns, rows = sheet(title, len(paths))
     reference = _reference(paths, truth)
     axes_world = widest_axes(reference)
     low, high = extent(reference @ axes_world.T)
     for number, (name, trajectory) in enumerate(paths.items()):
-        axes = panel(figure, number, columns=min(len(paths), _COLUMNS), rows=rows)
+        axes = panel(figure, number, columns=columns, rows=rows)
         if truth is not None:
             axes.plot(
                 *(truth.positions_world @ axes_world.T).T, color=hex_of(TRUTH), linewidth=2.2, alpha=0.5
@@ -88,7 +88,7 @@ def write_path_errors(
         step: That length, in words.
         title: Headline.
     """
-    figure = page(title, columns=2, rows=1, width_in=5.6, height_in=4.4)
+    figure = page(title, columns=2, rows=1, width_in=WIDE_IN, height_in=WIDE_IN)
     axes = panel(figure, 0, columns=2, rows=1)
     _draw_shares(axes, positions_m, list(positions_m))
     caption(axes, x="distance from the truth, m", y="share of the poses")
@@ -112,7 +112,9 @@ def write_registration_errors(
         title: Headline.
     """
     names = list(dict.fromkeys(name for kind in errors_m.values() for name in kind))
-    figure = page(title, columns=len(errors_m), rows=1, width_in=4.2, height_in=3.9, legend_in=_LEGEND_IN)
+    figure = page(
+        title, columns=len(errors_m), rows=1, width_in=WIDE_IN, height_in=WIDE_IN, legend_in=_LEGEND_IN
+    )
     for number, (kind, of_name) in enumerate(errors_m.items()):
         axes = panel(figure, number, columns=len(errors_m), rows=1, legend_in=_LEGEND_IN)
         axes.axvline(max_error_m, color=FAINT, linewidth=0.8, linestyle="dashed")

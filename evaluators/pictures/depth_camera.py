@@ -9,10 +9,27 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mapper.core.config import toml_text
+from mapper.core.units import MM_PER_M
 from mapper.evaluators.sensors.depth_accuracy import Accuracy, DepthLevel, ResidualMap
 from mapper.evaluators.sensors.depth_study import DepthStudy, NoiseFit, records_of
 from mapper.evaluators.study.table import csv_text
-from mapper.export.figures import FAINT, LINE, TEXT, Rgb, caption, hex_of, page, panel, save
+from mapper.export.figures import (
+    ESTIMATE,
+    FAINT,
+    LINE,
+    PANEL_IN,
+    START,
+    STRAY_PERCENT,
+    TEXT,
+    WIDE_IN,
+    Rgb,
+    caption,
+    hex_of,
+    page,
+    panel,
+    save,
+    sheet,
+)
 from mapper.runtime.atomic import MANIFEST_NAME, FolderKind, write_json, write_text
 from mapper.sensing.depth import depth_sigma_m
 
@@ -27,14 +44,10 @@ FOLDER = FolderKind(
     kind="depth accuracy",
 )
 
-_RAW: Rgb = (38, 145, 87)
-_FILTERED: Rgb = (214, 69, 37)
+_RAW, _FILTERED = START, ESTIMATE
 """Green before DIF and red after, as in Somlyai (PhD thesis), figure 2.16."""
 
-_MM = 1e3
-_COLUMNS = 4
-_MAP_IN, _BAR_IN, _CAPTION_IN = 3.6, 0.65, 0.4
-_CLIP_PERCENT = 99.0
+_BAR_IN, _CAPTION_IN = 0.65, 0.4
 
 
 def write_depth_study(folder: Path, study: DepthStudy) -> None:
@@ -77,12 +90,12 @@ def write_accuracy(path: Path, levels: Sequence[DepthLevel], fit: NoiseFit, *, t
         fit: The noise before DIF as a curve.
         title: Headline.
     """
-    figure = page(title, columns=2, rows=1, width_in=5.6, height_in=4.4)
+    figure = page(title, columns=2, rows=1, width_in=WIDE_IN, height_in=WIDE_IN)
     distance_m = [level.typical.distance_m for level in levels]
     axes = panel(figure, 0, columns=2, rows=1)
     for label, color, accuracies in _kinds(levels):
-        largest = [_MM * one.max_error_m for one in accuracies]
-        most = [_MM * one.max_error_99_m for one in accuracies]
+        largest = [MM_PER_M * one.max_error_m for one in accuracies]
+        most = [MM_PER_M * one.max_error_99_m for one in accuracies]
         axes.plot(distance_m, largest, "o-", color=hex_of(color), markersize=4, label=f"{label}, all pixels")
         axes.plot(
             distance_m,
@@ -96,10 +109,10 @@ def write_accuracy(path: Path, levels: Sequence[DepthLevel], fit: NoiseFit, *, t
     axes = panel(figure, 1, columns=2, rows=1)
     z = np.linspace(fit.low_m, fit.high_m, 200)
     axes.plot(
-        z, _MM * depth_sigma_m(fit.noise, z), color=TEXT, linewidth=1.0, label=f"σ = {fit.noise.text} m"
+        z, MM_PER_M * depth_sigma_m(fit.noise, z), color=TEXT, linewidth=1.0, label=f"σ = {fit.noise.text} m"
     )
     for label, color, accuracies in _kinds(levels):
-        spread = [_MM * one.std_m for one in accuracies]
+        spread = [MM_PER_M * one.std_m for one in accuracies]
         axes.plot(distance_m, spread, "o", color=hex_of(color), markersize=5, label=label)
     for marker, label, known_m in (
         ("^", "of a pixel over time", [level.temporal_m for level in levels]),
@@ -121,7 +134,9 @@ def _kinds(levels: Sequence[DepthLevel]) -> tuple[tuple[str, Rgb, list[Accuracy]
 def _draw_known(
     axes: "Axes", distance_m: Sequence[float], values_m: Sequence[float | None], *, marker: str, label: str
 ) -> None:
-    known = [(x, _MM * value) for x, value in zip(distance_m, values_m, strict=True) if value is not None]
+    known = [
+        (x, MM_PER_M * value) for x, value in zip(distance_m, values_m, strict=True) if value is not None
+    ]
     if known:
         axes.plot(*np.array(known).T, marker, color=FAINT, markersize=5, label=label, fillstyle="none")
 
@@ -144,13 +159,11 @@ def write_residuals(path: Path, maps: Sequence[ResidualMap], *, title: str) -> N
         maps: One or more.
         title: Headline.
     """
-    columns = min(len(maps), _COLUMNS)
-    rows = -(-len(maps) // columns)
-    width_in = _MAP_IN if columns > 1 else 2.0 * _MAP_IN
+    width_in = PANEL_IN if len(maps) > 1 else 2.0 * PANEL_IN
     height, width = maps[0].image.shape
     image_in = width_in - _BAR_IN
     cell_in = image_in * height / width + _CAPTION_IN
-    figure = page(title, columns=columns, rows=rows, width_in=width_in, height_in=cell_in)
+    figure, columns, rows = sheet(title, len(maps), width_in=width_in, height_in=cell_in)
     full = np.array([*figure.get_size_inches(), *figure.get_size_inches()])
     for number, one in enumerate(maps):
         row, column = divmod(number, columns)
@@ -160,9 +173,9 @@ def write_residuals(path: Path, maps: Sequence[ResidualMap], *, title: str) -> N
             tuple([left_in + image_in + 0.06, bottom_in, 0.12, cell_in - _CAPTION_IN] / full)
         )
         known = np.abs(one.error_m[~np.isnan(one.error_m)])
-        most_mm = _MM * max(float(np.percentile(known, _CLIP_PERCENT)), 1e-6)
+        most_mm = MM_PER_M * max(float(np.percentile(known, 100.0 - STRAY_PERCENT)), 1e-6)
         axes.imshow(one.image, cmap="gray", vmin=0, vmax=255)
-        shown = axes.imshow(_MM * one.error_m, cmap="RdBu_r", vmin=-most_mm, vmax=most_mm)
+        shown = axes.imshow(MM_PER_M * one.error_m, cmap="RdBu_r", vmin=-most_mm, vmax=most_mm)
         figure.colorbar(shown, cax=colorbar_axes).ax.tick_params(labelsize=7, colors=FAINT)
         caption(axes, title=f"{one.caption}; mm")
         axes.set_axis_off()

@@ -22,6 +22,7 @@ from mapper.export.figures import (
     TEXT,
     TRUTH,
     UNKNOWN_CELL,
+    WIDE_IN,
     Rgb,
     caption,
     draw_boxes,
@@ -41,7 +42,6 @@ if TYPE_CHECKING:
 TRAJECTORY = "trajectory.png"
 
 _COLOR_MAP = "turbo"
-_WIDTH_IN, _HEIGHT_IN = 5.6, 4.4
 
 
 def write_trajectory_errors(folder: Path, found: Assessment, *, title: str) -> Path:
@@ -68,7 +68,7 @@ def write_trajectory_errors(folder: Path, found: Assessment, *, title: str) -> P
     relative_percent = {
         f"{length.length_m:g} m": 100.0 * length.translation_ratio for length in found.lengths if len(length)
     }
-    figure = page(title, columns=2, rows=2, width_in=_WIDTH_IN, height_in=_HEIGHT_IN)
+    figure = page(title, columns=2, rows=2, width_in=WIDE_IN, height_in=WIDE_IN)
     path_axes, position_axes, length_axes, rotation_axes = (
         panel(figure, number, columns=2, rows=2) for number in range(4)
     )
@@ -161,7 +161,6 @@ AGREED: Rgb = OCCUPIED_CELL
 EXTRA: Rgb = ESTIMATE
 MISSING: Rgb = TRUTH
 
-_MAP_IN = 6.4
 _MARGIN_CELLS = 3
 _ERROR_WEIGHT = 3.0  # against voxels that agree, or a wrong one in a wall would not be seen
 _FAINTEST = 0.35  # of the colour of a column with a single voxel, so that it is seen
@@ -192,7 +191,7 @@ def write_map_errors(folder: Path, check: OccupancyCheck, *, title: str) -> Path
     points = [voxels for voxels, _ in kinds.values()]
     cells = [np.round(voxels / edge_m - 0.5).astype(np.int64) for voxels in points]
     paints = [(AGREED, 1.0), (EXTRA, _ERROR_WEIGHT), (MISSING, _ERROR_WEIGHT)]
-    figure = page(title, columns=2, rows=1, width_in=_MAP_IN, height_in=0.9 * _MAP_IN)
+    figure = page(title, columns=2, rows=1, width_in=WIDE_IN, height_in=WIDE_IN)
     for number, (name, axes_xyz) in enumerate((("from above", (0, 1)), ("from the side", (0, 2)))):
         axes = panel(figure, number, columns=2, rows=1)
         _draw(axes, [cell[:, axes_xyz] for cell in cells], paints, edge_m=edge_m)

@@ -8,7 +8,19 @@ import numpy as np
 
 from mapper.core.frames import Image
 from mapper.core.geometry import Array
-from mapper.export.figures import ESTIMATE, FAINT, LINE, TEXT, TRUTH, hex_of, new_figure, quiet_frame, save
+from mapper.export.figures import (
+    ESTIMATE,
+    FAINT,
+    HEAD_IN,
+    LINE,
+    PANEL_IN,
+    TEXT,
+    TRUTH,
+    hex_of,
+    new_figure,
+    quiet_frame,
+    save,
+)
 from mapper.line_laser.calibration import CalibrationShot, Fit, ahead_m, row_px, up_px
 from mapper.line_laser.config import StripeConfig
 from mapper.line_laser.detection import Method, responses, stripe_rows
@@ -16,8 +28,8 @@ from mapper.line_laser.detection import Method, responses, stripe_rows
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-_PANEL_IN, _COLUMNS = 3.5, 4
-_CAPTION_IN, _HEAD_IN = 0.3, 0.4
+_COLUMNS = 4
+_CAPTION_IN = 0.3
 _TITLES: Mapping[Method, str] = {
     "hue": "hue (figure 2.2)",
     "intensity": "intensity (2.39)",
@@ -42,9 +54,9 @@ def write_detections(
     """
     kept = responses(image, config)
     rows = {method: stripe_rows(response, join_px=config.join_px) for method, response in kept.items()}
-    height_in = _PANEL_IN * image.shape[0] / image.shape[1]
-    page_in = 2 * (height_in + _CAPTION_IN) + _HEAD_IN
-    figure = new_figure(_COLUMNS * _PANEL_IN, page_in)
+    height_in = PANEL_IN * image.shape[0] / image.shape[1]
+    page_in = 2 * (height_in + _CAPTION_IN) + HEAD_IN
+    figure = new_figure(_COLUMNS * PANEL_IN, page_in)
     colors = "orange: the row found" + ("" if true_rows is None else "; blue: the true one")
     figure.text(0.012, 1.0 - 0.1 / page_in, title, fontsize=13, fontweight="bold", color=TEXT, va="top")
     figure.text(0.988, 1.0 - 0.12 / page_in, colors, fontsize=9.5, color=FAINT, va="top", ha="right")

@@ -12,8 +12,11 @@ from mapper.export.figures import (
     END,
     ESTIMATE,
     FAINT,
+    HEAD_IN,
+    STRAY_PERCENT,
     TEXT,
     TRUTH,
+    WIDE_IN,
     fit_to_window,
     hex_of,
     new_figure,
@@ -26,10 +29,7 @@ from mapper.registration.config import VOXEL_M
 from mapper.registration.kd_tree import kd_tree
 
 _DRAWN = 60_000
-_COLUMN_IN = 5.0
-_TITLES_IN = 0.5  # each row's, and the page's
 _MIN_ROW_IN = 0.8
-_INSIDE = (1.0, 99.0)  # percentiles of the source: a few far returns must not shrink the rest
 _MARGIN = 0.05
 _VIEWS: dict[Sensor, dict[str, Array]] = {
     "lidar": {
@@ -71,10 +71,8 @@ def write_before_and_after(
     on_target = [tree.nearest(cloud)[1] <= near_m for cloud in moved]
     views = _VIEWS[sensor]
     windows = [_window(moved[-1] @ axes_of.T) for axes_of in views.values()]
-    heights_in = [
-        max(_COLUMN_IN * float(np.divide(*(high - low)[::-1])), _MIN_ROW_IN) for low, high in windows
-    ]
-    figure = new_figure(_COLUMN_IN * len(stages), sum(heights_in) + _TITLES_IN * (len(views) + 1))
+    heights_in = [max(WIDE_IN * float(np.divide(*(high - low)[::-1])), _MIN_ROW_IN) for low, high in windows]
+    figure = new_figure(WIDE_IN * len(stages), sum(heights_in) + HEAD_IN * (len(views) + 1))
     grid = figure.add_gridspec(len(views), len(stages), height_ratios=heights_in)
     for row, (view, axes_of) in enumerate(views.items()):
         low, high = windows[row]
@@ -98,7 +96,7 @@ def _thinned(points: Points32) -> Array:
 
 
 def _window(flat: Array) -> tuple[Array, Array]:
-    low, high = np.percentile(flat, _INSIDE, axis=0)
+    low, high = np.percentile(flat, (STRAY_PERCENT, 100.0 - STRAY_PERCENT), axis=0)
     margin = _MARGIN * float((high - low).max()) + 1e-3
     return low - margin, high + margin
 

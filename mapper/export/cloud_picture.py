@@ -10,23 +10,32 @@ from numpy.typing import NDArray
 from mapper.core.frames import Points32
 from mapper.core.geometry import Array
 from mapper.core.trajectory import Trajectory
-from mapper.export.figures import BACKDROP, END, ESTIMATE, LINE, START, hex_of, new_figure, save, scale_bar
+from mapper.export.figures import (
+    BACKDROP,
+    END,
+    ESTIMATE,
+    HEAD_IN,
+    IMAGE_PX,
+    LINE,
+    MARGIN_M,
+    START,
+    STRAY_PERCENT,
+    WIDE_IN,
+    hex_of,
+    new_figure,
+    save,
+    scale_bar,
+)
 from mapper.mapping.cloud import height_colors, thinned_to_view
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_MARGIN_M = 0.3
-HEADROOM_M = 0.3
-"""Above the highest pose; what lies higher would hide the rooms from above."""
-_VIEW_PX = 900
 _TILT_RAD = np.deg2rad(32.0)
 _TURN_RAD = np.deg2rad(-35.0)
-_VIEW_IN = 5.6  # height of a view
 _WIDEST = 2.0  # width over height
-_GAP_IN, _HEAD_IN, _FOOT_IN = 0.15, 0.4, 0.4
-_STRAY_PERCENT = 1.0
+_GAP_IN = 0.15
 
 
 def write_cloud_views(
@@ -50,12 +59,12 @@ def write_cloud_views(
     """
     positions = trajectory.positions_world
     points, colors = thinned_to_view(points, colors)
-    below = points[:, 2] <= positions[:, 2].max() + HEADROOM_M
+    below = points[:, 2] <= positions[:, 2].max() + MARGIN_M
     if below.any():
         points, colors = points[below], colors[below]
     heights_m = None
     if not has_colors:
-        low_m, high_m = np.percentile(points[:, 2], [_STRAY_PERCENT, 100.0 - _STRAY_PERCENT]).tolist()
+        low_m, high_m = np.percentile(points[:, 2], [STRAY_PERCENT, 100.0 - STRAY_PERCENT]).tolist()
         heights_m = low_m, high_m
         colors = height_colors(points[:, 2], between_m=heights_m)
     views = {
@@ -87,9 +96,9 @@ class _View:
         self.cloud = points @ R_view_world.T.astype(np.float32)
         self.path = positions @ R_view_world.T
         # A few stray points must not shrink the scene.
-        low, high = np.percentile(self.cloud[:, :2], [_STRAY_PERCENT, 100.0 - _STRAY_PERCENT], axis=0)
-        self.low: Array = np.minimum(low, self.path[:, :2].min(axis=0)) - _MARGIN_M
-        self.high: Array = np.maximum(high, self.path[:, :2].max(axis=0)) + _MARGIN_M
+        low, high = np.percentile(self.cloud[:, :2], [STRAY_PERCENT, 100.0 - STRAY_PERCENT], axis=0)
+        self.low: Array = np.minimum(low, self.path[:, :2].min(axis=0)) - MARGIN_M
+        self.high: Array = np.maximum(high, self.path[:, :2].max(axis=0)) + MARGIN_M
 
     @property
     def aspect(self) -> float:
@@ -100,15 +109,15 @@ class _View:
 
 def _page_for(views: Collection[_View]) -> "tuple[Figure, list[Axes]]":
     """Return a page with axes side by side, one for each view, all of one height."""
-    widths_in = [_VIEW_IN * min(view.aspect, _WIDEST) for view in views]
+    widths_in = [WIDE_IN * min(view.aspect, _WIDEST) for view in views]
     width_in = sum(widths_in) + (len(views) + 1) * _GAP_IN
-    height_in = _VIEW_IN + _HEAD_IN + _FOOT_IN
+    height_in = WIDE_IN + 2.0 * HEAD_IN
     figure = new_figure(width_in, height_in, background=BACKDROP)
     axes, left_in = [], _GAP_IN
     for view_in in widths_in:
         axes.append(
             figure.add_axes(
-                (left_in / width_in, _FOOT_IN / height_in, view_in / width_in, _VIEW_IN / height_in)
+                (left_in / width_in, HEAD_IN / height_in, view_in / width_in, WIDE_IN / height_in)
             )
         )
         left_in += view_in + _GAP_IN
@@ -130,7 +139,7 @@ def _height_legend(figure: "Figure", heights_m: tuple[float, float]) -> None:
 
 def _draw_view(axes: "Axes", view: _View, colors: NDArray[np.uint8]) -> None:
     cloud, path, low, high = view.cloud, view.path, view.low, view.high
-    pixel_m = float((high - low).max()) / _VIEW_PX
+    pixel_m = float((high - low).max()) / IMAGE_PX
     image = splat(cloud, colors, low=low, pixel_m=pixel_m, shape=np.ceil((high - low)[::-1] / pixel_m))
     axes.imshow(image, origin="lower", interpolation="antialiased", extent=(low[0], high[0], low[1], high[1]))
     axes.plot(*path[:, :2].T, color="white", linewidth=2.4, alpha=0.75)

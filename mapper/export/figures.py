@@ -30,24 +30,26 @@ _OKABE_ITO: dict[str, Rgb] = {
     "green": (0, 158, 115),
     "orange": (230, 159, 0),
     "purple": (204, 121, 167),
+    "yellow": (240, 228, 66),
 }
 
 INK: Rgb = (30, 33, 41)
 PAPER: Rgb = (255, 255, 255)
-BACKDROP: Rgb = (22, 24, 30)
+GREY: Rgb = (140, 146, 158)
+BACKDROP: Rgb = INK
 """Behind clouds."""
 
 ESTIMATE: Rgb = _OKABE_ITO["vermillion"]
-DOUBTFUL: Rgb = (240, 205, 20)
+DOUBTFUL: Rgb = _OKABE_ITO["yellow"]
 TRUTH: Rgb = _OKABE_ITO["blue"]
 START: Rgb = _OKABE_ITO["green"]
 END: Rgb = INK
-END_ON_DARK: Rgb = (242, 244, 248)
+END_ON_DARK: Rgb = PAPER
 PLAN: Rgb = (124, 58, 196)
 ACCEPTED: Rgb = _OKABE_ITO["purple"]
-REJECTED: Rgb = (150, 156, 166)
+REJECTED: Rgb = GREY
 FACTORS: dict[Origin, Rgb] = {
-    "odometry": (140, 146, 158),
+    "odometry": GREY,
     "loop": ACCEPTED,
     "wheel": _OKABE_ITO["orange"],
 }
@@ -56,7 +58,7 @@ VANISHED: Rgb = _OKABE_ITO["vermillion"]
 NOT_SEEN_AGAIN: Rgb = REJECTED
 UNKNOWN_CELL: Rgb = (214, 218, 224)
 FREE_CELL: Rgb = PAPER
-OCCUPIED_CELL: Rgb = (35, 41, 54)
+OCCUPIED_CELL: Rgb = INK
 
 RUNS: tuple[Rgb, ...] = (
     ESTIMATE,
@@ -79,9 +81,25 @@ FAINT = "#6c7280"
 LINE = "#c3c8d0"
 
 _DPI = 130
+PANEL_IN = 3.0
+WIDE_IN = 5.0
+"""Width of panels of which a page has one or two."""
+HEAD_IN = 0.5
+_COLUMNS = 4
+IMAGE_PX = 1000
+"""Longer side of an image that is drawn pixel by pixel."""
+MOST_CELLS = 4000
+"""Longer side of a grid whose cells are drawn, and not some of them as one."""
+CELL_PX = 4
+"""Edge of a cell in which more than its state is drawn."""
+MARGIN_M = 0.3
+"""Around a path or a map; above the highest pose, what lies higher would hide the rooms from above."""
+STRAY_PERCENT = 1.0
+"""Points that may lie outside of a picture at each side: a few far returns must not shrink the rest."""
+BAND_ALPHA = 60
 
 
-def new_figure(width_in: float, height_in: float, *, background: Rgb = (255, 255, 255)) -> "Figure":
+def new_figure(width_in: float, height_in: float, *, background: Rgb = PAPER) -> "Figure":
     """Return an empty page."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg  # takes half a second
     from matplotlib.figure import Figure
@@ -149,8 +167,6 @@ _COLORS: tuple[Rgb, ...] = (
     (30, 33, 41),
     (140, 146, 158),
 )
-_PANEL_IN = 3.0
-_HEAD_IN = 0.5
 _LEFT_IN = 0.85
 _EXTENT_MARGIN = 0.15
 _WIDE = 1e3  # from here on ticks at 1, 2, 5 would be written over one another
@@ -166,15 +182,24 @@ def page(
     *,
     columns: int,
     rows: int,
-    width_in: float = _PANEL_IN,
-    height_in: float = _PANEL_IN,
+    width_in: float = PANEL_IN,
+    height_in: float = PANEL_IN,
     legend_in: float = 0.0,
 ) -> "Figure":
     """Return an empty page for panels of one size, with room for a headline and, at the right, a legend."""
-    figure = new_figure(width_in * columns + legend_in, height_in * rows + _HEAD_IN)
+    figure = new_figure(width_in * columns + legend_in, height_in * rows + HEAD_IN)
     _, page_in = figure.get_size_inches()
     figure.text(0.02, 1.0 - 0.2 / page_in, title, fontsize=12, fontweight="bold", color=TEXT, va="top")
     return figure
+
+
+def sheet(
+    title: str, panels: int, *, width_in: float = PANEL_IN, height_in: float = PANEL_IN
+) -> tuple["Figure", int, int]:
+    """Return an empty page for a number of panels, and its columns and rows."""
+    columns = min(panels, _COLUMNS)
+    rows = -(-panels // columns)
+    return page(title, columns=columns, rows=rows, width_in=width_in, height_in=height_in), columns, rows
 
 
 def panel(
@@ -198,7 +223,7 @@ def panel(
     """
     width_in, height_in = figure.get_size_inches()
     row, column = divmod(number, columns)
-    cell_width_in, cell_height_in = (width_in - legend_in) / columns, (height_in - _HEAD_IN) / rows
+    cell_width_in, cell_height_in = (width_in - legend_in) / columns, (height_in - HEAD_IN) / rows
     below_in, above_in, right_in = 0.45, 0.3, 0.15
     axes = figure.add_axes(
         (
@@ -275,9 +300,6 @@ def extent(seen: Array) -> tuple[Array, Array]:
 SIGMAS = 2.0
 """Half the band's width, in standard deviations: in one direction 95 % of the errors lie within."""
 
-_BAND_PX = 1000
-_BAND_ALPHA = 60
-
 
 def band_image(positions: Array, half_widths_m: Array, *, low: Array, high: Array) -> NDArray[np.uint8]:
     """Return an RGBA image, row 0 lowest, of a band of varying width around a path.
@@ -288,7 +310,7 @@ def band_image(positions: Array, half_widths_m: Array, *, low: Array, high: Arra
         low: (2,) metres, the image's lower corner.
         high: (2,) metres, its upper corner.
     """
-    pixel_m = float((high - low).max()) / _BAND_PX
+    pixel_m = float((high - low).max()) / IMAGE_PX
     width, height = np.ceil((high - low) / pixel_m).astype(int)
     mask = np.zeros((max(height, 1), max(width, 1)), np.uint8)
     places = np.rint((positions[:, :2] - low) / pixel_m - 0.5).astype(np.int32)
@@ -296,8 +318,8 @@ def band_image(positions: Array, half_widths_m: Array, *, low: Array, high: Arra
     known = np.isfinite(half_widths_m)
     for index in np.flatnonzero(known).tolist():
         radius = float(radii[index])
-        cv2.circle(mask, places[index].tolist(), round(radius), _BAND_ALPHA, thickness=-1)
+        cv2.circle(mask, places[index].tolist(), round(radius), BAND_ALPHA, thickness=-1)
         if index and known[index - 1]:
             thickness = max(1, round(radius + float(radii[index - 1])))
-            cv2.line(mask, places[index - 1].tolist(), places[index].tolist(), _BAND_ALPHA, thickness)
+            cv2.line(mask, places[index - 1].tolist(), places[index].tolist(), BAND_ALPHA, thickness)
     return np.dstack([np.broadcast_to(np.array(ESTIMATE, np.uint8), (*mask.shape, 3)), mask])

@@ -7,7 +7,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.errors import DataError
-from mapper.export.figures import FREE_CELL, INK, OCCUPIED_CELL, PAPER, UNKNOWN_CELL, round_length
+from mapper.export.figures import (
+    FREE_CELL,
+    IMAGE_PX,
+    INK,
+    MOST_CELLS,
+    OCCUPIED_CELL,
+    PAPER,
+    UNKNOWN_CELL,
+    round_length,
+)
 from mapper.octree.grid import (
     FREE,
     FREE_PIXEL,
@@ -21,8 +30,6 @@ from mapper.octree.grid import (
 )
 from mapper.runtime.atomic import write_bytes, write_text
 
-_PICTURE_PX = 800
-_MOST_PX = 4000
 _STRIP_PX = 36
 _BAR_SHARE = 0.25  # of the picture's width
 
@@ -83,8 +90,8 @@ def grid_image(grid: OccupancyGrid) -> NDArray[np.uint8]:
 
 
 def _write_picture(path: Path, grid: OccupancyGrid) -> None:
-    grid = shrunk(grid, _MOST_PX)
-    enlargement = -(-_PICTURE_PX // max(grid.cells.shape))
+    grid = shrunk(grid, MOST_CELLS)
+    enlargement = -(-IMAGE_PX // max(grid.cells.shape))
     image = grid_image(grid)[::-1].repeat(enlargement, axis=0).repeat(enlargement, axis=1)
     image = np.vstack([image, _scale_and_legend(image.shape[1], grid.resolution_m / enlargement)])
     write_bytes(path, encode_png(path, image[:, :, ::-1]))

@@ -14,7 +14,7 @@ from mapper.mapping.cloud import Colors
 from mapper.runtime.atomic import atomic_file, write_bytes, write_text
 
 _PLY_VERTEX = np.dtype([("position", "<f4", 3), ("color", "u1", 3)])
-_CHUNK = 1 << 20  # vertices written at once
+_CHUNK = 1_000_000  # vertices written at once
 _PLY_TRIANGLE = np.dtype([("corners", "u1"), ("vertices", "<i4", 3)])
 
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from mapper.core.errors import DataError
 from mapper.export.export_folders import export_folder
-from mapper.export.figures import FREE_CELL, OCCUPIED_CELL, UNKNOWN_CELL
+from mapper.export.figures import CELL_PX, FREE_CELL, OCCUPIED_CELL, UNKNOWN_CELL
 from mapper.export.grid import write_grid, write_values
 from mapper.navigation.config import CostmapConfig
 from mapper.navigation.distance import plane_distances
@@ -20,9 +20,7 @@ from mapper.runtime.progress import Progress
 NO_INFORMATION, LETHAL, INSCRIBED, FREE_SPACE = 255, 254, 253, 0
 """nav2_costmap_2d's cost values."""
 
-_MOST_INFLATED = 98
-_INSCRIBED, _LETHAL, _UNKNOWN = 99, 100, 255
-_PICTURE_PX_PER_CELL = 4
+_INSCRIBED = OCCUPIED - 1
 
 
 def costmap(run: MapFolder, path: Path, _progress: Progress) -> None:
@@ -84,8 +82,8 @@ def occupancy_values(costs: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Return costs as nav2 publishes them: 0 free, 1 … 98, 99 inscribed, 100 lethal, 255 unknown."""
     table = np.zeros(256, np.uint8)
     inflated = np.arange(1, INSCRIBED)
-    table[1:INSCRIBED] = 1 + (_MOST_INFLATED - 1) * (inflated - 1) // (INSCRIBED - 2)
-    table[[INSCRIBED, LETHAL, NO_INFORMATION]] = _INSCRIBED, _LETHAL, _UNKNOWN
+    table[1:INSCRIBED] = 1 + (_INSCRIBED - 2) * (inflated - 1) // (INSCRIBED - 2)
+    table[[INSCRIBED, LETHAL, NO_INFORMATION]] = _INSCRIBED, OCCUPIED, NO_INFORMATION
     return table[costs]
 
 
@@ -93,9 +91,9 @@ def _picture(values: NDArray[np.uint8]) -> bytes:
     """Return a PNG: redder with the cost, obstacles dark, unknown grey."""
     share = np.clip(values, 0, _INSCRIBED).astype(np.float32)[..., None] / _INSCRIBED
     bgr = (1.0 - share) * FREE_CELL[::-1] + share * (40.0, 60.0, 225.0)
-    bgr[values == _LETHAL] = OCCUPIED_CELL[::-1]
-    bgr[values == _UNKNOWN] = UNKNOWN_CELL[::-1]
-    enlarged = np.kron(bgr[::-1].astype(np.uint8), np.ones((_PICTURE_PX_PER_CELL,) * 2 + (1,), np.uint8))
+    bgr[values == OCCUPIED] = OCCUPIED_CELL[::-1]
+    bgr[values == NO_INFORMATION] = UNKNOWN_CELL[::-1]
+    enlarged = np.kron(bgr[::-1].astype(np.uint8), np.ones((CELL_PX,) * 2 + (1,), np.uint8))
     _, encoded = cv2.imencode(".png", enlarged)
     return encoded.tobytes()
 

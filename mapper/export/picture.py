@@ -15,12 +15,16 @@ from mapper.core.geometry import Array, Points, distances_along
 from mapper.core.timebase import stretches
 from mapper.core.trajectory import Trajectory, plan_axes
 from mapper.export.figures import (
+    BAND_ALPHA,
+    CELL_PX,
     DOUBTFUL,
     END,
     ESTIMATE,
     FACTORS,
     FAINT,
     LINE,
+    MARGIN_M,
+    MOST_CELLS,
     PLAN,
     SIGMAS,
     START,
@@ -48,12 +52,8 @@ if TYPE_CHECKING:
 
     from mapper.run.folder import Run
 
-_MARGIN_M = 0.3
-_MOST_CELLS = 2000  # along an edge of a merged map: more than a page has pixels
 _NAMED = 12  # of many runs only the first are in the legend
 _ARROWS = 6  # along a path
-_SWEPT_PX = 4  # pixels per cell
-_SWEPT_ALPHA = 70
 
 
 def write_summary(
@@ -237,7 +237,7 @@ def write_merged(
         title: Headline.
         lines: Figures worth knowing, shown below the headline.
     """
-    grid, paths = shrunk(grid, _MOST_CELLS), list(paths_world.values())
+    grid, paths = shrunk(grid, MOST_CELLS), list(paths_world.values())
     low, high = _extent(grid, paths)
     with _grid_page(path, grid, paths, title, lines) as axes:
         for draw, (start, end) in zip((axes.axvline, axes.axhline), zip(low, high, strict=True), strict=True):
@@ -265,7 +265,7 @@ def write_layers(
         title: Headline.
         lines: Figures worth knowing, shown below the headline.
     """
-    grid, paths_world = shrunk(grid, _MOST_CELLS), [centres for centres, _ in layers.values()]
+    grid, paths_world = shrunk(grid, MOST_CELLS), [centres for centres, _ in layers.values()]
     with _grid_page(path, grid, paths_world, title, lines) as axes:
         for name, (centres, color) in layers.items():
             cells = np.unique(np.floor(centres[:, :2] / grid.resolution_m).astype(np.int64), axis=0)
@@ -281,11 +281,11 @@ def write_layers(
 
 def _swept(grid: OccupancyGrid, ends: Array, radius_m: float) -> NDArray[np.uint8]:
     """Return an RGBA image over the grid that shows where a disc passes along a path."""
-    pixel_m = grid.resolution_m / _SWEPT_PX
-    mask = np.zeros([n * _SWEPT_PX for n in grid.cells.shape], np.uint8)
+    pixel_m = grid.resolution_m / CELL_PX
+    mask = np.zeros([n * CELL_PX for n in grid.cells.shape], np.uint8)
     corners = np.rint((ends - grid.origin_world_m) / pixel_m - 0.5).astype(np.int32)
     width_px = max(1, round(2.0 * radius_m / pixel_m))
-    cv2.polylines(mask, [corners], isClosed=False, color=_SWEPT_ALPHA, thickness=width_px)
+    cv2.polylines(mask, [corners], isClosed=False, color=BAND_ALPHA, thickness=width_px)
     return np.dstack([np.broadcast_to(np.array(PLAN, np.uint8), (*mask.shape, 3)), mask])
 
 
@@ -320,7 +320,7 @@ def _extent(grid: OccupancyGrid, paths_world: Sequence[Array]) -> tuple[Array, A
     rows, columns = np.nonzero((grid.cells == FREE) | (grid.cells == OCCUPIED))
     cells = grid.origin_world_m + (np.column_stack([columns, rows]) + 0.5) * grid.resolution_m
     seen = np.concatenate([cells, *(path[:, :2] for path in paths_world)])
-    return seen.min(axis=0) - _MARGIN_M, seen.max(axis=0) + _MARGIN_M
+    return seen.min(axis=0) - MARGIN_M, seen.max(axis=0) + MARGIN_M
 
 
 def _mark_ends(axes: "Axes", positions: Array, *, end: str = "end") -> None:

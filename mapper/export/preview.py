@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mapper.core.errors import FrameError, WriteError
 from mapper.core.geometry import Array, Transform, apply
-from mapper.export.figures import ESTIMATE, FREE_CELL, OCCUPIED_CELL, START, Rgb
+from mapper.export.figures import ESTIMATE, FREE_CELL, OCCUPIED_CELL, START, STRAY_PERCENT, Rgb
 from mapper.features.frame_view import ImageView
 from mapper.mapping.levelling import AXES
 from mapper.run.observers import Step
@@ -28,9 +28,8 @@ PREVIEW = "preview.png"
 _FIRST_S, _REFRESH_S = 5.0, 2.0
 _CPU_SHARE = 0.008
 """Largest share of the build's CPU time that goes into points, and into pictures after the first."""
-_WIDTH_PX, _HEIGHT_PX, _MARGIN_PX, _TEXT_PX = 640, 480, 24, 28
+_WIDTH_PX, _HEIGHT_PX, _MARGIN_PX = 640, 480, 24
 _POINTS_OF_KEYFRAME = 500
-_OUTLIERS_PERCENT = 1.0  # far returns do not make the rest small
 
 
 class Preview:
@@ -145,20 +144,20 @@ def drawn(path: Array, points: Array, *, text: str) -> NDArray[np.uint8]:
     picture = np.full((_HEIGHT_PX, _WIDTH_PX, 3), FREE_CELL[::-1], np.uint8)
     low, high = path.min(axis=0), path.max(axis=0)
     if len(points):
-        spread = np.percentile(points, [_OUTLIERS_PERCENT, 100.0 - _OUTLIERS_PERCENT], axis=0)
+        spread = np.percentile(points, [STRAY_PERCENT, 100.0 - STRAY_PERCENT], axis=0)
         low, high = np.minimum(low, spread[0]), np.maximum(high, spread[1])
-    size_px = np.array([_WIDTH_PX - 2 * _MARGIN_PX, _HEIGHT_PX - 2 * _MARGIN_PX - _TEXT_PX])
+    size_px = np.array([_WIDTH_PX - 2 * _MARGIN_PX, _HEIGHT_PX - 2 * _MARGIN_PX - _MARGIN_PX])
     px_per_m = float((size_px / np.maximum(high - low, 1e-2)).min())
     middle = (low + high) / 2.0
 
-    centre_px = np.array([_WIDTH_PX / 2, (_HEIGHT_PX - _TEXT_PX) / 2])
+    centre_px = np.array([_WIDTH_PX / 2, (_HEIGHT_PX - _MARGIN_PX) / 2])
 
     def to_px(positions: Array) -> NDArray[np.int32]:
         right_down: Array = centre_px + (positions - middle) * px_per_m * np.array([1.0, -1.0])
         return right_down.round().astype(np.int32)
 
     columns, rows = to_px(points).T
-    inside = (columns >= 0) & (columns < _WIDTH_PX) & (rows >= 0) & (rows < _HEIGHT_PX - _TEXT_PX)
+    inside = (columns >= 0) & (columns < _WIDTH_PX) & (rows >= 0) & (rows < _HEIGHT_PX - _MARGIN_PX)
     picture[rows[inside], columns[inside]] = OCCUPIED_CELL[::-1]
     line = to_px(path)
     cv2.polylines(picture, [line], False, _bgr(ESTIMATE), 2, cv2.LINE_AA)

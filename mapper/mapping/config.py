@@ -2,9 +2,9 @@
 
 import json
 import math
-from typing import Annotated, Literal, Protocol, Self
+from typing import Literal, Protocol, Self
 
-from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt, model_validator
+from pydantic import NonNegativeInt, PositiveFloat, PositiveInt, model_validator
 
 from mapper.core.config import Config
 from mapper.navigation.config import TraversableConfig
@@ -33,10 +33,6 @@ class McapConfig(Config):
     """Every n-th frame's colour image, or scan, is logged; 0 logs none."""
     image_width_px: PositiveInt = 320
     """Wider images are shrunk."""
-    image_quality: Annotated[int, Field(ge=1, le=100)] = 80
-    """Quality of the JPEG images, on the scale of libjpeg."""
-    scan_voxel_m: PositiveFloat = 0.3
-    """Scans are thinned to one point per voxel."""
     frame_times: bool = True
     """Log the milliseconds of every frame; without them two builds of a log give the same bytes."""
 

@@ -33,6 +33,7 @@ from mapper.octree.scan_updates import (
     pack,
 )
 from mapper.octree.slice import Band, cut_slice
+from mapper.registration.config import VOXEL_M
 from mapper.runtime.ordered_map import ordered_map
 from mapper.runtime.progress import Progress
 from mapper.sources.base import Log, Skipped
@@ -351,10 +352,10 @@ def _prepared(job: _Job, config: FuseSettings, caster: Caster) -> _Prepared | Sk
 
 def _snapshot(frame: Frame, scan: Scan, config: McapConfig) -> Snapshot | ScanSnapshot:
     if not isinstance(frame, RgbdFrame):
-        return ScanSnapshot(scan.stamp_ns, scan.points_body[thin(scan.points_body, config.scan_voxel_m)])
+        return ScanSnapshot(scan.stamp_ns, scan.points_body[thin(scan.points_body, VOXEL_M["lidar"])])
     return Snapshot(
         frame.stamp_ns,
-        encode_jpeg(frame.image, width_px=config.image_width_px, quality=config.image_quality),
+        encode_jpeg(frame.image, width_px=config.image_width_px),
         shrunk_camera(frame.camera, width_px=config.image_width_px),
         frame.T_body_camera,
     )

@@ -5,14 +5,15 @@ import cv2
 from mapper.core.errors import DataError
 from mapper.core.frames import Image, PinholeCamera
 
+_QUALITY = 80  # of 100 on libjpeg's scale
 
-def encode_jpeg(image: Image, *, width_px: int, quality: int) -> bytes:
+
+def encode_jpeg(image: Image, *, width_px: int) -> bytes:
     """Return an image as JPEG, shrunk to ``width_px`` if it is wider. Pure and thread-safe.
 
     Args:
         image: (H, W, 3) uint8 RGB or (H, W) uint8 grey.
         width_px: Largest width of the result; the aspect ratio is kept.
-        quality: 1 … 100 on the scale of libjpeg.
     """
     height, width = image.shape[:2]
     if width > width_px:
@@ -21,7 +22,7 @@ def encode_jpeg(image: Image, *, width_px: int, quality: int) -> bytes:
         )
     if image.ndim == 3:
         image = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
-    done, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    done, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
     if not done:
         raise DataError(f"image {image.shape} cannot be encoded as JPEG")
     return bytes(data)

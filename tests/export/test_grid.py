@@ -77,9 +77,9 @@ def test_the_picture_is_large_and_the_right_way_up(tmp_path):
     write_grid(tmp_path, "m", OccupancyGrid(cells, np.array([0.0, 0.0]), 0.05))
 
     picture = cv2.imread(str(tmp_path / "m.png"))
-    picture = picture[:400]  # the scale and the legend are below
+    picture = picture[:500]  # the scale and the legend are below
 
-    assert picture.shape == (400, 800, 3)
+    assert picture.shape == (500, 1000, 3)
     assert picture[-1, 0].max() < 70  # lowest y, lowest x: dark
     assert picture[0, -1].min() == 255  # highest y, highest x: white
     assert len(np.unique(picture.reshape(-1, 3), axis=0)) == 3

@@ -26,7 +26,6 @@ from mapper.run.results import RunResults
 
 _SIZED_LEVELS = 4
 _VIEW_PX = 1600
-_VIEW_QUALITY = 85
 
 
 Question = Literal["Is it right?", "Is it complete?", "How fast was it?", ""]
@@ -147,7 +146,7 @@ def views_uri(run: Run) -> str | None:
     if image is None:
         raise DataError(f"{path}: cannot be read as an image; make it again with mapper fuse")
     rgb = np.ascontiguousarray(image[:, :, ::-1])
-    return data_uri("jpeg", encode_jpeg(rgb, width_px=_VIEW_PX, quality=_VIEW_QUALITY))
+    return data_uri("jpeg", encode_jpeg(rgb, width_px=_VIEW_PX))
 
 
 class Seconds:

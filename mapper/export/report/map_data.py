@@ -12,12 +12,13 @@ from numpy.typing import NDArray
 
 from mapper.core.errors import DataError
 from mapper.core.timebase import NS_PER_S, Stamps, nearest
-from mapper.export.cloud_picture import HEADROOM_M
+from mapper.export.figures import MARGIN_M
 from mapper.export.report.data import Chapter, data_uri, four_digits
 from mapper.export.report.packing import Plane, pack_layers, pack_points
 from mapper.export.run_maps import snapshots_of
 from mapper.mapping.fusion import Snapshot
 from mapper.mapping.thumbnails import encode_jpeg
+from mapper.octree.casting_kernels import FREE, OCCUPIED
 from mapper.octree.keys import BLOCK_BITS, BLOCK_VOXELS, KEY_BITS, codes_of, codes_of_keys, keys_of
 from mapper.octree.map import OctreeMap
 from mapper.octree.queries import Leaves
@@ -95,17 +96,14 @@ MOST_POINTS = 2_000_000
 _MOST_BYTES = 13_000_000  # of the data of one page, as text
 _SPARE = 0.97  # fewer points compress a little worse
 _LEAST_BYTES = 1000
-_MOST_LAYER_BYTES = 3_000_000  # of one page
-_MOST_LAYER_CELLS = 1 << 27  # all heights of one run together
+_MOST_LAYER_BYTES = 4_000_000  # of one page, as text
+_MOST_LAYER_CELLS = 100_000_000  # all heights of one run together
 _POINT_STEPS = 16  # per voxel of the cloud: 1.3 mm where these are 2 cm
 _COLOR_MASK = 0xFC  # six bits of each channel: the two lowest take as much room as the position
-_FREE, _OCCUPIED = 1, 2  # a cell that is neither is 0: unknown
-_BASE64_RATIO = 4 / 3
 _NEVER_SEEN = 1023  # of the steps in which the time of the first hit is given
 _HITS_PER_OCTAVE = 16
 _MOST_IMAGES = 160
 _IMAGE_PX = 256
-_IMAGE_QUALITY = 70
 _MOST_IMAGE_GAP_NS = NS_PER_S // 2
 
 
@@ -134,7 +132,7 @@ def map_of(chapter: Chapter, *, runs: int = 1, most_points: int = MOST_POINTS) -
         "is_observed": observed is not None,
         "frames": list(_frames(chapter, [stamp_ns for stamp_ns, _ in images])),
         "images": [data_uri("jpeg", jpeg) for _, jpeg in images],
-        "headroom_m": four_digits(float(trajectory.positions_world[:, 2].max()) + HEADROOM_M),
+        "headroom_m": four_digits(float(trajectory.positions_world[:, 2].max()) + MARGIN_M),
     }
     most, room = most_points // runs - shown["voxels"]["count"], _MOST_BYTES // runs - len(json.dumps(shown))
     cloud = _cloud(chapter, octree.resolution_m, observed, most=most, has_colors=bool(snapshots))
@@ -160,7 +158,7 @@ def map_of_octree(octree: OctreeMap, *, highest_m: float) -> dict[str, Any]:
         "is_observed": False,
         "frames": [],
         "images": [],
-        "headroom_m": four_digits(highest_m + HEADROOM_M),
+        "headroom_m": four_digits(highest_m + MARGIN_M),
     }
 
 
@@ -242,9 +240,9 @@ def _layers(octree: OctreeMap, *, most_bytes: int) -> dict[str, Any]:
         low, high = keys.min(axis=0), keys.max(axis=0) + 1
         if np.prod(high - low) > _MOST_LAYER_CELLS:
             continue
-        states = np.where(nodes.log_odds >= octree.occupied_log_odds, _OCCUPIED, _FREE).astype(np.uint8)
+        states = np.where(nodes.log_odds >= octree.occupied_log_odds, OCCUPIED, FREE).astype(np.uint8)
         packed = pack_layers(_cells_by_height(keys - low, states, shape=tuple(high - low)))
-        if len(packed["data"]) <= _BASE64_RATIO * most_bytes:
+        if len(packed["data"]) <= most_bytes:
             break
     edge_m = nodes.edge_m
     corner = nodes.centres_world.min(axis=0) - 0.5 * edge_m
@@ -283,7 +281,7 @@ def _thumbnail(jpeg: bytes) -> bytes:
         raise DataError(
             f"image of {len(jpeg)} bytes in a run's MCAP log: not JPEG; make the log again with mapper fuse"
         )
-    return encode_jpeg(image, width_px=_IMAGE_PX, quality=_IMAGE_QUALITY)
+    return encode_jpeg(image, width_px=_IMAGE_PX)
 
 
 def _frames(chapter: Chapter, image_stamps_ns: Sequence[int]) -> Iterator[dict[str, Any]]:

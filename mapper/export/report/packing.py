@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mapper.octree.keys import codes_of_keys
 
-_STEPS = 65535
+_STEPS = np.iinfo(np.uint16).max
 """Largest number of steps along an axis: positions are 16-bit integers."""
 _LEVEL = 9
 

@@ -9,7 +9,7 @@ import rerun.blueprint as rrb
 from mapper.core.frames import Points32, Sensor
 from mapper.core.geometry import Array, Transform
 from mapper.export.figures import ESTIMATE, TRUTH
-from mapper.export.rerun.recording import RerunLog, new_recording, recorded, transform_of
+from mapper.export.rerun.recording import LINE_PX, RerunLog, new_recording, recorded, transform_of
 from mapper.export.rerun.target import streaming
 from mapper.export.run_maps import maps_of, snapshots_of
 from mapper.mapping.cloud import thinned_to_view
@@ -84,7 +84,6 @@ def about_text(run: Run, *, name: str) -> str:
 
 
 _TIMELINE = "stage"
-_DOT_PX = rr.Radius.ui_points(1.5)
 _UP = {"lidar": rr.ViewCoordinates.RIGHT_HAND_Z_UP, "rgbd": rr.ViewCoordinates.RDF}
 
 
@@ -119,7 +118,7 @@ def record_registration(
             ("world/target", points_target, TRUTH),
             ("world/source", points_source, ESTIMATE),
         ):
-            cloud = rr.Points3D(points.astype(np.float32), colors=[color], radii=_DOT_PX)
+            cloud = rr.Points3D(points.astype(np.float32), colors=[color], radii=LINE_PX)
             recording.log(entity, cloud, static=True)
         for number, (text, T_target_source) in enumerate(stages):
             recording.set_time(_TIMELINE, sequence=number)

@@ -15,9 +15,9 @@ from mapper.config.build import RerunConfig
 from mapper.core.errors import FrameError
 from mapper.core.frames import RgbdFrame, Scan, Sensor
 from mapper.core.geometry import Array, Transform, inverse
-from mapper.export.figures import ACCEPTED, ESTIMATE, FACTORS, REJECTED, Rgb
+from mapper.export.figures import ACCEPTED, ESTIMATE, FACTORS, REJECTED, START, Rgb
 from mapper.export.rerun.finished import about_text, extent, log_run
-from mapper.export.rerun.recording import RerunLog, recorded, transform_of
+from mapper.export.rerun.recording import THIN_PX, RerunLog, recorded, transform_of
 from mapper.features.frame_view import ImageView
 from mapper.mapping.fusion import Maps
 from mapper.mapping.thumbnails import encode_jpeg, shrunk_camera
@@ -36,8 +36,6 @@ _UPRIGHT: dict[Sensor, Transform] = {
     "rgbd": np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]]),
     "lidar": np.eye(4),
 }
-_MATCHED: Rgb = (60, 200, 120)
-_UNMATCHED: Rgb = (150, 150, 150)
 
 
 class LiveRerun:
@@ -107,7 +105,7 @@ class LiveRerun:
         camera = shrunk_camera(frame.camera, width_px=width_px)
         if self._frames == 0:
             self._log.mount(camera, frame.T_body_camera)
-        jpeg = encode_jpeg(frame.image, width_px=width_px, quality=80)
+        jpeg = encode_jpeg(frame.image, width_px=width_px)
         image = rr.EncodedImage(contents=jpeg, media_type="image/jpeg")
         self._log.log(self._log.camera, image, stamp_ns=frame.stamp_ns)
         view = step.view()
@@ -123,14 +121,12 @@ class LiveRerun:
         held = matches or nothing
         dots = rr.Points2D(
             drawn(view.pixels),
-            colors=np.where(
-                held.is_inlier[:, None], np.array(_MATCHED, np.uint8), np.array(_UNMATCHED, np.uint8)
-            ),
+            colors=np.where(held.is_inlier[:, None], np.array(START, np.uint8), np.array(REJECTED, np.uint8)),
             radii=rr.Radius.ui_points(1.5),
         )
         moved = np.isfinite(held.previous_px[:, 0])
         chain = np.stack([drawn(held.previous_px[moved]), drawn(view.pixels[moved])], axis=1)
-        lines = rr.LineStrips2D(chain, colors=[_MATCHED], radii=rr.Radius.ui_points(0.7))
+        lines = rr.LineStrips2D(chain, colors=[START], radii=THIN_PX)
         self._log.log(f"{self._log.camera}/features", dots, stamp_ns=view.stamp_ns)
         self._log.log(f"{self._log.camera}/matches", lines, stamp_ns=view.stamp_ns)
 

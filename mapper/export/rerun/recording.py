@@ -126,9 +126,8 @@ _SERIES: dict[str, Rgb] = {
     "residual": (124, 58, 196),
     "ms": (214, 69, 37),
 }
-_LINE_PX = rr.Radius.ui_points(1.5)
-_THIN_PX = rr.Radius.ui_points(0.7)
-_DOT_PX = rr.Radius.ui_points(2.5)
+LINE_PX = rr.Radius.ui_points(1.5)
+THIN_PX = rr.Radius.ui_points(0.7)
 
 
 class RerunLog:
@@ -193,20 +192,20 @@ class RerunLog:
     def path(self, name: str, trajectory: Trajectory) -> None:
         """Log a whole trajectory, "estimate" or "truth"."""
         strip = trajectory.positions_world.astype(np.float32)
-        self.log(f"world/path/{name}", rr.LineStrips3D([strip], colors=[_PATHS[name]], radii=_LINE_PX))
+        self.log(f"world/path/{name}", rr.LineStrips3D([strip], colors=[_PATHS[name]], radii=LINE_PX))
 
     def graph(self, graph: PoseGraph) -> None:
         """Log the nodes, and the factors that are no loops, as lines by origin."""
         positions = {node: T[:3, 3] for node, T in graph.T_world_node.items()}
         self.log(
             "world/graph/nodes",
-            rr.Points3D(np.array(list(positions.values())), colors=[ESTIMATE], radii=_DOT_PX),
+            rr.Points3D(np.array(list(positions.values())), colors=[ESTIMATE], radii=LINE_PX),
         )
         for origin, color in FACTORS.items():
             ends = [(positions[f.i], positions[f.j]) for f in graph.factors if f.origin == origin]
             if ends and origin != "loop":
                 self.log(
-                    f"world/graph/{origin}", rr.LineStrips3D(np.array(ends), colors=[color], radii=_THIN_PX)
+                    f"world/graph/{origin}", rr.LineStrips3D(np.array(ends), colors=[color], radii=THIN_PX)
                 )
 
     def loops(self, loops: Iterable[LoopClosure], T_world_node: Mapping[int, Transform]) -> None:
@@ -220,7 +219,7 @@ class RerunLog:
             ]
             if ends:
                 self.log(
-                    f"world/loops/{verdict}", rr.LineStrips3D(np.array(ends), colors=[color], radii=_LINE_PX)
+                    f"world/loops/{verdict}", rr.LineStrips3D(np.array(ends), colors=[color], radii=LINE_PX)
                 )
         if loops:
             self._columns(
@@ -268,7 +267,7 @@ class RerunLog:
         for name, trajectory in paths.items():
             cells = (trajectory.positions_world[:, :2] - grid.origin_world_m) / grid.resolution_m
             strip = np.column_stack([cells[:, 0], height - cells[:, 1]])
-            self.log(f"slice/{name}", rr.LineStrips2D([strip], colors=[_PATHS[name]], radii=_LINE_PX))
+            self.log(f"slice/{name}", rr.LineStrips2D([strip], colors=[_PATHS[name]], radii=LINE_PX))
 
     def diagnostics(self, records: Sequence[FrameRecord]) -> None:
         """Log how every frame went, as curves."""

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
 from mapper.core.errors import ConfigError, ViewerError
+from mapper.core.units import MIB
 from mapper.runtime.atomic import atomic_file
 
 if TYPE_CHECKING:
@@ -25,8 +26,6 @@ ENDING = ".rrd"
 _SPAWN, _CONNECT = "spawn", "connect"
 _TIMEOUT_S = 3.0
 _START_S = 30.0
-_PIPE_BYTES = 1 << 20
-_FLUSH_S = 60.0
 
 
 def check_target(target: str) -> str:
@@ -89,7 +88,7 @@ def streaming(
         recording.connect_grpc(url, default_blueprint=blueprint)
     yield
     try:
-        recording.flush(timeout_sec=_FLUSH_S)
+        recording.flush(timeout_sec=_START_S)
     except RuntimeError as error:
         raise ViewerError(f"rerun: the viewer went away: {error}; record to a FILE{ENDING} instead") from None
 
@@ -121,7 +120,7 @@ def _piped(recording: "rr.RecordingStream", path: Path, blueprint: "rrb.Blueprin
 
 def _copy(read: int, path: Path, errors: list[OSError]) -> None:
     with os.fdopen(read, "rb", buffering=0) as pipe, path.open("wb", buffering=0) as file:
-        while data := pipe.read(_PIPE_BYTES):
+        while data := pipe.read(MIB):
             try:
                 while data and not errors:
                     data = data[file.write(data) :]
