@@ -7,14 +7,11 @@ import numpy as np
 
 from mapper.core.frames import Scan
 from mapper.core.geometry import Array, Transform, apply
-from mapper.registration.planes import Patches, least_support, levels_of, subsampled
+from mapper.registration.planes import PARALLEL_RAD, Patches, least_support, levels_of, subsampled
 
-_FLAT_COSINE = np.cos(np.radians(10.0))
 _NEAR_FLOOR_M = 0.15
-_MAX_BELOW_FLOOR_RATIO = 0.01
 _LOWEST_PERCENT = 0.5
 _NEAR_SENSOR_M = 12.0
-_MIN_SENSOR_HEIGHT_M = 0.15
 _MIN_FLOOR_POINTS = 100
 
 
@@ -47,7 +44,7 @@ def floor_of(patches: Patches, heights_m: Array, *, up_world: Array, tolerance_m
     """
     if not len(heights_m):
         return Floor(None, "no points seen: the floor is put at the first pose", is_seen=False)
-    faces_up = patches.normals_world @ up_world > _FLAT_COSINE
+    faces_up = patches.normals_world @ up_world > np.cos(PARALLEL_RAD)
     heights_up_m = patches.centres_world[faces_up] @ up_world
     surfaces = levels_of(heights_up_m, tolerance_m=tolerance_m, least=least_support(len(heights_up_m)))
     if surfaces:
@@ -55,11 +52,11 @@ def floor_of(patches: Patches, heights_m: Array, *, up_world: Array, tolerance_m
         # A surface has fringes just above and below it; the best supported of the lowest ones comes first.
         chosen = int(np.flatnonzero(medians_m <= medians_m.min() + _NEAR_FLOOR_M)[0])
         floor_m = float(medians_m[chosen])
-        if (heights_m < floor_m - _NEAR_FLOOR_M).mean() <= _MAX_BELOW_FLOOR_RATIO:
+        if (heights_m < floor_m - _NEAR_FLOOR_M).mean() <= 0.01 * _LOWEST_PERCENT:
             detail = f"floor seen in {len(surfaces[chosen])} of {len(patches)} patches"
             return Floor(floor_m, detail, is_seen=True)
     lowest_m = float(np.percentile(heights_m, _LOWEST_PERCENT))
-    detail = f"no floor seen: z = 0 is where the lowest {_LOWEST_PERCENT} % of the points end"
+    detail = f"no floor seen: z = 0 is where the lowest {_LOWEST_PERCENT:g} % of the points end"
     return Floor(lowest_m, detail, is_seen=False)
 
 
@@ -73,7 +70,7 @@ def floor_below(scans: Sequence[tuple[Scan, Transform]], up_world: Array, *, tol
         points_world = apply(T_world_body, scan.points_body.astype(np.float64)) - sensor_world
         heights_m = points_world @ up_world
         across_m = np.linalg.norm(points_world - heights_m[:, np.newaxis] * up_world, axis=1)
-        below_m = heights_m[(across_m <= _NEAR_SENSOR_M) & (heights_m < -_MIN_SENSOR_HEIGHT_M)]
+        below_m = heights_m[(across_m <= _NEAR_SENSOR_M) & (heights_m < -_NEAR_FLOOR_M)]
         least = max(_MIN_FLOOR_POINTS, len(below_m) // 4)
         levels = levels_of(below_m, tolerance_m=tolerance_m, least=least)
         if levels:

@@ -5,16 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from mapper.core.geometry import Array
-from mapper.registration.planes import Patches
+from mapper.registration.planes import MIN_AGREEING_RATIO, MIN_PATCHES, PARALLEL_RAD, Patches
 
-_UPRIGHT_SINE = np.sin(np.radians(8.0))
 _QUARTER_RAD = 0.5 * np.pi
 _STEP_RAD = np.radians(0.5)
-_TOLERANCE_RAD = np.radians(5.0)
 _ITERATIONS = 5
-_MIN_UPRIGHT = 30
-_MIN_AGREEING_RATIO = 0.4
-"""Least share of normals within 5° of the axes: of random directions it is one in nine."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,7 +19,7 @@ class WallHeading:
     Attributes:
         angle_rad: Angle from the x axis to the nearest of the four directions of the walls, within ±45°,
             counter-clockwise about the vertical.
-        agreeing_ratio: Share of the upright patches that face along or across it, to 5°.
+        agreeing_ratio: Share of the upright patches that face along or across it, to 8°.
         upright: Number of upright patches.
     """
 
@@ -35,7 +30,7 @@ class WallHeading:
     @property
     def determined(self) -> bool:
         """Whether enough walls agree: not so among trees, or in a round hall."""
-        return self.upright >= _MIN_UPRIGHT and self.agreeing_ratio >= _MIN_AGREEING_RATIO
+        return self.upright >= MIN_PATCHES and self.agreeing_ratio >= MIN_AGREEING_RATIO
 
 
 def wall_heading(patches: Patches, R_level_world: Array) -> WallHeading:
@@ -50,7 +45,7 @@ def wall_heading(patches: Patches, R_level_world: Array) -> WallHeading:
         R_level_world: (3, 3), z up.
     """
     normals = patches.normals_world @ R_level_world.T
-    upright = normals[np.abs(normals[:, 2]) < _UPRIGHT_SINE]
+    upright = normals[np.abs(normals[:, 2]) < np.sin(PARALLEL_RAD)]
     if not len(upright):
         return WallHeading(0.0, 0.0, 0)
     angles_rad = np.arctan2(upright[:, 1], upright[:, 0])
@@ -61,7 +56,7 @@ def wall_heading(patches: Patches, R_level_world: Array) -> WallHeading:
         off_rad = _off_rad(angles_rad, heading_rad)
         weights = _weights(off_rad)
         heading_rad += float(weights @ off_rad / max(float(weights.sum()), 1e-12))
-    agreeing = np.abs(_off_rad(angles_rad, heading_rad)) <= _TOLERANCE_RAD
+    agreeing = np.abs(_off_rad(angles_rad, heading_rad)) <= PARALLEL_RAD
     return WallHeading(float(_off_rad(heading_rad, 0.0)), float(agreeing.mean()), len(upright))
 
 
@@ -72,5 +67,5 @@ def _off_rad(angles_rad: Array | float, heading_rad: float) -> Array:
 
 
 def _weights(off_rad: Array) -> Array:
-    weights: Array = np.clip(1.0 - (off_rad / _TOLERANCE_RAD) ** 2, 0.0, None) ** 2
+    weights: Array = np.clip(1.0 - (off_rad / PARALLEL_RAD) ** 2, 0.0, None) ** 2
     return weights

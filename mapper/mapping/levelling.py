@@ -15,6 +15,9 @@ from mapper.mapping.config import LevelConfig
 from mapper.mapping.floor import floor_below, floor_of, heights_of
 from mapper.mapping.heading import WallHeading, wall_heading
 from mapper.registration.planes import (
+    MAX_TILT_RAD,
+    MIN_PATCHES,
+    PARALLEL_RAD,
     Patches,
     Vertical,
     patches_of,
@@ -50,12 +53,8 @@ AXES: Mapping[Sensor, BodyAxes] = {
 _MAX_READING_GAP_NS = 50_000_000
 _MIN_READINGS = 50
 _MAX_READINGS = 5000
-_MAX_TILT_RAD = np.radians(60.0)
 _MAX_SPREAD_RAD = np.radians(20.0)
-_SAME_DIRECTION_RAD = np.radians(3.0)
 _CLEAR_SPREAD_RATIO = 1.25
-
-_MIN_PATCHES = 30
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -204,7 +203,7 @@ class _Candidate:
         return float(np.arccos(np.clip(self.up_world @ other.up_world, -1.0, 1.0)))
 
     def contradicts(self, other: "_Candidate") -> bool:
-        return self.angle_to(other) > float(_MAX_TILT_RAD)
+        return self.angle_to(other) > float(MAX_TILT_RAD)
 
 
 def _felt(accelerations: Accelerations | None, trajectory: Trajectory) -> list[Array]:
@@ -242,14 +241,14 @@ def _up(
         if up_world is not None:
             return up_world, "accelerometer", detail
         details.append(detail)
-    if len(patches) >= _MIN_PATCHES:
+    if len(patches) >= MIN_PATCHES:
         vertical = vertical_of(patches, up_guess_world=up_guess, tolerance_m=tolerance_m)
         detail = _planes_text(vertical, len(patches))
         if vertical.is_agreed:
             return vertical.up_world, "planes", "; ".join([*details, detail])
         details.append(f"planes do not agree: {detail}")
     else:
-        details.append(f"only {len(patches)} flat patches seen, want {_MIN_PATCHES}")
+        details.append(f"only {len(patches)} flat patches seen, want {MIN_PATCHES}")
     return up_guess, "camera", "; ".join([*details, "up is the sensor's mean up direction"])
 
 
@@ -267,7 +266,7 @@ def _up_by_accelerometer(
     found = []
     for R_body_sensor in _right_angled_frames():
         mean, spread_rad = _mean_direction(readings @ R_body_sensor.T, R_world_body)
-        if mean @ up_guess > np.cos(_MAX_TILT_RAD):
+        if mean @ up_guess > np.cos(MAX_TILT_RAD):
             found.append((spread_rad, mean))
     if not found:
         return None, "accelerometer: no axes put up within 60° of the camera's"
@@ -278,10 +277,10 @@ def _up_by_accelerometer(
             None,
             f"accelerometer: readings spread over {np.degrees(spread_rad):.0f}°, at most 20° is usable",
         )
-    others = [spread for spread, up in found if up @ up_world < np.cos(_SAME_DIRECTION_RAD)]
+    others = [spread for spread, up in found if up @ up_world < np.cos(PARALLEL_RAD)]
     if others and others[0] < _CLEAR_SPREAD_RATIO * spread_rad:
         stated_up, stated_spread_rad = _mean_direction(readings, R_world_body)
-        is_possible = stated_up @ up_guess > np.cos(_MAX_TILT_RAD)
+        is_possible = stated_up @ up_guess > np.cos(MAX_TILT_RAD)
         if accelerations.are_axes_stated and is_possible and stated_spread_rad <= _MAX_SPREAD_RAD:
             detail = f"{len(readings)} accelerometer readings in the axes that the log states"
             return stated_up, f"{detail}, spread over {np.degrees(stated_spread_rad):.1f}°"

@@ -19,23 +19,28 @@ _FLATNESS_RATIO = 0.1
 _BREADTH_RATIO = 0.05
 """A patch's second variance against its largest: below, it is a line, for instance one LiDAR ring."""
 
-_CONE_RAD = np.radians(60.0)
+MAX_TILT_RAD = np.radians(60.0)
+"""Largest angle between up and the sensor's own up: a camera is held roughly upright."""
 _GRID_STEP_RAD = np.radians(2.5)
 _GRID_PATCHES = 2000
-_TOLERANCE_RAD = np.radians(8.0)
+PARALLEL_RAD = np.radians(8.0)
+"""Directions that differ by less are the same."""
 _REFINED_TOLERANCE_RAD = np.radians(5.0)
 _NORMAL_NOISE_RAD = np.radians(3.0)
 _WIDENINGS = (4.0, 3.0, 2.0, 1.5, 1.0, 1.0, 1.0)
 """Factors of the tolerance of a level surface's heights, by iteration, while its tilt is refined."""
-_MIN_CONSTRAINT_RATIO = 0.02
+MIN_PATCHES = 30
+"""Fewer show no direction."""
+MIN_AGREEING_RATIO = 0.4
+"""Least share of patches along or across a direction: of random ones it is one in six."""
 _MIN_LEVEL_PATCHES = 5
-_MIN_LEVEL_RATIO = 0.03
-_MIN_AGREEING_RATIO = 0.3
+_MIN_SUPPORT_RATIO = 0.03
+"""Least share of the patches that make a surface, or that constrain a tilt."""
 
 # Weights of patches: a random normal lies within 8° of an axis in 0.5 % of all cases, and within 8° of the
 # plane across it in 14 %; the ratio of the logarithms is about 2.5. Surfaces that face down are measured less
 # reliably: ceilings are rarely in view, and the backs of steep objects resemble them.
-_FACING_UP, _FACING_DOWN, _UPRIGHT = 2.5, 1.25, 1.0
+_FACING_UP, _FACING_DOWN = 2.5, 1.25  # of upright patches, 1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,7 +79,7 @@ class Vertical:
     @property
     def is_agreed(self) -> bool:
         """Whether enough patches are horizontal or upright."""
-        return self.horizontal_ratio + self.upright_ratio >= _MIN_AGREEING_RATIO
+        return self.horizontal_ratio + self.upright_ratio >= MIN_AGREEING_RATIO
 
 
 def patches_of(scans: Sequence[tuple[Scan, Transform]], *, tolerance_m: float) -> Patches:
@@ -124,7 +129,7 @@ def vertical_of(patches: Patches, *, up_guess_world: Array, tolerance_m: float) 
         heights = _heights_cost(patches, up, widening * tolerance_m)
         cost = by_normals + heights * (_NORMAL_NOISE_RAD / tolerance_m) ** 2
         axes = np.linalg.eigh(cost)[1]
-        determined = bool(np.linalg.eigvalsh(by_normals)[1] > _MIN_CONSTRAINT_RATIO * len(normals))
+        determined = bool(np.linalg.eigvalsh(by_normals)[1] > _MIN_SUPPORT_RATIO * len(normals))
         free = axes[:, :1] if determined else axes[:, :2]
         up = free @ (free.T @ up_guess_world)
         up /= np.linalg.norm(up)
@@ -180,7 +185,7 @@ def _normals_cost(normals: Array, up: Array) -> Array:
 
 def _heights_cost(patches: Patches, up: Array, tolerance_m: float) -> Array:
     """Return (3, 3) C with uᵀCu = Σ (u·(c − mean of its level))² over the patches of level surfaces."""
-    level = patches.centres_world[np.abs(patches.normals_world @ up) > np.cos(_TOLERANCE_RAD)]
+    level = patches.centres_world[np.abs(patches.normals_world @ up) > np.cos(PARALLEL_RAD)]
     cost = np.zeros((3, 3))
     for members in levels_of(level @ up, tolerance_m=tolerance_m, least=least_support(len(level))):
         offsets = level[members] - level[members].mean(axis=0)
@@ -190,7 +195,7 @@ def _heights_cost(patches: Patches, up: Array, tolerance_m: float) -> Array:
 
 def least_support(patches: int) -> int:
     """Return the fewest level patches, of so many, that make a surface rather than a coincidence."""
-    return max(_MIN_LEVEL_PATCHES, int(_MIN_LEVEL_RATIO * patches))
+    return max(_MIN_LEVEL_PATCHES, int(_MIN_SUPPORT_RATIO * patches))
 
 
 def flat_cells(points: Points, tolerance_m: float) -> tuple[Points, Array]:
@@ -225,7 +230,7 @@ def flat_cells(points: Points, tolerance_m: float) -> tuple[Points, Array]:
 
 def _cone(axis: Array) -> Array:
     """Return (N, 3) unit vectors, evenly spread by a Fibonacci spiral (González 2010), within the cone."""
-    cap = 1.0 - np.cos(_CONE_RAD)
+    cap = 1.0 - np.cos(MAX_TILT_RAD)
     count = int(2.0 * np.pi * cap / _GRID_STEP_RAD**2)
     k = np.arange(count)
     cosine = 1.0 - cap * (k + 0.5) / count
@@ -242,7 +247,7 @@ def _cone(axis: Array) -> Array:
 
 def _consistency(cosines: Array) -> Array:
     """Return each patch's score for each candidate axis, from the cosine between normal and candidate."""
-    along = np.clip(1.0 - (1.0 - np.abs(cosines)) / (1.0 - np.cos(_TOLERANCE_RAD)), 0.0, None)
-    across = np.clip(1.0 - (cosines / np.sin(_TOLERANCE_RAD)) ** 2, 0.0, None)
-    agreement: Array = along * np.where(cosines > 0.0, _FACING_UP, _FACING_DOWN) + across * _UPRIGHT
+    along = np.clip(1.0 - (1.0 - np.abs(cosines)) / (1.0 - np.cos(PARALLEL_RAD)), 0.0, None)
+    across = np.clip(1.0 - (cosines / np.sin(PARALLEL_RAD)) ** 2, 0.0, None)
+    agreement: Array = along * np.where(cosines > 0.0, _FACING_UP, _FACING_DOWN) + across
     return agreement
