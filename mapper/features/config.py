@@ -6,6 +6,8 @@ from pydantic import Field, PositiveFloat, PositiveInt
 
 from mapper.core.config import Config
 
+_ENOUGH = 0.3  # of the most features
+
 
 class _DetectorConfig(Config):
     """Settings of any detector."""
@@ -21,8 +23,11 @@ class _AdaptiveConfig(_DetectorConfig):
 
     threshold: float
     min_threshold: float
-    min_features: PositiveInt = 300
-    """With fewer features the threshold is halved."""
+
+    @property
+    def enough_features(self) -> int:
+        """With fewer features the threshold is halved: three tenths of the most."""
+        return round(_ENOUGH * self.max_features)
 
 
 class SurfConfig(_AdaptiveConfig):

@@ -41,7 +41,7 @@ class _OpenCvDetector(Generic[AnyConfig]):
             partial(self._attempt, gray),
             config.threshold,
             floor=config.min_threshold,
-            want=config.min_features,
+            want=config.enough_features,
         )
 
     @abstractmethod

@@ -31,7 +31,7 @@ class Surf:
         )
         points = points[np.argsort(-points[:, 3], kind="stable")]
         threshold = config.threshold
-        while threshold > config.min_threshold and (points[:, 3] >= threshold).sum() < config.min_features:
+        while threshold > config.min_threshold and (points[:, 3] >= threshold).sum() < config.enough_features:
             threshold *= 0.5
         points = points[points[:, 3] >= max(threshold, config.min_threshold)][: config.max_features]
         angles_rad = orientations(gray, points)

@@ -43,11 +43,9 @@ class GateConfig(Config):
     slack_rad: PositiveFloat = 0.1
     """How far a loop may turn a node, however short the path."""
     drift_ratio: NonNegativeFloat = 0.05
-    """Addition to ``slack_m``, in metres per metre of path."""
+    """Addition to ``slack_m`` per metre of path, and to ``slack_rad`` per radian turned."""
     drift_rad_per_m: NonNegativeFloat = 0.02
     """Addition to ``slack_rad`` per metre of path."""
-    drift_rad_per_rad: NonNegativeFloat = 0.05
-    """Addition to ``slack_rad`` per radian turned."""
 
 
 class NoLoopsConfig(Config):
@@ -156,9 +154,7 @@ class ThesisLoopsConfig(Config):
     keyframe_interval: PositiveInt = 20
     """One keyframe, the sharpest, in this many frames."""
     sharp_ratio: PositiveFloat = 1.2
-    """A frame is sharp if it has this many times the median number of features of the last frames."""
-    median_frames: PositiveInt = 20
-    """Number of frames of that median. Raise it if the camera shakes for long."""
+    """A frame is sharp if it has this many times the median number of features of as many last frames."""
     max_distance_m: PositiveFloat = 0.5
     """Largest distance of a near keyframe; the thesis leaves it open, as it does the angle."""
     max_angle_rad: PositiveFloat = 0.5

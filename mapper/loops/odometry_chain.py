@@ -12,7 +12,6 @@ from mapper.graph.model import BetweenFactor
 from mapper.loops.closure import Discrepancy
 from mapper.loops.config import GateConfig
 
-_FIRST_CAPACITY = 1024
 _MAX_STEP_M, _MAX_STEP_RAD = 1.0, 0.5
 """Largest standard deviations of an odometry's step: a motion that surfaces leave open is still predicted."""
 
@@ -75,7 +74,7 @@ class OdometryChain:
 
     def __init__(self) -> None:
         self._edges: dict[int, list[tuple[int, _Edge]]] = {}
-        self._component = np.arange(_FIRST_CAPACITY)  # of each node: the number of one in it
+        self._component = np.arange(1)  # of each node: the number of one in it
         self._members: dict[int, list[int]] = {}  # of components of more than one node
 
     def add(self, factors: Iterable[BetweenFactor]) -> None:
@@ -189,5 +188,5 @@ def allowed(config: GateConfig, path: NodePath) -> Discrepancy:
         translation_m=config.slack_m + config.drift_ratio * path.path_m,
         rotation_rad=config.slack_rad
         + config.drift_rad_per_m * path.path_m
-        + config.drift_rad_per_rad * path.turned_rad,
+        + config.drift_ratio * path.turned_rad,
     )

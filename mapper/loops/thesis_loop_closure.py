@@ -39,7 +39,7 @@ class ThesisLoopDetector(LoopDetector):
             drift_ratio=0.0,
         )
         self._sharpest = SharpestKeyframes(config.keyframe_interval)
-        self._features: deque[int] = deque(maxlen=config.median_frames)
+        self._features: deque[int] = deque(maxlen=config.keyframe_interval)
         self._recent: deque[tuple[int, ImageView]] = deque(maxlen=config.keyframe_interval)
         self._views: dict[int, Archived[ImageView]] = {}
         self._stamps_ns: list[int] = []

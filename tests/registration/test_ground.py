@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 
 from mapper.core.geometry import angle_between, apply, rotation_exp, transform
+from mapper.registration.hough import description
 from mapper.registration.hough.config import (
     CellsConfig,
     ConstellationConfig,
@@ -161,11 +162,12 @@ def test_objects_are_the_parts_of_a_group(rng):
     assert len(centres_in(scan[len(scan) - 400 :], ObjectsConfig(coarse_m=0.1, fine_m=0.1))) > 10
 
 
-def test_a_group_without_a_large_part_is_one_object():
+def test_a_group_without_a_large_part_is_one_object(monkeypatch):
     corners = np.array([[0.0, 0.0], [0.9, 0.0], [0.0, 0.9], [0.9, 0.9]])
     scattered = np.column_stack([corners + 4.2, np.ones(4)]).astype(np.float32)
 
-    centres = centres_of(scattered, ObjectsConfig(min_voxels_ratio=2.0))
+    monkeypatch.setattr(description, "_MIN_VOXELS_RATIO", 2.0)
+    centres = centres_of(scattered, ObjectsConfig())
 
     assert centres == pytest.approx(np.array([[4.65, 4.65]]))
 

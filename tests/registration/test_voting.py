@@ -18,7 +18,7 @@ def rng():
 
 def brute_force(target, source, alpha_rad, config):
     """Return one slice of the accumulator, summed over 3×3 bins (Nagy et al. 2016, alg. 1)."""
-    half = int(np.ceil((config.max_offset_m + config.margin_m) / config.bin_m))
+    half = int(np.ceil((config.max_offset_m + config.width_m) / config.bin_m))
     offsets = target[:, None] - turned(source, alpha_rad)[None]
     bins = np.floor(offsets.reshape(-1, 2) / config.bin_m + 0.5).astype(int) + half
     grid = np.zeros((2 * half + 3, 2 * half + 3), int)
@@ -99,7 +99,7 @@ def test_peaks_are_distinct_and_descending(rng):
             turn = a.alpha_rad - b.alpha_rad
             turn = abs(np.arctan2(np.sin(turn), np.cos(turn)))
             apart_m = np.hypot(a.dx_m - b.dx_m, a.dy_m - b.dy_m)
-            assert apart_m > config.distinct_m or turn > config.distinct_rad
+            assert apart_m > config.width_m or turn > config.distinct_rad
 
 
 def test_nothing_votes_for_nothing():

@@ -60,8 +60,6 @@ class CellsConfig(Config):
     kind: Literal["cells"] = "cells"
     cell_m: PositiveFloat = 2.0
     """Edge of a cell."""
-    min_voxels_ratio: NonNegativeFloat = 0.5
-    """An occupied cell has at least this many times the voxels of the cloud's median cell."""
 
 
 class ObjectsConfig(Config):
@@ -72,8 +70,6 @@ class ObjectsConfig(Config):
     """Cells of this edge that touch make a group of objects."""
     fine_m: PositiveFloat = 0.4
     """Inside a group, cells of this edge that touch make one object."""
-    min_voxels_ratio: NonNegativeFloat = 0.5
-    """An object has at least this many times the voxels of the cloud's median coarse cell."""
 
 
 class ConstellationConfig(Config):
@@ -92,8 +88,6 @@ class VotingConfig(Config):
 
     max_offset_m: PositiveFloat = 10.0
     """Largest offset searched along each axis."""
-    margin_m: NonNegativeFloat = 2.0
-    """Extra range of the accumulator, as a peak at its edge would be cut off."""
     bin_m: PositiveFloat = 1.0
     """Edge of a bin of dx and dy; one bin is centred on zero."""
     angles: PositiveInt = 180
@@ -101,23 +95,23 @@ class VotingConfig(Config):
     them."""
     peaks: PositiveInt = 20
     """Distinct peaks that are verified."""
-    distinct_m: PositiveFloat = 2.0
-    """A peak nearer to a higher one than this, and than ``distinct_rad``, is the same peak."""
     distinct_rad: PositiveFloat = 0.09
-    """A peak nearer to a higher one than this, and than ``distinct_m``, is the same peak."""
+    """A peak nearer to a higher one than this, and than two bins, is the same peak."""
+
+    @property
+    def width_m(self) -> float:
+        """Width of a peak: nearer ones are the same, and one at the end of the range would be cut off."""
+        return 2.0 * self.bin_m
 
 
 class OverlapConfig(Config):
     """Verification of the peaks: planar refinement by overlap, then the free-space check."""
 
     voxel_m: PositiveFloat = 0.4
-    """Obstacles of one scan within a voxel of those of the other overlap."""
+    """Obstacles of one scan within a voxel of those of the other overlap. It is also the first step in which
+    the overlap is maximised from each peak, along each axis; the step is halved twice."""
     obstacles: PositiveInt = 1000
     """Number of obstacle voxels, and of ground columns, that are compared, evenly chosen."""
-    step_m: PositiveFloat = 0.4
-    """First step in which the overlap is maximised from each peak, along each axis; it is halved twice."""
-    step_rad: PositiveFloat = 0.0175
-    """First step of the heading, likewise."""
     candidates: PositiveInt = 6
     """Number of peaks, those with most overlap, that get the free-space check."""
     distinct_m: PositiveFloat = 1.0

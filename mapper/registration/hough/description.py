@@ -41,7 +41,7 @@ def _min_voxels(flat: Array, config: CellsConfig | ObjectsConfig) -> float:
     """Return the least number of voxels of an object or an occupied cell, in a cloud of this density."""
     cell_m = config.coarse_m if isinstance(config, ObjectsConfig) else config.cell_m
     _, counts = np.unique(_cell_numbers(flat, cell_m), return_counts=True)
-    return max(1.0, config.min_voxels_ratio * float(np.median(counts)))
+    return max(1.0, _MIN_VOXELS_RATIO * float(np.median(counts)))
 
 
 def _objects(flat: Array, config: ObjectsConfig) -> NDArray[np.intp]:
@@ -75,6 +75,8 @@ def _cells(flat: Array, cell_m: float) -> NDArray[np.int64]:
     return np.floor(flat / cell_m).astype(np.int64)
 
 
+_MIN_VOXELS_RATIO = 0.5
+"""An object, or an occupied cell, has at least this many times the voxels of the cloud's median cell."""
 DIRECTION_RAD = 0.0175
 """Resolution of the range image: one degree."""
 

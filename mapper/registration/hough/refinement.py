@@ -10,7 +10,7 @@ import numpy as np
 from mapper.core.frames import Scan
 from mapper.core.geometry import Points, Transform, apply, planar_motion, rotation_exp, transform
 from mapper.registration.hough.config import HoughConfig, NdtStagesConfig, OverlapConfig
-from mapper.registration.hough.description import HoughDescription
+from mapper.registration.hough.description import DIRECTION_RAD, HoughDescription
 from mapper.registration.hough.ground import Ground
 from mapper.registration.hough.search_kernels import FULL_OVERLAP, hill_climb
 from mapper.registration.ndt import refine_by_cells
@@ -66,8 +66,8 @@ def refine_planar(
         np.array(motion),
         overlap.voxel_m,
         config.constellation.ground.min_obstacle_m,
-        overlap.step_m,
-        overlap.step_rad,
+        overlap.voxel_m,
+        DIRECTION_RAD,
         _HALVINGS,
     )
     share = total / (FULL_OVERLAP * max(len(source.heights_m), 1))

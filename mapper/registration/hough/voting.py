@@ -46,7 +46,7 @@ def vote(target: Array, source: Array, config: VotingConfig) -> list[Peak]:
     if len(target) == 0 or len(source) == 0:
         return []
     alphas = (np.arange(config.angles) - config.angles // 2) * (2.0 * np.pi / config.angles)
-    half_bins = int(np.ceil((config.max_offset_m + config.margin_m) / config.bin_m))
+    half_bins = int(np.ceil((config.max_offset_m + config.width_m) / config.bin_m))
     votes, offsets = vote_slices(
         np.ascontiguousarray(target),
         np.ascontiguousarray(source),
@@ -68,5 +68,5 @@ def vote(target: Array, source: Array, config: VotingConfig) -> list[Peak]:
             votes=int(heights[i]),
             score=float(heights[i] / norm),
         )
-        for i in distinct(offsets_m, turns, config.peaks, config.distinct_m, config.distinct_rad)
+        for i in distinct(offsets_m, turns, config.peaks, config.width_m, config.distinct_rad)
     ]
