@@ -6,8 +6,8 @@ import numpy as np
 
 from mapper.core.errors import SourceError
 from mapper.core.frames import NO_DISTORTION
-from mapper.core.geometry import Transform, angle_between
-from mapper.core.rotations import pose_of_row, row_of_pose
+from mapper.core.geometry import Transform, angle_between, inverse
+from mapper.core.rotations import row_of_pose
 from mapper.sources.calibration import (
     Calibration,
     DepthCamera,
@@ -22,6 +22,7 @@ from mapper.sources.ros.index import Series
 from mapper.sources.ros.messages import EXTRINSICS, CameraMessage, Window
 from mapper.sources.ros.reader import RecordingReader
 from mapper.sources.ros.topics import CameraTopics, is_called_registered, shared_namespaces
+from mapper.sources.text import pose_from_numbers
 
 _SAME_LENS_RATIO = 0.01
 _SAME_PLACE_M = 0.005
@@ -147,8 +148,10 @@ def _apart_m(T_color_depth: Transform | None) -> float:
 def _recorded_pose(
     reader: RecordingReader, topics: CameraTopics, frames: tuple[str, str]
 ) -> tuple[Transform | None, str, list[str]]:
-    """Return T_color_depth by tf, else by RealSense's own topic, its source, and a note if these differ."""
+    """Return T_color_depth by tf, else by RealSense's own topics, its source, and a note if these differ."""
     of_topic, topic = _pose_of_topic(reader, topics.color.topic.name)
+    if of_topic is None:
+        of_topic, topic = _pose_of_streams(reader, topics)
     color_frame, depth_frame = frames
     of_tf = None if color_frame == depth_frame else reader.tree.find(color_frame, depth_frame)
     if of_tf is None:
@@ -171,10 +174,30 @@ def _pose_of_topic(reader: RecordingReader, color: str) -> tuple[Transform | Non
         if series.topic.type in EXTRINSICS and name.endswith("/depth_to_color")
     ]
     name = max(names, key=lambda one: shared_namespaces(one, color), default="")
-    message = reader.firsts.get(name)
-    if not isinstance(message, list):
+    return _stated_pose(reader, name), name
+
+
+def _pose_of_streams(reader: RecordingReader, topics: CameraTopics) -> tuple[Transform | None, str]:
+    """Return T_color_depth of realsense-viewer's recordings, and its sources.
+
+    Beside …/Depth_0/image/data, …/Depth_0/tf/0 maps points of a reference, the same of all streams, to the
+    stream's frame (librealsense, ros_writer::write_extrinsics).
+    """
+    names, poses = [], []
+    for series in (topics.color, topics.depth):
+        stream = f"{series.topic.name.removesuffix('/image/data')}/tf/"
+        names.append(next((name for name in reader.series if name.startswith(stream)), ""))
+        poses.append(_stated_pose(reader, names[-1]))
+    T_color_reference, T_depth_reference = poses
+    if T_color_reference is None or T_depth_reference is None:
         return None, ""
-    return pose_of_row(np.array(message[0].numbers)), name
+    return T_color_reference @ inverse(T_depth_reference), " and ".join(names)
+
+
+def _stated_pose(reader: RecordingReader, name: str) -> Transform | None:
+    """Return the pose in the first message of a topic; None without one."""
+    message = reader.firsts.get(name)
+    return pose_from_numbers(np.array(message[0].numbers)) if isinstance(message, list) and message else None
 
 
 def _is_same_pose(T_a: Transform, T_b: Transform) -> bool:

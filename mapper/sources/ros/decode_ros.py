@@ -122,6 +122,11 @@ def _transforms(m: Any) -> list[PoseMessage]:
     return [pose for transform in m.transforms for pose in _transform_stamped(transform)]
 
 
+def _transform(m: Any) -> list[PoseMessage]:
+    p, q = m.translation, m.rotation
+    return [PoseMessage(0, "", "", (p.x, p.y, p.z, q.x, q.y, q.z, q.w))]
+
+
 def _extrinsics(data: memoryview, *, is_little_endian: bool) -> list[PoseMessage]:
     """Return the pose of the depth stream in another, as the topic's name says, of RealSense's Extrinsics.
 
@@ -148,6 +153,7 @@ _READERS: Mapping[str, Callable[[Any], Message]] = {
     "geometry_msgs/msg/PoseWithCovarianceStamped": _pose_stamped,
     "nav_msgs/msg/Odometry": _pose_stamped,
     "geometry_msgs/msg/TransformStamped": _transform_stamped,
+    "geometry_msgs/msg/Transform": _transform,
     "tf2_msgs/msg/TFMessage": _transforms,
     "tf/msg/tfMessage": _transforms,
 }

@@ -187,6 +187,7 @@ TRANSFORMS = frozenset(
     {"tf2_msgs/msg/TFMessage", "tf/msg/tfMessage", "foxglove.FrameTransform", "foxglove.FrameTransforms"}
 )
 EXTRINSICS = frozenset({"realsense2_camera_msgs/msg/Extrinsics", "realsense2_camera/msg/Extrinsics"})
+STREAM_POSES = frozenset({"geometry_msgs/msg/Transform"})
 WITH_HEADER = IMAGES | CAMERAS | CLOUDS | IMUS | POSES | {"foxglove.FrameTransform"}
-READ = WITH_HEADER | TRANSFORMS | EXTRINSICS
-SMALL = POSES | TRANSFORMS | EXTRINSICS
+READ = WITH_HEADER | TRANSFORMS | EXTRINSICS | STREAM_POSES
+SMALL = POSES | TRANSFORMS | EXTRINSICS | STREAM_POSES

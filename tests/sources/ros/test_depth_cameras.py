@@ -12,7 +12,9 @@ from mapper.sources import open_source
 from mapper.sources.config import CameraConfig, SourceConfig, TopicsConfig
 from mapper.sources.inspection import inspect_log
 from mapper.sources.ros.decode import decode
+from mapper.sources.ros.encode_ros import SerializedMessage
 from mapper.sources.ros.recording import Topic
+from mapper.sources.ros.typestore import make_message, serialize
 from mapper.sources.writers import write_log
 from tests.support.depth_cameras import BESIDE, write_unregistered
 from tests.support.recordings import CAMERA, COLOR, camera_info, image, shots, transforms, write
@@ -177,3 +179,33 @@ def test_depth_called_registered_of_the_same_lens_is_taken_so(tmp_path):
     chosen = TopicsConfig(depth=DEPTH)
     log = opened(tmp_path / "b.mcap", unregistered(CAMERA), topics=chosen)
     assert any("as it is read" in note for note in log.notes)
+
+
+def stream_pose(topic, T):
+    x, y, z, *q = row_of_pose(T).tolist()
+    message = make_message(
+        "geometry_msgs/msg/Transform",
+        translation=make_message("geometry_msgs/msg/Vector3", x=x, y=y, z=z),
+        rotation=make_message("geometry_msgs/msg/Quaternion", **dict(zip("xyzw", q, strict=True))),
+    )
+    return SerializedMessage(FIRST_NS, topic, "geometry_msgs/msg/Transform", serialize(message))
+
+
+def test_a_recording_of_realsense_viewer_states_the_pose_of_each_stream(tmp_path):
+    color, depth = "/device_0/sensor_1/Color_0", "/device_0/sensor_0/Depth_0"
+    names = {COLOR: f"{color}/image/data", DEPTH: f"{depth}/image/data"}
+    names |= {"/cam/color/camera_info": f"{color}/info/camera_info"}
+    names |= {"/cam/depth/camera_info": f"{depth}/info/camera_info"}
+    frames = [m._replace(topic=names[m.topic]) for m in unregistered(T=None, frame="optical")]
+    with pytest.raises(SourceError, match="depth_in_color"):
+        opened(tmp_path / "a.bag", frames)
+    T_depth_reference = exp(np.array([0.01, 0.0, 0.02]), np.array([0.0, -0.01, 0.0]))
+    poses = [
+        stream_pose(f"{color}/tf/0", BESIDE @ T_depth_reference),
+        stream_pose(f"{depth}/tf/0", T_depth_reference),
+    ]
+    log = opened(tmp_path / "b.bag", [*frames, *poses])
+    (note,) = (one for one in log.notes if "as it is read" in one)
+    assert "15.0 mm" in note
+    assert "0.54°" in note
+    np.testing.assert_allclose(log[0].depth_m[20:28, 28:36], 2.0, atol=0.02)

@@ -5,11 +5,14 @@ import pytest
 from kiss_icp.datasets.rosbag import RosbagDataset
 
 from mapper.config.loading import load_config
+from mapper.evaluators.metrics.trajectory import align, associate, ate
+from mapper.pipeline.build import build
 from mapper.pipeline.track import track_log
 from mapper.runtime.progress import SILENT
 from mapper.sources import open_source
 from mapper.sources.config import SourceConfig
 from mapper.sources.writers import write_log
+from tests.support.depth_cameras import write_unregistered
 from tests.support.paths import DATA
 
 
@@ -29,6 +32,23 @@ def test_fr1_xyz_gives_the_identical_trajectory(tmp_path, kind):
     assert len(expected) == 61
     np.testing.assert_array_equal(found.stamps_ns, expected.stamps_ns)
     np.testing.assert_array_equal(found.T_world_body, expected.T_world_body)
+
+
+@pytest.mark.slow
+def test_fr1_xyz_seen_by_a_depth_camera_beside_colour_s_gives_the_path_and_the_map(tmp_path):
+    registered = open_source(log_or_skip("tum_fr1_xyz"), SourceConfig(last_frame=60))
+    write_unregistered(tmp_path / "bag", registered)
+    config = load_config()
+    wanted, found = (
+        build(log, config, tmp_path / name)
+        for name, log in (("wanted", registered), ("found", open_source(tmp_path / "bag")))
+    )
+    pairs = [associate(run.trajectory, registered.truth) for run in (wanted, found)]
+    errors_m = [ate(align(one, "se3").moved(one)).rmse for one in pairs]
+    assert errors_m[1] < 1.15 * errors_m[0]
+    counts = [run.manifest.counts for run in (wanted, found)]
+    assert counts[1].tracked >= counts[0].tracked - 2
+    assert counts[1].occupied == pytest.approx(counts[0].occupied, rel=0.05)
 
 
 @pytest.mark.parametrize("kind", ["mcap", "bag"])
