@@ -23,7 +23,7 @@ _MOST_OFF_CENTRE = 0.4
 """Principal point's distance from the centre as a share of the side: images are cropped by less."""
 _CENTRED = 0.05
 
-_Distortion = tuple[float, float, float, float, float]
+Distortion = tuple[float, float, float, float, float]
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,11 +48,18 @@ class Calibration:
     fy_px: float
     cx_px: float
     cy_px: float
-    distortion: _Distortion = NO_DISTORTION
+    distortion: Distortion = NO_DISTORTION
     lens: Lens | None = None
     size_px: tuple[int, int] | None = None
     depth_units_per_m: float | None = None
     depth: "DepthCamera | None" = None
+
+    def notes(self) -> list[str]:
+        """Return sentences on what is made of the images as they are read."""
+        notes = [] if self.depth is None else [self.depth.note]
+        if self.lens is not None:
+            notes.append(f"the distortion {self.lens.model} is taken out of the images as they are read")
+        return notes
 
     def with_y_down(self) -> "Calibration":
         """Return the same camera with its y axis mirrored, so that fy is positive."""

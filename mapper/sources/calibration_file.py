@@ -14,7 +14,8 @@ from mapper.core.config import toml_text
 from mapper.core.errors import DataError, SourceError
 from mapper.core.frames import NO_DISTORTION, PinholeCamera
 from mapper.runtime.regular_files import HEAD_BYTES, parse_toml, read_text
-from mapper.sources.calibration import Calibration, DepthCamera
+from mapper.sources.calibration import Calibration, DepthCamera, Distortion
+from mapper.sources.lens import COEFFICIENTS_TEXT, Lens
 from mapper.sources.text import pose_from_numbers
 
 _FILE_NAMES = (
@@ -59,7 +60,8 @@ def calibration_file(folder: Path) -> Path | None:
 def read_calibration(path: Path) -> Calibration:
     """Read intrinsics from TOML, JSON, YAML, or text of a matrix or of fx fy cx cy.
 
-    TOML keys: fx_px fy_px cx_px cy_px, and optionally width_px height_px, distortion (k1 k2 p1 p2 k3),
+    TOML keys: fx_px fy_px cx_px cy_px, and optionally width_px height_px, distortion (k1 k2 p1 p2 k3, also k4
+    k5 k6 and more as OpenCV orders them, or a fisheye's k1 k2 k3 k4), distortion_model ("equidistant"),
     depth_factor (image units per metre) and, where depth is not registered to colour, depth_intrinsics_px
     (fx fy cx cy), depth_distortion and depth_in_color (x y z qx qy qz qw).
 
@@ -68,21 +70,24 @@ def read_calibration(path: Path) -> Calibration:
     """
     text = read_text(path, error=SourceError)
     numbers: _Numbers
+    model = ""
     try:
         if path.suffix == ".toml":
-            numbers = _toml_numbers(parse_toml(text))
+            table = dict(parse_toml(text))
+            model = _lens_model(f"{table.pop('distortion_model', '')}")
+            numbers = _toml_numbers(table)
             unknown = sorted(set(numbers) - _KEYS)
             if unknown:
                 raise DataError(f"{unknown[0]}: unknown key; known are {', '.join(sorted(_KEYS))}")
         elif path.suffix == ".json":
-            numbers = _json_numbers(json.loads(text))
+            numbers, model = _json_numbers(json.loads(text))
         elif path.suffix == ".txt" and _INFO_KEY in text:
             numbers = _info_numbers(text)
         elif path.suffix == ".txt" and not _KEY_AND_NUMBER.search(text):
             numbers = _text_numbers(text)
         else:
-            numbers = _yaml_numbers(text.replace("=", ":") if path.suffix == ".txt" else text)
-        return _interpret(numbers, f"{path}")
+            numbers, model = _yaml_numbers(text.replace("=", ":") if path.suffix == ".txt" else text)
+        return _interpret(numbers, model, f"{path}")
     except (ValueError, RecursionError) as error:  # RecursionError: of brackets within brackets
         raise SourceError(f"{path}: not valid {path.suffix[1:].upper()}: {error}") from None
     except (DataError, OverflowError) as error:  # an integer that is too large for a float
@@ -122,6 +127,7 @@ _NAMES = {
     "p1": ("p1",),
     "p2": ("p2",),
     "k3": ("k3",),
+    "k4": ("k4",),
     "depth_intrinsics": ("depth_intrinsics_px",),
     "depth_distortion": ("depth_distortion",),
     "depth_in_color": ("depth_in_color",),
@@ -130,7 +136,7 @@ _UNITS_PER_M = (1e-3, 1e7)  # of a depth image: kilometres to tenths of a microm
 _KEYS = {name for names in _NAMES.values() for name in names}
 
 
-def _interpret(numbers: _Numbers, origin: str) -> Calibration:
+def _interpret(numbers: _Numbers, model: str, origin: str) -> Calibration:
     found = {meaning: numbers[name] for meaning, names in _NAMES.items() for name in names if name in numbers}
     for meaning, values in found.items():
         if not all(map(math.isfinite, values)):
@@ -146,10 +152,10 @@ def _interpret(numbers: _Numbers, origin: str) -> Calibration:
     missing = [meaning for meaning in ("fx", "fy", "cx", "cy") if meaning not in one]
     if missing:
         raise DataError(f"no number {missing[0]}_px; want fx_px, fy_px, cx_px and cy_px")
-    distortion = found.get("distortion") or [one.get(name, 0.0) for name in ("k1", "k2", "p1", "p2", "k3")]
-    if any(distortion[5:]):
-        raise DataError(f"{len(distortion)} distortion coefficients; only k1, k2, p1, p2, k3 are supported")
-    k1, k2, p1, p2, k3 = (*distortion[:5], *NO_DISTORTION)[:5]
+    coefficients = ["k1", "k2", "k3", "k4"] if model else ["k1", "k2", "p1", "p2", "k3"]
+    distortion, lens = _distortion(
+        found.get("distortion") or [one.get(name, 0.0) for name in coefficients], model
+    )
     low, high = _UNITS_PER_M
     if not low <= one.get("depth_factor", 1.0) <= high:
         raise DataError(f"depth_factor {one['depth_factor']:g}, want {low:g} to {high:g} units per metre")
@@ -157,25 +163,37 @@ def _interpret(numbers: _Numbers, origin: str) -> Calibration:
     return Calibration(
         origin,
         *(one["fx"], one["fy"], one["cx"], one["cy"]),
-        distortion=(k1, k2, p1, p2, k3),
+        distortion=distortion,
+        lens=lens,
         size_px=size,
         depth_units_per_m=one.get("depth_factor"),
         depth=_depth_camera(found, origin),
     )
 
 
+def _distortion(coefficients: Sequence[float], model: str) -> tuple[Distortion, Lens | None]:
+    """Return k1 k2 p1 p2 k3, or none of these and a lens of another kind."""
+    if model or any(coefficients[5:]):
+        lens = Lens(model or "rational_polynomial", coefficients)
+        if not lens.is_known:
+            raise DataError(f"{len(coefficients)} distortion coefficients; want {COEFFICIENTS_TEXT}")
+        return NO_DISTORTION, lens
+    k1, k2, p1, p2, k3 = (*coefficients[:5], *NO_DISTORTION)[:5]
+    return (k1, k2, p1, p2, k3), None
+
+
 def _depth_camera(found: _Numbers, origin: str) -> DepthCamera | None:
     if not any(name.startswith("depth_") and name != "depth_factor" for name in found):
         return None
     intrinsics, pose = found.get("depth_intrinsics", ()), found.get("depth_in_color", ())
-    k1, k2, p1, p2, k3 = (*found.get("depth_distortion", ()), *NO_DISTORTION)[:5]
+    distortion, lens = _distortion(found.get("depth_distortion", ()), "")
     T_color_depth = pose_from_numbers(np.array(pose)) if len(pose) == 7 else None
     if len(intrinsics) != 4 or T_color_depth is None:
         raise DataError(
             "want depth_intrinsics_px = [fx, fy, cx, cy] and depth_in_color = [x, y, z, qx, qy, qz, qw]"
         )
     fx, fy, cx, cy = intrinsics
-    calibration = Calibration(f"{origin}: depth", fx, fy, cx, cy, distortion=(k1, k2, p1, p2, k3))
+    calibration = Calibration(f"{origin}: depth", fx, fy, cx, cy, distortion=distortion, lens=lens)
     return DepthCamera(calibration, T_color_depth, origin)
 
 
@@ -200,6 +218,11 @@ def _toml_numbers(table: Mapping[str, Any]) -> dict[str, Sequence[float]]:
 _ANY_LINE = re.IGNORECASE | re.MULTILINE
 _INFO_KEY = "m_calibrationColorIntrinsic"
 _MAY_BE_OTHER = ("info.txt", "metadata.json", "transforms.json")
+_POLYNOMIAL_LENS = re.compile(r"radtan|plumb_bob|rational_polynomial", re.IGNORECASE)
+_OTHER_LENS = re.compile(
+    r"equidistant|fisheye|kannala_?brandt|(?:^|:)\s*\"?(?P<unknown>omni|mei|eucm|ds|fov|atan)\"?\s*$",
+    _ANY_LINE,
+)
 _KEY_AND_NUMBER = re.compile(r"(?:fl?_?x(?:_px)?|camera_matrix|\bk)\"?\s*[:=]", re.IGNORECASE)
 _COLOUR_SECTION = re.compile(r"^\w*(?:color|colour|rgb)\w*:[ \t]*\n(?:[ \t]+.*\n?|\s*\n)+", _ANY_LINE)
 _YAML_ENTRY = re.compile(
@@ -208,20 +231,35 @@ _YAML_ENTRY = re.compile(
 )
 
 
-def _yaml_numbers(text: str) -> dict[str, Sequence[float]]:
-    """Take the numbers of "key: 1.0", "key: [1.0, …]", "- 1.0" lines, and a matrix's nested "data: […]".
-
-    Of several sections only that of the colour camera is read, where one is called so.
+def _lens_model(text: str) -> str:
+    """Return the model of a lens in a text that is not Brown–Conrady's; empty without one.
 
     Raises:
-        DataError: The lens has another model, or a number stands for two cameras.
+        DataError: It is one that is not known, or there are two.
+    """
+    text = re.sub("#.*", "", text)
+    found = _OTHER_LENS.search(text)
+    if found is None:
+        return ""
+    if found["unknown"]:
+        raise DataError(f"{found['unknown']} lens; known are plumb_bob, rational_polynomial and equidistant")
+    if other := _POLYNOMIAL_LENS.search(text):
+        raise DataError(f"lenses of two models, {other[0]} and {found[0]}; keep the colour camera's alone")
+    return "equidistant"
+
+
+def _yaml_numbers(text: str) -> tuple[dict[str, Sequence[float]], str]:
+    """Take the numbers of "key: 1.0", "key: [1.0, …]", "- 1.0" lines, and a matrix's nested "data: […]".
+
+    Of several sections only that of the colour camera is read, where one is called so. With them comes the
+    lens' model if it is not Brown–Conrady's.
+
+    Raises:
+        DataError: The lens is of an unknown model, or a number stands for two cameras.
     """
     if len(sections := _COLOUR_SECTION.findall(text)) == 1:
         text = sections[0]
-    if model := re.search(r"equidistant|fisheye|kannalabrandt|:\s*(?:omni|eucm|ds|fov)\s*$", text, _ANY_LINE):
-        raise DataError(
-            f"{model[0].strip(': ')} lens; only Brown–Conrady (plumb_bob) distortion is supported"
-        )
+    model = _lens_model(text)
     numbers: dict[str, Sequence[float]] = {}
     parent = ""
     for entry in _YAML_ENTRY.finditer(text):
@@ -238,16 +276,15 @@ def _yaml_numbers(text: str) -> dict[str, Sequence[float]]:
         if key in _KEYS and numbers.setdefault(key, found) != found:
             raise DataError(f"{key} is there twice; keep the colour camera's alone")
         numbers[key] = found
-    return numbers
+    return numbers, model
 
 
-def _json_numbers(table: Any) -> _Numbers:
+def _json_numbers(table: Any) -> tuple[_Numbers, str]:
     """Take the matrix of Open3D and Record3D, column by column, or the numbers of Replica and nerfstudio."""
     camera = table.get("camera", table) if isinstance(table, dict) else None
     if not isinstance(camera, dict):
         raise DataError("no table of numbers")
-    if "FISHEYE" in str(camera.get("camera_model", "")) or camera.get("is_fisheye"):
-        raise DataError("fisheye lens; only Brown–Conrady (plumb_bob) distortion is supported")
+    model = "equidistant" if camera.get("is_fisheye") else _lens_model(f"{camera.get('camera_model', '')}")
     frames = camera.get("frames")
     first = frames[0] if isinstance(frames, list) and frames and isinstance(frames[0], dict) else {}
     numbers = _toml_numbers({key: v for key, v in {**first, **camera}.items() if _is_numeric(v)})
@@ -256,7 +293,7 @@ def _json_numbers(table: Any) -> _Numbers:
         numbers["k"] = np.reshape(K, (3, 3)).T.ravel().tolist() if is_by_column else K
     if camera is not table and "scale" in numbers:
         numbers["depth_factor"] = numbers["scale"]
-    return numbers
+    return numbers, model
 
 
 def _is_numeric(value: Any) -> bool:

@@ -14,6 +14,7 @@ POLYNOMIAL_MODELS = frozenset({"plumb_bob", "brown_conrady", "rational_polynomia
 FISHEYE_MODELS = frozenset({"equidistant", "kannala_brandt", "kannala_brandt4", "fisheye"})
 """Names of the model of 4 coefficients of Kannala & Brandt (2006)."""
 _COEFFICIENTS = {True: (4,), False: (4, 5, 8, 12, 14)}
+COEFFICIENTS_TEXT = "5, 8, 12 or 14 as OpenCV orders them, or 4 of an equidistant lens"
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,5 +1,7 @@
 """Intrinsics in the files that other programs and data sets put beside their images."""
 
+import cv2
+import numpy as np
 import pytest
 
 from mapper.core.errors import SourceError
@@ -26,6 +28,22 @@ m_calibrationColorIntrinsic = 60.0 0 31.5 0 0 61.0 23.5 0 0 0 1 0 0 0 0 1
 REPLICA = '{"camera": {"w": 64, "h": 48, "fx": 60, "fy": 61, "cx": 31.5, "cy": 23.5, "scale": 6553.5}}'
 TWO_CAMERAS = KALIBR + KALIBR.replace("cam0", "cam1").replace("31.5", "33.0")
 NERFSTUDIO = '{"fl_x": 60.0, "fl_y": 61, "cx": 31.5, "cy": 23.5, "w": 64, "h": 48, "aabb_scale": 16}'
+FISHEYE_MODEL, FLAG = '"camera_model": "OPENCV_FISHEYE"', '"is_fisheye": true'
+FISHEYE_OF_NERFSTUDIO = f'{{"k1": 0.1, "k2": -0.2, "k3": 0.001, "k4": 0.002, {FISHEYE_MODEL}, '
+ORB_SLAM3 = """%YAML:1.0
+Camera.type: "KannalaBrandt8"  # as a T265 has it, not radtan
+Camera1.fx: 60.0
+Camera1.fy: 61.0
+Camera1.cx: 31.5
+Camera1.cy: 23.5
+Camera1.k1: 0.1
+Camera1.k2: -0.2
+Camera1.k3: 0.001
+Camera1.k4: 0.002
+Camera.width: 64
+Camera.height: 48
+"""
+TOML = "fx_px = 60.0\nfy_px = 61.0\ncx_px = 31.5\ncy_px = 23.5\n"
 OPENLORIS = """%YAML:1.0
 d400_color_optical_frame:
    fps: 30
@@ -93,6 +111,48 @@ def test_intrinsics_beside_the_only_sequence_of_a_folder_are_found(tmp_path):
     assert open_source(tmp_path).entry_at(0).load().camera.fx_px == 60.0
 
 
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("camchain.yaml", KALIBR.replace("radtan", "equidistant")),
+        ("camera.yaml", ORB_SLAM3),
+        ("transforms.json", NERFSTUDIO.replace("{", FISHEYE_OF_NERFSTUDIO, 1)),
+        ("transforms.json", NERFSTUDIO.replace("{", FISHEYE_OF_NERFSTUDIO.replace(FISHEYE_MODEL, FLAG), 1)),
+        (
+            "calibration.toml",
+            TOML + 'distortion_model = "equidistant"\ndistortion = [0.1, -0.2, 0.001, 0.002]\n',
+        ),
+    ],
+)
+def test_a_fisheye_s_four_coefficients_are_taken_out_of_the_images(tmp_path, name, text):
+    (tmp_path / name).write_text(text)
+    calibration = read_calibration(tmp_path / name)
+    assert calibration.lens.is_fisheye
+    assert list(calibration.lens.coefficients) == [0.1, -0.2, 0.001, 0.002]
+    assert not any(calibration.distortion)
+    for i in range(2):
+        write_picture(tmp_path / "color" / f"{i:06d}.png", tmp_path / "depth" / f"{i:06d}.png", i)
+    log = open_source(tmp_path)
+    frame, recorded = log[0], cv2.imread(str(tmp_path / "color/000000.png"))[:, :, ::-1]
+    columns, rows = calibration.lens.maps(frame.camera)
+    assert log.entry_at(0).files is None
+    np.testing.assert_array_equal(frame.image, cv2.remap(recorded, columns, rows, cv2.INTER_LINEAR))
+    assert sum("equidistant is taken out" in note for note in log.notes) == 1
+
+
+def test_eight_coefficients_are_a_rational_lens(tmp_path):
+    azure = [0.52, -2.6, 0.0006, -0.0002, 1.5, 0.4, -2.42, 1.43]
+    path = tmp_path / "calibration.toml"
+    path.write_text(f"{TOML}distortion = {azure}\n")
+    lens = read_calibration(path).lens
+    assert not lens.is_fisheye
+    assert lens.coefficients == azure
+    depth = "depth_intrinsics_px = [60, 60, 31, 23]\ndepth_in_color = [0, 0, 0, 0, 0, 0, 1]\n"
+    path.write_text(f"{TOML}{depth}depth_distortion = {azure}\n")
+    calibration = read_calibration(path)
+    assert (calibration.lens, calibration.depth.calibration.lens.coefficients) == (None, azure)
+
+
 @pytest.mark.parametrize("text", [b"recorded on a Tuesday\n", b"am Dienstag, den 3. M\xe4rz\n"])
 def test_notes_on_something_else_are_no_calibration(tmp_path, text):
     (tmp_path / "info.txt").write_bytes(text)
@@ -104,14 +164,19 @@ def test_notes_on_something_else_are_no_calibration(tmp_path, text):
     [
         ("camchain.yaml", TWO_CAMERAS, "intrinsics is there twice; keep the colour camera's alone"),
         ("camera.yaml", "Camera1.fx: 60.0\nCamera2.fx: 61.0\n", "fx is there twice"),
-        ("camchain.yaml", KALIBR.replace("pinhole", "omni"), "omni lens; only Brown–Conrady"),
+        ("camchain.yaml", KALIBR.replace("pinhole", "omni"), "omni lens; known are"),
         ("K.txt", "60 0 31.5\n0 61 23.5\n", "want a 3×3 matrix, or a line of fx fy cx cy"),
         ("K.txt", "sixty", "K.txt: not valid TXT: could not convert string to float: 'sixty'"),
         ("intrinsic.json", "[1]", "no table of numbers"),
         ("intrinsic.json", "{", "not valid JSON"),
         ("info.txt", "m_calibrationColorIntrinsic: 1", "no number fx_px"),
-        ("transforms.json", '{"fl_x": 60, "is_fisheye": true}', "fisheye lens"),
-        ("transforms.json", '{"fl_x": 60, "camera_model": "OPENCV_FISHEYE"}', "fisheye lens"),
+        (
+            "camchain.yaml",
+            KALIBR.replace("radtan", "fov").replace(", 0.001, 0.002", ""),
+            "fov lens; known are",
+        ),
+        ("camchain.yaml", KALIBR + "  other: equidistant\n", "lenses of two models, radtan and equidistant"),
+        ("transforms.json", NERFSTUDIO.replace("{", '{"camera_model": "FOV", ', 1), "FOV lens; known are"),
     ],
 )
 def test_what_is_none_or_of_two_cameras_is_refused_in_words(tmp_path, name, text, why):

@@ -123,7 +123,6 @@ def rgbd_log(
     refuse_links_out((file for pair in pairs for file in (pair.colour, pair.depth)), log=folder)
     units_per_m = calibration.depth_units_per_m or depth_units_per_m
     camera = _camera_of(pairs, calibration, depth_units_per_m=units_per_m, path=path)
-    depth_notes = [] if calibration.depth is None else [calibration.depth.note]
     accelerations, acceleration_notes = read_accelerations(folder)
 
     def entry_at(index: int) -> RgbdEntry:
@@ -153,7 +152,7 @@ def rgbd_log(
         entry_at=entry_at,
         truth=poses,
         accelerations=accelerations,
-        notes=[*notes, *camera.notes(), *depth_notes, *acceleration_notes],
+        notes=[*notes, *camera.notes(), *calibration.notes(), *acceleration_notes],
     )
 
 

@@ -64,7 +64,7 @@ def calibrate(
         own = _colour_calibration(reader, topics, topics.own_info, config, colour_px)
     depth, notes = _depth_camera(reader, topics, own, config, frames, colour_px, depth_px)
     if depth is not None:
-        return replace(calibration, depth=depth), [*notes, depth.note]
+        return replace(calibration, depth=depth), notes
     if frames[0] != frames[1]:
         notes.append(f"depth in frame {frames[1]} is taken to be registered to colour in {frames[0]}")
     return calibration, notes

@@ -149,13 +149,11 @@ def _rgbd(reader: RecordingReader, topics: CameraTopics, config: SourceConfig) -
         depth_px=depth_px,
         where=f"{where}: {color.topic.name}, {depth.topic.name}",
     )
-    notes += [*camera_notes, *camera.notes()]
+    notes += [*camera_notes, *camera.notes(), *calibration.notes()]
     factor = None if config.camera is None else config.camera.depth_factor
     float_units_per_m = (factor or 1.0) if has_float_depth(first_depth) else None
     units_per_m = (factor or MM_PER_M) if float_units_per_m is None else TUM_UNITS_PER_M
     is_jpeg = isinstance(first_color, FileMessage) and bytes(first_color.data[:2]) == _JPEG_START
-    if calibration.lens is not None:
-        notes.append(f"the distortion {calibration.lens.model} is taken out of the images as they are read")
 
     def entry_at(index: int) -> FrameRef:
         return rgbd_entry(
