@@ -7,7 +7,8 @@ import typer
 
 from mapper.cli.answer import Answer, Output, record_in
 from mapper.cli.completion import run_folders
-from mapper.cli.merge import Place, PosesFile, placing_of
+from mapper.cli.merge import Place, PosesFile
+from mapper.cli.options import refuse_several
 from mapper.runtime.result_paths import DIFFS, joined_names, place_of
 
 if TYPE_CHECKING:
@@ -54,29 +55,27 @@ def diff(
 
     Example: mapper diff runs/monday runs/tuesday --out diffs/tuesday
     """
-    from mapper.merging.differences import differences_of, summary, write_differences
+    from mapper.api.merging import diff as diff_runs
+    from mapper.merging.differences import summary
     from mapper.run.folder import open_run
-    from mapper.runtime.executor import IN_PROCESS
 
+    refuse_several({"--place": place, "--poses": poses})
     earlier, later = open_run(before), open_run(after)
-    progress = output.progress()
     out = place_of(out, DIFFS / joined_names([before, after]), overwrite=overwrite)
-    placing = placing_of(
-        [earlier, later],
-        place,
-        poses,
-        default="auto",
-        jointly=False,
-        workers=IN_PROCESS,
-        progress=progress,
+    found = diff_runs(
+        earlier,
+        later,
+        out=out,
+        place=place,
+        poses=poses,
+        tolerance_m=tolerance_m,
+        min_voxels=min_voxels,
+        progress=output.progress(),
+        overwrite=overwrite,
     )
-    found = differences_of(*placing.placed, tolerance_m=tolerance_m, min_voxels=min_voxels)
-    placed = placing.placed[-1].how
-    write_differences(out, found, earlier, later, placed=placed, overwrite=overwrite)
-    if found.warning:
-        progress.note(found.warning)
+    record = record_in(out)
     table = _table(found, earlier.config.octree.resolution_m)
-    return Answer(record_in(out), f"{summary(found)}\nplaced {placed}\n{table}\n{out}")
+    return Answer(record, f"{summary(found)}\nplaced {record['placed']}\n{table}\n{out}")
 
 
 def _table(found: "Differences", resolution_m: float) -> str:

@@ -211,12 +211,12 @@ def _plot(
 def _of_merged_map(
     folder: Path, align: Align, reference: Path | None, voxels: int, format_: Format
 ) -> Answer:
-    from mapper.cli.report import distinct_names
     from mapper.evaluators.metrics.evaluate import Assessment
     from mapper.evaluators.metrics.map_reference import read_reference
     from mapper.evaluators.metrics.merged_map import merged_map_metrics, merged_map_quality
     from mapper.evaluators.metrics.metric import records_of
     from mapper.merging.merged_map import open_map
+    from mapper.runtime.result_paths import distinct_names
 
     merged = open_map(folder)
     names = distinct_names([Path(run.path) for run in merged.manifest.runs])

@@ -41,7 +41,8 @@ def export(
     from mapper.config.loading import overridden
     from mapper.export.exporters import export as export_run
     from mapper.merging import open_map_folder
-    from mapper.run.folder import MapFolder, moved_log, open_run
+    from mapper.run.folder import moved_log, open_run
+    from mapper.run.map_folder import MapFolder
 
     if as_ != "octomap":
         refuse_with(f"--as {as_}", {"--level": level})

@@ -28,11 +28,11 @@ def inspect(
     """
     import dataclasses
 
-    from mapper.config.loading import load_config, load_source_config
-    from mapper.sources.inspection import inspect_log
+    from mapper.api.logs import inspect as inspect_log
+    from mapper.config.loading import load_config
 
     overrides = set_ or []
-    found = inspect_log(log, load_source_config(None, overrides))
+    found = inspect_log(log, overrides)
     problem, plan = found.problem, ""
     if found.log is not None:
         config = load_config(None, overrides, sensor=found.log.sensor)

@@ -50,21 +50,13 @@ def localise(
 
     Example: mapper localise logs/tuesday --in runs/flat --out runs/tuesday
     """
-    from mapper.config.loading import overridden
-    from mapper.pipeline.known_map import load_known_map
-    from mapper.pipeline.localise import localise as localise_log
-    from mapper.sources import open_source
-    from mapper.sources.config import SourceConfig
+    from mapper.api.localise import localise as localise_log
 
     out = place_of(out, RUNS / f"{name_of(log)}-in-{name_of(in_)}", overwrite=overwrite)
-    progress = output.progress()
-    known = load_known_map(in_, progress=progress)
     overrides = merged(selection(first, last, stride, None), set_)
-    config = overridden(known.config.model_copy(update={"source": SourceConfig()}), overrides)
-    source = open_source(log, config.source)
-    for note in source.notes:
-        progress.note(note)
-    manifest = localise_log(source, known, config, out, progress=progress, overwrite=overwrite)
+    manifest = localise_log(
+        log, in_, out=out, overrides=overrides, progress=output.progress(), overwrite=overwrite
+    )
     error = untrusted(out, manifest.verdict) if strict and manifest.verdict is not None else None
     return Answer(_document(manifest, out), _text(manifest, out), error=error)
 

@@ -1,23 +1,17 @@
 """``mapper merge``: many runs as one map, and the options for where the worlds of several runs lie."""
 
-from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, assert_never
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from mapper.cli.answer import Answer, Output
 from mapper.cli.completion import run_folders
 from mapper.cli.options import refuse_several, workers_for
-from mapper.runtime.result_paths import MAPS, joined_names
 
 if TYPE_CHECKING:
     from mapper.merging.merge import Merged
-    from mapper.merging.merged_map import MergedMap, RunInMap
-    from mapper.merging.placing import Placing
-    from mapper.run.folder import Run
-    from mapper.runtime.executor import Workers
-    from mapper.runtime.progress import Progress
+    from mapper.merging.merged_map import RunInMap
 
 Place = Literal["built", "truth", "auto"]
 """Source of the poses of the runs' worlds in the map."""
@@ -28,55 +22,6 @@ PosesFile = Annotated[
         "--poses", help="File of the worlds' poses in the map, one line per run: RUN tx ty tz qx qy qz qw."
     ),
 ]
-
-
-def placing_of(
-    runs: "Sequence[Run]",
-    place: Place | None,
-    poses: Path | None,
-    *,
-    default: Place,
-    jointly: bool,
-    known: "MergedMap | None" = None,
-    workers: "Workers",
-    progress: "Progress",
-) -> "Placing":
-    """Return the runs with the poses of their worlds.
-
-    Args:
-        runs: Runs to be placed.
-        place: Source of the poses.
-        poses: File of the poses.
-        default: Source if neither is given.
-        jointly: Whether shared places bend the runs, or place each as a rigid body.
-        known: A map of the first of them, to which the others are added.
-        workers: Workers that compare places.
-        progress: Receives stages and notes.
-
-    Raises:
-        ConfigError: Both are given.
-        MapperError: A pose is missing; see :mod:`mapper.merging.placing` and
-            :mod:`mapper.pipeline.place_runs`.
-    """
-    from mapper.merging.placing import Placing, as_built, by_poses, by_truth
-
-    refuse_several({"--place": place, "--poses": poses})
-    if poses is not None:
-        return Placing(by_poses(runs, poses))
-    match place or default:
-        case "built":
-            return Placing(as_built(runs))
-        case "truth":
-            return Placing(by_truth(runs))
-        case "auto":
-            from mapper.pipeline.place_runs import place_by_shared_places, place_jointly
-
-            if not jointly:
-                return place_by_shared_places(runs, workers=workers, progress=progress)
-            known = known if known is not None and known.graph is not None else None
-            return place_jointly(runs, known=known, workers=workers, progress=progress)
-        case unreachable:
-            assert_never(unreachable)
 
 
 def merge(
@@ -125,34 +70,18 @@ def merge(
     Example: mapper merge runs/monday runs/tuesday --out maps/campus --processes 2, or: mapper merge runs/*
     --out maps/city --place truth --scheduler tcp://10.0.0.1:8786
     """
-    from mapper.merging.merge import merge as merge_runs
-    from mapper.merging.merged_map import open_map
-    from mapper.merging.runs_in_map import runs_of
-    from mapper.run.folder import open_run
-    from mapper.run.manifest import is_merged_map
+    from mapper.api.merging import merge as merge_runs
 
-    workers = workers_for(processes, scheduler, default=1)
-    progress = output.progress()
-    known = open_map(runs[0]) if is_merged_map(runs[0]) else None
-    default: Place = "built"
-    if known is None:
-        built, out = [open_run(run) for run in runs], out or MAPS / joined_names(runs)
-    else:
-        built, out = [*runs_of(known), *(open_run(run) for run in runs[1:])], out or known.path
-        overwrite |= out.resolve() == known.path.resolve()
-        if known.graph is not None:
-            default = "auto"
-    placing = placing_of(
-        built, place, poses, default=default, jointly=True, known=known, workers=workers, progress=progress
-    )
+    refuse_several({"--place": place, "--poses": poses})
     merged = merge_runs(
-        placing,
-        out,
+        runs,
+        out=out,
+        place=place,
+        poses=poses,
         tile_m=tile_m,
-        workers=workers,
-        progress=progress,
+        workers=workers_for(processes, scheduler, default=1),
+        progress=output.progress(),
         overwrite=overwrite,
-        known=known,
     )
     document = {
         "path": merged.map.path,

@@ -10,7 +10,7 @@ import typer
 from mapper.cli.answer import Answer, Output
 from mapper.cli.completion import run_folders
 from mapper.cli.groups import Verb
-from mapper.cli.options import assignments, refuse_with
+from mapper.cli.options import refuse_with
 from mapper.core.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -63,37 +63,18 @@ def plan(
 
     Example: mapper plan runs/xyz --from 2.1 -0.3 --to 1.9 1.4 --radius 0.15
     """
-    from mapper.config.loading import overridden
-    from mapper.export.plan import draw_plan, plan_json, write_plan
-    from mapper.merging import open_map_folder
-    from mapper.merging.slicing import keep_out_of, traversable_of
-    from mapper.navigation.config import PlanConfig
-    from mapper.navigation.planner import plan_2d, plan_3d, plan_storeys
-    from mapper.octree.grid import with_obstacles
-    from mapper.octree.map import read_octree
+    from mapper.api.plan import plan as plan_path
+    from mapper.export.plan import plan_json
     from mapper.run import files
-    from mapper.run.folder import Run
 
     if in_3d:
         refuse_with("--3d", {"--layer": layer})
     has_storeys = not in_3d and layer == "traversable" and (run / f"{files.storey(0)}.yaml").exists()
     counts = (3,) if in_3d else (2, 3) if has_storeys else (2,)
     start, goal = (_point(text, name, counts) for text, name in zip((from_, to), _POINT_OPTIONS, strict=True))
-    config = overridden(PlanConfig(), assignments({"radius_m": radius, "unknown": unknown, "layer": layer}))
-    built = open_map_folder(run)
-    on_floor = config.layer == "traversable"
-    grid = built.traversable if on_floor else with_obstacles(built.slice, built.keepout)
-    if in_3d:
-        octree = read_octree(built.file(files.OCTREE_OT))
-        found = plan_3d(octree, start, goal, config=config, keep_out=keep_out_of(built))
-    elif has_storeys:
-        found = plan_storeys(traversable_of(built), start, goal, config=config)
-    else:
-        found = plan_2d(grid, start, goal, config=config)
-    if isinstance(built, Run):
-        write_plan(built, found, grid=grid)
-    else:
-        draw_plan(run, found, grid=grid)
+    given = {"radius_m": radius, "unknown": unknown, "layer": layer}
+    settings = {name: value for name, value in given.items() if value is not None}
+    found = plan_path(run, start, goal, in_3d=in_3d, settings=settings)
     points = ["  ".join(f"{value:7.3f}" for value in waypoint) for waypoint in found.waypoints_world]
     return Answer(
         {"picture": run / files.PLAN_VIEW, **json.loads(plan_json(found))},

@@ -1,33 +1,12 @@
 """``mapper report``: runs as one HTML page."""
 
-from collections import Counter
-from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from mapper.cli.answer import Answer, Output, made
 from mapper.cli.options import Overwrite, RunFolders
-
-if TYPE_CHECKING:
-    from mapper.export.report.data import Figure, Question
-    from mapper.run.folder import Run
-
-
-_DIGITS = 3
-_ACCURACY = frozenset(
-    {
-        "ATE RMSE",
-        "RPE translation RMSE",
-        "RPE rotation RMSE",
-        "relative translation mean",
-        "relative rotation mean",
-        "loops wrongly accepted",
-    }
-)
-_COVERAGE = frozenset({"path length", "longest gap", "true revisits", "true revisits with a loop"})
-"""Quantities of metrics by what they answer."""
 
 
 def report(
@@ -43,85 +22,9 @@ def report(
 
     Example: mapper report runs/xyz runs/xyz-isvd --out report.html
     """
-    from mapper.export.report.data import chapter_of
-    from mapper.export.report.page import write_report
+    from mapper.evaluators.pictures.run_report import report as report_on
     from mapper.run.folder import open_run
-    from mapper.runtime.atomic import refuse_existing
-    from mapper.runtime.result_paths import place_of
 
-    out = place_of(out, Path("report.html"), overwrite=overwrite)
-    refuse_existing(out, overwrite=overwrite)
     loaded = [open_run(run) for run in runs]
-    names = distinct_names(runs)
     with output.waiting("report"):
-        chapters = [chapter_of(run, name, _figures(run)) for run, name in zip(loaded, names, strict=True)]
-        write_report(out, chapters)
-    return made(out)
-
-
-def distinct_names(runs: Sequence[Path]) -> list[str]:
-    """Return the folders' names, or their paths as given where names are not unique."""
-    short = [run.resolve().name for run in runs]
-    seen = Counter(short)
-    return [str(run) if seen[name] > 1 else name for run, name in zip(runs, short, strict=True)]
-
-
-def _figures(run: "Run") -> "list[Figure]":
-    from mapper.evaluators.metrics.evaluate import assess
-    from mapper.evaluators.metrics.loops import loop_metrics_of_run
-    from mapper.evaluators.metrics.metric import shown
-    from mapper.export.report.data import Figure
-
-    metrics = list(assess(run.trajectory, run.truth, frames_ns=run.frames_ns).metrics)
-    if run.truth is not None:
-        metrics += loop_metrics_of_run(run, run.truth)
-    figures = [Figure(name, value, "Is it right?") for name, value in _correctness(run)]
-    figures += [Figure(name, value, "Is it complete?") for name, value in _completeness(run)]
-    for metric in metrics:
-        name, value, unit = shown(metric, digits=_DIGITS)
-        figures.append(Figure(name, f"{value} {unit}", _question(metric.quantity)))
-    return figures + [Figure(name, value, "How fast was it?") for name, value in _speed(run)]
-
-
-def _correctness(run: "Run") -> list[tuple[str, str]]:
-    import numpy as np
-
-    from mapper.export.figures import SIGMAS
-
-    counts, poses = run.manifest.counts, run.poses
-    rows: list[tuple[str, str]] = [("verdict", run.verdict.state)]
-    if np.isfinite(poses.position_sigmas_m).any():
-        widest_m = SIGMAS * float(np.nanmax(poses.position_sigmas_m))
-        rows.append((f"uncertainty of the path, {SIGMAS:g} σ", f"at most {widest_m:.{_DIGITS}g} m"))
-    if counts.loop_candidates:
-        rows.append(("loops that hold", f"{counts.loops} of {counts.loop_candidates} candidates"))
-    return rows
-
-
-def _completeness(run: "Run") -> list[tuple[str, str]]:
-    counts = run.manifest.counts
-    incomplete = (("doubtful", counts.doubtful), ("lost", counts.lost), ("skipped", counts.skipped))
-    return [
-        ("frames tracked", f"{counts.tracked} of {counts.listed}"),
-        *((f"frames {what}", str(n)) for what, n in incomplete if n),
-        ("graph", f"{counts.nodes} nodes, {counts.factors} factors"),
-        ("octree", f"{counts.voxels_text} of {run.config.octree.resolution_m:g} m"),
-        ("cloud", f"{counts.cloud_points:,} points"),
-    ]
-
-
-def _speed(run: "Run") -> list[tuple[str, str]]:
-    timing = run.manifest.timing
-    return [
-        ("build", f"{timing.total_s:.{_DIGITS}g} s for {timing.log_s:.{_DIGITS}g} s of log"),
-        ("× real time", f"{timing.real_time_factor:.{_DIGITS}g}"),
-        ("frames per second", f"{timing.frames_per_s:.{_DIGITS}g}"),
-        *((f"to {stage}", f"{seconds:.{_DIGITS}g} s") for stage, seconds in timing.stage_s.items()),
-        ("peak memory", f"{timing.peak_memory_mb:.{_DIGITS}g} MB"),
-    ]
-
-
-def _question(quantity: str) -> "Question":
-    if quantity in _ACCURACY:
-        return "Is it right?"
-    return "Is it complete?" if quantity in _COVERAGE else ""
+        return made(report_on(loaded, out, overwrite=overwrite))

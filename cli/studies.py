@@ -49,16 +49,18 @@ def compare(
 
     Example: mapper compare rgbd_dataset_freiburg1_xyz --method isvd --method gicp --out runs/compared
     """
-    from mapper.config.loading import overridden
-    from mapper.evaluators.compare.config import CompareConfig
-    from mapper.evaluators.compare.files import REPORT, compare_into, tables_text
-    from mapper.sources import open_source
+    from mapper.evaluators.compare.api import compare as compare_methods
+    from mapper.evaluators.compare.files import REPORT, tables_text
 
-    given = CompareConfig(methods=tuple(method or ()))
     short_options = [*selection(first, last, stride, None), *assignments({"pairs": pairs, "seed": seed})]
-    config = overridden(given, merged(short_options, set_))
-    source = open_source(log, config.source)
-    comparison = compare_into(out, source, config, overwrite=overwrite, progress=output.progress())
+    comparison = compare_methods(
+        log,
+        methods=method or (),
+        out=out,
+        overrides=merged(short_options, set_),
+        overwrite=overwrite,
+        progress=output.progress(),
+    )
     return Answer(record_in(out, REPORT), f"{tables_text(comparison)}\n{files_text(out)}")
 
 

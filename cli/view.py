@@ -1,6 +1,5 @@
 """``mapper view``: a finished run in Rerun, or runs as one page with the map in 3D."""
 
-from collections.abc import Sequence
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated
@@ -9,30 +8,8 @@ import typer
 
 from mapper.cli.answer import Answer, Output, made
 from mapper.cli.options import RunFolders, refuse_several, refuse_without
-from mapper.cli.report import distinct_names
 from mapper.core.errors import ConfigError
 from mapper.runtime.atomic import refuse_existing
-
-
-def write_page(runs: Sequence[Path], path: Path, *, overwrite: bool) -> Path:
-    """Write the map of some runs, or a merged map, as a page; return its path."""
-    from mapper.export.report.data import chapter_of
-    from mapper.export.report.map_page import write_map_page
-    from mapper.run.folder import open_run
-    from mapper.run.manifest import is_merged_map
-
-    refuse_existing(path, overwrite=overwrite)
-    if len(runs) == 1 and is_merged_map(runs[0]):
-        from mapper.merging.map_page import write_merged_map_page
-        from mapper.merging.merged_map import open_map
-
-        merged = open_map(runs[0])
-        write_merged_map_page(path, merged, distinct_names([Path(run.path) for run in merged.manifest.runs]))
-        return path
-    loaded = [open_run(run) for run in runs]
-    names = distinct_names(runs)
-    write_map_page(path, [chapter_of(run, name, ()) for run, name in zip(loaded, names, strict=True)])
-    return path
 
 
 def view(
@@ -59,13 +36,13 @@ def view(
 
     Example: mapper view runs/xyz --spawn, or: mapper view runs/xyz --html
     """
+    from mapper.api.runs import write_page
     from mapper.run.files import RERUN
     from mapper.run.folder import open_run
 
     refuse_several({"--rrd": rrd, "--spawn": spawn, "--connect": connect, "--html": html})
     if html:
-        page = write_page(runs, out or Path(f"{runs[0].resolve().name}.html"), overwrite=overwrite)
-        return made(page)
+        return made(write_page(runs, out, overwrite=overwrite))
     refuse_without("--html", {"--out": out})
     if len(runs) > 1:
         raise ConfigError(f"{len(runs)} runs: Rerun shows one; --html shows several")

@@ -14,11 +14,15 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from mapper.api.build import build
-    from mapper.api.logs import open_log
+    from mapper.api.localise import localise
+    from mapper.api.logs import inspect, open_log
+    from mapper.api.merging import diff, merge
     from mapper.api.octree import read_octree
+    from mapper.api.plan import plan
     from mapper.api.register import register
     from mapper.config.loading import load_config
     from mapper.core.errors import MapperError
+    from mapper.evaluators.compare.api import compare
     from mapper.evaluators.metrics.evaluate import evaluate
     from mapper.octree.map import OctreeMap
     from mapper.run.folder import Run, open_run
@@ -30,10 +34,16 @@ __all__ = [
     "OctreeMap",
     "Run",
     "build",
+    "compare",
+    "diff",
     "evaluate",
+    "inspect",
     "load_config",
+    "localise",
+    "merge",
     "open_log",
     "open_run",
+    "plan",
     "read_octree",
     "register",
 ]
@@ -43,10 +53,16 @@ _HOMES = {
     "OctreeMap": "mapper.octree.map",
     "Run": "mapper.run.folder",
     "build": "mapper.api.build",
+    "compare": "mapper.evaluators.compare.api",
+    "diff": "mapper.api.merging",
     "evaluate": "mapper.evaluators.metrics.evaluate",
+    "inspect": "mapper.api.logs",
     "load_config": "mapper.config.loading",
+    "localise": "mapper.api.localise",
+    "merge": "mapper.api.merging",
     "open_log": "mapper.api.logs",
     "open_run": "mapper.run.folder",
+    "plan": "mapper.api.plan",
     "read_octree": "mapper.api.octree",
     "register": "mapper.api.register",
 }

@@ -1,7 +1,6 @@
 """From a log to a run, by a caller's own odometry if one is given."""
 
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mapper.api.logs import open_log
+from mapper.api.progress import AnyProgress, receiver_of
 from mapper.config.build import BuildConfig
 from mapper.config.loading import Settings, load_config, overridden
 from mapper.core.config import flattened
@@ -21,7 +21,7 @@ from mapper.pipeline.build import build as build_run
 from mapper.run import files
 from mapper.run.folder import Run
 from mapper.run.observers import NULL_OBSERVER, Observer
-from mapper.runtime.progress import SILENT, Progress, Report
+from mapper.runtime.progress import Progress
 from mapper.runtime.regular_files import AnyPath
 from mapper.runtime.result_paths import RUNS, name_of, place_of
 from mapper.sources.base import Log
@@ -90,7 +90,7 @@ def build(
     config: BuildConfig | Settings | AnyPath | None = None,
     settings: Settings | None = None,
     odometry: OwnOdometry | None = None,
-    progress: Progress | Callable[[str], object] | None = None,
+    progress: AnyProgress = None,
     observer: Observer = NULL_OBSERVER,
     overwrite: bool = False,
 ) -> Run:
@@ -128,7 +128,7 @@ def build(
         >>> run.verdict.state
         'trusted'
     """
-    receiver = _receiver(progress)
+    receiver = receiver_of(progress)
     if isinstance(config, Mapping):
         settings = {**flattened(config), **flattened(settings or {})}
         config = None
@@ -173,39 +173,3 @@ def _first_settings(own: Odometry[Any] | Trajectory | None, out: Path) -> dict[s
             return {**_OWN_POSES, "odometry.path": out.resolve() / files.ODOMETRY}
         case _:
             return {"odometry.kind": "own", "odometry.name": type(own).__name__}
-
-
-def _receiver(progress: Progress | Callable[[str], object] | None) -> Progress:
-    if progress is None:
-        return SILENT
-    if isinstance(progress, Progress):
-        return progress
-    if callable(progress):
-        return _Lines(progress)
-    raise ConfigError(f"progress: {progress!r} is no function of a line; want print, or None for silence")
-
-
-class _Lines:
-    """Progress as lines of text, one at the beginning of each stage, each tenth of it, and each note."""
-
-    def __init__(self, write: Callable[[str], object]) -> None:
-        self._write = write
-
-    @contextmanager
-    def stage(self, name: str) -> Iterator[Report]:
-        """Write the stage's name, and then its tenths."""
-        written = 0
-        self._write(name)
-
-        def report(done: int, total: int) -> None:
-            nonlocal written
-            tenth = 10 * done // max(total, 1)
-            if tenth > written:
-                written = tenth
-                self._write(f"{name} {done}/{total}")
-
-        yield report
-
-    def note(self, message: str) -> None:
-        """Write the note."""
-        self._write(message)

@@ -1,5 +1,6 @@
 """Recorded logs, and single frames, by name."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from mapper.config.loading import Settings, load_source_config
@@ -9,6 +10,7 @@ from mapper.runtime.regular_files import AnyPath
 from mapper.sources import open_source
 from mapper.sources.base import Log
 from mapper.sources.config import SourceConfig
+from mapper.sources.inspection import Inspection, inspect_log
 from mapper.sources.scan_folders.clouds import read_scan
 
 
@@ -41,6 +43,23 @@ def open_log(path: AnyPath, *, config: AnyPath | None = None, settings: Settings
         (240, 320, 3) 3
     """
     return open_source(Path(path), load_source_config(config, settings=settings))
+
+
+def inspect(path: AnyPath, overrides: Sequence[str] = (), *, settings: Settings | None = None) -> Inspection:
+    """Return what is in a log, as ``mapper inspect`` shows it: topics, rates, gaps, calibration, truth.
+
+    Args:
+        path: As of :func:`open_log`.
+        overrides: ``source.key=value`` as text; other settings are left out.
+        settings: The same as values by dotted name.
+
+    Returns:
+        The findings; their ``problem`` says why nothing can be mapped, or is None.
+
+    Raises:
+        ConfigError: A setting is unknown or has no such value.
+    """
+    return inspect_log(Path(path), load_source_config(None, overrides, settings=settings))
 
 
 def read_frame(name: AnyPath, config: SourceConfig) -> tuple[Frame, Sensor]:

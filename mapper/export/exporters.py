@@ -16,7 +16,8 @@ from mapper.runtime.progress import SILENT, Progress
 
 if TYPE_CHECKING:
     from mapper.config.build import BuildConfig
-    from mapper.run.folder import MapFolder, Run
+    from mapper.run.folder import Run
+    from mapper.run.map_folder import MapFolder
 
 Write = Callable[[Any, Path, Progress], None]
 """Writes one file of a ``Run``, or of any ``MapFolder``, atomically; long jobs report progress."""

@@ -8,7 +8,7 @@ import numpy as np
 from mapper.export.export_folders import export_folder
 from mapper.export.grid import encode_png, grid_image
 from mapper.octree.grid import UNKNOWN, OccupancyGrid
-from mapper.run.folder import MapFolder
+from mapper.run.map_folder import MapFolder
 from mapper.runtime.atomic import write_bytes, write_text
 from mapper.runtime.progress import Progress
 

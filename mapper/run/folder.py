@@ -1,12 +1,13 @@
-"""Run folder: a finished run, its log and its files, read on first access; its interface with merged maps."""
+"""Run folder: a finished run, its log and its files, read on first access."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from functools import cached_property
+from importlib import import_module
 from pathlib import Path
 from shlex import quote
-from typing import TYPE_CHECKING, Protocol, Self
+from typing import TYPE_CHECKING, Any
 
 from mapper.config.build import BuildConfig
 from mapper.config.loading import load_run_config
@@ -43,52 +44,7 @@ if TYPE_CHECKING:  # compiled code, which takes longer to load than most files o
     from mapper.octree.grid import OccupancyGrid
     from mapper.octree.map import OctreeMap
     from mapper.run.cloud import Cloud
-
-
-class MapFolder(Protocol):
-    """Interface of runs and merged maps: maps, and the settings of what is made from them."""
-
-    @property
-    def path(self) -> Path:
-        """Folder of the run or map."""
-        ...
-
-    @property
-    def config(self) -> BuildConfig:
-        """Settings."""
-        ...
-
-    @property
-    def octree(self) -> "OctreeMap":
-        """Occupancy map."""
-        ...
-
-    @property
-    def slice(self) -> "OccupancyGrid":
-        """2D navigation map."""
-        ...
-
-    @property
-    def traversable(self) -> "OccupancyGrid":
-        """Floor that a robot can drive on."""
-        ...
-
-    @property
-    def keepout(self) -> "OccupancyGrid | None":
-        """Keep-out regions in the slice's cells; None if there are none."""
-        ...
-
-    def file(self, name: str, /) -> Path:
-        """Return the path of one of its files."""
-        ...
-
-    def changing(self, names: Iterable[str], /) -> AbstractContextManager[None]:
-        """Return a context in which files of the folder may be written."""
-        ...
-
-    def with_config(self, config: BuildConfig, /) -> Self:
-        """Return the same map with other settings."""
-        ...
+    from mapper.runtime.progress import Progress
 
 
 @dataclass(frozen=True)
@@ -241,6 +197,83 @@ class Run:
         from mapper.export.picture import plot_run
 
         return plot_run(self, axes)
+
+    def export(
+        self,
+        kind: str,
+        path: AnyPath | None = None,
+        *,
+        settings: Mapping[str, Any] | None = None,
+        overwrite: bool = False,
+        progress: "Progress | Callable[[str], object] | None" = None,
+    ) -> Path:
+        """Write the run for another program, as ``mapper export --as KIND`` does, and return where it is.
+
+        Args:
+            kind: Such as "octomap", "las" or "rosbag2".
+            path: File or folder to write; None keeps a file in the run.
+            settings: Values by dotted name that this kind reads, such as ``{"mesh.voxel_m": 0.01}``.
+            overwrite: Replace what is at PATH.
+            progress: As for ``mapper.build``.
+
+        Raises:
+            ConfigError: No such kind, a name that does not end like one, or settings that it does not read.
+            RunError: PATH is there already, or a file or the log that the kind needs is missing.
+        """
+        written: Path = import_module("mapper.api.runs").export(
+            self, kind, path, settings=settings, overwrite=overwrite, progress=progress
+        )
+        return written
+
+    def fuse(
+        self,
+        *,
+        settings: Mapping[str, Any] | None = None,
+        trajectory: Trajectory | None = None,
+        progress: "Progress | Callable[[str], object] | None" = None,
+    ) -> "Run":
+        """Make the maps again with other settings or poses, as ``mapper fuse`` does, and return the new run.
+
+        Args:
+            settings: Values by dotted name, such as ``{"octree.resolution_m": 0.1}``.
+            trajectory: Better poses of the body; None keeps the run's.
+            progress: As for ``mapper.build``.
+
+        Raises:
+            RunError: The log is no longer there, or is not what it was.
+            ConfigError: A setting is unknown, has no such value, or is not of the maps.
+        """
+        fused: Run = import_module("mapper.api.runs").fuse(
+            self, settings=settings, trajectory=trajectory, progress=progress
+        )
+        return fused
+
+    def view(self, path: AnyPath | None = None, *, overwrite: bool = False) -> Path:
+        """Write the map in 3D as a page for any browser, as ``mapper view --html`` does; return its path.
+
+        Args:
+            path: HTML file to write; None is ``RUN.html`` in the current folder.
+            overwrite: Replace a file that is there.
+
+        Raises:
+            RunError: The file is there already.
+        """
+        written: Path = import_module("mapper.api.runs").write_page([self.path], path, overwrite=overwrite)
+        return written
+
+    def report(self, path: AnyPath | None = None, *, overwrite: bool = False) -> Path:
+        """Write a page with the run's map, verdict and numbers, as ``mapper report`` does; return its path.
+
+        Args:
+            path: HTML file to write; None is ``report.html``, or with a number if that exists.
+            overwrite: Replace a file that is there.
+
+        Raises:
+            RunError: The file is there already.
+        """
+        reports = import_module("mapper.evaluators.pictures.run_report")
+        written: Path = reports.report([self], path, overwrite=overwrite)
+        return written
 
     def _repr_html_(self) -> str:
         from mapper.export.picture import run_html

@@ -1,6 +1,7 @@
 """Paths of results that a caller does not name: after the log or run, with a number if that is taken."""
 
 import os
+from collections import Counter
 from collections.abc import Sequence
 from itertools import count
 from pathlib import Path
@@ -56,6 +57,13 @@ def joined_names(paths: Sequence[Path]) -> str:
     names = [name_of(path) for path in paths[:_MOST_NAMED]]
     more = [f"{len(paths) - _MOST_NAMED}-more"] if len(paths) > _MOST_NAMED else []
     return "+".join([*names, *more])
+
+
+def distinct_names(runs: Sequence[Path]) -> list[str]:
+    """Return the folders' names, or their paths as given where names are not unique."""
+    short = [run.resolve().name for run in runs]
+    seen = Counter(short)
+    return [str(run) if seen[name] > 1 else name for run, name in zip(runs, short, strict=True)]
 
 
 def _is_taken(path: Path) -> bool:

@@ -1,6 +1,7 @@
 """What a new user types, as typed: text for paths, attributes for parts, numpy everywhere."""
 
 import re
+import shutil
 from pathlib import Path
 
 import matplotlib as mpl
@@ -292,3 +293,51 @@ def test_a_misspelt_name_is_told_to_python():
     with pytest.raises(AttributeError) as caught:
         _ = mapper.biuld
     assert (caught.value.name, caught.value.obj) == ("biuld", mapper)  # of which it makes "Did you mean"
+
+
+def copy_of(run, folder):
+    return mapper.open_run(shutil.copytree(run.path, folder))
+
+
+def test_a_run_makes_what_the_verbs_make(run, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    own = copy_of(run, tmp_path / "own")
+    assert own.export("las", "cloud.laz") == Path("cloud.laz")
+    assert own.export("octomap", "wide.bt", settings={"octomap.level": 1}) == Path("wide.bt")
+    assert mapper.read_octree("wide.bt").resolution == 0.1
+    with pytest.raises(mapper.MapperError, match="no exporter 'laz'"):
+        own.export("laz")
+    assert (own.view(), own.report()) == (Path("own.html"), Path("report.html"))
+    assert own.report() == Path("report-2.html")
+    for page in ("own.html", "report.html"):
+        assert Path(page).read_text().startswith("<!DOCTYPE html>")
+    lines = []
+    fused = own.fuse(settings={"slice.max_height_m": 0.6}, progress=lines.append)
+    assert (fused.path, fused.config.slice.max_height_m) == (own.path, 0.6)
+    assert "fuse" in lines
+    with pytest.raises(mapper.MapperError, match="did you mean"):
+        own.fuse(settings={"slice.max_hight_m": 0.6})
+
+
+def test_the_verbs_are_functions(run, desk_log, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    found = mapper.inspect(desk_log)
+    assert (found.problem, found.log.frames.count) == (None, 31)
+
+    own = copy_of(run, tmp_path / "own")
+    free = np.argwhere(own.slice.cells == 0)
+    goal = own.slice.origin + (free[len(free) // 2, ::-1] + 0.5) * own.slice.resolution
+    plan = mapper.plan(own, goal, goal, settings={"radius_m": 0.0})
+    np.testing.assert_allclose(plan.waypoints_world[-1], goal)
+    assert (own.path / "plan.json").exists()
+    with pytest.raises(mapper.MapperError, match=r"want \(2,\) metres"):
+        mapper.plan(own, [0.0, 0.0, 0.0], goal)
+
+    changes = mapper.diff(run, own.path, place="built")
+    assert (changes.appeared, changes.vanished) == ([], [])
+    assert len(list((tmp_path / "diffs").iterdir())) == 1
+    merged = mapper.merge([run, own.path], out="both")
+    assert merged.map.path == Path("both")
+    assert len(merged.map.manifest.runs) == 2
+    with pytest.raises(mapper.MapperError, match="no runs"):
+        mapper.merge([])

@@ -59,6 +59,7 @@ needs no tracking, a run needs no merging."""
 
 ASKS_UPWARDS = {
     ("mapper/run/folder.py", "mapper.export.picture"),
+    ("mapper/__init__.py", "mapper.evaluators.compare.api"),
     ("mapper/__init__.py", "mapper.evaluators.metrics.evaluate"),
 }
 """Imports against the order, loaded when they are used: ``run.plot()`` and notebooks draw a run, and
@@ -66,6 +67,8 @@ ASKS_UPWARDS = {
 
 ASKS_BY_NAME = {
     ("mapper/core/trajectory.py", "mapper.sources.trajectory_files"),
+    ("mapper/run/folder.py", "mapper.api.runs"),
+    ("mapper/run/folder.py", "mapper.evaluators.pictures.run_report"),
 }
 """Modules that import a module of this project that imports them: loaded by name when they are used."""
 
