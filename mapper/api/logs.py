@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from mapper.config.loading import Settings, load_source_config
 from mapper.core.errors import SourceError
@@ -10,8 +11,10 @@ from mapper.runtime.regular_files import AnyPath
 from mapper.sources import open_source
 from mapper.sources.base import Log
 from mapper.sources.config import SourceConfig
-from mapper.sources.inspection import Inspection, inspect_log
 from mapper.sources.scan_folders.clouds import read_scan
+
+if TYPE_CHECKING:
+    from mapper.sources.inspection import Inspection
 
 
 def open_log(path: AnyPath, *, config: AnyPath | None = None, settings: Settings | None = None) -> Log:
@@ -45,7 +48,9 @@ def open_log(path: AnyPath, *, config: AnyPath | None = None, settings: Settings
     return open_source(Path(path), load_source_config(config, settings=settings))
 
 
-def inspect(path: AnyPath, overrides: Sequence[str] = (), *, settings: Settings | None = None) -> Inspection:
+def inspect(
+    path: AnyPath, overrides: Sequence[str] = (), *, settings: Settings | None = None
+) -> "Inspection":
     """Return what is in a log, as ``mapper inspect`` shows it: topics, rates, gaps, calibration, truth.
 
     Args:
@@ -59,6 +64,8 @@ def inspect(path: AnyPath, overrides: Sequence[str] = (), *, settings: Settings 
     Raises:
         ConfigError: A setting is unknown or has no such value.
     """
+    from mapper.sources.inspection import inspect_log  # loads foxglove, which opening a log may not need
+
     return inspect_log(Path(path), load_source_config(None, overrides, settings=settings))
 
 
