@@ -36,37 +36,13 @@ from mapper.runtime.journal import Journal, StateFile, opened_state
 from mapper.runtime.progress import Progress, peak_memory_mb
 from mapper.runtime.state_file import dump, dumps, load, loads
 
-EVERY_S = 4.0
-"""Seconds between two checkpoints, at least."""
-_SHARE, _LONGEST_S = 0.015, 9.0
-"""Largest share of the CPU time that checkpoints take; after so many seconds one is due whatever it costs."""
+EVERY_S = 9.0
+"""Seconds between two checkpoints, which a build that is stopped loses at most."""
 _TIMES = "resumed.json"
 _JOURNAL = "tracking.journal"
 
 Step = Literal["tracked", "solved"]
 """Steps of a build whose results are kept whole."""
-
-
-class _Schedule:
-    """Schedule of checkpoints: seconds between them, and more where one takes much of the CPU time."""
-
-    def __init__(self, every_s: float) -> None:
-        """Begin now; with 0 s one is always due."""
-        self.cost_s = 0.0
-        self._every_s = every_s
-        self.restart()
-
-    def restart(self) -> None:
-        """Count from now on."""
-        self._last_s, self._last_cpu_s = time.monotonic(), time.process_time()
-
-    def is_due(self, *, is_busy: bool) -> bool:
-        """Return whether it is time for the next checkpoint, unless the last one is still being written."""
-        if self._every_s <= 0.0:
-            return True
-        since_s, since_cpu_s = time.monotonic() - self._last_s, time.process_time() - self._last_cpu_s
-        is_cheap = self.cost_s <= _SHARE * since_cpu_s
-        return not is_busy and since_s >= self._every_s and (is_cheap or since_s > _LONGEST_S)
 
 
 class Checkpoints:
@@ -93,7 +69,8 @@ class Checkpoints:
         self.progress = progress
         self.is_off = False
         self.is_solved = False
-        self._schedule = _Schedule(every_s)
+        self._every_s = every_s
+        self._last_s = time.monotonic()
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="checkpoint")
         self._pending: Future[None] | None = None
         self._written: list[Archived[Any]] = []
@@ -239,7 +216,8 @@ class Checkpoints:
     def is_due(self) -> bool:
         """Return whether it is time for the next checkpoint, and the last one is on the disk."""
         is_busy = self._pending is not None and not self._pending.done()
-        if self.is_off or not self._schedule.is_due(is_busy=is_busy):
+        is_early = time.monotonic() - self._last_s < self._every_s
+        if self.is_off or (self._every_s > 0.0 and (is_busy or is_early)):
             return False
         self._wait()
         return not self.is_off
@@ -250,21 +228,13 @@ class Checkpoints:
         Args:
             take: Function that copies what changes, and returns the function that writes it.
         """
-        self._schedule.restart()
-        began_s = time.thread_time()
+        self._last_s = time.monotonic()
         try:
             write = take()
         except DataError as error:
             self._give_up(str(error))
             return
-        taken_s = time.thread_time() - began_s
-
-        def timed() -> None:
-            began_s = time.thread_time()
-            write()
-            self._schedule.cost_s = taken_s + time.thread_time() - began_s
-
-        self._pending = self._thread.submit(timed)
+        self._pending = self._thread.submit(write)
 
     def _wait(self) -> None:
         pending, self._pending = self._pending, None

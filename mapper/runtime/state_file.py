@@ -26,7 +26,6 @@ from mapper.runtime.archived import Archivable, Archived, reference_of
 
 _HEAD = struct.Struct("<8sQ")
 _MAGIC = b"mapstat2"
-_MOST_TEXT_BYTES = 1 << 30
 _PACKAGES = tuple(
     f"mapper.{name}."
     for name in (
@@ -113,7 +112,7 @@ def load(
     """
     try:
         magic, length = _HEAD.unpack(file.read(_HEAD.size))
-        if magic != _MAGIC or length > _MOST_TEXT_BYTES:
+        if magic != _MAGIC:
             raise DataError("a state that cannot be read: it begins with other bytes")
         text = file.read(length)
         return _Decoder(file.read(), fixed or {}, archived).decode(json.loads(text))
