@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from mapper.config.loading import load_config
+from mapper.core.units import MB
 from mapper.pipeline.build import build
 from mapper.pipeline.tracking_checkpoints import TrackingCheckpoints
 from mapper.run import files
@@ -35,7 +36,6 @@ from mapper.sources.base import Log
 ROWS = 10
 FRAMES_PER_ROOM, SCAN_STEP_M = 50, 0.5
 """At 10 Hz; a room is 4.4 m across, and has an aisle."""
-MB = 1e6
 
 
 class Enough(KeyboardInterrupt):

@@ -7,12 +7,11 @@ import typer
 
 from mapper.cli.answer import Answer, Output, rows_text
 from mapper.cli.options import Overrides, assignments, merged
+from mapper.core.errors import listed
 from mapper.runtime.result_paths import RUNS, name_of, place_of
 
 if TYPE_CHECKING:
     from mapper.export.solved_graph import SolvedGraph
-
-_MOST_SIZES = 8
 
 
 def solve(
@@ -88,6 +87,4 @@ def _table(solved: "SolvedGraph") -> str:
 def _sizes_text(sizes: list[int]) -> str:
     if len(sizes) == 1:
         return "1"
-    more = ", …" if len(sizes) > _MOST_SIZES else ""
-    shown = ", ".join(map(str, sizes[:_MOST_SIZES]))
-    return f"{len(sizes)}, each solved on its own: {shown}{more} nodes"
+    return f"{len(sizes)}, each solved on its own: {listed([f'{size} nodes' for size in sizes])}"

@@ -20,7 +20,7 @@ from mapper.evaluators.pictures.comparison import (
     write_registration_errors,
 )
 from mapper.evaluators.study.engine import CELLS
-from mapper.evaluators.study.table import Column, Table, column, csv_text, decimals
+from mapper.evaluators.study.table import Column, Table, column, csv_text, decimals, degrees, percent
 from mapper.run.manifest import library_versions
 from mapper.runtime.atomic import MANIFEST_NAME, FolderKind, atomic_folder, write_json, write_text
 from mapper.runtime.progress import SILENT, Progress
@@ -170,7 +170,7 @@ def _by_guess(comparison: Comparison) -> dict[str, dict[str, Array]]:
     }
 
 
-_DEGREES = decimals(2, times=math.degrees(1.0))
+_DEGREES = degrees(2)
 _CENTIMETRES = decimals(2, times=100.0)
 
 
@@ -190,9 +190,9 @@ def _odometry(comparison: Comparison) -> Table:
             Column("ate_rmse_m", "ATE RMSE m", decimals(4)),
             Column("rpe_rmse_m", f"RPE {step} m", decimals(4)),
             Column("rpe_rmse_rad", f"RPE {step} °", _DEGREES),
-            Column("drift_ratio", "drift %", decimals(1, times=100.0)),
+            Column("drift_ratio", "drift %", percent(1)),
             Column("failures", "failures"),
-            Column("coverage_ratio", "coverage %", decimals(0, times=100.0)),
+            Column("coverage_ratio", "coverage %", percent(0)),
             Column("frames_per_s", "frames/s", decimals(1)),
         ],
         records=[
@@ -232,7 +232,7 @@ def _registration(comparison: Comparison) -> Table:
         columns=[
             Column("method", "method"),
             Column("guess_off_by", "guess off by"),
-            Column("right_ratio", "right %", decimals(0, times=100.0)),
+            Column("right_ratio", "right %", percent(0)),
             Column("wrong", "wrong"),
             Column("no_answer", "no answer"),
             Column("median_m", "median cm", _CENTIMETRES),

@@ -124,7 +124,7 @@ def _octree(octree: OctreeMap, voxel_m: float) -> Reference:
 
 
 SCENE = "scene.json"
-_BATCH = 1 << 12  # points at once; those of a map lie together, so that most solids are out of reach
+_BATCH = 4096  # points at once; those of a map lie together, so that most solids are out of reach
 
 
 def scene_distance(path: Path) -> SignedDistance:

@@ -9,6 +9,7 @@ from scipy.spatial import cKDTree
 
 from mapper.core.errors import DataError
 from mapper.core.geometry import Array, Points
+from mapper.core.voxel_grid import DIAGONAL
 from mapper.evaluators.metrics.metric import Metric
 from mapper.octree.keys import KEY_COUNT, KEY_ZERO
 from mapper.octree.map import OctreeMap
@@ -22,8 +23,6 @@ LogOddsAt = Callable[[Points], NDArray[np.float32]]
 
 Keys = NDArray[np.int64]
 Mask = NDArray[np.bool_]
-
-_SQRT3 = float(np.sqrt(3.0))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -106,7 +105,7 @@ def assess_by_distance(
         found=_near(surface, keys[occupied], voxels=voxels),
         seen=np.ones(len(surface), np.bool_),
         free_right=distance_m[~occupied] >= -reach_m,
-        open_free=~occupied[distance_m > reach_m * _SQRT3],
+        open_free=~occupied[distance_m > reach_m * DIAGONAL],
         voxels=voxels,
         resolution_m=edge_m,
     )

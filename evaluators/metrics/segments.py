@@ -1,6 +1,5 @@
 """Relative errors over segments of the path, as the KITTI odometry benchmark defines them."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -10,7 +9,7 @@ from mapper.core.errors import DataError
 from mapper.core.geometry import Array
 from mapper.evaluators.metrics.metric import Metric
 from mapper.evaluators.metrics.trajectory import Matched, motion_errors, progress_of, statistics
-from mapper.evaluators.study.table import Column, Record, decimals
+from mapper.evaluators.study.table import Column, Record, degrees, percent
 
 KITTI_LENGTHS_M = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
 EVERY_FRAMES = 10
@@ -101,7 +100,7 @@ def segment_metrics(errors: Sequence[LengthErrors]) -> list[Metric]:
     ]
 
 
-_PERCENT, _DEGREES = decimals(3, times=100.0), decimals(5, times=math.degrees(1.0))
+_PERCENT, _DEGREES = percent(3), degrees(5)
 _FIGURES = ("mean", "median", "max")
 LENGTH_COLUMNS = (
     Column("length_m", "segment, m", "{:g}".format),

@@ -9,6 +9,7 @@ from tempfile import TemporaryDirectory
 
 from mapper.config.build import BuildConfig
 from mapper.config.loading import load_config
+from mapper.core.units import MB
 from mapper.evaluators.papers.model import PaperCell, PaperTable
 from mapper.evaluators.papers.paper import (
     CONFIGS,
@@ -33,7 +34,6 @@ from mapper.run.files import CLOUD, OCTREE_BT
 
 _OURS, _CLOUD, _OCTREE = "Zhao", "dense cloud", "octree 0.05 m"
 _RESOLUTION_M = 0.05
-_MB = 1e6
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,8 +125,8 @@ class ZhaoJob(Measurement):
             values = {
                 ("3", _OURS): run.manifest.timing.total_s,
                 ("4", _OURS): ate_rmse_m(run.trajectory, truth),
-                ("5", _CLOUD): (run.path / CLOUD).stat().st_size / _MB,
-                ("5", _OCTREE): (run.path / OCTREE_BT).stat().st_size / _MB,
+                ("5", _CLOUD): (run.path / CLOUD).stat().st_size / MB,
+                ("5", _OCTREE): (run.path / OCTREE_BT).stat().st_size / MB,
             }
         lost = f"{self.sequence}, seed {self.seed}: {counts.lost} of {counts.read} frames were not placed."
         notes = {

@@ -9,6 +9,7 @@ import numpy as np
 from mapper.core.frames import Image
 from mapper.core.geometry import Array
 from mapper.export.figures import (
+    COLUMNS,
     ESTIMATE,
     FAINT,
     HEAD_IN,
@@ -28,7 +29,6 @@ from mapper.line_laser.detection import Method, responses, stripe_rows
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-_COLUMNS = 4
 _CAPTION_IN = 0.3
 _TITLES: Mapping[Method, str] = {
     "hue": "hue (figure 2.2)",
@@ -56,7 +56,7 @@ def write_detections(
     rows = {method: stripe_rows(response, join_px=config.join_px) for method, response in kept.items()}
     height_in = PANEL_IN * image.shape[0] / image.shape[1]
     page_in = 2 * (height_in + _CAPTION_IN) + HEAD_IN
-    figure = new_figure(_COLUMNS * PANEL_IN, page_in)
+    figure = new_figure(COLUMNS * PANEL_IN, page_in)
     colors = "orange: the row found" + ("" if true_rows is None else "; blue: the true one")
     figure.text(0.012, 1.0 - 0.1 / page_in, title, fontsize=13, fontweight="bold", color=TEXT, va="top")
     figure.text(0.988, 1.0 - 0.12 / page_in, colors, fontsize=9.5, color=FAINT, va="top", ha="right")
@@ -67,10 +67,10 @@ def write_detections(
         for method, response in kept.items()
     ]
     for number, (name, pixels, found) in enumerate(panels):
-        row, column = divmod(number, _COLUMNS)
+        row, column = divmod(number, COLUMNS)
         bottom_in = (1 - row) * (height_in + _CAPTION_IN)
         axes = figure.add_axes(
-            ((column + 0.015) / _COLUMNS, bottom_in / page_in, 0.97 / _COLUMNS, 0.97 * height_in / page_in)
+            ((column + 0.015) / COLUMNS, bottom_in / page_in, 0.97 / COLUMNS, 0.97 * height_in / page_in)
         )
         # What is kept must be seen, however dark it is.
         shown = pixels if pixels.ndim == 3 else np.where(pixels > 0, 110 + pixels * (145.0 / 255.0), 0.0)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from mapper.core.errors import SourceError
 from mapper.core.frames import Image
 from mapper.core.geometry import Array
-from mapper.evaluators.study.table import Column, Record, Table, csv_text, decimals
+from mapper.evaluators.study.table import Column, Record, Table, csv_text, percent
 from mapper.line_laser.config import StripeConfig
 from mapper.line_laser.detection import METHODS, Method, Response, responses, stripe_rows
 from mapper.line_laser.files import DETECTIONS, RANGE_ERRORS
@@ -27,7 +27,7 @@ TOLERANCE_PX = 3.0
 """A pixel within this distance of the stripe's true middle shows the stripe."""
 
 
-PERCENT = decimals(1, times=100.0)
+PERCENT = percent(1)
 """Shows a share."""
 
 _COLUMNS = (

@@ -2,6 +2,7 @@
 
 import csv
 import io
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -88,6 +89,16 @@ class Table:
 def decimals(count: int, *, times: float = 1.0) -> Callable[[float], str]:
     """Return what shows a number, in another unit if it is multiplied, with so many decimals."""
     return lambda value: f"{times * value:.{count}f}"
+
+
+def percent(count: int) -> Callable[[float], str]:
+    """Return what shows a share in per cent."""
+    return decimals(count, times=100.0)
+
+
+def degrees(count: int) -> Callable[[float], str]:
+    """Return what shows radians in degrees."""
+    return decimals(count, times=math.degrees(1.0))
 
 
 def indented(notes: Sequence[str]) -> list[str]:

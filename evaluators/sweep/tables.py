@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from statistics import median
 
-from mapper.evaluators.study.table import MISSING, Column, Record, Value, decimals, text_table
+from mapper.evaluators.study.table import MISSING, Column, Record, Value, decimals, percent, text_table
 from mapper.evaluators.sweep.plan import RUNS, BuildName, Plan
 from mapper.runtime.resumable_jobs import JobResult
 
@@ -39,7 +39,7 @@ class Quantity:
 QUANTITIES = (
     Quantity("ate_m", "ATE RMSE m", decimals(4), min, needs_coverage=True),
     Quantity("rpe_1s_m", "RPE 1 s m", decimals(4), min, needs_coverage=True),
-    Quantity("coverage_ratio", "coverage %", decimals(0, times=100.0), max),
+    Quantity("coverage_ratio", "coverage %", percent(0), max),
     Quantity("loops", "loops", decimals(0)),
     Quantity("frames_per_s", "frames/s", decimals(1), max),
     Quantity("peak_memory_mb", "peak MB", decimals(0), min),

@@ -1,5 +1,7 @@
 """Voxel grid downsampling: the first point in every voxel, or the mean of its points."""
 
+import math
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -7,6 +9,9 @@ from numpy.typing import NDArray
 from mapper.core.frames import Points32
 from mapper.core.geometry import Points
 from mapper.core.voxel_index import cell_key, claim_row, voxel_index
+
+DIAGONAL = math.sqrt(3.0)
+"""Largest distance of the centres of voxels that share a corner, in edges."""
 
 
 def thin(points: Points32, voxel_m: float) -> NDArray[np.intp]:

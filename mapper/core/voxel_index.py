@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 
 AXIS_BITS = 21
 """Bits of each coordinate in a ``cell_key``; cells 2²¹ apart along an axis have the same key."""
+HALF_SPAN = 1 << (AXIS_BITS - 1)
+"""Cells on either side of the origin; within, a position in cells is exact to a millionth of one."""
 
 FIBONACCI = -7046029254386353131
 """2⁶⁴/φ as int64: a product with it spreads neighbouring keys (Knuth, TAOCP vol. 3, §6.4)."""

@@ -85,7 +85,7 @@ PANEL_IN = 3.0
 WIDE_IN = 5.0
 """Width of panels of which a page has one or two."""
 HEAD_IN = 0.5
-_COLUMNS = 4
+COLUMNS = 4
 IMAGE_PX = 1000
 """Longer side of an image that is drawn pixel by pixel."""
 MOST_CELLS = 4000
@@ -197,7 +197,7 @@ def sheet(
     title: str, panels: int, *, width_in: float = PANEL_IN, height_in: float = PANEL_IN
 ) -> tuple["Figure", int, int]:
     """Return an empty page for a number of panels, and its columns and rows."""
-    columns = min(panels, _COLUMNS)
+    columns = min(panels, COLUMNS)
     rows = -(-panels // columns)
     return page(title, columns=columns, rows=rows, width_in=width_in, height_in=height_in), columns, rows
 

@@ -3,7 +3,6 @@
 Depth counts as in the octree: up to the same limit, and not where something moved, which the octree lacks.
 """
 
-import math
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -27,6 +26,7 @@ from mapper.core.frames import (
     undistortion_maps,
 )
 from mapper.core.geometry import Transform, inverse
+from mapper.core.voxel_grid import DIAGONAL
 from mapper.export.mesh_files import Triangles, write_mesh
 from mapper.mapping.cloud import Colors
 from mapper.mapping.config import edits_of
@@ -38,9 +38,6 @@ from mapper.runtime.extras import extra
 from mapper.runtime.ordered_map import ordered_map
 from mapper.runtime.progress import Progress
 from mapper.sources.base import FrameRef, Skipped
-
-_NEAR_VOXELS = math.sqrt(3.0)
-"""Noise scatters depth over voxels beside the octree's occupied ones: those that share a corner with one."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -117,7 +114,8 @@ def as_mapped(frame: RgbdFrame, T_world_body: Transform, octree: OctreeMap, edit
     measured = (frame.depth_m > 0.0) & np.isfinite(frame.depth_m)
     depth_m = np.where(measured, frame.depth_m, np.float32(0.0))
     points_world = back_project(depth_m, ray_table(frame.camera), T_world_body @ frame.T_body_camera)
-    max_distance_m = _NEAR_VOXELS * octree.resolution_m
+    # Noise scatters depth over voxels beside the octree's occupied ones: those that share a corner with one.
+    max_distance_m = DIAGONAL * octree.resolution_m
     is_mapped = octree.are_near_occupied(points_world, max_distance_m=max_distance_m)
     if editor.edits.erase or editor.edits.keep:
         is_mapped &= editor.leave(points_world)
@@ -129,7 +127,8 @@ _BLOCK_VOXELS = 8
 """Edge of a block. Of Open3D's usual 16 two thirds would lie beyond the truncation, and be computed."""
 _TRUNCATION_VOXELS = 4.0
 """How far from the surface distances count; thinner than the depth noise tears holes."""
-_VOXEL_BYTES = 4 + 4 + 12  # distance, weight and colour, all float32: integers would round at every frame
+_VOXEL_BYTES = 5 * np.dtype(np.float32).itemsize
+"""Distance, weight and colour, all float32: integers would round at every frame."""
 _LIBRARIES = "libgl1 libegl1 libx11-6 libudev1 libusb-1.0-0 libidn2-0 libgomp1"
 
 

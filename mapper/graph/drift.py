@@ -10,8 +10,8 @@ import numpy as np
 from mapper.core.geometry import Array, Transform, adjoint, inverse, log, stride_for
 from mapper.graph.model import BetweenFactor
 
-_MOST_TRIED = 5
-"""Loops between the same two parts that are tried as their connection."""
+MOST_TRIED = 8
+"""Loops between the same two parts that are tried as their connection, and clusters of loops as outliers."""
 
 
 def innovations(known: Sequence[BetweenFactor], loops: Sequence[BetweenFactor]) -> Array:
@@ -32,7 +32,7 @@ def innovations(known: Sequence[BetweenFactor], loops: Sequence[BetweenFactor]) 
     nodes = [node for loop in loops for node in (loop.i, loop.j)]
     tree = _spanning_tree(known, nodes)
     while between := tree.between_first_parts(loops):
-        tried = between[:: stride_for(len(between), _MOST_TRIED)]
+        tried = between[:: stride_for(len(between), MOST_TRIED)]
         trees = [_spanning_tree([*known, connection], nodes) for connection in tried]
         best = min(range(len(tried)), key=lambda k: float(np.median([*map(trees[k].innovation, between)])))
         known, tree = [*known, tried[best]], trees[best]

@@ -13,7 +13,7 @@ from mapper.core.clusters import cluster_numbers
 from mapper.core.geometry import Array
 from mapper.graph.batch import Effort, Part, PartSolution, solve
 from mapper.graph.config import GraphConfig
-from mapper.graph.drift import innovations
+from mapper.graph.drift import MOST_TRIED, innovations
 from mapper.graph.model import BetweenFactor
 from mapper.graph.terms import Kernel, between
 from mapper.graph.uncertainty import MEDIAN_CHI2
@@ -35,7 +35,6 @@ _UNUSED_LOOP_RATIO = 4.0
 """Factor on the limit of an unused loop: the path has not been optimised with it."""
 _CLUSTER_NODES = 10
 """Loops whose ends are at most so many nodes apart, in the order of ids, form a cluster, tried as one."""
-_MAX_CLUSTERS_TRIED = 8
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -121,7 +120,7 @@ def _refine_inliers(
     """
     clusters = sorted(_clusters(part), key=lambda cluster: -float(apart[cluster].max()))
     cost = _cost(part, now, limit)
-    for cluster in (None, *clusters[:_MAX_CLUSTERS_TRIED]):
+    for cluster in (None, *clusters[:MOST_TRIED]):
         inliers = now.chi2 <= limit
         tried = now.chi2 <= _UNUSED_LOOP_RATIO * limit if cluster is None else inliers & ~cluster
         if inliers.all() or (tried == inliers).all():

@@ -10,7 +10,7 @@ MEDIAN_CHI2 = 5.348
 """Median of χ² with six degrees of freedom."""
 _LIMIT_CHI2 = 22.458
 """99.9 % of χ² with six degrees of freedom (Bar-Shalom, Li & Kirubarajan 2001, §1.5.4)."""
-_SHARE = 0.02
+MODEL_SHARE = 0.02
 """Model error as a share of distance and angle: calibration and depth distortion, common to all pixels."""
 _LEAST = 1e-3  # metres and radians
 
@@ -90,8 +90,8 @@ def with_model_error(information: Array, T_i_j: Transform, *, scale: float = 1.0
     distance_m = float(np.linalg.norm(T_i_j[:3, 3]))
     return inflated(
         information,
-        sigma_rad=scale * (_LEAST + _SHARE * angle_rad),
-        sigma_m=scale * (_LEAST + _SHARE * distance_m),
+        sigma_rad=scale * (_LEAST + MODEL_SHARE * angle_rad),
+        sigma_m=scale * (_LEAST + MODEL_SHARE * distance_m),
     )
 
 

@@ -23,6 +23,8 @@ Verdict = Literal["accepted", "rejected"]
 SOLVER = "solver"
 """``LoopClosure.rejected_by`` of a loop that the rest of the graph contradicts."""
 
+LEAST_AGREEING = 3
+"""Loops that have to agree for two paths, or a path and a map, to be tied by them alone."""
 MIN_WEIGHT = 0.5
 """A loop with less weight in the solution is rejected, and is no factor of the solved graph."""
 

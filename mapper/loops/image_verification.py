@@ -16,7 +16,7 @@ from mapper.core.geometry import Array, Points, Transform, adjoint, apply, inver
 from mapper.features.frame_view import FrameView, ImageView
 from mapper.features.hamming import match_mutual_bits
 from mapper.features.matching import Pairs, homography_inliers, match_mutual
-from mapper.graph.uncertainty import with_model_error
+from mapper.graph.uncertainty import MODEL_SHARE, with_model_error
 from mapper.loops.base import Verification
 from mapper.loops.config import ImageVerificationConfig
 from mapper.registration.base import Alignment
@@ -40,8 +40,6 @@ _MAX_HAMMING = 64
 _P3P_PAIRS, _P3P_TOLERANCE_PX, _P3P_ITERATIONS = 4, 4.0, 300
 
 _MAX_WIDE_RATIO = 0.85
-_DEPTH_SHARE = 0.02
-"""Error of depths beside the sensor's noise: its scale, and the slope where a feature lies."""
 _MIN_WIDE_INLIERS = 8
 """Random pairs agree with one motion by three to six, seldom by ten: fewer would only take longer."""
 _MIN_SAME, _MAX_THROUGH, _MIN_CORRELATION = 0.8, 0.05, 0.6
@@ -292,7 +290,7 @@ def _measured(i: ImageView, j: ImageView, pairs: Pairs, T_j_i: Transform, *, mat
 def _wide_measurements(view: ImageView, features: NDArray[np.intp]) -> tuple[Array, Array, Array]:
     """Return (M, 3) u, v, bf/z, their (M, 3) inverse variances, and (5,) intrinsics."""
     z = view.points_camera[features, 2]
-    sigma_m = np.hypot(depth_sigma_m(KINECT_NOISE, z), _DEPTH_SHARE * z)
+    sigma_m = np.hypot(depth_sigma_m(KINECT_NOISE, z), MODEL_SHARE * z)
     return image_measurements(
         view.pixels[features],
         z,

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from mapper.core.errors import DataError
 from mapper.core.frames import Points32
-from mapper.core.voxel_index import AXIS_BITS, cell_key, cell_of, claim_row, voxel_index
+from mapper.core.voxel_index import HALF_SPAN, cell_key, cell_of, claim_row, voxel_index
 from mapper.octree.blocks import GROWTH
 
 Real = TypeVar("Real", bound="np.floating[Any]")
@@ -20,8 +20,7 @@ Colors = NDArray[np.uint8]
 MOST_TO_VIEW = 5_000_000
 """Largest number of points of a cloud that is made to be looked at."""
 
-_HALF_SPAN = 1 << (AXIS_BITS - 1)  # voxels on either side of the world's origin
-_BATCH = 1 << 16  # points added at once: bounds the memory reserved ahead of need
+_BATCH = 65_536  # points added at once: bounds the memory reserved ahead of need
 _LOWEST_LEVEL = 30.0  # of 255: where the palette of heights begins
 
 
@@ -70,7 +69,7 @@ class CloudBuilder:
         if len(points_world) == 0:
             return
         reach_m = max(float(points_world.max()), -float(points_world.min()))
-        limit_m = (_HALF_SPAN - 1) * self.voxel_m
+        limit_m = (HALF_SPAN - 1) * self.voxel_m
         if not reach_m <= limit_m:  # also refuses NaN
             raise DataError(
                 f"cloud: a coordinate of {reach_m} m; {self.voxel_m} m voxels reach {limit_m:.0f} m, "

@@ -9,17 +9,20 @@ from mapper.core.frames import ray_table
 from mapper.core.geometry import Array
 from mapper.runtime.ordered_map import ordered_map
 from mapper.sensing.config import KINECT_NOISE, DepthNoiseConfig
-from mapper.sensing.planes import TILES_ACROSS, cut_tiles, distance_levels, fit_planes
-from mapper.sources.base import FrameRef, Log, read_depth
+from mapper.sensing.planes import (
+    LEAST_SIGMA_M,
+    MAX_NOISE_RATIO,
+    TILES_ACROSS,
+    cut_tiles,
+    distance_levels,
+    fit_planes,
+)
+from mapper.sources.base import SPREAD_FRAMES, FrameRef, Log, read_depth
 
-_FRAMES = 24
 _STRIDE_PX = 2
 _MIN_MEASURED_RATIO = 0.9
-_MAX_NOISE_RATIO = 0.1
 _FLATTEST_PERCENT = 25.0
 """Relief only adds to the noise, so that of the flatter tiles is the sensor's."""
-_LEAST_QUADRATIC_PER_M = 1e-6
-"""Noise of exact depth images, which is not 0 only by rounding."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,7 +58,7 @@ def measure_noise(source: Log, *, given: DepthNoiseConfig | None = None, workers
         given: The noise, where the user has set it; then only depths are collected.
         workers: Threads that decode frames.
     """
-    entries = source.spread_entries(_FRAMES)
+    entries = source.spread_entries(SPREAD_FRAMES)
     seen = [one for one in ordered_map(_seen, entries, workers=workers) if one is not None]
     depths_m = np.concatenate([np.empty(0), *(depths for depths, _, _ in seen)])
     if given is not None:
@@ -69,7 +72,7 @@ def measure_noise(source: Log, *, given: DepthNoiseConfig | None = None, workers
     far = len(distances_m) // 2
     quadratic_per_m = float(f"{np.median(sigmas_m[far:] / distances_m[far:] ** 2):.3g}")
     return MeasuredNoise(
-        DepthNoiseConfig(quadratic_per_m=max(quadratic_per_m, _LEAST_QUADRATIC_PER_M)),
+        DepthNoiseConfig(quadratic_per_m=max(quadratic_per_m, LEAST_SIGMA_M)),
         f"measured on planes {distances_m[0]:.1f} to {distances_m[-1]:.1f} m away",
         depths_m,
     )
@@ -91,7 +94,7 @@ def _seen(entry: FrameRef) -> tuple[Array, Array, Array] | None:
     rays = cut_tiles(ray_table(frame.camera)[::_STRIDE_PX, ::_STRIDE_PX], side)[measured]
     planes = fit_planes(tiles_m, rays)
     distance_m = np.median(planes.depth_m, axis=1)
-    flat = planes.explain(tiles_m > 0.0) & (planes.sigma_m <= _MAX_NOISE_RATIO * distance_m)
+    flat = planes.explain(tiles_m > 0.0) & (planes.sigma_m <= MAX_NOISE_RATIO * distance_m)
     return some_m, distance_m[flat], planes.sigma_m[flat]
 
 

@@ -19,6 +19,7 @@ from mapper.graph.config import GraphConfig
 from mapper.graph.model import BetweenFactor, PoseGraph, PoseSigmas
 from mapper.graph.optimize import optimize
 from mapper.loops.closure import (
+    LEAST_AGREEING,
     MIN_WEIGHT,
     Discrepancy,
     LoopClosure,
@@ -31,8 +32,6 @@ from mapper.loops.config import GateConfig
 from mapper.loops.odometry_chain import NodePath, allowed
 from mapper.loops.shared_places import SharedPlace
 
-LEAST_PLACES = 3
-"""Least number of places that agree to tie two runs."""
 _LEAST_LEAD = 2.0
 """Least ratio of the places that agree with the best pose to those that agree with any other: where rooms
 look alike, a run may fit in several."""
@@ -107,8 +106,8 @@ def _find_consensus(places: Sequence[SharedPlace], gate: GateConfig) -> tuple[li
     best = int(agree.sum(axis=1).argmax())
     inside = agree[best]
     agreeing = [place for place, is_inside in zip(places, inside, strict=True) if is_inside]
-    if len(agreeing) < LEAST_PLACES:
-        return [], f"{len(agreeing)} of {len(places)} places agree, want {LEAST_PLACES}"
+    if len(agreeing) < LEAST_AGREEING:
+        return [], f"{len(agreeing)} of {len(places)} places agree, want {LEAST_AGREEING}"
     rival = int(agree[~inside][:, ~inside].sum(axis=1).max(initial=0))
     if len(agreeing) < _LEAST_LEAD * rival:
         return [], f"{len(agreeing)} places agree on one pose and {rival} on another: places look alike"

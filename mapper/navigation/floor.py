@@ -25,10 +25,11 @@ MAX_SENSOR_HEIGHT_M = 4.0
 """Sensors are carried no higher than this above the ground."""
 _CHANGE_PER_M = 10.0
 """A change of the sensor's height by a metre costs as much as this number of samples without ground below."""
-_LONGEST_STEPS, _LEAST_BREAK_M = 5.0, 2.0
+_LONGEST_STEPS = 5.0
+_STRETCH_M = 2.0
+"""Length of a step, whatever is usual, that breaks a path, and of a stretch that was travelled along."""
 _STEADY_M = 0.3
-_DRIVEN_M = 2.5
-_NEAR_GROUND_M = 0.25
+"""Heights that differ by less are the same ground's."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -188,7 +189,7 @@ def _sample(positions_world: Points, spacing_m: float) -> tuple[Points, NDArray[
         return positions_world.copy(), np.empty(0, np.int64)
     steps_m = np.linalg.norm(np.diff(positions_world, axis=0), axis=1)
     moving = steps_m[steps_m > 1e-3]
-    longest_m = max(_LEAST_BREAK_M, _LONGEST_STEPS * float(np.median(moving))) if len(moving) else 0.0
+    longest_m = max(_STRETCH_M, _LONGEST_STEPS * float(np.median(moving))) if len(moving) else 0.0
     pieces, breaks, count = [positions_world[:1]], [], 1
     last = positions_world[0]
     for position, step_m in zip(positions_world[1:], steps_m, strict=True):
@@ -222,7 +223,7 @@ def _mask_driven(
         is_usual = any(abs(height_m - one) <= _STEADY_M for one in usual)
         if not seen[first:last].any() and not is_usual:
             continue
-        if is_usual or on_floor.mean() > 0.5 or (not usual and extent_m >= _DRIVEN_M):
+        if is_usual or on_floor.mean() > 0.5 or (not usual and extent_m >= _STRETCH_M):
             kept[first:last] = True
             usual.append(height_m)
     return kept
@@ -249,7 +250,7 @@ def add_footprint(
     places = path.points_world[:, :2] / cell_m - (columns.first - KEY_ZERO)
     heights = path.points_world[:, 2] / cell_m
     rooms = np.minimum(np.rint(path.sensor_m / cell_m).astype(np.int64), limits.room)
-    near = max(limits.step, round(_NEAR_GROUND_M / cell_m))
+    near = max(limits.step, round(_STEADY_M / cell_m))
     column, top = kernels.find_swept(columns, places, heights, rooms, radius_m / cell_m, limits.step, near)
     if not len(column):  # obstacles everywhere below the path
         return columns, np.zeros(len(columns.tops), np.bool_)

@@ -11,6 +11,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from mapper.core.geometry import Array, path_length
+from mapper.core.voxel_grid import DIAGONAL
 from mapper.navigation.distance import DistanceField, Distances, interpolate_at
 
 Cell = tuple[int, int, int]
@@ -18,11 +19,11 @@ Cells = NDArray[np.int64]
 
 _START = 255  # in the table of steps: the start of the search
 _UNREACHED = 254
-_ROOT_2, _ROOT_3 = np.sqrt([2.0, 3.0])
+_ROOT_2 = np.sqrt(2.0)
 _SAMPLES_PER_CELL = 4
 _GAIN = 1e-4  # of the length: a round that shortens by less is the last
 _MOST_POINTS = 4000
-_STEEPEST = _ROOT_3  # slope of a trilinear mix of distances that differ by at most 1 between neighbours
+_STEEPEST = DIAGONAL  # slope of a trilinear mix of distances that differ by at most 1 between neighbours
 _LEAST_STEP = 0.2  # cells, where a line's clearance is just the radius
 
 
@@ -134,7 +135,7 @@ def _octile(a: int, b: int, c: int) -> float:
     """Return the length of a shortest path over so many cells along each axis without obstacles."""
     longest, shortest = max(a, b, c), min(a, b, c)
     middle = a + b + c - longest - shortest
-    return float(_ROOT_3 * shortest + _ROOT_2 * (middle - shortest) + (longest - middle))
+    return float(DIAGONAL * shortest + _ROOT_2 * (middle - shortest) + (longest - middle))
 
 
 @njit(cache=True, nogil=True, inline="always")

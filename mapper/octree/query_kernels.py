@@ -7,6 +7,7 @@ from numba import njit
 from numpy import float32, float64, int16, int64
 from numpy.typing import NDArray
 
+from mapper.core.voxel_index import VACANT
 from mapper.octree.blocks import slot_of
 from mapper.octree.casting_kernels import CHUNK, NEVER
 from mapper.octree.keys import (
@@ -23,7 +24,6 @@ from mapper.octree.keys import (
     morton,
 )
 
-_NOT_LISTED = -1
 _OFFSETS: NDArray[np.int64] = keys_of(np.arange(BLOCK_VOXELS))
 """(512, 3) keys of a block's voxels relative to its first, in Morton order."""
 
@@ -154,7 +154,7 @@ def find_nearest(table, block_codes, points, reach, threshold):
     """
     # Filled for a block when a search first reaches it: other blocks cost nothing.
     counts, members = (
-        np.full(len(block_codes), _NOT_LISTED, int16),
+        np.full(len(block_codes), VACANT, int16),
         np.empty((len(block_codes), BLOCK_VOXELS), int16),
     )
     found, squares = np.full(len(points), -1, int64), np.full(len(points), np.inf)
@@ -211,7 +211,7 @@ def _gap_square(point, x, y, z):
 @njit(cache=True, nogil=True)
 def _visit(table, slot, code, counts, members, point, threshold, best, nearest):
     """Return squared distance and code of the nearest voxel so far, after a block's occupied voxels."""
-    if counts[slot] == _NOT_LISTED:
+    if counts[slot] == VACANT:
         counts[slot] = _list_occupied(table.values[slot], threshold, members[slot])
     if counts[slot] == 0:
         return best, nearest

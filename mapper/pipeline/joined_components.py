@@ -16,7 +16,14 @@ from mapper.features.frame_view import ImageView
 from mapper.graph.components import components
 from mapper.graph.model import PoseGraph
 from mapper.loops.base import Verification
-from mapper.loops.closure import Discrepancy, LoopClosure, accepted_loops, discrepancy, exceeds
+from mapper.loops.closure import (
+    LEAST_AGREEING,
+    Discrepancy,
+    LoopClosure,
+    accepted_loops,
+    discrepancy,
+    exceeds,
+)
 from mapper.loops.config import GateConfig, PlaceLoopsConfig
 from mapper.loops.image_verification import verify_wide
 from mapper.odometry.base import FrameResult
@@ -34,8 +41,6 @@ _ODOMETRY = IsvdOdometryConfig(
 """Whose views are compared: with more features than usual, as little of the farther view is shared."""
 _AROUND, _AROUND_NS = 3, NS_PER_S
 """Frames before and after one that shows a known place, within this time: they measure it as well."""
-_MIN_LINKS = 3
-"""Pairs of frames that have to agree on a place."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -184,7 +189,7 @@ def _agreed(links: Sequence[_Link], graph: PoseGraph, gate: GateConfig) -> LoopC
         for T_i_j, information in carried
         if not exceeds(discrepancy(T_i_j, np.eye(4), best.T_i_j), limit)
     ]
-    if len(agreeing) < _MIN_LINKS or 2 * len(agreeing) <= len(links):
+    if len(agreeing) < LEAST_AGREEING or 2 * len(agreeing) <= len(links):
         return None
     poses, informations = zip(*agreeing, strict=True)
     (i, j), found = best.nodes, best.found

@@ -19,7 +19,15 @@ from mapper.graph.config import GraphConfig
 from mapper.graph.model import PoseGraph
 from mapper.graph.optimize import optimize
 from mapper.graph.uncertainty import MEDIAN_CHI2
-from mapper.loops.closure import SOLVER, Discrepancy, accepted_loops, discrepancy, exceeds, why_none_accepted
+from mapper.loops.closure import (
+    LEAST_AGREEING,
+    SOLVER,
+    Discrepancy,
+    accepted_loops,
+    discrepancy,
+    exceeds,
+    why_none_accepted,
+)
 from mapper.loops.config import GateConfig, PlaceLoopsConfig, ScanLoopsConfig
 from mapper.loops.map_constraints import build_map_constraint_detector
 from mapper.loops.odometry_chain import NodePath, allowed
@@ -40,8 +48,8 @@ from mapper.run.writer import RunWriter, first_manifest, write_run
 from mapper.runtime.progress import SILENT, Progress
 from mapper.sources.base import Log
 
-_WINDOW, _LEAST = 5, 3
-"""Constraints on either side of a jump that are compared, and how many there must be."""
+_WINDOW = 5
+"""Constraints on either side of a jump that are compared."""
 _MAX_ACROSS, _MIN_WITHIN = 0.2, 0.6
 """Shares of the pairs that agree: across a jump few do, on either side of it most."""
 
@@ -103,7 +111,7 @@ def _constrained(tracking: TrackingResult, nodes: Sequence[int]) -> list[_Constr
 def _jumps(constrained: Sequence[_Constrained], gate: GateConfig) -> list[tuple[int, int]]:
     """Return the last node before every jump and the first after it."""
     best, least = None, _MAX_ACROSS
-    for k in range(_LEAST, len(constrained) - _LEAST + 1):
+    for k in range(LEAST_AGREEING, len(constrained) - LEAST_AGREEING + 1):
         before, after = constrained[max(k - _WINDOW, 0) : k], constrained[k : k + _WINDOW]
         across = float(np.mean([_agree(a, b, gate) for a, b in product(before, after)]))
         if across < least and min(_within(before, gate), _within(after, gate)) >= _MIN_WITHIN:
@@ -142,8 +150,6 @@ def _cut(tracking: TrackingResult, last: int, first: int, map_node: int) -> Trac
 
 
 _STATES: Mapping[str, StretchState] = {"tracked": "localised", "doubtful": "doubtful"}
-_LEAST_CONSTRAINTS = 3
-"""A part of the path that fewer constraints tie to the map is not localised."""
 _FAR, _FAR_BEYOND = 3.0, 0.2
 """Distances along the path to the nearest constraint beyond which a frame is doubtful, as factors on
 ``loops.agreement_path_m``: between two constraints, and with one on one side only, which hides a jump."""
@@ -245,12 +251,12 @@ def _supported(tracking: TrackingResult) -> TrackingResult:
     """Return the result without the constraints of parts that too few tie to the map."""
     part_of = component_numbers(tracking.graph.without_loops())
     tied = Counter(part_of[loop.j] for loop in accepted_loops(tracking.loops))
-    weak = {part for part, count in tied.items() if count < _LEAST_CONSTRAINTS}
+    weak = {part for part, count in tied.items() if count < LEAST_AGREEING}
     if not weak:
         return tracking
     loops = tuple(
         loop.rejected(
-            "few", f"{tied[part_of[loop.j]]} constraints tie its part of the path, want {_LEAST_CONSTRAINTS}"
+            "few", f"{tied[part_of[loop.j]]} constraints tie its part of the path, want {LEAST_AGREEING}"
         )
         if loop.verdict == "accepted" and part_of[loop.j] in weak
         else loop

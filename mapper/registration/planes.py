@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from mapper.core.frames import Scan
 from mapper.core.geometry import Array, Points, Transform, apply, stride_for
 
-_POINTS_PER_SCAN = 4000
-"""Evenly chosen points of a scan: more hardly change the planes and take longer."""
+_ENOUGH = 4000
+"""Evenly chosen points of a scan, or patches: more hardly change the planes and take longer."""
 _CELL_RANGE_RATIO = 0.1
 _CELL_LIMITS_M = (0.15, 1.0)
 _MIN_PATCH_POINTS = 8
@@ -22,7 +22,6 @@ _BREADTH_RATIO = 0.05
 MAX_TILT_RAD = np.radians(60.0)
 """Largest angle between up and the sensor's own up: a camera is held roughly upright."""
 _GRID_STEP_RAD = np.radians(2.5)
-_GRID_PATCHES = 2000
 PARALLEL_RAD = np.radians(8.0)
 """Directions that differ by less are the same."""
 _REFINED_TOLERANCE_RAD = np.radians(5.0)
@@ -105,7 +104,7 @@ def patches_of(scans: Sequence[tuple[Scan, Transform]], *, tolerance_m: float) -
 
 def subsampled(scan: Scan) -> Points:
     """Return (M, 3) float64 points of a scan, evenly chosen, body frame; M ≤ 4000."""
-    stride = stride_for(len(scan.points_body), _POINTS_PER_SCAN)
+    stride = stride_for(len(scan.points_body), _ENOUGH)
     return scan.points_body[::stride].astype(np.float64)
 
 
@@ -167,7 +166,7 @@ def levels_of(heights_m: Array, *, tolerance_m: float, least: int) -> list[NDArr
 
 def _best_on_grid(normals: Array, up_guess_world: Array) -> Array:
     candidates = _cone(up_guess_world)
-    few = normals[:: stride_for(len(normals), _GRID_PATCHES)]
+    few = normals[:: stride_for(len(normals), _ENOUGH)]
     score = _consistency(few @ candidates.T).sum(axis=0) * (candidates @ up_guess_world) ** 2
     best: Array = candidates[int(np.argmax(score))]
     return best

@@ -10,11 +10,11 @@ from mapper.core.errors import DataError
 from mapper.core.frames import Points32
 from mapper.core.geometry import Array, Points
 from mapper.core.voxel_grid import voxel_means
+from mapper.core.voxel_index import HALF_SPAN
 from mapper.registration.kd_tree import KdTree, kd_tree, neighbours_of
 
 _NEIGHBOURS = 10
 _FEWEST_NEIGHBOURS = 5
-_VOXELS_ACROSS = 2**20  # within, positions in voxels are exact to a millionth of one
 _LINE = 1e-12
 """Least squared length of a normal before it is normalised, relative to the spread's; points on a line have
 none."""
@@ -63,7 +63,7 @@ def prepared(points: Points32 | Points, *, voxel_m: float, neighbours: int = _NE
     """
     if len(points) == 0:
         return Prepared(np.empty((0, 3)), np.empty((0, 3)), voxel_m, neighbours, None)
-    farthest_m, limit_m = float(np.abs(points).max()), _VOXELS_ACROSS * voxel_m
+    farthest_m, limit_m = float(np.abs(points).max()), HALF_SPAN * voxel_m
     if farthest_m >= limit_m:
         raise DataError(
             f"cloud: a coordinate of {farthest_m:.0f} m is beyond {limit_m:.0f} m, the most at "

@@ -21,7 +21,8 @@ _MAX_TILT_RAD = np.radians(60.0)
 _LEVEL_RATIO = 1.1
 _ROUNDS = 4
 _OUTLIER_SIGMAS = 4.0
-_LEAST_SIGMA_M = 1e-6
+LEAST_SIGMA_M = 1e-6
+"""Noise of exact depth images, which is not 0 only by rounding."""
 _SAFE_DETERMINANT = 1e-18
 
 
@@ -105,7 +106,7 @@ def fit_planes(depth_m: Array, rays: Array) -> Planes:
     used = measured
     for _ in range(_ROUNDS):
         on_plane_m, sigma_m = _on_plane(coefficients, directions, depth_m, used)
-        limit_m = _OUTLIER_SIGMAS * np.maximum(sigma_m, _LEAST_SIGMA_M)
+        limit_m = _OUTLIER_SIGMAS * np.maximum(sigma_m, LEAST_SIGMA_M)
         used = measured & (np.abs(depth_m - on_plane_m) <= limit_m[:, None])
         # Gauss–Newton: z changes by −z² · ray with the coefficients.
         rows = -directions * on_plane_m[..., None] ** 2

@@ -15,6 +15,9 @@ from mapper.core.timebase import Stamps
 from mapper.core.trajectory import Trajectory
 from mapper.sensing.gyroscope import Gyroscope
 
+SPREAD_FRAMES = 24
+"""Frames, spread over a log, by which its sensor is judged."""
+
 
 class ImageFile(Protocol):
     """An encoded image: a ``Path``, or a message that has one."""

@@ -10,12 +10,12 @@ from mapper.core.clusters import cluster_numbers
 from mapper.core.errors import FrameError
 from mapper.core.frames import Sensor
 from mapper.core.geometry import Array, Points
-from mapper.sources.base import Log
+from mapper.sources.base import SPREAD_FRAMES, Log
 
 Box = tuple[float, float, float, float, float, float]
 """Least x y z, then largest x y z, metres, body frame."""
 
-_FRAMES, _MIN_FRAMES = 24, 8
+_MIN_FRAMES = 8
 _MIN_STANDING_RATIO, _SURE_RATIO, _MIN_SURE_CELLS = 0.6, 0.95, 2
 """Shares of the frames in which a cell of the vehicle has returns: at the edge of a driver who walks along,
 and in the middle. With fewer of the latter a group is a wall that the sensor happens to keep beside."""
@@ -95,7 +95,7 @@ def _clouds(log: Log, scale: _Scale) -> tuple[list[Points], int]:
     """Return the points around the sensor of some frames, without the ground, and the number of all."""
     clouds: list[Points] = []
     returns = 0
-    for entry in log.spread_entries(_FRAMES):
+    for entry in log.spread_entries(SPREAD_FRAMES):
         try:
             points = entry.scan().points_body
         except FrameError:

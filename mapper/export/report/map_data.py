@@ -95,7 +95,6 @@ MOST_POINTS = 2_000_000
 
 _MOST_BYTES = 13_000_000  # of the data of one page, as text
 _SPARE = 0.97  # fewer points compress a little worse
-_LEAST_BYTES = 1000
 _MOST_LAYER_BYTES = 4_000_000  # of one page, as text
 _MOST_LAYER_CELLS = 100_000_000  # all heights of one run together
 _POINT_STEPS = 16  # per voxel of the cloud: 1.3 mm where these are 2 cm
@@ -136,7 +135,7 @@ def map_of(chapter: Chapter, *, runs: int = 1, most_points: int = MOST_POINTS) -
     }
     most, room = most_points // runs - shown["voxels"]["count"], _MOST_BYTES // runs - len(json.dumps(shown))
     cloud = _cloud(chapter, octree.resolution_m, observed, most=most, has_colors=bool(snapshots))
-    while len(cloud["data"]) > max(room, _LEAST_BYTES):
+    while cloud["count"] and len(cloud["data"]) > room:
         most = int(_SPARE * cloud["count"] * max(room, 1) / len(cloud["data"]))
         cloud = _cloud(chapter, octree.resolution_m, observed, most=most, has_colors=bool(snapshots))
     return {"cloud": cloud, **shown}

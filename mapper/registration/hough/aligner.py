@@ -26,9 +26,6 @@ from mapper.runtime.progress import Stopwatch
 
 MIN_CENTRES = 5
 """A scan with fewer centres shows no objects."""
-MIN_SCORE = 0.0
-"""A best candidate with a lower score is refused without being refined. Right ones had 0.3 and more, those of
-different streets −0.4 and less."""
 MIN_GROUND_RATIO = 0.15
 """Share of a scan's ground that the other scan measured, too. Where two views have but a wall in common, any
 wall fits: wrong answers that nothing contradicted had 0.07 and less, right ones 0.31 and more."""
@@ -190,7 +187,7 @@ class HoughAligner:
             reason = "no offset within the accumulator joins any two centres"
             return Stages(peaks, None, None, failed(reason), watch.seconds)
         hough = candidates[0]
-        if hough.score < MIN_SCORE:
+        if hough.score < 0.0:  # right ones had 0.3 and more, those of different streets −0.4 and less
             reason = (
                 f"under the best motion {hough.agreeing_ratio:.0%} of a scan's obstacles are where the other "
                 f"saw any, and {hough.contradicting_ratio:.0%} where it looked through: different places"

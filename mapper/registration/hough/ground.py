@@ -17,11 +17,9 @@ from mapper.registration.hough.ground_kernels import column_heights, score_plane
 
 LEVEL_ABOVE_RAD = 0.09
 """A smaller tilt stays: on a sloping street the plane would tilt what gravity has levelled."""
-BELOW_WEIGHT = 1.0
-"""Cost of a point below the plane, in inliers: nothing lies below the ground."""
 MIN_INLIER_RATIO = 0.03
 """With a smaller share of inliers there is no ground, and the scan is taken as level."""
-_REFITS = 3
+FITS = 3
 MIN_POINTS = 3
 """Columns with fewer points are noise."""
 
@@ -38,11 +36,11 @@ class Levelling:
     """
 
     T_level_body: Transform
-    tilt_rad: float
-    inlier_ratio: float
+    tilt_rad: float = 0.0
+    inlier_ratio: float = 0.0
 
 
-_WITHOUT_GROUND = Levelling(np.eye(4), 0.0, 0.0)
+_WITHOUT_GROUND = Levelling(np.eye(4))
 
 
 def level(points_body: Points32, config: LevellingConfig) -> Levelling:
@@ -66,11 +64,10 @@ def level(points_body: Points32, config: LevellingConfig) -> Levelling:
         config.min_height_m,
         config.max_height_m,
         config.inlier_m,
-        BELOW_WEIGHT,
     )
     if score < 0.0:
         return _WITHOUT_GROUND
-    for _ in range(_REFITS):
+    for _ in range(FITS):
         plane = _refitted(few, plane, config.inlier_m)
     up, height_m = plane[:3], float(plane[3])
     ratio = float((np.abs(few @ up + height_m) <= config.inlier_m).mean())

@@ -32,11 +32,11 @@ def thin(points, cell_m, reach_m):
 
 
 @njit(cache=True, nogil=True)
-def score_planes(points, triples, min_cosine, low_m, high_m, tolerance_m, below_weight):
+def score_planes(points, triples, min_cosine, low_m, high_m, tolerance_m):
     """Return the best plane (nx, ny, nz, d) with n·p + d = 0, n up, and its score; a score < 0 is none.
 
-    A plane's score is its number of inliers less ``below_weight`` times the number of points clearly below
-    it: nothing lies below the ground.
+    A plane's score is its number of inliers less the number of points more than
+    twice as far below it: nothing lies below the ground.
 
     Args:
         points: (N, 3) metres.
@@ -45,7 +45,6 @@ def score_planes(points, triples, min_cosine, low_m, high_m, tolerance_m, below_
         low_m: Least height of the origin above the plane, d.
         high_m: Largest height of the origin above the plane.
         tolerance_m: Largest distance of an inlier.
-        below_weight: Weight of a point more than twice as far below.
     """
     best = np.zeros(4)
     best_score = -1.0
@@ -70,7 +69,7 @@ def score_planes(points, triples, min_cosine, low_m, high_m, tolerance_m, below_
                 below += 1
             elif abs(height) <= tolerance_m:
                 on += 1
-        score = on - below_weight * below
+        score = float(on - below)
         if score > best_score:
             best_score = score
             best[0], best[1], best[2], best[3] = nx, ny, nz, d

@@ -11,7 +11,7 @@ from mapper.core.frames import Scan
 from mapper.core.geometry import Points, Transform, apply, planar_motion, rotation_exp, transform
 from mapper.registration.hough.config import HoughConfig, NdtStagesConfig, OverlapConfig
 from mapper.registration.hough.description import DIRECTION_RAD, HoughDescription
-from mapper.registration.hough.ground import Ground
+from mapper.registration.hough.ground import FITS, Ground
 from mapper.registration.hough.search_kernels import FULL_OVERLAP, hill_climb
 from mapper.registration.ndt import refine_by_cells
 from mapper.registration.refining import refined_motion
@@ -19,11 +19,8 @@ from mapper.registration.surfaces import Prepared, prepared
 
 _HALVINGS = 2
 """Number of times that the steps are halved: to a quarter of a voxel; the points are then refined."""
-_FITS = 3
 _FIT_WIDTH_M = 0.5
 _MIN_FIT_CELLS = 30
-_FIT_RIDGE = 1.0
-"""Weight, in cells, of a plane without step or slope."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,10 +85,11 @@ def align_grounds(target: Ground, source: Ground, fit: PlanarFit) -> Transform:
     rows = np.column_stack([np.ones(len(x)), x, y])[seen]
     gaps_m = heights[seen] - z[seen]
     plane = np.array([np.median(gaps_m), 0.0, 0.0])
-    for _ in range(_FITS):
+    for _ in range(FITS):
         weights = np.clip(1.0 - ((gaps_m - rows @ plane) / _FIT_WIDTH_M) ** 2, 0.0, None) ** 2
         weighted = rows * weights[:, np.newaxis]
-        plane = np.linalg.solve(weighted.T @ rows + _FIT_RIDGE * np.eye(3), weighted.T @ gaps_m)
+        # A plane without step or slope counts as much as one cell.
+        plane = np.linalg.solve(weighted.T @ rows + np.eye(3), weighted.T @ gaps_m)
     step, slope_x, slope_y = plane
     tilt = transform(rotation_exp(np.array([slope_y, -slope_x, 0.0])), np.array([0.0, 0.0, step]))
     return tilt @ T
