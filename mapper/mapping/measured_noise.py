@@ -11,7 +11,6 @@ from mapper.runtime.ordered_map import ordered_map
 from mapper.sensing.config import KINECT_NOISE, DepthNoiseConfig
 from mapper.sensing.planes import (
     LEAST_SIGMA_M,
-    MAX_NOISE_RATIO,
     TILES_ACROSS,
     cut_tiles,
     distance_levels,
@@ -21,6 +20,8 @@ from mapper.sources.base import SPREAD_FRAMES, FrameRef, Log, read_depth
 
 _STRIDE_PX = 2
 _MIN_MEASURED_RATIO = 0.9
+_MAX_NOISE_RATIO = 0.1
+"""Twice what a plane may have elsewhere: a smaller limit would cut off the noise of far planes."""
 _FLATTEST_PERCENT = 25.0
 """Relief only adds to the noise, so that of the flatter tiles is the sensor's."""
 
@@ -94,7 +95,7 @@ def _seen(entry: FrameRef) -> tuple[Array, Array, Array] | None:
     rays = cut_tiles(ray_table(frame.camera)[::_STRIDE_PX, ::_STRIDE_PX], side)[measured]
     planes = fit_planes(tiles_m, rays)
     distance_m = np.median(planes.depth_m, axis=1)
-    flat = planes.explain(tiles_m > 0.0) & (planes.sigma_m <= MAX_NOISE_RATIO * distance_m)
+    flat = planes.explain(tiles_m > 0.0) & (planes.sigma_m <= _MAX_NOISE_RATIO * distance_m)
     return some_m, distance_m[flat], planes.sigma_m[flat]
 
 
