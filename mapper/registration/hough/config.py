@@ -51,7 +51,8 @@ class GroundConfig(Config):
     """Higher points are dropped. The paper has 4 m; a tilted sensor sees mostly walls, and more of them up to
     8 m."""
     voxel_m: PositiveFloat = 0.4
-    """Obstacles are thinned to one point per voxel, so that sparse and dense clouds have equal weight."""
+    """Obstacles are thinned to one point per voxel, so that sparse and dense clouds have equal weight. Those
+    of one scan overlap within a voxel of the other's; this is maximised in steps of a voxel, halved twice."""
 
 
 class CellsConfig(Config):
@@ -107,9 +108,6 @@ class VotingConfig(Config):
 class OverlapConfig(Config):
     """Verification of the peaks: planar refinement by overlap, then the free-space check."""
 
-    voxel_m: PositiveFloat = 0.4
-    """Obstacles of one scan within a voxel of those of the other overlap. It is also the first step in which
-    the overlap is maximised from each peak, along each axis; the step is halved twice."""
     obstacles: PositiveInt = 1000
     """Number of obstacle voxels, and of ground columns, that are compared, evenly chosen."""
     candidates: PositiveInt = 6

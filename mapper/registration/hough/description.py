@@ -130,10 +130,10 @@ def describe(scan: Scan, config: HoughConfig) -> HoughDescription:
     volume = draw_volume(
         around.obstacles,
         around.heights_m,
-        overlap.voxel_m,
-        2 * int(np.ceil(ground.radius_m / overlap.voxel_m)),
+        ground.voxel_m,
+        2 * int(np.ceil(ground.radius_m / ground.voxel_m)),
         ground.min_obstacle_m,
-        int((ground.max_obstacle_m - ground.min_obstacle_m) / overlap.voxel_m) + 1,
+        int((ground.max_obstacle_m - ground.min_obstacle_m) / ground.voxel_m) + 1,
     )
     return HoughDescription(
         around.levelling.T_level_body,

@@ -55,15 +55,14 @@ def refine_planar(
     config: HoughConfig,
 ) -> PlanarFit:
     """Return the planar motion near (dx, dy, α) under which the obstacles overlap most."""
-    overlap = config.overlap
+    ground = config.constellation.ground
     (dx_m, dy_m, alpha_rad), total = hill_climb(
         target.volume,
         source.checked_obstacles.points_level,
         source.heights_m,
         np.array(motion),
-        overlap.voxel_m,
-        config.constellation.ground.min_obstacle_m,
-        overlap.voxel_m,
+        ground.voxel_m,
+        ground.min_obstacle_m,
         DIRECTION_RAD,
         _HALVINGS,
     )

@@ -210,7 +210,7 @@ def overlap_of(volume, points, heights, motion, voxel_m, low_m):
 
 
 @njit(cache=True, nogil=True)
-def hill_climb(volume, points, heights, motion, voxel_m, low_m, step_m, step_rad, halvings):
+def hill_climb(volume, points, heights, motion, voxel_m, low_m, step_rad, halvings):
     """Return the (dx, dy, α) of a local maximum of the overlap near ``motion``, and its overlap.
 
     The best of six neighbours is taken until none is better; then the steps are halved.
@@ -220,15 +220,14 @@ def hill_climb(volume, points, heights, motion, voxel_m, low_m, step_m, step_rad
         points: (N, 2) or (N, 3) x and y of the points, metres, level frame.
         heights: (N,) heights of the points above the ground, metres.
         motion: Motion at which the search begins.
-        voxel_m: Edge of a voxel of the volume.
+        voxel_m: Edge of a voxel of the volume, and first step along x and y.
         low_m: Height of its lowest layer above the ground.
-        step_m: First step along x and y.
         step_rad: First step of α.
         halvings: Number of times that the steps are halved.
     """
     here = motion.copy()
     best = overlap_of(volume, points, heights, here, voxel_m, low_m)
-    step = np.array([step_m, step_m, step_rad])
+    step = np.array([voxel_m, voxel_m, step_rad])
     for _ in range(halvings + 1):
         climbing = True
         while climbing:
