@@ -113,7 +113,7 @@ def _bag(compression: Bag1Writer.CompressionFormat) -> Maker:
         writer.set_compression(compression)
         with writer:
             connections: dict[str, object] = {}
-            for stamp_ns, topic, type_, cdr in shots(FRAMES):
+            for stamp_ns, topic, type_, cdr, _ in shots(FRAMES):
                 if topic not in connections:
                     connections[topic] = writer.add_connection(topic, type_, typestore=typestore("ros1"))
                 writer.write(connections[topic], stamp_ns, typestore("cdr").cdr_to_ros1(cdr, type_))
