@@ -238,6 +238,11 @@ class RgbdFrame:
         return self.stamp_ns / NS_PER_S
 
     @property
+    def depth_stamp_ns(self) -> int:
+        """Time of the depth image, nanoseconds."""
+        return self.stamp_ns + round(self.depth_delay_s * NS_PER_S)
+
+    @property
     def image_checksum(self) -> int | None:
         """Number by which images differ: a frozen camera's have the same; None of an image of one shade."""
         return _checksum(self.image)

@@ -12,6 +12,8 @@ _MAX_STRETCH = 1.5
 """Distance of two neighbours' projections, relative to that of a surface that faces the cameras, beyond which
 an edge lies between them. Cameras b apart see a plane at a distance h stretched by b / h at most, so planes
 from two baselines on stay whole; the noise of depth moves a projection by less than a tenth of a pixel."""
+_MOST_SPACING_PX = 64.0
+"""Side of a pixel of depth in the other image: 10 px of 64 × 64 sensors before 640 columns."""
 _VIEW_MARGIN = 1.1
 """Squared tangent to which rays are projected, relative to the image's corners: farther out the polynomial
 of a lens may lead back into the image."""
@@ -37,7 +39,7 @@ class DepthRegistration:
             T_camera_depth: (4, 4) pose of the depth camera in the other camera's frame.
 
         Raises:
-            DataError: T_camera_depth is no rigid motion.
+            DataError: T_camera_depth is no rigid motion, or a pixel of depth covers too many of the other.
         """
         if not is_rigid(T_camera_depth):
             raise DataError("T_camera_depth is not a rigid motion")
@@ -53,6 +55,11 @@ class DepthRegistration:
             [np.median(np.diff(rays_depth[..., axis], axis=1 - axis).astype(np.float64)) for axis in (0, 1)]
         )
         self._spacing_px = (steps * [camera.fx_px, camera.fy_px]).astype(np.float32)
+        if not (self._spacing_px <= _MOST_SPACING_PX).all():
+            raise DataError(
+                f"depth camera: its pixels are {self._spacing_px.max():.0f} pixels of colour's apart, "
+                f"want at most {_MOST_SPACING_PX:.0f}; is its focal length right?"
+            )
 
     def register(self, depth_m: DepthImage) -> DepthImage:
         """Return (h, w) depth of the other camera's pixels, metres; 0 is no measurement.
@@ -78,10 +85,13 @@ class DepthRegistration:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _project(depth_m, rays, t, optics, max_tangent2, projected):  # type: ignore[no-untyped-def]
-    """Write column, row and depth of each pixel in the other camera; depth 0 where it is not seen there."""
+    """Write column, row and depth of each pixel in the other camera; depth 0 where it is not seen there.
+
+    Nothing is less than half as far from a camera beside the other: that would cover all of the image.
+    """
     fx, fy, cx, cy, k1, k2, p1, p2, k3 = optics
     t0, t1, t2 = t
-    zero, one, two = np.float32(0.0), np.float32(1.0), np.float32(2.0)
+    zero, half, one, two = np.float32(0.0), np.float32(0.5), np.float32(1.0), np.float32(2.0)
     for i in range(depth_m.shape[0]):
         measured_m, a, b, c = depth_m[i], rays[0, i], rays[1, i], rays[2, i]
         columns, rows, depths = projected[0, i], projected[1, i], projected[2, i]
@@ -93,7 +103,8 @@ def _project(depth_m, rays, t, optics, max_tangent2, projected):  # type: ignore
             radial = one + r2 * (k1 + r2 * (k2 + r2 * k3))
             columns[j] = fx * (x * radial + two * p1 * x * y + p2 * (r2 + two * x * x)) + cx
             rows[j] = fy * (y * radial + p1 * (r2 + two * y * y) + two * p2 * x * y) + cy
-            depths[j] = z if (measured_m[j] > zero) & (z > zero) & (r2 <= max_tangent2) else zero
+            is_seen = (measured_m[j] > zero) & (z > half * measured_m[j]) & (r2 <= max_tangent2)
+            depths[j] = z if is_seen else zero
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -164,10 +164,11 @@ def _write_images(entry: FrameRef, out: Path) -> _Written:
         write_bytes(out / depth, image_bytes(files.depth))
         return _Written(entry.stamp_ns, colour, depth, files.depth_stamp_ns, files.depth_units_per_m)
     frame = _load(entry)
-    colour, depth = Path("rgb", f"{stamp}.png"), Path("depth", f"{stamp}.png")
+    depth_stamp = seconds_text_from_ns(frame.depth_stamp_ns)
+    colour, depth = Path("rgb", f"{stamp}.png"), Path("depth", f"{depth_stamp}.png")
     write_bytes(out / colour, encode_colour(frame.image))
     write_bytes(out / depth, encode_depth(frame.depth_m, TUM_UNITS_PER_M))
-    return _Written(entry.stamp_ns, colour, depth, entry.stamp_ns, TUM_UNITS_PER_M)
+    return _Written(entry.stamp_ns, colour, depth, frame.depth_stamp_ns, TUM_UNITS_PER_M)
 
 
 def _list_text(title: str, name: str, files: dict[int, Path]) -> str:

@@ -14,7 +14,7 @@ from rosbags.rosbag1 import Writer as Bag1Writer
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Bag2Writer
 
-from mapper.core.frames import Frame, RgbdFrame, Scan
+from mapper.core.frames import Frame, PinholeCamera, RgbdFrame, Scan
 from mapper.core.timebase import NS_PER_S
 from mapper.core.trajectory import Trajectory
 from mapper.export.exporters import EXPORTERS
@@ -27,6 +27,7 @@ from mapper.sources.calibration_file import calibration_text
 from mapper.sources.ros.typestore import typestore
 from mapper.sources.writers import LogKind, write_log
 from tests.support.clouds import save_cloud
+from tests.support.depth_cameras import write_unregistered
 from tests.support.desk import DESK, build_desk_run
 from tests.support.logs import MemoryEntry, log_in_memory
 from tests.support.octree_maps import COLORED, mapped
@@ -272,6 +273,12 @@ def _run_without_digests(folder: Path) -> Path:
     return folder / "run"
 
 
+def _depth_camera(folder: Path) -> Path:
+    wide = PinholeCamera(106, 60, 53.0, 53.0, 52.4, 30.1)
+    write_unregistered(folder / "log", rgbd_log(), wide, is_in_tf=False)
+    return folder / "log"
+
+
 FORMATS: Mapping[str, Maker] = {
     "tum": _written(rgbd_log, "tum", "log"),
     "mbag": _written(rgbd_log, "mbag", "log"),
@@ -286,6 +293,7 @@ FORMATS: Mapping[str, Maker] = {
     "rosbag2": lambda folder: write(folder / "log", shots(FRAMES)),
     "rosbag2, messages": _rosbag2(StoragePlugin.SQLITE3, CompressionMode.MESSAGE),
     "rosbag2, mcap": _rosbag2(StoragePlugin.MCAP, CompressionMode.STORAGE),
+    "rosbag2, depth camera": _depth_camera,
     "foxglove": _foxglove,
     "foxglove, json": _foxglove_json,
     "lidar mcap": _written(lidar_log, "mcap", "log.mcap"),

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -45,7 +47,7 @@ def reference(depth_m, depth_camera, camera, T):
     pixels = np.full((*depth_m.shape, 2), np.nan)
     depths = np.zeros(depth_m.shape)
     limit = 1.1 * (ray_table(camera).astype(float) ** 2).sum(axis=2).max()
-    seen = (points[:, 2] > 0.0) & ((points[:, :2] / points[:, 2:]) ** 2).sum(axis=1).__le__(limit)
+    seen = (points[:, 2] > 0.5 * z) & ((points[:, :2] / points[:, 2:]) ** 2).sum(axis=1).__le__(limit)
     rows, columns, points = rows[seen], columns[seen], points[seen]
     pixels[rows, columns] = camera.distort(camera.project(points))
     depths[rows, columns] = points[:, 2]
@@ -153,8 +155,8 @@ def test_what_lies_outside_the_view_is_not_led_back_into_it_by_the_lens():
 def test_points_behind_the_other_camera_are_not_seen():
     T = np.eye(4)
     T[2, 3] = -1.0
-    near = np.full((120, 212), 0.5, np.float32)
-    assert not register(near, DEPTH, COLOR, T).any()
+    for near_m in (0.5, 1.001):
+        assert not register(np.full((120, 212), near_m, np.float32), DEPTH, COLOR, T).any()
     assert not register(np.zeros((120, 212), np.float32), DEPTH, COLOR, T).any()
 
 
@@ -163,3 +165,5 @@ def test_other_sizes_and_other_motions_are_refused():
         register(np.zeros((120, 160), np.float32), DEPTH, COLOR, D435)
     with pytest.raises(DataError):
         DepthRegistration(ray_table(DEPTH), COLOR, 2.0 * np.eye(4))
+    with pytest.raises(DataError):
+        DepthRegistration(ray_table(replace(DEPTH, fx_px=1.0)), COLOR, D435)

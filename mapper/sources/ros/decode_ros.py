@@ -7,7 +7,7 @@ import numpy as np
 from rosbags.serde import SerdeError
 
 from mapper.core.errors import DataError
-from mapper.core.geometry import transform
+from mapper.core.geometry import is_rigid, transform
 from mapper.core.rotations import row_of_pose
 from mapper.core.timebase import NS_PER_S
 from mapper.sources.ros.cloud_messages import Field, structured
@@ -28,7 +28,6 @@ from mapper.sources.ros.typestore import typestore
 POINT_FIELD_TYPES = dict(enumerate(("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8"), start=1))
 """Numpy's names of PointField's constants."""
 _EXTRINSICS_NUMBERS = 12
-_ROTATION_TOLERANCE = 1e-3
 
 
 def decode_ros(topic: Topic, data: memoryview) -> Message:
@@ -137,10 +136,10 @@ def _extrinsics(data: memoryview, *, is_little_endian: bool) -> list[PoseMessage
     if len(data) < size_bytes:
         raise DataError(f"a damaged message: {len(data)} bytes, want at least {size_bytes}")
     numbers = np.frombuffer(data[-size_bytes:], "<f8" if is_little_endian else ">f8").astype(np.float64)
-    R = numbers[:9].reshape(3, 3).T
-    if not (np.isfinite(numbers).all() and np.abs(R @ R.T - np.eye(3)).max() < _ROTATION_TOLERANCE):
-        raise DataError("a damaged message: its rotation is none")
-    return [PoseMessage(0, "", "", row_of_pose(transform(R, numbers[9:])).tolist())]
+    T = transform(numbers[:9].reshape(3, 3).T, numbers[9:])
+    if not is_rigid(T):
+        raise DataError("a damaged message: it is no rigid motion")
+    return [PoseMessage(0, "", "", row_of_pose(T).tolist())]
 
 
 _READERS: Mapping[str, Callable[[Any], Message]] = {

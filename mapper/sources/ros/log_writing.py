@@ -136,7 +136,7 @@ def _images(entry: FrameRef) -> tuple[SerializedMessage, SerializedMessage]:
     return (
         image_message(entry.stamp_ns, f"{COLOR}/image_raw", frame.rgb, encoding="rgb8", frame=_CAMERA_FRAME),
         image_message(
-            entry.stamp_ns, f"{DEPTH}/image_raw", frame.depth_m, encoding="32FC1", frame=_CAMERA_FRAME
+            frame.depth_stamp_ns, f"{DEPTH}/image_raw", frame.depth_m, encoding="32FC1", frame=_CAMERA_FRAME
         ),
     )
 

@@ -75,8 +75,13 @@ def test_scans_are_those_of_the_frames_and_a_converted_log_is_registered(tmp_pat
     assert entry.files is None
     assert write_log(log, tmp_path / "tum", kind="tum") == []
     again = open_source(tmp_path / "tum")
+    assert again.entry_at(0).files.depth_stamp_ns == log[0].depth_stamp_ns < log[0].stamp_ns
     np.testing.assert_allclose(again[0].depth_m, log[0].depth_m, atol=1.1e-4)
     assert again[0].camera == log[0].camera
+    assert write_log(log, tmp_path / "log.mcap", kind="mcap") == []
+    again = open_source(tmp_path / "log.mcap")
+    np.testing.assert_array_equal(again[0].depth_m, log[0].depth_m)
+    assert again[0].depth_stamp_ns == log[0].depth_stamp_ns
 
 
 @pytest.mark.parametrize(
@@ -106,7 +111,8 @@ def test_a_rotation_that_is_none_is_a_damaged_message():
     numbers = np.array([*np.full(9, 0.5), 0.015, 0.0, 0.0])
     data = memoryview(b"\0\1\0\0" + numbers.astype("<f8").tobytes())
     topic = Topic("/camera/extrinsics/depth_to_color", "realsense2_camera_msgs/msg/Extrinsics", "cdr")
-    for damaged in (data, data[:60]):
+    huge = memoryview(b"\0\1\0\0" + np.full(12, 1e300).astype("<f8").tobytes())
+    for damaged in (data, data[:60], huge):
         with pytest.raises(DataError):
             decode(topic, damaged)
 
