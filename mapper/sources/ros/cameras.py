@@ -149,11 +149,11 @@ def _recorded_pose(
     reader: RecordingReader, topics: CameraTopics, frames: tuple[str, str]
 ) -> tuple[Transform | None, str, list[str]]:
     """Return T_color_depth by tf, else by RealSense's own topics, its source, and a note if these differ."""
-    of_topic, topic = _pose_of_topic(reader, topics.color.topic.name)
-    if of_topic is None:
-        of_topic, topic = _pose_of_streams(reader, topics)
     color_frame, depth_frame = frames
-    of_tf = None if color_frame == depth_frame else reader.tree.find(color_frame, depth_frame)
+    if color_frame == depth_frame:  # the driver's topics are about its own depth images, not these
+        return *_pose_of_streams(reader, topics), []
+    of_topic, topic = _pose_of_topic(reader, topics.color.topic.name)
+    of_tf = reader.tree.find(color_frame, depth_frame)
     if of_tf is None:
         return of_topic, topic, []
     notes = []

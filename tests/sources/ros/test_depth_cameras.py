@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from mcap.writer import Writer as McapWriter
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from mapper.core.errors import DataError, SourceError
@@ -17,7 +18,7 @@ from mapper.sources.ros.recording import Topic
 from mapper.sources.ros.typestore import make_message, serialize
 from mapper.sources.writers import write_log
 from tests.support.depth_cameras import BESIDE, write_unregistered
-from tests.support.recordings import CAMERA, COLOR, camera_info, image, shots, transforms, write
+from tests.support.recordings import CAMERA, COLOR, add_messages, camera_info, image, shots, transforms, write
 from tests.support.tum_logs import FIRST_NS, picture
 
 WIDE = PinholeCamera(106, 60, 53.0, 53.0, 52.4, 30.1)
@@ -215,3 +216,18 @@ def test_a_recording_of_realsense_viewer_states_the_pose_of_each_stream(tmp_path
     assert "15.0 mm" in note
     assert "0.54°" in note
     np.testing.assert_allclose(log[0].depth_m[20:28, 28:36], 2.0, atol=0.02)
+
+
+def test_depth_in_colour_s_frame_is_registered_whatever_the_driver_s_topic_says(tmp_path):
+    numbers = np.concatenate([BESIDE[:3, :3].ravel(order="F"), BESIDE[:3, 3]])
+    type_, cdr = "realsense2_camera_msgs/msg/Extrinsics", b"\0\1\0\0" + numbers.astype("<f8").tobytes()
+    extrinsics = SerializedMessage(FIRST_NS, "/cam/extrinsics/depth_to_color", type_, cdr)
+    for frame, is_registered in (("optical", True), ("depth_optical", False)):
+        path = tmp_path / f"{frame}.mcap"
+        with path.open("wb") as file:
+            writer = McapWriter(file)
+            writer.start(profile="ros2")
+            add_messages(writer, [extrinsics, *unregistered(CAMERA, T=None, frame=frame)])
+            writer.finish()
+        notes = open_source(path).notes
+        assert any("as it is read" in note for note in notes) != is_registered
