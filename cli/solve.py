@@ -87,4 +87,4 @@ def _table(solved: "SolvedGraph") -> str:
 def _sizes_text(sizes: list[int]) -> str:
     if len(sizes) == 1:
         return "1"
-    return f"{len(sizes)}, each solved on its own: {listed([f'{size} nodes' for size in sizes])}"
+    return f"{len(sizes)}, each solved on its own: {listed(list(map(str, sizes)))} nodes"

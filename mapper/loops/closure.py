@@ -23,6 +23,8 @@ Verdict = Literal["accepted", "rejected"]
 SOLVER = "solver"
 """``LoopClosure.rejected_by`` of a loop that the rest of the graph contradicts."""
 
+MIN_CONFLICTS = 4
+"""Rejected loops that have to agree before they count against odometry or wheels."""
 LEAST_AGREEING = 3
 """Loops that have to agree for two paths, or a path and a map, to be tied by them alone."""
 MIN_WEIGHT = 0.5

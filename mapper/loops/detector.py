@@ -14,10 +14,10 @@ from mapper.core.timebase import NS_PER_S
 from mapper.features.frame_view import FrameView
 from mapper.graph.model import PoseGraph
 from mapper.loops.base import Place, Proposer, Verifier, verify_proposal
-from mapper.loops.closure import Discrepancy, LoopClosure, discrepancy, exceeds
+from mapper.loops.closure import MIN_CONFLICTS, Discrepancy, LoopClosure, discrepancy, exceeds
 from mapper.loops.config import KeyframeLoopsConfig
 from mapper.loops.consistency_check import ConsistencyCheck
-from mapper.loops.drift_gate import MIN_CONFLICTS, DriftGate
+from mapper.loops.drift_gate import DriftGate
 from mapper.loops.odometry_chain import OdometryChain
 from mapper.loops.online_pose_estimator import OnlinePoseEstimator
 from mapper.loops.place_file import AnyPlace

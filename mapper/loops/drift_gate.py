@@ -12,9 +12,6 @@ from mapper.loops.consistency_check import ConsistencyCheck
 from mapper.loops.odometry_chain import OdometryChain, allowed
 from mapper.loops.online_pose_estimator import OnlinePoseEstimator
 
-MIN_CONFLICTS = 4
-"""Number of others that must agree with a rejected loop before it counts against odometry or wheels."""
-
 
 class DriftGate:
     """Drift gate: compares measured loops with the current estimate of the poses.

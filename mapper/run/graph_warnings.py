@@ -8,8 +8,7 @@ from mapper.core.errors import GraphError
 from mapper.core.geometry import distances_along, inverse, log
 from mapper.graph.marginals import marginals_of
 from mapper.graph.model import PoseGraph
-from mapper.loops.closure import SOLVER
-from mapper.loops.drift_gate import MIN_CONFLICTS
+from mapper.loops.closure import MIN_CONFLICTS, SOLVER
 from mapper.run.manifest import RunWarning
 from mapper.run.results import RunResults
 from mapper.run.timeline import TimeLine, counted
