@@ -43,6 +43,7 @@ from numpy.typing import NDArray
 
 from mapper.core.frames import Points32
 from mapper.core.geometry import Array, Points, Transform
+from mapper.core.voxel_index import row_of, voxel_index
 from mapper.octree.bit_planes import (
     ALL_SET,
     NONE_SET,
@@ -114,7 +115,8 @@ class MovingObjects:
         if not moving.any():
             return moving
         below = _codes_below(codes[moving])
-        candidates = np.flatnonzero(np.isin(codes, below) & ~moving)
+        is_below = _are_among(codes, voxel_index(len(below), below))
+        candidates = np.flatnonzero(is_below & ~moving)
         lowered = points_world[candidates].astype(np.float64) - [0.0, 0.0, self.resolution_m]
         is_ground = self._lie_in(self.surfaces, codes[candidates])
         is_ground |= self._lie_in(self.surfaces, self._codes_of(lowered))
@@ -251,6 +253,14 @@ def _codes_below(codes: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return the codes of the voxels up to two below some, and up to one aside of these."""
     around = (keys_of(np.unique(codes))[:, np.newaxis] + _BELOW).reshape(-1, 3)
     return np.unique(codes_of_keys(around[((around >= 0) & (around < KEY_COUNT)).all(axis=1)]))
+
+
+@njit(cache=True, nogil=True)
+def _are_among(codes, index):
+    among = np.empty(len(codes), np.bool_)
+    for i in range(len(codes)):
+        among[i] = row_of(index, codes[i]) >= 0
+    return among
 
 
 @njit(cache=True, nogil=True)

@@ -21,7 +21,7 @@ _VELOCITY_NS = NS_PER_S // 10
 _CLEARLY = 2.0
 """The cubic is followed where its variance is this many times less than that of the line: next to a gap that
 a loop has opened the velocity is wrong."""
-_WINDOWS = 200
+_WINDOWS = 50
 _MIN_WINDOWS = 3
 _LEAST_VARIANCE = 1e-8
 """(0.1 mm)² and (0.1 mrad)²: a path that is smoother than that is a synthetic one."""

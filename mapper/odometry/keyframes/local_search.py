@@ -102,9 +102,6 @@ class LocalSearch:
             landmarks["observers"][ids],
             observation.weights_among(moved),
         )
-        T_camera_world, _ = refined(
-            T_camera_world, landmarks["position"][ids[agree]], observation, features[agree]
-        )
         if agree.sum() < max(config.min_inliers, least_by_chance(len(visible) + len(matched))):
             return None
         landmark_of_feature[features[~agree]] = -1
