@@ -18,17 +18,19 @@ def prepare_environment() -> None:
     """Leave the threads to us, and give compiled code a place where it may be kept."""
     import mapper
     from mapper.runtime.extras import one_thread_per_library
+    from mapper.runtime.kernels import drop_stale_kernels
 
     one_thread_per_library()
     os.environ.setdefault("RUST_LOG", "off")  # Rerun would print lines of its own beside our errors
     package = Path(mapper.__file__).parent
     if not os.access(package, os.W_OK):  # numba keeps its code beside ours, and refuses to work if it cannot
         os.environ.setdefault("NUMBA_CACHE_DIR", str(cache_folder() / "numba"))
+    drop_stale_kernels()
 
 
 def note_compilation(progress: "Progress") -> None:
     """Say that a verb takes longer this time, if numba has not compiled our kernels before."""
-    from mapper.runtime.doctor import compiled_kernels
+    from mapper.runtime.kernels import compiled_kernels
 
     if not compiled_kernels():
         progress.note("first run here: the kernels are compiled once, which takes about a minute")

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import hypothesis
 import pytest
 
+from mapper.runtime.kernels import drop_stale_kernels
 from tests.support.paths import ROOT
 from tests.support.shared_folders import shared_folder
 from tests.support.tum_logs import write_tiny_log
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
 
 hypothesis.settings.register_profile("no deadline", deadline=None)  # the machine may be busy
 hypothesis.settings.load_profile("no deadline")
+drop_stale_kernels()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

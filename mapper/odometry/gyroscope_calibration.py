@@ -5,9 +5,8 @@ from math import pi
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
-from mapper.core.geometry import Array
+from mapper.core.geometry import Array, rotation_exp
 from mapper.core.timebase import NS_PER_S, Stamps
 from mapper.sensing.gyroscope import Gyroscope
 
@@ -144,7 +143,7 @@ def _refine(
         step = np.linalg.solve(information, gradient)
         cost = float(lengths.sum())
         found = GyroscopeCalibration(
-            Rotation.from_rotvec(step[:3]).as_matrix() @ found.R_body_imu,
+            rotation_exp(step[:3]) @ found.R_body_imu,
             found.bias + step[3:6],
             found.offset_s + float(step[6]),
             found.scale,
@@ -187,5 +186,7 @@ def _prior_sigmas(gyroscope: Gyroscope) -> Array:
 
 def _logs(R: Array) -> Array:
     """Return the (M, 3) rotation vectors of (M, 3, 3) rotations."""
+    from scipy.spatial.transform import Rotation  # takes long to import, and few logs have a gyroscope
+
     vectors: Array = Rotation.from_matrix(R).as_rotvec()
     return vectors

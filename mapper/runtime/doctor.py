@@ -16,6 +16,7 @@ from typing import Literal
 import mapper
 from mapper.core.errors import DataError
 from mapper.runtime.extras import DISTRIBUTION, install_line
+from mapper.runtime.kernels import compiled_kernels, kernel_folder
 from mapper.runtime.ordered_map import ordered_map
 from mapper.runtime.progress import SILENT, Progress
 
@@ -109,16 +110,6 @@ def processors() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))  # a container may have fewer than the machine
     return os.cpu_count() or 1
-
-
-def kernel_folder() -> Path:
-    """Return the folder that keeps compiled kernels: NUMBA_CACHE_DIR, or that of this package."""
-    return Path(os.environ.get("NUMBA_CACHE_DIR") or Path(mapper.__file__).parent)
-
-
-def compiled_kernels() -> set[Path]:
-    """Return the kernels that are compiled, as files without the line and the version at the end."""
-    return {file.with_name(file.name.rpartition("-")[0]) for file in kernel_folder().rglob("*.nbi")}
 
 
 def apt_line(missing: Iterable[str]) -> str:

@@ -11,6 +11,7 @@ import pytest
 
 from mapper.cli.environment import interrupt, note_compilation
 from mapper.core.errors import Terminated
+from mapper.runtime.kernels import drop_stale_kernels
 
 
 def test_compilation_is_noted_until_numba_has_kept_its_code(tmp_path, monkeypatch):
@@ -63,3 +64,18 @@ def test_an_interrupt_waits_for_compilers_and_imports(module, monkeypatch):
     while not sent and time.monotonic() < until:
         time.sleep(0.01)
     assert sent == [signal.SIGTERM]
+
+
+def test_kernels_of_other_modules_are_dropped(tmp_path, monkeypatch):
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    index = tmp_path / "mapper_0123" / "kernels.cast_rays-155.py311.nbi"
+    index.parent.mkdir()
+    index.touch()
+    drop_stale_kernels()  # nothing says what these were compiled with
+    assert not index.exists()
+    index.touch()
+    drop_stale_kernels()
+    assert index.exists()
+    next(tmp_path.glob("__pycache__/*")).write_text("other modules")
+    drop_stale_kernels()
+    assert not index.exists()
