@@ -105,12 +105,12 @@ def build_frame_odometry(
             from mapper.odometry.keyframes.motion_tracker import MotionPoseTracker
             from mapper.odometry.keyframes.odometry import KeyframeOdometry
 
-            return KeyframeOdometry(config, partial(MotionPoseTracker, config), motion_check)
+            return KeyframeOdometry(config, partial(MotionPoseTracker, config), motion_check, gyroscope)
         case PnpConfig():
             from mapper.odometry.keyframes.odometry import KeyframeOdometry
             from mapper.odometry.keyframes.pnp_tracker import PnpPoseTracker
 
-            return KeyframeOdometry(config, PnpPoseTracker, motion_check)
+            return KeyframeOdometry(config, PnpPoseTracker, motion_check, gyroscope)
         case GicpOdometryConfig() | IcpOdometryConfig() | KissOdometryConfig() | HoughOdometryConfig():
             from mapper.odometry.scans.odometry import ScanOdometry
 

@@ -22,6 +22,7 @@ _MEDIAN_LENGTH = 1.538  # of a vector of three independent normal errors, in sta
 _LONGEST_TURN_RAD = 2.8
 _ANOTHER_RAD, _CERTAIN_RAD = 0.2, 0.05  # of a mounting that contradicts tf's; of one that is known
 _ANOTHER_UNIT = 1.25
+_CONTRADICTION_RAD, _CONTRADICTION_SIGMAS = 0.2, 6.0  # far beyond any error but that of a wrong pose
 
 
 class MotionPrior:
@@ -43,6 +44,7 @@ class MotionPrior:
         self._measured = 0
         self._next_fit = _FIRST_FIT
         self._used = self._uncovered = 0
+        self._rejected_ns = -1
 
     def turn(self, begin_ns: int, end_ns: int) -> Array | None:
         """Return the rotation (3, 3) of the body between two times; None if constant velocity is better."""
@@ -124,6 +126,23 @@ class MotionPrior:
             self._fit(gyroscope)
             grown = round(self._measured * _FITS_GROW)
             self._next_fit = min(grown, self._measured + _MOST_BETWEEN_FITS)
+
+    def reject(self, begin_ns: int, end_ns: int, R_begin_end: Array) -> bool:
+        """Return whether the gyroscope rules out a rotation (3, 3) of the body between two times.
+
+        Each frame that is rejected counts as an error of the gyroscope, so that one that has become wrong
+        soon rejects nothing.
+        """
+        found = self._turn(begin_ns, end_ns)
+        if found is None or len(self._errors) < _FEWEST_ERRORS:
+            return False
+        sigma_rad = math.hypot(found[1], float(np.median(self._errors)) / _MEDIAN_LENGTH)
+        off_rad = float(np.linalg.norm(rotation_log(found[0].T @ R_begin_end)))
+        is_ruled_out = off_rad > max(_CONTRADICTION_RAD, _CONTRADICTION_SIGMAS * sigma_rad)
+        if is_ruled_out and end_ns != self._rejected_ns:
+            self._rejected_ns = end_ns
+            self._errors.append(off_rad)
+        return is_ruled_out
 
     def notes(self) -> list[str]:
         """Return how the gyroscope was used and calibrated, and what contradicts it, a sentence each."""

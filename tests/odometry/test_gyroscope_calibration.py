@@ -5,6 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from mapper.core.deskew import STILL
+from mapper.core.geometry import rotation_exp
 from mapper.core.timebase import NS_PER_S
 from mapper.odometry.gyroscope_calibration import calibrate
 from mapper.odometry.motion_prior import MotionPrior
@@ -130,6 +131,34 @@ def test_a_gyroscope_that_contradicts_the_frames_is_not_used():
     _, used, prior = predictions(readings(times_s, rates), *frames(times_s, other))
     assert used.mean() < 0.05
     assert len(prior.notes()) >= 1
+
+
+def test_a_rotation_is_rejected_that_the_gyroscope_rules_out():
+    times_s, rates, R = swinging(15)
+    stamps_ns, noisy = frames(times_s, R)
+    begin_ns, end_ns = int(stamps_ns[0]), int(stamps_ns[1])
+    R_true = R[0].T @ R[1]
+    wrong = R_true @ rotation_exp(np.array([0.0, 0.0, 0.5]))
+    _, _, prior = predictions(readings(times_s, rates), stamps_ns, noisy)
+    assert prior.reject(begin_ns, end_ns, wrong)
+    assert not prior.reject(begin_ns, end_ns, R_true @ rotation_exp(np.array([0.0, 0.0, 0.1])))
+    assert not MotionPrior(readings(times_s, rates)).reject(begin_ns, end_ns, wrong)  # not calibrated yet
+    _, _, other = swinging(16)
+    _, _, unrelated = predictions(readings(times_s, rates), *frames(times_s, other))
+    assert not unrelated.reject(begin_ns, end_ns, wrong)
+
+
+def test_a_gyroscope_that_has_become_wrong_soon_rejects_nothing():
+    times_s, rates, R = swinging(17)
+    stamps_ns, noisy = frames(times_s, R)
+    _, _, prior = predictions(readings(times_s, rates), stamps_ns, noisy)
+    turned = rotation_exp(np.array([0.0, 0.0, 0.5]))
+    rejected = [
+        prior.reject(int(stamps_ns[k]), int(stamps_ns[k + 1]), R[k].T @ R[k + 1] @ turned) for k in range(30)
+    ]
+    assert rejected[0]
+    assert not rejected[-1]
+    assert sum(rejected) < 20
 
 
 def test_a_gyroscope_of_another_clock_is_named():

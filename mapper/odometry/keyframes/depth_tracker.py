@@ -20,7 +20,7 @@ from mapper.odometry.keyframes.depth_alignment import (
 from mapper.odometry.keyframes.earlier_depth import EarlierDepth
 from mapper.odometry.keyframes.landmarks import LandmarkMap
 from mapper.odometry.keyframes.local_search import LocalSearch
-from mapper.odometry.keyframes.pose_tracker import TrackedPose, predicted, project, unmatched
+from mapper.odometry.keyframes.pose_tracker import TrackedPose, project, unmatched
 
 _MIN_VISIBLE_RATIO = 0.3
 _MIN_WEAKEST_RATIO = 0.5
@@ -67,7 +67,7 @@ class DepthTracker:
         self,
         observation: ImageObservation,
         last: TrackedPose,
-        before_last: TrackedPose | None,
+        T_predicted: Transform | None,
         found: TrackedPose | None,
     ) -> TrackedPose | None:
         """Return a frame's pose by landmarks and depth together, where there are few landmarks.
@@ -75,7 +75,7 @@ class DepthTracker:
         Args:
             observation: The frame.
             last: The last frame that was tracked.
-            before_last: The one before it, if it predicts the motion.
+            T_predicted: T_camera_world (4, 4) by the motion since; None if nothing tells it.
             found: The pose from landmarks alone; None if they gave none.
 
         Returns:
@@ -87,9 +87,10 @@ class DepthTracker:
             return found
         if found is None and self._unobserved_s(observation) > _MAX_UNOBSERVED_S:
             return None
-        T_predicted = predicted(observation.stamp_ns, last, before_last)
+        gap_s = 0.0
         if T_predicted is None:
             T_predicted = last.T_camera_world
+            gap_s = (observation.stamp_ns - last.observation.stamp_ns) / NS_PER_S
         starts = [T_predicted] if found is None else [found.T_camera_world, T_predicted]
         for T_camera_world in starts:
             alignment = self._aligned(observation, T_camera_world, T_predicted, last, found)
@@ -111,7 +112,6 @@ class DepthTracker:
             method="depth+map",
         )
         if found is None:
-            gap_s = 0.0 if before_last else (observation.stamp_ns - last.observation.stamp_ns) / NS_PER_S
             return self._by_depth(observation, alignment, reference, gap_s)
         joint = self._aligned(observation, found.T_camera_world, T_predicted, last, found)
         return found if joint is None or not _agrees(joint) else self._by_both(observation, joint, found)

@@ -14,7 +14,7 @@ from mapper.odometry.keyframes.camera_motion import refined_by_established
 from mapper.odometry.keyframes.earlier_depth import EarlierDepth
 from mapper.odometry.keyframes.landmark_kernels import project_visible
 from mapper.odometry.keyframes.landmarks import Ids, LandmarkMap
-from mapper.odometry.keyframes.pose_tracker import MAX_HAMMING, TrackedPose, refined, rms_px
+from mapper.odometry.keyframes.pose_tracker import MAX_HAMMING, TrackedPose, rms_px
 
 _MAX_RATIO = 0.8
 _CHANCE = 0.02

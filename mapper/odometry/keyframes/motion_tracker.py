@@ -1,4 +1,4 @@
-"""Pose tracker by constant velocity: the last frame's points are searched near their predicted pixels."""
+"""Pose tracker by predicted motion: the last frame's points are searched near their predicted pixels."""
 
 from dataclasses import replace
 
@@ -6,14 +6,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.doubts import Doubt
-from mapper.core.geometry import Points, apply, inverse
+from mapper.core.geometry import Points, Transform, apply, inverse
 from mapper.odometry.camera.image_observation import ImageObservation
 from mapper.odometry.config import LocalMapConfig
 from mapper.odometry.keyframes.camera_motion import agreeing, camera_motion
 from mapper.odometry.keyframes.earlier_depth import EarlierDepth
 from mapper.odometry.keyframes.landmarks import Ids, LandmarkMap
 from mapper.odometry.keyframes.local_search import LocalSearch
-from mapper.odometry.keyframes.pose_tracker import TrackedPose, predicted, project, unmatched
+from mapper.odometry.keyframes.pose_tracker import TrackedPose, project, unmatched
 from mapper.odometry.keyframes.relocalizer import Relocalizer
 
 _MAX_RATIO = 0.9
@@ -36,10 +36,10 @@ class MotionPoseTracker:
         self._earlier_depth = EarlierDepth(landmark_map, config.depth_noise)
 
     def track(
-        self, observation: ImageObservation, last: TrackedPose, before_last: TrackedPose | None
+        self, observation: ImageObservation, last: TrackedPose, T_predicted: Transform | None
     ) -> TrackedPose | None:
         """Try the predicted motion, then the latest keyframes."""
-        by_motion = self._by_motion(observation, last, before_last)
+        by_motion = self._by_motion(observation, last, T_predicted)
         if by_motion is not None and by_motion.inliers >= self._config.weak_inliers:
             return by_motion
         # A pose with few inliers may be wrong, so a pose that does not depend on the prediction competes.
@@ -76,10 +76,9 @@ class MotionPoseTracker:
         return replace(best, doubts=(*best.doubts, doubt))
 
     def _by_motion(
-        self, observation: ImageObservation, last: TrackedPose, before_last: TrackedPose | None
+        self, observation: ImageObservation, last: TrackedPose, T_predicted: Transform | None
     ) -> TrackedPose | None:
-        """Search the last frame's points near the pixels that constant velocity predicts."""
-        T_predicted = predicted(observation.stamp_ns, last, before_last)
+        """Search the last frame's points near their predicted pixels."""
         T_camera_world = last.T_camera_world if T_predicted is None else T_predicted
         known, points_world, landmark = self._known_points(last)
         pixels = project(T_camera_world, points_world, observation.intrinsics)

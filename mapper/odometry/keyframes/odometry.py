@@ -7,7 +7,7 @@ import numpy as np
 
 from mapper.core.deskew import Motion, Twist
 from mapper.core.frames import Frame
-from mapper.core.geometry import Array, inverse
+from mapper.core.geometry import Array, Transform, inverse
 from mapper.features.factory import build_detector
 from mapper.features.frame_view import ImageView
 from mapper.graph.model import BetweenFactor
@@ -28,11 +28,18 @@ from mapper.odometry.keyframes.earlier_depth import EarlierDepth
 from mapper.odometry.keyframes.frame_doubts import UNDOUBTED, Assessment, FrameDoubts
 from mapper.odometry.keyframes.landmarks import LandmarkMap
 from mapper.odometry.keyframes.local_mapping import KeyframeDecision, LocalMapping
-from mapper.odometry.keyframes.pose_tracker import PoseTracker, TrackedPose, predicted
+from mapper.odometry.keyframes.pose_tracker import (
+    PoseTracker,
+    TrackedPose,
+    predict_by_turn,
+    predict_by_velocity,
+)
 from mapper.odometry.keyframes.relocalizer import Relocalizer
 from mapper.odometry.keyframes.rolling_shutter import RollingShutter
 from mapper.odometry.keyframes.tracking import Tracking
+from mapper.odometry.motion_prior import MotionPrior
 from mapper.places.vocabulary import load_vocabulary
+from mapper.sensing.gyroscope import Gyroscope
 
 _OWN_SHARE = 0.5
 """Share of a pose's information that is left as its landmarks were measured no better than its features."""
@@ -52,6 +59,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         config: KeyframeOdometryConfig,
         make_tracker: MakePoseTracker,
         motion_check: MotionCheck | None = None,
+        gyroscope: Gyroscope | None = None,
     ) -> None:
         """Start before the first frame.
 
@@ -59,6 +67,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
             config: Settings.
             make_tracker: Makes the pose tracker.
             motion_check: Rules out poses after a gap; None if only the images measure the motion.
+            gyroscope: Angular velocities of the log; None if it has none.
         """
         self._config = config
         self._detector = build_detector(config.detector)
@@ -67,7 +76,8 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         self._map = LandmarkMap(scale_factor=self._detector.scale_factor, readout=readout)
         relocalizer = Relocalizer(config, self._map, self._vocabulary)
         tracker = make_tracker(self._map, relocalizer)
-        self._tracking = Tracking(config, self._map, relocalizer, tracker, motion_check)
+        self._prior = MotionPrior(gyroscope)
+        self._tracking = Tracking(config, self._map, relocalizer, tracker, motion_check, self._prior)
         self._shutter = RollingShutter(readout)
         self._earlier_depth = EarlierDepth(self._map, config.depth_noise)
         self._doubts = FrameDoubts()
@@ -92,15 +102,17 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         if not follows:
             self._shutter.restart()  # the motion before a gap is not that in this image
         observation = self._shutter.predict(observation)
-        pose = None if last is None else self._tracking.find_pose(observation, last, self._before_last)
+        by_velocity, expected = self._predict(observation.stamp_ns)
+        pose = None if last is None else self._tracking.find_pose(observation, last, expected)
         if last is None or pose is None:
             return self._begin_sub_map_or_lose(observation)
         if follows:
             pose = self._shutter.refine(pose, last, self._map.positions_of(pose.landmark_of_feature))
         information = self._tracking.information(pose)
-        expected = None if was_lost else predicted(pose.stamp_ns, last, self._before_last)
         displaced = self._earlier_depth.displacement(pose.observation, pose.T_camera_world, pose.reference)
         assessed = self._doubts.assess(pose, covariance_of(information), last, expected, displaced)
+        if follows and not assessed.doubts:
+            self._learn_turn(last, pose, by_velocity)
         # The motion before a gap does not predict the motion after it.
         self._before_last, self._last = None if was_lost else last, pose
         self._agreeing = pose.landmark_of_feature >= 0
@@ -130,6 +142,10 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
                 previous_px[now] = observation.pixels[then]
         return FeatureMatches(self._agreeing, previous_px)
 
+    def gyroscope_notes(self) -> Sequence[str]:
+        """Return how the gyroscope was used, if the log has one."""
+        return self._prior.notes()
+
     def sensor_notes(self) -> Sequence[str]:
         """Return the estimated readout time of the camera's shutter, if it has any."""
         sentence = self._map.readout.sentence
@@ -142,6 +158,24 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
     def finish(self) -> Sequence[BetweenFactor]:
         """Return the factors between the keyframes, at their final poses."""
         return self._mapping.factors()
+
+    def _predict(self, stamp_ns: int) -> tuple[Transform | None, Transform | None]:
+        """Return the next T_camera_world by constant velocity, and by the gyroscope if that is better."""
+        last = self._last
+        if last is None or self._tracking.is_lost:
+            return None, None
+        by_velocity = predict_by_velocity(stamp_ns, last, self._before_last)
+        R_last_body = self._prior.turn(last.stamp_ns, stamp_ns)
+        if R_last_body is None:
+            return by_velocity, by_velocity
+        return by_velocity, predict_by_turn(last, by_velocity, R_last_body)
+
+    def _learn_turn(self, last: TrackedPose, pose: TrackedPose, by_velocity: Transform | None) -> None:
+        T_last_body = inverse(last.body_pose) @ pose.body_pose
+        constant = np.eye(4)
+        if by_velocity is not None:
+            constant = inverse(pose.observation.T_body_camera @ by_velocity @ last.body_pose)
+        self._prior.learn(last.stamp_ns, pose.stamp_ns, T_last_body[:3, :3], constant[:3, :3])
 
     def _begin_sub_map_or_lose(self, observation: ImageObservation) -> FrameResult:
         """Return a lost frame, or begin a new sub-map with it once enough frames matched no landmarks."""

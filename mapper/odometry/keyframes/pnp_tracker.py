@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 
-from mapper.core.geometry import inverse
+from mapper.core.geometry import Transform, inverse
 from mapper.odometry.camera.image_observation import ImageObservation
 from mapper.odometry.keyframes.landmarks import LandmarkMap
 from mapper.odometry.keyframes.pose_tracker import TrackedPose
@@ -17,7 +17,7 @@ class PnpPoseTracker:
         self._relocalizer = relocalizer
 
     def track(
-        self, observation: ImageObservation, last: TrackedPose, _before_last: TrackedPose | None, /
+        self, observation: ImageObservation, last: TrackedPose, _T_predicted: Transform | None, /
     ) -> TrackedPose | None:
         """Match the latest keyframes, and the similar ones as well while few landmarks agree."""
         return self._relocalizer.best_among(self._candidates(observation, last), observation, method="pnp")

@@ -75,9 +75,15 @@ class PoseTracker(Protocol):
     """Method that finds the pose of a frame while the frame before it was tracked."""
 
     def track(
-        self, observation: ImageObservation, last: TrackedPose, before_last: TrackedPose | None, /
+        self, observation: ImageObservation, last: TrackedPose, T_predicted: Transform | None, /
     ) -> TrackedPose | None:
-        """Return the pose of a frame, given those of the two frames before it; None if it is not found."""
+        """Return the pose of a frame, given that of the frame before it; None if it is not found.
+
+        Args:
+            observation: The frame.
+            last: The frame before it.
+            T_predicted: T_camera_world (4, 4) by the motion; None if nothing tells it.
+        """
         ...
 
 
@@ -86,7 +92,9 @@ def unmatched(observation: ImageObservation) -> Ids:
     return np.full(len(observation), -1, np.int32)
 
 
-def predicted(stamp_ns: int, last: TrackedPose, before_last: TrackedPose | None) -> Transform | None:
+def predict_by_velocity(
+    stamp_ns: int, last: TrackedPose, before_last: TrackedPose | None
+) -> Transform | None:
     """Return T_camera_world under constant velocity, also across dropped frames; None if nothing tells it."""
     if before_last is None:
         return None
@@ -97,6 +105,15 @@ def predicted(stamp_ns: int, last: TrackedPose, before_last: TrackedPose | None)
     rotation_rad, translation_m = log(last.T_camera_world @ inverse(before_last.T_camera_world))
     T_camera_world: Transform = exp(steps * rotation_rad, steps * translation_m) @ last.T_camera_world
     return T_camera_world
+
+
+def predict_by_turn(last: TrackedPose, T_by_velocity: Transform | None, R_last_body: Array) -> Transform:
+    """Return T_camera_world with a measured rotation of the body since, and the predicted position."""
+    T_body_camera, T_world_body = last.observation.T_body_camera, last.body_pose.copy()
+    if T_by_velocity is not None:
+        T_world_body[:3, 3] = inverse(T_body_camera @ T_by_velocity)[:3, 3]
+    T_world_body[:3, :3] = T_world_body[:3, :3] @ R_last_body
+    return inverse(T_world_body @ T_body_camera)
 
 
 def project(T_camera_world: Transform, points_world: Points, intrinsics: Array) -> Array:

@@ -2,14 +2,16 @@
 
 from functools import partial
 
-from mapper.core.geometry import Array, adjoint, inverse
+from mapper.core.geometry import Array, Transform, adjoint, inverse
 from mapper.odometry.base import MotionCheck, is_gap
 from mapper.odometry.camera.image_observation import ImageObservation
 from mapper.odometry.config import KeyframeOdometryConfig
 from mapper.odometry.keyframes.depth_tracker import DepthTracker
+from mapper.odometry.keyframes.keyframe import Keyframe
 from mapper.odometry.keyframes.landmarks import LandmarkMap
 from mapper.odometry.keyframes.pose_tracker import PoseTracker, TrackedPose, unmatched
 from mapper.odometry.keyframes.relocalizer import Relocalizer
+from mapper.odometry.motion_prior import MotionPrior
 
 _MIN_START_FEATURES = 100
 """Features with depth that a sub-map's first frame must have: a few times ``min_inliers``."""
@@ -25,6 +27,7 @@ class Tracking:
         relocalizer: Relocalizer,
         tracker: PoseTracker,
         motion_check: MotionCheck | None,
+        prior: MotionPrior,
     ) -> None:
         """Start before the first frame.
 
@@ -34,27 +37,29 @@ class Tracking:
             relocalizer: Finds poses without a prediction.
             tracker: Finds poses of frames that follow a tracked one.
             motion_check: Rules out poses after a gap; None if nothing but the images tells of the motion.
+            prior: Rules out poses that contradict a gyroscope.
         """
         self._config = config
         self._map = landmark_map
         self._relocalizer = relocalizer
         self._tracker = tracker
         self._motion_check = motion_check
+        self._prior = prior
         self._depth = DepthTracker(config, landmark_map)
         self._unknown_frames = 0  # since the last pose, those with enough features to begin a sub-map
         self.is_lost = False
 
     def find_pose(
-        self, observation: ImageObservation, last: TrackedPose, before_last: TrackedPose | None
+        self, observation: ImageObservation, last: TrackedPose, T_predicted: Transform | None
     ) -> TrackedPose | None:
         """Track from the last frame; if that fails, or it was lost, relocalise among similar keyframes.
 
         Args:
             observation: The frame.
             last: The last frame that was tracked.
-            before_last: The one before it, if the two predict the motion.
+            T_predicted: T_camera_world (4, 4) by the motion since; None if nothing tells it.
         """
-        tracked_pose = None if self.is_lost else self._follow(observation, last, before_last)
+        tracked_pose = None if self.is_lost else self._follow(observation, last, T_predicted)
         if tracked_pose is None:
             tracked_pose = self._relocalise(observation, last)
         self.is_lost = tracked_pose is None
@@ -90,11 +95,13 @@ class Tracking:
         return information
 
     def _follow(
-        self, observation: ImageObservation, last: TrackedPose, before_last: TrackedPose | None
+        self, observation: ImageObservation, last: TrackedPose, T_predicted: Transform | None
     ) -> TrackedPose | None:
-        tracked_pose = self._tracker.track(observation, last, before_last)
-        tracked_pose = self._depth.supported(observation, last, before_last, tracked_pose)
-        if tracked_pose is None:
+        tracked_pose = self._tracker.track(observation, last, T_predicted)
+        if tracked_pose is not None and self._turns_otherwise(tracked_pose, last):
+            tracked_pose = None
+        tracked_pose = self._depth.supported(observation, last, T_predicted, tracked_pose)
+        if tracked_pose is None or self._turns_otherwise(tracked_pose, last):
             return None
         is_known = self._is_steady(tracked_pose, last) or self._is_possible(tracked_pose, last)
         return tracked_pose if is_known else None
@@ -110,6 +117,10 @@ class Tracking:
         found = self._depth.supported(observation, relocalised or last, None, relocalised)
         return found if found is not None and is_possible(found) else None
 
+    def _turns_otherwise(self, tracked_pose: TrackedPose, since: TrackedPose | Keyframe) -> bool:
+        R_since_body = since.body_pose[:3, :3].T @ tracked_pose.body_pose[:3, :3]
+        return self._prior.reject(since.stamp_ns, tracked_pose.stamp_ns, R_since_body)
+
     def _is_steady(self, tracked_pose: TrackedPose, last: TrackedPose) -> bool:
         """Return whether a pose is soon after the last one, and in its sub-map."""
         keyframes = self._map.keyframes
@@ -123,13 +134,13 @@ class Tracking:
         tracked frame, and that since the keyframe that was recognised, if it is of another sub-map.
         """
         check = self._motion_check
-        if check is None:
-            return True
         keyframes = self._map.keyframes
         known = keyframes[tracked_pose.reference]
         since = last if known.origin == keyframes[last.reference].origin else known
+        if self._turns_otherwise(tracked_pose, since):
+            return False
         T_begin_end = inverse(since.body_pose) @ tracked_pose.body_pose
-        if not check.contradiction(T_begin_end, since.stamp_ns, tracked_pose.stamp_ns):
+        if check is None or not check.contradiction(T_begin_end, since.stamp_ns, tracked_pose.stamp_ns):
             return True
         self._unknown_frames = self._config.max_lost_frames  # another place, so a sub-map may begin at once
         return False
