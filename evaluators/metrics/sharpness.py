@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from mapper.core.deskew import deskewed
 from mapper.core.errors import DataError
 from mapper.core.frames import Sensor
 from mapper.core.geometry import Array, Points, apply, stride_for
@@ -73,7 +72,7 @@ def views_of(source: Log, trajectory: Trajectory, *, progress: Progress = SILENT
     points, towards, frames = [np.empty((0, 3))], [np.empty((0, 3))], [np.empty(0, np.int64)]
     with progress.stage("sharp") as report:
         for number, frame in enumerate(chosen):
-            scan = deskewed(frame.entry.scan(), frame.twist)
+            scan = frame.scan_of(frame.entry.scan())
             few = scan.points_body[:: max(1, len(scan.points_body) * len(chosen) // _POINTS)]
             points.append(apply(frame.T_world_body, few.astype(np.float64)))
             towards.append((scan.origin_body - few) @ frame.T_world_body[:3, :3].T)

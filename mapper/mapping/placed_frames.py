@@ -5,12 +5,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mapper.core.deskew import STILL, Twist, deskewed, twist_at
+from mapper.core.deskew import deskewed
 from mapper.core.frames import Frame, Scan
 from mapper.core.geometry import Transform
 from mapper.core.trajectory import Trajectory
 from mapper.octree.casting import reach_m
 from mapper.octree.config import OctreeConfig
+from mapper.sensing.gyroscope import Gyroscope, motion_during
 from mapper.sources.base import FrameRef, Log
 
 
@@ -22,17 +23,20 @@ class PlacedFrame:
         entry: The frame.
         index: Index of its pose in the trajectory.
         T_world_body: (4, 4) its final pose.
-        twist: Its velocity there, for deskewing.
+        trajectory: Final poses of all frames.
+        gyroscope: Readings of the log, for deskewing.
     """
 
     entry: FrameRef
     index: int
     T_world_body: Transform
-    twist: Twist
+    trajectory: Trajectory
+    gyroscope: Gyroscope | None
 
     def scan_of(self, frame: Frame) -> Scan:
         """Return the loaded frame as a scan, deskewed."""
-        return deskewed(frame.scan(), self.twist)
+        scan = frame.scan()
+        return deskewed(scan, motion_during(scan, self.trajectory, self.index, self.gyroscope))
 
 
 def placed_frames(source: Log, trajectory: Trajectory) -> Iterator[PlacedFrame]:
@@ -40,8 +44,7 @@ def placed_frames(source: Log, trajectory: Trajectory) -> Iterator[PlacedFrame]:
     index_of = {int(stamp_ns): index for index, stamp_ns in enumerate(trajectory.stamps_ns)}
     for entry in source.entries_of(index_of):
         index = index_of[entry.stamp_ns]
-        twist = STILL if source.sensor == "rgbd" else twist_at(trajectory, index)
-        yield PlacedFrame(entry, index, trajectory.T_world_body[index], twist)
+        yield PlacedFrame(entry, index, trajectory.T_world_body[index], trajectory, source.gyroscope)
 
 
 def within_reach(scan: Scan, T_world_body: Transform, config: OctreeConfig) -> tuple[Scan, int]:

@@ -19,6 +19,7 @@ from mapper.sources.base import FrameRef
 if TYPE_CHECKING:
     from mapper.core.deskew import Motion
     from mapper.features.frame_view import FrameView
+    from mapper.odometry.gyroscope_calibration import GyroscopeCalibration
 
 
 @dataclass(frozen=True, slots=True)
@@ -196,6 +197,10 @@ class GyroscopeUser(Protocol):
 
     def gyroscope_notes(self) -> Sequence[str]:
         """Return how it was used once the log has ended, a sentence each; nothing if the log has none."""
+        ...
+
+    def gyroscope_calibration(self) -> GyroscopeCalibration | None:
+        """Return its calibration once the log has ended; None if it was of no use."""
         ...
 
 

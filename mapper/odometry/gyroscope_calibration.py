@@ -1,6 +1,6 @@
 """Calibration of a gyroscope by the rotations that an odometry measures: mounting, bias, clock and unit."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import pi
 
 import numpy as np
@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from mapper.core.geometry import Array, rotation_exp
 from mapper.core.timebase import NS_PER_S, Stamps
 from mapper.sensing.gyroscope import Gyroscope
+from mapper.sources.base import Log
 
 _STATED_RAD, _UNSTATED_RAD = 0.1, 2.0  # a mounting in tf is right to some degrees, or wrong altogether
 _BIAS_RADPS, _OFFSET_S = 0.02, 0.05  # of units without calibration, and of unsynchronised clocks
@@ -68,6 +69,23 @@ class GyroscopeCalibration:
         J[:, :, 3:6] = -0.5 * seconds[:, None, None] * (R @ (np.eye(3) + G[0].transpose(0, 2, 1)))
         J[:, :, 6] = by_time @ R.T
         return R_begin_end, J, G[1] & early[1] & late[1]
+
+    def applied_to(self, gyroscope: Gyroscope) -> Gyroscope:
+        """Return the readings of the body: in its axes and the frames' clock, without the bias."""
+        return replace(
+            gyroscope,
+            stamps_ns=gyroscope.stamps_ns - round(self.offset_s * NS_PER_S),
+            rates_radps=(self.scale * gyroscope.rates_radps - self.bias) @ self.R_body_imu.T,
+            R_body_imu=np.eye(3),
+            is_of_body=True,
+        )
+
+
+def with_body_rates(log: Log, calibration: GyroscopeCalibration | None) -> Log:
+    """Return a log with the readings of its gyroscope calibrated; the log itself without one of both."""
+    if calibration is None or log.gyroscope is None or log.gyroscope.is_of_body:
+        return log
+    return replace(log, gyroscope=calibration.applied_to(log.gyroscope))
 
 
 def uncalibrated(gyroscope: Gyroscope) -> GyroscopeCalibration:

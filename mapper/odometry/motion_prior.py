@@ -10,6 +10,7 @@ from mapper.core.geometry import Array, Transform, rotation_log
 from mapper.core.timebase import NS_PER_S
 from mapper.odometry.gyroscope_calibration import (
     DEGREES,
+    GyroscopeCalibration,
     calibrate,
     uncalibrated,
 )
@@ -38,6 +39,7 @@ class MotionPrior:
         """Begin before the first frame."""
         self._gyroscope = gyroscope
         self._calibration = None if gyroscope is None else uncalibrated(gyroscope)
+        self._of_body: Gyroscope | None = None  # made when it is needed
         self._intervals: deque[tuple[int, int, Array]] = deque(maxlen=_KEPT)
         self._errors: deque[float] = deque(maxlen=_ERRORS)
         self._errors_without: deque[float] = deque(maxlen=_ERRORS)
@@ -77,24 +79,15 @@ class MotionPrior:
             half_s: Half of its duration.
             velocity_mps: (3,) in the body's axes in the middle.
         """
-        gyroscope, calibration = self._gyroscope, self._calibration
         half_ns = round(half_s * NS_PER_S)
-        if gyroscope is None or calibration is None or not half_ns:
-            return None
-        if self.turn(middle_ns - half_ns, middle_ns + half_ns) is None:
-            return None
-        shift_ns = round(calibration.offset_s * NS_PER_S)
         begin_ns, end_ns = middle_ns - half_ns, middle_ns + half_ns
-        first, last = np.searchsorted(gyroscope.stamps_ns, [begin_ns + shift_ns, end_ns + shift_ns])
-        inside = gyroscope.stamps_ns[first:last] - shift_ns
-        knots_ns = np.unique(np.concatenate([inside, [begin_ns, middle_ns, end_ns]]))
-        steps, _, _ = calibration.turns(gyroscope, knots_ns[:-1], knots_ns[1:])
-        R = [np.eye(3)]
-        for step in steps:
-            R.append(R[-1] @ step)
-        R_begin = np.array(R)
-        R_begin_middle = R_begin[int(np.searchsorted(knots_ns, middle_ns))]
-        return SampledMotion((knots_ns - middle_ns) / NS_PER_S, R_begin_middle.T @ R_begin, velocity_mps)
+        if not half_ns or self.turn(begin_ns, end_ns) is None:
+            return None
+        assert self._gyroscope is not None
+        assert self._calibration is not None
+        if self._of_body is None:
+            self._of_body = self._calibration.applied_to(self._gyroscope)
+        return self._of_body.motion(begin_ns, middle_ns, end_ns, velocity_mps)
 
     def spread_radps(self) -> float:
         """Return the standard deviation of the angular velocity that the gyroscope gives, rad/s."""
@@ -143,6 +136,13 @@ class MotionPrior:
             self._rejected_ns = end_ns
             self._errors.append(off_rad)
         return is_ruled_out
+
+    @property
+    def calibration(self) -> GyroscopeCalibration | None:
+        """The gyroscope's calibration, if it predicts the last rotations better than constant velocity."""
+        if not self._used or np.median(self._errors) >= np.median(self._errors_without):
+            return None
+        return self._calibration
 
     def notes(self) -> list[str]:
         """Return how the gyroscope was used and calibrated, and what contradicts it, a sentence each."""
@@ -197,6 +197,7 @@ class MotionPrior:
         begins_ns, ends_ns = (np.array([one[k] for one in self._intervals], np.int64) for k in (0, 1))
         R_begin_end = np.array([one[2] for one in self._intervals])
         self._calibration = calibrate(gyroscope, begins_ns, ends_ns, R_begin_end)
+        self._of_body = None
         count = len(self._errors)
         R_turned, _, _ = self._calibration.turns(gyroscope, begins_ns[-count:], ends_ns[-count:])
         self._errors.clear()

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from mapper.config.build import BuildConfig
-from mapper.core.deskew import deskewed, twist_at
+from mapper.core.deskew import deskewed
 from mapper.core.errors import FrameError
 from mapper.core.frames import Scan
 from mapper.core.timebase import check_stamps
@@ -17,6 +17,7 @@ from mapper.core.trajectory import Trajectory
 from mapper.mapping.levelling import Level, axes_of, find_level
 from mapper.navigation.floor import MAX_SENSOR_HEIGHT_M
 from mapper.odometry.base import Odometry
+from mapper.odometry.gyroscope_calibration import with_body_rates
 from mapper.pipeline.checkpoint_identity import identity_of, kept_from_before
 from mapper.pipeline.checkpoints import (
     EVERY_S,
@@ -33,11 +34,12 @@ from mapper.pipeline.tracking_checkpoints import TrackingCheckpoints
 from mapper.pipeline.tracking_result import TrackingResult, from_tracking, refuse_a_fragment, save_places
 from mapper.run import files
 from mapper.run.folder import Run, open_run
-from mapper.run.manifest import Levelling, RunWarning, Solve, Weight
+from mapper.run.manifest import GyroscopeFit, Levelling, RunWarning, Solve, Weight
 from mapper.run.observers import NULL_OBSERVER, Observer
 from mapper.run.stored_tracking import save_solved, save_tracking
 from mapper.run.writer import RunWriter, first_manifest, write_run
 from mapper.runtime.progress import SILENT, Progress
+from mapper.sensing.gyroscope import motion_during
 from mapper.sources.base import Log
 from mapper.sources.trajectory_files import write_tum
 
@@ -145,6 +147,8 @@ class _Steps:
         """Write the result of tracking, unless too little was tracked for a map."""
         self.writer.warn(tracking.warnings)
         save_tracking(self.writer, from_tracking(tracking, self.source.truth))
+        if tracking.gyroscope is not None:
+            self.writer.update(gyroscope=GyroscopeFit.of(tracking.gyroscope))
         refuse_a_fragment(tracking, self.config, sensor=self.source.sensor)
         return tracking
 
@@ -155,7 +159,7 @@ class _Steps:
         tracking = replace(tracking, graph=graph.graph, loops=graph.loops)
         tracking = largest_component(tracking, progress=self.progress)
         with self.writer.clock.stage("level"):
-            level = level_of(self.source, tracking, self.config)
+            level = level_of(with_body_rates(self.source, tracking.gyroscope), tracking, self.config)
         tracking = replace(tracking, graph=tracking.graph.moved(level.T_level_world))
         solved = _Solved(tracking, graph.report, level)
         if self.checkpoints is not None:
@@ -209,7 +213,10 @@ def level_of(source: Log, tracking: TrackingResult, config: BuildConfig) -> Leve
     trajectory = tracking.tracked_trajectory()
     scans = _spread_scans(source, trajectory, config.level.frames)
     placed = [
-        (deskewed(scan, twist_at(trajectory, index)), trajectory.T_world_body[index])
+        (
+            deskewed(scan, motion_during(scan, trajectory, index, source.gyroscope)),
+            trajectory.T_world_body[index],
+        )
         for index, scan in scans.items()
     ]
     return find_level(

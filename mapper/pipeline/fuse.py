@@ -207,7 +207,7 @@ def fuse_into(
             make_writer(writer.folder / files.SCAN_UPDATES, settings.octree) as updates,
         ):
             maps = fuse_log(
-                source,
+                writer.manifest.with_body_rates(source),
                 results.tracked,
                 settings,
                 progress=progress,

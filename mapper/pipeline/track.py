@@ -233,6 +233,7 @@ class _FirstPass:
             self.frame_ms,
             warnings,
             detector.places(),
+            odometry.gyroscope_calibration() if isinstance(odometry, GyroscopeUser) else None,
         )
 
     def _warnings(self, graph: PoseGraph, odometry: Odometry[Any], checks: ReadingChecks) -> list[RunWarning]:

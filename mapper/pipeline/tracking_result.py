@@ -11,6 +11,7 @@ from mapper.graph.model import PoseGraph
 from mapper.loops.closure import LoopClosure
 from mapper.loops.place_file import AnyPlace, write_places
 from mapper.odometry.base import FrameResult, see_more
+from mapper.odometry.gyroscope_calibration import GyroscopeCalibration
 from mapper.run import files
 from mapper.run.doubtful_frames import placed_by_neighbours
 from mapper.run.frame_outcomes import records_of
@@ -42,6 +43,7 @@ class TrackingResult:
         frame_ms: Wall milliseconds that each frame took to read, detect and track, by stamp.
         warnings: Warnings about the frames that were read.
         places: Places by node, of the nodes that were searched for loops.
+        gyroscope: Calibration of the log's gyroscope; None if it has none that was of use.
     """
 
     tracks: tuple[FrameResult, ...]
@@ -51,6 +53,7 @@ class TrackingResult:
     frame_ms: Mapping[int, float]
     warnings: Sequence[RunWarning] = ()
     places: Mapping[int, AnyPlace] = field(default_factory=dict)
+    gyroscope: GyroscopeCalibration | None = None
 
     @property
     def placed(self) -> list[FrameResult]:

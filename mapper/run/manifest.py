@@ -5,8 +5,9 @@ import sys
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
-from typing import Literal, TypeVar
+from typing import Literal, Self, TypeVar
 
+import numpy as np
 from pydantic import Field, ValidationError
 from pydantic_core import from_json
 
@@ -14,9 +15,11 @@ import mapper
 from mapper.core.config import Config, drop_unknown
 from mapper.core.errors import DataError, RunError
 from mapper.mapping.config import AppliedEdit
+from mapper.odometry.gyroscope_calibration import GyroscopeCalibration, with_body_rates
 from mapper.runtime.atomic import MANIFEST_NAME, write_text
 from mapper.runtime.regular_files import MOST_BYTES, read_regular, read_text
 from mapper.sensing.config import DepthNoiseConfig
+from mapper.sources.base import Log
 from mapper.sources.config import SourceConfig
 
 Status = Literal["building", "complete", "failed", "interrupted"]
@@ -168,6 +171,34 @@ class Solve(Config):
     """Share of the loops that reached the solver and were rejected by it."""
 
 
+class GyroscopeFit(Config):
+    """Calibration of the log's gyroscope, by which scans are deskewed."""
+
+    R_body_imu: tuple[tuple[float, float, float], ...]
+    bias_radps: tuple[float, float, float]
+    offset_s: float
+    """Added to the frames' stamps it gives the readings'."""
+    scale: float
+    """Factor from the readings to rad/s; negative where their axes are left-handed."""
+
+    @classmethod
+    def of(cls, calibration: GyroscopeCalibration) -> Self:
+        """Return the record of a calibration."""
+        return cls(
+            R_body_imu=calibration.R_body_imu.tolist(),
+            bias_radps=calibration.bias.tolist(),
+            offset_s=calibration.offset_s,
+            scale=calibration.scale,
+        )
+
+    @property
+    def calibration(self) -> GyroscopeCalibration:
+        """The calibration, without its uncertainty."""
+        return GyroscopeCalibration(
+            np.array(self.R_body_imu), np.array(self.bias_radps), self.offset_s, self.scale, np.zeros((7, 7))
+        )
+
+
 class Levelling(Config):
     """Record of how the world's z axis and floor were found."""
 
@@ -257,6 +288,8 @@ class Manifest(Config):
     """None until the maps are made."""
     solve: Solve | None = None
     levelling: Levelling | None = None
+    gyroscope: GyroscopeFit | None = None
+    """None where the log has no gyroscope that was of use."""
     depth: DepthReach | None = None
     """None where the range of octree and cloud is a setting."""
     edits: tuple[AppliedEdit, ...] = ()
@@ -264,6 +297,10 @@ class Manifest(Config):
     timing: Timing = Timing()
     files: dict[str, FileDigest] = Field(default_factory=dict)
     """Every file of the run but this; empty while it is being built."""
+
+    def with_body_rates(self, log: Log) -> Log:
+        """Return the run's log with the readings of its gyroscope calibrated as by the run."""
+        return with_body_rates(log, None if self.gyroscope is None else self.gyroscope.calibration)
 
     def save(self, path: Path) -> None:
         """Write the manifest atomically."""

@@ -24,6 +24,7 @@ from mapper.odometry.base import (
 from mapper.odometry.camera.image_observation import ImageObservation, observe_image
 from mapper.odometry.camera.readout_time import ReadoutTime
 from mapper.odometry.config import KeyframeOdometryConfig
+from mapper.odometry.gyroscope_calibration import GyroscopeCalibration
 from mapper.odometry.keyframes.earlier_depth import EarlierDepth
 from mapper.odometry.keyframes.frame_doubts import UNDOUBTED, Assessment, FrameDoubts
 from mapper.odometry.keyframes.landmarks import LandmarkMap
@@ -145,6 +146,10 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
     def gyroscope_notes(self) -> Sequence[str]:
         """Return how the gyroscope was used, if the log has one."""
         return self._prior.notes()
+
+    def gyroscope_calibration(self) -> GyroscopeCalibration | None:
+        """Return the gyroscope's calibration, if the log has one that was of use."""
+        return self._prior.calibration
 
     def sensor_notes(self) -> Sequence[str]:
         """Return the estimated readout time of the camera's shutter, if it has any."""

@@ -13,6 +13,7 @@ from mapper.core.geometry import Array, Transform, adjoint, inverse
 from mapper.features.frame_view import ScanView
 from mapper.graph.model import BetweenFactor
 from mapper.odometry.base import Diagnostics, FrameOdometry, FrameResult, lost_frame
+from mapper.odometry.gyroscope_calibration import GyroscopeCalibration
 from mapper.odometry.keyframe_distance import is_far
 from mapper.odometry.motion_prior import MotionPrior
 from mapper.odometry.scans.config import ScanOdometryConfig
@@ -101,6 +102,10 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
     def gyroscope_notes(self) -> Sequence[str]:
         """Return how the gyroscope was used, if the log has one."""
         return self._prior.notes()
+
+    def gyroscope_calibration(self) -> GyroscopeCalibration | None:
+        """Return the gyroscope's calibration, if the log has one that was of use."""
+        return self._prior.calibration
 
     def matches(self) -> None:
         """Return None: the pose is not from features."""
