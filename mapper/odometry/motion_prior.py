@@ -2,6 +2,7 @@
 
 import math
 from collections import deque
+from typing import Any
 
 import numpy as np
 
@@ -47,6 +48,10 @@ class MotionPrior:
         self._next_fit = _FIRST_FIT
         self._used = self._uncovered = 0
         self._rejected_ns = -1
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the state without the calibrated readings, which are made again when they are needed."""
+        return {**self.__dict__, "_of_body": None}
 
     def turn(self, begin_ns: int, end_ns: int) -> Array | None:
         """Return the rotation (3, 3) of the body between two times; None if constant velocity is better."""

@@ -196,6 +196,7 @@ def test_a_prior_goes_on_from_its_state_without_the_readings_in_it():
     stamps_ns, noisy = frames(times_s, R)
     _, _, prior = predictions(readings(times_s, rates), stamps_ns[:60], noisy[:60])
     fixed = fixed_parts(prior, (Gyroscope,))
+    assert prior.sweep(int(stamps_ns[30]), 0.05, np.zeros(3)) is not None
     data = dumps(prior, fixed=fixed)
     again = loads(data, fixed=fixed)
     assert len(data) < 100_000
