@@ -16,6 +16,7 @@ from mapper.odometry.gyroscope_calibration import (
     uncalibrated,
 )
 from mapper.sensing.gyroscope import Gyroscope
+from mapper.sensing.sweep_motion import sampled_motion
 
 _FIRST_FIT, _FITS_GROW, _MOST_BETWEEN_FITS = 8, 1.5, 100
 _KEPT = 400  # intervals that a fit uses: bias drifts over minutes
@@ -92,7 +93,7 @@ class MotionPrior:
         assert self._calibration is not None
         if self._of_body is None:
             self._of_body = self._calibration.applied_to(self._gyroscope)
-        return self._of_body.motion(begin_ns, middle_ns, end_ns, velocity_mps)
+        return sampled_motion(self._of_body, begin_ns, middle_ns, end_ns, velocity_mps)
 
     def spread_radps(self) -> float:
         """Return the standard deviation of the angular velocity that the gyroscope gives, rad/s."""

@@ -39,7 +39,7 @@ from mapper.run.observers import NULL_OBSERVER, Observer
 from mapper.run.stored_tracking import save_solved, save_tracking
 from mapper.run.writer import RunWriter, first_manifest, write_run
 from mapper.runtime.progress import SILENT, Progress
-from mapper.sensing.gyroscope import motion_during
+from mapper.sensing.sweep_motion import motion_during
 from mapper.sources.base import Log
 from mapper.sources.trajectory_files import write_tum
 

@@ -5,11 +5,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.core.deskew import Motion, SampledMotion, twist_at
-from mapper.core.frames import Scan
 from mapper.core.geometry import Array
 from mapper.core.timebase import GAP_INTERVALS, NS_PER_S, Stamps
-from mapper.core.trajectory import Trajectory
 
 _LEAST_GAP_NS = 20_000_000
 """Readings farther apart than this, and than ``GAP_INTERVALS`` of their usual ones, have a gap between."""
@@ -100,51 +97,5 @@ class Gyroscope:
         )
         return R_begin_end, known
 
-    def motion(self, begin_ns: int, zero_ns: int, end_ns: int, velocity_mps: Array) -> SampledMotion | None:
-        """Return the body's motion during a sweep by readings of the body; None where they have a gap.
-
-        Args:
-            begin_ns: Time of the first point.
-            zero_ns: Time from which the motion is counted, not before that.
-            end_ns: Time of the last point.
-            velocity_mps: (3,) in the body's axes at ``zero_ns``.
-        """
-        first, last = np.searchsorted(self.stamps_ns, [begin_ns, end_ns])
-        knots_ns = np.unique(np.concatenate([self.stamps_ns[first:last], [begin_ns, zero_ns, end_ns]]))
-        steps, known = self.rotations(knots_ns[:-1], knots_ns[1:], np.zeros(3))
-        if not len(steps) or not known.all():
-            return None
-        R = [np.eye(3)]
-        for step in steps:
-            R.append(R[-1] @ step)
-        R_begin = np.array(R)
-        R_begin_zero = R_begin[int(np.searchsorted(knots_ns, zero_ns))]
-        return SampledMotion((knots_ns - zero_ns) / NS_PER_S, R_begin_zero.T @ R_begin, velocity_mps)
-
     def _of(self, kept: NDArray[np.bool_]) -> "Gyroscope":
         return replace(self, stamps_ns=self.stamps_ns[kept], rates_radps=self.rates_radps[kept])
-
-
-def motion_during(scan: Scan, trajectory: Trajectory, index: int, gyroscope: Gyroscope | None) -> Motion:
-    """Return the body's motion during a scan, for deskewing: by the gyroscope, or by the poses around it.
-
-    Args:
-        scan: The scan, as it was measured.
-        trajectory: Poses of the body.
-        index: Index of the scan's pose.
-        gyroscope: Readings of the log; they count if they are of the body.
-    """
-    twist = twist_at(trajectory, index)
-    if gyroscope is None or not gyroscope.is_of_body or scan.times_s is None or not len(scan.times_s):
-        return twist
-    first, last = max(index - 1, 0), min(index + 1, len(trajectory) - 1)
-    if first == last:
-        return twist
-    stamps_ns, poses = trajectory.stamps_ns, trajectory.T_world_body
-    elapsed_s = float(stamps_ns[last] - stamps_ns[first]) / NS_PER_S
-    velocity_mps = (poses[last, :3, 3] - poses[first, :3, 3]) @ poses[index, :3, :3] / elapsed_s
-    begin_ns, end_ns = (
-        scan.stamp_ns + round(float(time_s) * NS_PER_S) for time_s in (scan.times_s.min(), scan.times_s.max())
-    )
-    zero_ns = scan.stamp_ns
-    return gyroscope.motion(min(begin_ns, zero_ns), zero_ns, max(end_ns, zero_ns), velocity_mps) or twist
