@@ -34,7 +34,9 @@ def drop_stale_kernels() -> None:
     with suppress(OSError):  # a folder that cannot be written keeps no kernels either
         if mark.exists() and mark.read_text() == names:
             return
+        ours = {Path(module).stem for module in modules}  # other packages' kernels may lie beside them
         for index in kernel_folder().rglob("*.nbi"):
-            index.unlink(missing_ok=True)
+            if index.name.partition(".")[0] in ours:
+                index.unlink(missing_ok=True)
         folder.mkdir(parents=True, exist_ok=True)
         mark.write_text(names)

@@ -71,6 +71,9 @@ def test_kernels_of_other_modules_are_dropped(tmp_path, monkeypatch):
     index = tmp_path / "mapper_0123" / "kernels.cast_rays-155.py311.nbi"
     index.parent.mkdir()
     index.touch()
+    foreign = tmp_path / "other_0123" / "solver_of_another_package.step-7.py311.nbi"
+    foreign.parent.mkdir()
+    foreign.touch()
     drop_stale_kernels()  # nothing says what these were compiled with
     assert not index.exists()
     index.touch()
@@ -79,3 +82,4 @@ def test_kernels_of_other_modules_are_dropped(tmp_path, monkeypatch):
     next(tmp_path.glob("__pycache__/*")).write_text("other modules")
     drop_stale_kernels()
     assert not index.exists()
+    assert foreign.exists()
