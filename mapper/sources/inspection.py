@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mapper.core.errors import DataError, FrameError, SourceError
+from mapper.core.errors import DataError, DependencyError, FrameError, SourceError
 from mapper.core.frames import Frame, PinholeCamera, RgbdFrame, Scan, Sensor
 from mapper.core.timebase import GAP_INTERVALS, MAX_TRUTH_GAP_NS, NS_PER_S, Stamps, check_stamps, nearest
 from mapper.core.trajectory import Trajectory
@@ -126,7 +126,7 @@ def inspect_log(path: Path, config: SourceConfig) -> Inspection:
     topics = [_topic(series) for series in reader.series.values()]
     try:
         log = selected(recording_log(reader, config), config)
-    except SourceError as error:
+    except (DependencyError, SourceError) as error:
         return Inspection(path, topics, None, str(error))
     return _inspected(path, topics, log)
 

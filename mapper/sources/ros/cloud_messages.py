@@ -19,6 +19,11 @@ Field = tuple[str, int, str, int]
 
 _SEPARATE_COLOURS = (("r", "g", "b"), ("red", "green", "blue"))
 _PACKED_COLOURS = ("rgb", "rgba")
+_LIVOX_FIELDS = {"tag", "line"}
+_LIVOX_NOISE = 0b1111
+"""Bits of a Livox point's tag that are not zero for noise: by its position (stray points between near and far
+surfaces), and by its intensity (rain, fog, dust). The next two count returns (Livox SDK protocol, tag
+information; of a Mid-360 they are a third kind of confidence)."""
 
 
 def structured(
@@ -71,6 +76,17 @@ def structured(
         raise DataError(
             f"a cloud of {rows}×{columns} points of {point_bytes} bytes in {len(data)} bytes: {error}"
         ) from None
+
+
+def without_noise(points: NDArray[np.void]) -> tuple[NDArray[np.void], list[str]]:
+    """Return points without those that a Livox tags as noise, and a note on these; others as they are."""
+    if not set(points.dtype.names or ()) >= _LIVOX_FIELDS or points.dtype["tag"] != np.uint8:
+        return points, []
+    is_noise = points["tag"] & _LIVOX_NOISE != 0
+    if not (count := int(is_noise.sum())):
+        return points, []
+    note = f"points tagged as noise (rain, dust, edges) are left out: {count} of {len(points)} of the first"
+    return points[~is_noise], [note]
 
 
 def scan_from(

@@ -10,8 +10,10 @@ from mapper.core.errors import DataError
 from mapper.core.geometry import is_rigid, transform
 from mapper.core.rotations import row_of_pose
 from mapper.core.timebase import NS_PER_S
-from mapper.sources.ros.cloud_messages import Field, structured
+from mapper.sources.ros.cloud_messages import Field, structured, without_noise
+from mapper.sources.ros.driver_messages import decode_driver_message
 from mapper.sources.ros.messages import (
+    DRIVER_CLOUDS,
     EXTRINSICS,
     CameraMessage,
     CloudMessage,
@@ -35,9 +37,12 @@ def decode_ros(topic: Topic, data: memoryview) -> Message:
 
     Raises:
         DataError: The message is damaged, or of a type that is not read.
+        DependencyError: The library that decodes a driver's packets is not installed.
     """
     if topic.type in EXTRINSICS:
         return _extrinsics(data, is_little_endian=topic.encoding == "ros1" or bool(data[1] & 1))
+    if topic.type in DRIVER_CLOUDS:
+        return decode_driver_message(topic, data)
     read = _READERS.get(topic.type)
     if read is None:
         raise DataError(f"messages of type {topic.type} are not read")
@@ -100,7 +105,8 @@ def _cloud(m: Any) -> CloudMessage:
         shape=(m.height, m.width),
         row_bytes=m.row_step,
     )
-    return CloudMessage(_ns(m.header.stamp), m.header.frame_id, points, notes=notes)
+    points, noise_notes = without_noise(points)
+    return CloudMessage(_ns(m.header.stamp), m.header.frame_id, points, notes=[*notes, *noise_notes])
 
 
 def _imu(m: Any) -> ImuMessage:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.core.errors import DataError, FrameError
+from mapper.core.errors import DataError, DependencyError, FrameError
 from mapper.core.geometry import Array
 from mapper.core.timebase import LATEST_NS, NS_PER_S, Stamps
 from mapper.core.units import MIB
@@ -126,7 +126,7 @@ def first_messages(recording: Recording, series: Iterable[Series]) -> dict[str, 
         if one.topic.type not in READ:
             continue
         for i in range(min(_TRIED, len(one))):
-            with suppress(DataError, FrameError):
+            with suppress(DataError, DependencyError, FrameError):
                 firsts[one.topic.name] = _whole_message(recording, one, i)
                 break
     return firsts
@@ -136,7 +136,7 @@ def why_unread(recording: Recording, series: Series) -> str:
     """Return why the first message of a topic cannot be read, with its name; empty if it can."""
     try:
         _whole_message(recording, series, 0)
-    except (DataError, FrameError) as error:
+    except (DataError, DependencyError, FrameError) as error:
         return f"{series.topic.name}: {str(error).removeprefix(f'{series.topic.name}: ')}"
     return ""
 
@@ -147,6 +147,7 @@ def _whole_message(recording: Recording, series: Series, i: int) -> Message:
     Raises:
         DataError: It is damaged.
         FrameError: It cannot be read, or has no image although its type says so.
+        DependencyError: The library that decodes it is not installed.
     """
     message = decode(series.topic, recording.read(series.place(i)))
     if isinstance(message, ImageMessage):

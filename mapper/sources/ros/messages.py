@@ -100,12 +100,13 @@ class CameraMessage:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CloudMessage:
-    """A point cloud (sensor_msgs/PointCloud2, foxglove.PointCloud).
+    """A point cloud (sensor_msgs/PointCloud2, foxglove.PointCloud, a LiDAR driver's own message).
 
     Attributes:
         stamp_ns: Time of the cloud.
         frame: Coordinate frame of the points.
-        points: (N,) structured view of the message's own bytes; organised rows follow each other.
+        points: (N,) records, a view of the message's own bytes where it holds such; organised rows follow
+            each other.
         T_frame_points: Pose of the points in ``frame``; only Foxglove's clouds have another than identity.
         notes: What was left out or corrected to read it, a sentence each.
     """
@@ -172,7 +173,12 @@ PIXELS = frozenset({"sensor_msgs/msg/Image", "foxglove.RawImage"})
 FILES = frozenset({"sensor_msgs/msg/CompressedImage", "foxglove.CompressedImage"})
 IMAGES = PIXELS | FILES
 CAMERAS = frozenset({"sensor_msgs/msg/CameraInfo", "foxglove.CameraCalibration"})
-CLOUDS = frozenset({"sensor_msgs/msg/PointCloud2", "foxglove.PointCloud"})
+LIVOX = frozenset(
+    f"{package}/msg/CustomMsg" for package in ("livox_ros_driver", "livox_ros_driver2", "livox_interfaces")
+)
+VELODYNE = frozenset({"velodyne_msgs/msg/VelodyneScan"})
+DRIVER_CLOUDS = LIVOX | VELODYNE
+CLOUDS = frozenset({"sensor_msgs/msg/PointCloud2", "foxglove.PointCloud"}) | DRIVER_CLOUDS
 IMUS = frozenset({"sensor_msgs/msg/Imu"})
 POSES = frozenset(
     {

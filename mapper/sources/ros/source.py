@@ -9,6 +9,7 @@ from mapper.core.errors import SourceError
 from mapper.core.frames import Sensor
 from mapper.core.timebase import NS_PER_S, Stamps
 from mapper.core.units import MM_PER_M
+from mapper.runtime.extras import require
 from mapper.sources.base import FrameRef, Log
 from mapper.sources.config import SourceConfig
 from mapper.sources.image_files.image_sizes import recorded_camera
@@ -23,6 +24,7 @@ from mapper.sources.ros.index import Series, why_unread
 from mapper.sources.ros.message_order import ordered, paired
 from mapper.sources.ros.messages import (
     READ,
+    VELODYNE,
     CloudMessage,
     FileMessage,
     ImageMessage,
@@ -51,6 +53,7 @@ def recording_log(reader: RecordingReader, config: SourceConfig) -> Log:
     Raises:
         SourceError: Nothing in it can be mapped, a requested topic is missing, images do not
             pair, or the camera is unknown.
+        DependencyError: Its clouds are packets, and the library that decodes them is not installed.
     """
     recording = reader.recording
     unread = [
@@ -169,6 +172,8 @@ def _rgbd(reader: RecordingReader, topics: CameraTopics, config: SourceConfig) -
 
 
 def _lidar(reader: RecordingReader, clouds: Series, config: SourceConfig) -> _Frames:
+    if clouds.topic.type in VELODYNE:
+        require("velodyne_decoder", "velodyne", f"{reader.recording.path}: reading {clouds.topic.name}")
     i, notes = ordered(clouds)
     first = reader.firsts.get(clouds.topic.name)
     if isinstance(first, CloudMessage):

@@ -243,10 +243,11 @@ def is_called_registered(name: str) -> bool:
 
 
 def _cloud_rank(name: str) -> tuple[int, ...]:
-    """Rank clouds of a driver before clouds that were computed from them."""
+    """Rank clouds of a driver before clouds that were computed from them, and before its packets."""
     lower = name.lower()
     is_made = any(word in lower for word in ("map", "filter", "ground", "cluster", "registered", "depth"))
-    return int(is_made), int(not any(word in lower for word in ("lidar", "velodyne", "ouster", "points")))
+    is_driven = any(word in lower for word in ("lidar", "velodyne", "ouster", "points"))
+    return int(is_made), int(not is_driven), int("packets" in lower)
 
 
 def _plain_rank(name: str) -> tuple[int, ...]:
