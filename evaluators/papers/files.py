@@ -1,6 +1,5 @@
 """Files of `mapper reproduce`: the tables as Markdown, CSV and LaTeX, plots, and a page of them."""
 
-import base64
 import os
 import re
 from collections.abc import Mapping, Sequence
@@ -45,14 +44,14 @@ from mapper.export.figures import (
     TEXT,
     TRUTH,
     WIDE_IN,
+    box_panels,
     caption,
     draw_boxes,
     hex_of,
-    panel,
+    panels,
     save,
-    sheet,
 )
-from mapper.export.html import bullets, document, section
+from mapper.export.html import bullets, document, image, section
 from mapper.export.html import table as html_table
 from mapper.runtime.atomic import write_text
 from mapper.sources.trajectory_files import read_tum
@@ -139,7 +138,11 @@ def _latex(reproduction: Reproduction) -> str:
 def _page(folder: Path, reproduction: Reproduction, plots: Mapping[str, Path]) -> str:
     main = [_section(each, plots.get(each.name)) for each in _filled(reproduction)]
     of_tables = {each.name for each in reproduction.tables}
-    main += [section(name, _image(path)) for name, path in plots.items() if name not in of_tables]
+    main += [
+        section(name, image(path.read_bytes(), path.stem))
+        for name, path in plots.items()
+        if name not in of_tables
+    ]
     if reproduction.pictures:  # they can be many, so they stay beside the page
         links = (
             f'<li><a href="{escape(os.path.relpath(path, folder))}">{escape(path.stem)}</a></li>'
@@ -155,17 +158,10 @@ def _section(each: PaperTable, plot: Path | None) -> str:
     shown = _shown(each, _everything_known(each))
     head = [column.title for column in shown.columns]
     body = html_table(head, shown_cells(shown.columns, shown.records)) + bullets(shown.notes)
-    return section(shown.title, body + (_image(plot) if plot else ""))
-
-
-def _image(path: Path) -> str:
-    data = base64.b64encode(path.read_bytes()).decode()
-    return f'<p><img alt="{escape(path.stem)}" src="data:image/png;base64,{data}"></p>'
+    return section(shown.title, body + (image(plot.read_bytes(), plot.stem) if plot else ""))
 
 
 TRAJECTORIES, SCENES = "trajectories.png", "scenes.png"
-_BOX_IN = 0.3
-_LETTER_IN = 0.062
 _NUMBER = re.compile(r"\d+")
 _LEGEND: dict[str, Any] = {"fontsize": 7, "framealpha": 0.9, "edgecolor": LINE}
 
@@ -206,9 +202,8 @@ def write_plots(folder: Path, reproduction: Reproduction) -> dict[str, Path]:
 def _write_curves(path: Path, table: PaperTable) -> None:
     """Draw each row's figures over what the columns count; a column without a number is a level."""
     rows = _by_row(table)
-    figure, across, down = sheet(_title(table), len(rows), width_in=WIDE_IN)
-    for number, (row, cells) in enumerate(rows.items()):
-        axes = panel(figure, number, columns=across, rows=down)
+    figure, panes = panels(_title(table), len(rows), width_in=WIDE_IN)
+    for axes, (row, cells) in zip(panes, rows.items(), strict=True):
         printed = {cell.column: [cell.published] for cell in cells if cell.published is not None}
         ours = {cell.column: cell.ours for cell in cells if cell.ours}
         _draw_curve(axes, printed, color=hex_of(TRUTH), label="printed")
@@ -235,11 +230,8 @@ def _draw_curve(axes: "Axes", figures: Mapping[str, Sequence[float]], *, color: 
 def _write_boxes(path: Path, table: PaperTable) -> None:
     """Draw each row's figures over the seeds, a box for each column, with the printed one as a mark."""
     rows = _by_row(table)
-    most = max(len(cells) for cells in rows.values())
-    figure, across, down = sheet(_title(table), len(rows), width_in=WIDE_IN, height_in=0.9 + _BOX_IN * most)
-    left_in = _label_in(_columns(table))
-    for number, (row, cells) in enumerate(rows.items()):
-        axes = panel(figure, number, columns=across, rows=down, left_in=left_in)
+    figure, panes = box_panels(_title(table), len(rows), _columns(table))
+    for axes, (row, cells) in zip(panes, rows.items(), strict=True):
         printed = {k: cell.published for k, cell in enumerate(cells, 1) if cell.published is not None}
         axes.plot(list(printed.values()), list(printed), "D", color=hex_of(TRUTH), zorder=3, label="printed")
         ours = [(figure, k) for k, cell in enumerate(cells, 1) for figure in cell.ours]
@@ -254,10 +246,8 @@ def _write_boxes(path: Path, table: PaperTable) -> None:
 
 def _write_scenes(path: Path, tables: Sequence[PaperTable], *, title: str) -> None:
     columns = _columns(tables[0])
-    figure, across, down = sheet(title, len(columns), width_in=WIDE_IN, height_in=0.9 + _BOX_IN * len(tables))
-    left_in = _label_in([_short(table) for table in tables])
-    for number, column in enumerate(columns):
-        axes = panel(figure, number, columns=across, rows=down, left_in=left_in)
+    figure, panes = box_panels(title, len(columns), [_short(table) for table in tables])
+    for axes, column in zip(panes, columns, strict=True):
         draw_boxes(axes, {_short(table): _figures_of(table, column) for table in tables})
         caption(axes, title=column)
     save(figure, path)
@@ -280,9 +270,8 @@ def _write_paths(path: Path, paths: Sequence[PaperPath]) -> None:
     for each, errors in zip(paths, errors_m, strict=True):
         most_m[each.row] = max(most_m.get(each.row, 0.0), float(errors.max()))
     title = "Paths over the truth, coloured by their error"
-    figure, across, down = sheet(title, len(paths), width_in=WIDE_IN, height_in=WIDE_IN)
-    for number, (each, pairs, errors) in enumerate(zip(paths, matched, errors_m, strict=True)):
-        axes = panel(figure, number, columns=across, rows=down)
+    figure, panes = panels(title, len(paths), width_in=WIDE_IN)
+    for axes, each, pairs, errors in zip(panes, paths, matched, errors_m, strict=True):
         add_color_bar(axes, draw_path(axes, pairs, errors, most_m=most_m[each.row]))
         caption(axes, title=f"{each.row}, {each.method}: ATE {each.ate_m:.4f} m")
     save(figure, path)
@@ -290,10 +279,6 @@ def _write_paths(path: Path, paths: Sequence[PaperPath]) -> None:
 
 def _title(table: PaperTable) -> str:
     return f"{table.name}: {table.metric}, {table.unit}"
-
-
-def _label_in(labels: Sequence[str]) -> float:
-    return 0.3 + _LETTER_IN * max(map(len, labels))
 
 
 def _by_row(table: PaperTable) -> dict[str, list[PaperCell]]:

@@ -23,10 +23,8 @@ from mapper.export.figures import (
     extent,
     fit_to_window,
     hex_of,
-    page,
-    panel,
+    panels,
     save,
-    sheet,
     widest_axes,
 )
 from mapper.export.mcap_log import McapLog
@@ -56,12 +54,11 @@ def write_paths(
         captions: A few words for each name.
         title: Headline.
     """
-    figure, columns, rows = sheet(title, len(paths))
+    figure, panes = panels(title, len(paths))
     reference = _reference(paths, truth)
     axes_world = widest_axes(reference)
     low, high = extent(reference @ axes_world.T)
-    for number, (name, trajectory) in enumerate(paths.items()):
-        axes = panel(figure, number, columns=columns, rows=rows)
+    for number, (axes, (name, trajectory)) in enumerate(zip(panes, paths.items(), strict=True)):
         if truth is not None:
             axes.plot(
                 *(truth.positions_world @ axes_world.T).T, color=hex_of(TRUTH), linewidth=2.2, alpha=0.5
@@ -88,13 +85,11 @@ def write_path_errors(
         step: That length, in words.
         title: Headline.
     """
-    figure = page(title, columns=2, rows=1, width_in=WIDE_IN, height_in=WIDE_IN)
-    axes = panel(figure, 0, columns=2, rows=1)
-    _draw_shares(axes, positions_m, list(positions_m))
-    caption(axes, x="distance from the truth, m", y="share of the poses")
-    axes = panel(figure, 1, columns=2, rows=1)
-    draw_boxes(axes, steps_m)
-    caption(axes, x=f"error of the motion over {step}, m")
+    figure, (shares, boxes) = panels(title, 2, width_in=WIDE_IN)
+    _draw_shares(shares, positions_m, list(positions_m))
+    caption(shares, x="distance from the truth, m", y="share of the poses")
+    draw_boxes(boxes, steps_m)
+    caption(boxes, x=f"error of the motion over {step}, m")
     save(figure, path)
 
 
@@ -112,14 +107,12 @@ def write_registration_errors(
         title: Headline.
     """
     names = list(dict.fromkeys(name for kind in errors_m.values() for name in kind))
-    figure = page(
-        title, columns=len(errors_m), rows=1, width_in=WIDE_IN, height_in=WIDE_IN, legend_in=_LEGEND_IN
-    )
-    for number, (kind, of_name) in enumerate(errors_m.items()):
-        axes = panel(figure, number, columns=len(errors_m), rows=1, legend_in=_LEGEND_IN)
+    count = len(errors_m)
+    figure, panes = panels(title, count, columns=count, width_in=WIDE_IN, legend_in=_LEGEND_IN)
+    for axes, (kind, of_name) in zip(panes, errors_m.items(), strict=True):
         axes.axvline(max_error_m, color=FAINT, linewidth=0.8, linestyle="dashed")
         _draw_shares(axes, of_name, names)
-        shares = "share of the pairs" if number == 0 else ""
+        shares = "share of the pairs" if axes is panes[0] else ""
         caption(axes, title=kind, x="distance from the truth, m", y=shares)
     lines, labels = axes.get_legend_handles_labels()
     figure.legend(lines, labels, loc="center right", fontsize=8, frameon=False)

@@ -25,10 +25,9 @@ from mapper.export.figures import (
     Rgb,
     caption,
     hex_of,
-    page,
-    panel,
+    image_panels,
+    panels,
     save,
-    sheet,
 )
 from mapper.runtime.atomic import MANIFEST_NAME, FolderKind, write_json, write_text
 from mapper.sensing.depth import depth_sigma_m
@@ -47,7 +46,7 @@ FOLDER = FolderKind(
 _RAW, _FILTERED = START, ESTIMATE
 """Green before DIF and red after, as in Somlyai (PhD thesis), figure 2.16."""
 
-_BAR_IN, _CAPTION_IN = 0.65, 0.4
+_BAR_IN = 0.65
 
 
 def write_depth_study(folder: Path, study: DepthStudy) -> None:
@@ -90,9 +89,8 @@ def write_accuracy(path: Path, levels: Sequence[DepthLevel], fit: NoiseFit, *, t
         fit: The noise before DIF as a curve.
         title: Headline.
     """
-    figure = page(title, columns=2, rows=1, width_in=WIDE_IN, height_in=WIDE_IN)
+    figure, (axes, spreads) = panels(title, 2, width_in=WIDE_IN)
     distance_m = [level.typical.distance_m for level in levels]
-    axes = panel(figure, 0, columns=2, rows=1)
     for label, color, accuracies in _kinds(levels):
         largest = [MM_PER_M * one.max_error_m for one in accuracies]
         most = [MM_PER_M * one.max_error_99_m for one in accuracies]
@@ -106,21 +104,20 @@ def write_accuracy(path: Path, levels: Sequence[DepthLevel], fit: NoiseFit, *, t
             label=f"{label}, without the worst 1 %",
         )
     _finish(axes, "largest error Δd, mm")
-    axes = panel(figure, 1, columns=2, rows=1)
     z = np.linspace(fit.low_m, fit.high_m, 200)
-    axes.plot(
+    spreads.plot(
         z, MM_PER_M * depth_sigma_m(fit.noise, z), color=TEXT, linewidth=1.0, label=f"σ = {fit.noise.text} m"
     )
     for label, color, accuracies in _kinds(levels):
         spread = [MM_PER_M * one.std_m for one in accuracies]
-        axes.plot(distance_m, spread, "o", color=hex_of(color), markersize=5, label=label)
+        spreads.plot(distance_m, spread, "o", color=hex_of(color), markersize=5, label=label)
     for marker, label, known_m in (
         ("^", "of a pixel over time", [level.temporal_m for level in levels]),
         ("v", "that stays over time", [level.fixed_m for level in levels]),
         ("_", "a step of quantisation", [level.typical.step_m for level in levels]),
     ):
-        _draw_known(axes, distance_m, known_m, marker=marker, label=label)
-    _finish(axes, "standard deviation s, mm")
+        _draw_known(spreads, distance_m, known_m, marker=marker, label=label)
+    _finish(spreads, "standard deviation s, mm")
     save(figure, path)
 
 
@@ -160,23 +157,15 @@ def write_residuals(path: Path, maps: Sequence[ResidualMap], *, title: str) -> N
         title: Headline.
     """
     width_in = PANEL_IN if len(maps) > 1 else 2.0 * PANEL_IN
-    height, width = maps[0].image.shape
-    image_in = width_in - _BAR_IN
-    cell_in = image_in * height / width + _CAPTION_IN
-    figure, columns, rows = sheet(title, len(maps), width_in=width_in, height_in=cell_in)
-    full = np.array([*figure.get_size_inches(), *figure.get_size_inches()])
-    for number, one in enumerate(maps):
-        row, column = divmod(number, columns)
-        left_in, bottom_in = column * width_in + 0.1, (rows - 1 - row) * cell_in + 0.1
-        axes = figure.add_axes(tuple([left_in, bottom_in, image_in, cell_in - _CAPTION_IN] / full))
-        colorbar_axes = figure.add_axes(
-            tuple([left_in + image_in + 0.06, bottom_in, 0.12, cell_in - _CAPTION_IN] / full)
-        )
+    shape = maps[0].image.shape
+    figure, panes = image_panels(title, len(maps), shape, width_in=width_in, right_in=_BAR_IN)
+    for axes, one in zip(panes, maps, strict=True):
         known = np.abs(one.error_m[~np.isnan(one.error_m)])
         most_mm = MM_PER_M * max(float(np.percentile(known, 100.0 - STRAY_PERCENT)), 1e-6)
         axes.imshow(one.image, cmap="gray", vmin=0, vmax=255)
         shown = axes.imshow(MM_PER_M * one.error_m, cmap="RdBu_r", vmin=-most_mm, vmax=most_mm)
-        figure.colorbar(shown, cax=colorbar_axes).ax.tick_params(labelsize=7, colors=FAINT)
+        bar = figure.colorbar(shown, cax=axes.inset_axes((1.03, 0.0, 0.05, 1.0)))
+        bar.ax.tick_params(labelsize=7, colors=FAINT)
         caption(axes, title=f"{one.caption}; mm")
         axes.set_axis_off()
     save(figure, path)

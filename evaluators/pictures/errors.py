@@ -29,8 +29,7 @@ from mapper.export.figures import (
     extent,
     fit_to_window,
     hex_of,
-    page,
-    panel,
+    panels,
     save,
     widest_axes,
 )
@@ -68,10 +67,8 @@ def write_trajectory_errors(folder: Path, found: Assessment, *, title: str) -> P
     relative_percent = {
         f"{length.length_m:g} m": 100.0 * length.translation_ratio for length in found.lengths if len(length)
     }
-    figure = page(title, columns=2, rows=2, width_in=WIDE_IN, height_in=WIDE_IN)
-    path_axes, position_axes, length_axes, rotation_axes = (
-        panel(figure, number, columns=2, rows=2) for number in range(4)
-    )
+    figure, panes = panels(title, 4, columns=2, width_in=WIDE_IN)
+    path_axes, position_axes, length_axes, rotation_axes = panes
     caption(path_axes, title="over the truth, seen from where it is widest")
     add_color_bar(path_axes, draw_path(path_axes, matched, errors_m))
     for axes, values, quantity in (
@@ -191,9 +188,8 @@ def write_map_errors(folder: Path, check: OccupancyCheck, *, title: str) -> Path
     points = [voxels for voxels, _ in kinds.values()]
     cells = [np.round(voxels / edge_m - 0.5).astype(np.int64) for voxels in points]
     paints = [(AGREED, 1.0), (EXTRA, _ERROR_WEIGHT), (MISSING, _ERROR_WEIGHT)]
-    figure = page(title, columns=2, rows=1, width_in=WIDE_IN, height_in=WIDE_IN)
-    for number, (name, axes_xyz) in enumerate((("from above", (0, 1)), ("from the side", (0, 2)))):
-        axes = panel(figure, number, columns=2, rows=1)
+    figure, panes = panels(title, 2, width_in=WIDE_IN)
+    for axes, name, axes_xyz in zip(panes, ("from above", "from the side"), ((0, 1), (0, 2)), strict=True):
         _draw(axes, [cell[:, axes_xyz] for cell in cells], paints, edge_m=edge_m)
         caption(axes, title=name, x="x (m)", y="xyz"[axes_xyz[1]] + " (m)")
     for kind, (_, color) in kinds.items():

@@ -9,15 +9,14 @@ import numpy as np
 from mapper.core.frames import Image
 from mapper.core.geometry import Array
 from mapper.export.figures import (
-    COLUMNS,
     ESTIMATE,
     FAINT,
-    HEAD_IN,
     LINE,
-    PANEL_IN,
     TEXT,
     TRUTH,
+    caption,
     hex_of,
+    image_panels,
     new_figure,
     quiet_frame,
     save,
@@ -29,7 +28,6 @@ from mapper.line_laser.detection import Method, responses, stripe_rows
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-_CAPTION_IN = 0.3
 _TITLES: Mapping[Method, str] = {
     "hue": "hue (figure 2.2)",
     "intensity": "intensity (2.39)",
@@ -54,34 +52,25 @@ def write_detections(
     """
     kept = responses(image, config)
     rows = {method: stripe_rows(response, join_px=config.join_px) for method, response in kept.items()}
-    height_in = PANEL_IN * image.shape[0] / image.shape[1]
-    page_in = 2 * (height_in + _CAPTION_IN) + HEAD_IN
-    figure = new_figure(COLUMNS * PANEL_IN, page_in)
     colors = "orange: the row found" + ("" if true_rows is None else "; blue: the true one")
-    figure.text(0.012, 1.0 - 0.1 / page_in, title, fontsize=13, fontweight="bold", color=TEXT, va="top")
-    figure.text(0.988, 1.0 - 0.12 / page_in, colors, fontsize=9.5, color=FAINT, va="top", ha="right")
+    figure, panes = image_panels(f"{title} – {colors}", 1 + len(kept), image.shape)
     nothing = np.full(image.shape[1], np.nan)
-    panels = [("image", image, nothing)]
-    panels += [
+    shown = [("image", image, nothing)]
+    shown += [
         (f"{_TITLES[method]}: {np.isfinite(rows[method]).mean():.0%} of columns", response, rows[method])
         for method, response in kept.items()
     ]
-    for number, (name, pixels, found) in enumerate(panels):
-        row, column = divmod(number, COLUMNS)
-        bottom_in = (1 - row) * (height_in + _CAPTION_IN)
-        axes = figure.add_axes(
-            ((column + 0.015) / COLUMNS, bottom_in / page_in, 0.97 / COLUMNS, 0.97 * height_in / page_in)
-        )
+    for axes, (name, pixels, found) in zip(panes, shown, strict=True):
         # What is kept must be seen, however dark it is.
-        shown = pixels if pixels.ndim == 3 else np.where(pixels > 0, 110 + pixels * (145.0 / 255.0), 0.0)
-        axes.imshow(shown, cmap="gray", vmin=0, vmax=255, interpolation="antialiased")
-        if true_rows is not None and number:
+        visible = pixels if pixels.ndim == 3 else np.where(pixels > 0, 110 + pixels * (145.0 / 255.0), 0.0)
+        axes.imshow(visible, cmap="gray", vmin=0, vmax=255, interpolation="antialiased")
+        if true_rows is not None and found is not nothing:
             axes.plot(true_rows, color=hex_of(TRUTH), linewidth=3.0, alpha=0.55)
         axes.plot(found, ".", color=hex_of(ESTIMATE), markersize=1.6)
         axes.set_xlim(0, image.shape[1] - 1)
         axes.set_ylim(image.shape[0] - 1, 0)
         axes.set_axis_off()
-        axes.set_title(name, fontsize=9.5, color=TEXT, loc="left")
+        caption(axes, title=name)
     save(figure, path)
 
 

@@ -1,10 +1,9 @@
 """Files of a sweep: the table for programs, and the page for people."""
 
-import math
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from html import escape
-from statistics import median
+
+import numpy as np
 
 from mapper.evaluators.study.engine import versions
 from mapper.evaluators.study.table import MISSING, Record, Value, csv_text, write_parquet
@@ -20,7 +19,8 @@ from mapper.evaluators.sweep.tables import (
     grouped,
     sweep_records,
 )
-from mapper.export.html import bullets, document, section
+from mapper.export.figures import TEXT, box_panels, caption, draw_boxes, png_of
+from mapper.export.html import bullets, document, image, section, table
 from mapper.run.files import SUMMARY
 from mapper.runtime.atomic import write_text
 from mapper.runtime.resumable_jobs import JobResult
@@ -63,7 +63,7 @@ def page_of(plan: Plan, records: Sequence[Record], *, title: str) -> str:
         section("Failed and left out", bullets(bad) if bad else "<p>Nothing.</p>"),
         section("Builds", _builds(records)),
         section("Methods and configurations", _settings(plan)),
-        section("Versions", _table(["", "version"], versions().items())),
+        section("Versions", table(["", "version"], versions().items())),
     ]
     counts = [f"{sum(r['status'] == status for r in records)} {status}" for status in _statuses(records)]
     header = f"<h1>{escape(title)}</h1><div>{escape(', '.join(counts))}</div>"
@@ -83,14 +83,13 @@ def _compared(groups: Groups, quantity: Quantity) -> str:
             _cell(of_log[variant].text(quantity), is_best=variant in best) for variant in variants
         )
         rows.append(f"<tr><th>{escape(log)}</th>{cells}</tr>")
-    table = f"<table><thead>{_head(variants)}</thead><tbody>{''.join(rows)}</tbody></table>"
+    compared = f"<table><thead>{_head(variants)}</thead><tbody>{''.join(rows)}</tbody></table>"
     hint = "Median over the seeds, and the range. " if _has_range(groups) else ""
     hint += _BOLD[quantity.needs_coverage] if quantity.best else ""
     charts = ""
     if quantity.key in _DRAWN:
-        figures = "".join(_chart(log, of_log, quantity) for log, of_log in groups.items())
-        charts = f'<div class="columns">{figures}</div>'
-    return f'<p class="hint">{hint}</p><div class="scroll">{table}</div>{charts}'
+        charts = "".join(_chart(log, of_log, quantity) for log, of_log in groups.items())
+    return f'<p class="hint">{hint}</p><div class="scroll">{compared}</div>{charts}'
 
 
 def _has_range(groups: Groups) -> bool:
@@ -111,24 +110,16 @@ def _cell(text: str, *, is_best: bool = False) -> str:
 
 
 def _chart(log: str, of_log: Mapping[Variant, Group], quantity: Quantity) -> str:
-    methods = list(dict.fromkeys(method for method, _ in of_log))
-    lines = [
-        Line(
-            f"{method}, {configuration}",
-            methods.index(method),
-            group.values(quantity.key),
-            group.text(quantity),
-        )
-        for (method, configuration), group in of_log.items()
-    ]
-    caption = f"{escape(log)}, {escape(quantity.title)}"
-    return f"<figure><figcaption>{caption}</figcaption>{dot_chart(lines)}</figure>"
-
-
-def _table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
-    top = "".join(f"<th>{escape(text)}</th>" for text in head)
-    body = "".join(f"<tr>{''.join(map(_cell, row))}</tr>" for row in rows)
-    return f'<div class="scroll"><table><thead><tr>{top}</tr></thead><tbody>{body}</tbody></table></div>'
+    """Return a picture with a dot for every build and a box for all of a variant; empty if it would be."""
+    values = {", ".join(variant): group.values(quantity.key) for variant, group in of_log.items()}
+    if not any(value > 0.0 for known in values.values() for value in known):
+        return ""
+    figure, (axes,) = box_panels(log, 1, list(values))
+    dots = [(value, row) for row, known in enumerate(values.values(), 1) for value in known]
+    axes.plot(*zip(*dots, strict=True), "o", color=TEXT, markersize=4, zorder=3)
+    draw_boxes(axes, {label: np.array(known) for label, known in values.items()})
+    caption(axes, x=quantity.title)
+    return image(png_of(figure), f"{log}, {quantity.title}")
 
 
 def _builds(records: Sequence[Record]) -> str:
@@ -142,8 +133,8 @@ def _builds(records: Sequence[Record]) -> str:
             run = record["run"]
             cells += f'<td><a href="{escape(str(run))}/{SUMMARY}">picture</a></td>' if run else "<td></td>"
         rows.append(f"<tr>{cells}</tr>")
-    table = f"<table class='wide'><thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
-    return f'<div class="scroll">{table}</div>'
+    builds = f"<table class='wide'><thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
+    return f'<div class="scroll">{builds}</div>'
 
 
 def _shown(value: Value) -> str:
@@ -160,86 +151,8 @@ def _settings(plan: Plan) -> str:
     rows += [("configuration", one.name, _settings_text(one)) for one in config.configuration]
     if config.seeds:
         rows.append(("seeds", "", ", ".join(map(str, config.seeds))))
-    return _table(["", "name", "settings"], rows)
+    return table(["", "name", "settings"], rows)
 
 
 def _settings_text(variant: ConfigurationConfig, file: str = "") -> str:
     return ", ".join([*([file] if file else []), *variant.set]) or "defaults"
-
-
-_WIDTH, _ROW, _LABELS, _BELOW, _EDGE = 620, 20, 230, 24, 24
-_COLOURS = 6
-_FEWEST_TICKS, _MOST_TICKS = 3, 8
-
-
-@dataclass(frozen=True, slots=True)
-class Line:
-    """One line of the chart: the builds by one method and configuration.
-
-    Attributes:
-        label: Text at its left.
-        colour: Number of its colour.
-        values: Sorted; none if there is nothing to draw.
-        text: Value in words.
-    """
-
-    label: str
-    colour: int
-    values: Sequence[float]
-    text: str
-
-
-def dot_chart(lines: Sequence[Line]) -> str:
-    """Return a chart with a dot at each line's median and a bar over its range, on a logarithmic scale.
-
-    Values that are not positive are drawn at the left edge.
-    """
-    positive = [value for line in lines for value in line.values if value > 0.0]
-    if not positive:
-        return "<p>nothing to draw</p>"
-    low, high = _widened(min(positive), max(positive))
-    bottom = _ROW * len(lines)
-
-    def x(value: float) -> float:
-        ratio = math.log(max(value, low) / low) / math.log(high / low)
-        return _LABELS + ratio * (_WIDTH - _LABELS - _EDGE)
-
-    marks = [
-        f'<line class="grid" x1="{x(tick):.1f}" x2="{x(tick):.1f}" y1="0" y2="{bottom}"/>'
-        f'<text x="{x(tick):.1f}" y="{bottom + 15}" text-anchor="middle">{tick:g}</text>'
-        for tick in _ticks(low, high)
-    ]
-    for row, line in enumerate(lines):
-        y = _ROW * (row + 0.5)
-        marks.append(f'<text x="{_LABELS - 8}" y="{y + 4}" text-anchor="end">{escape(line.label)}</text>')
-        if not line.values:
-            marks.append(f'<text x="{_LABELS + 4}" y="{y + 4}">{escape(line.text)}</text>')
-            continue
-        colour = f"var(--run{line.colour % _COLOURS})"
-        marks.append(
-            f"<g><title>{escape(f'{line.label}: {line.text}')}</title>"
-            f'<line x1="{x(line.values[0]):.1f}" x2="{x(line.values[-1]):.1f}" y1="{y}" y2="{y}"'
-            f' stroke="{colour}" stroke-width="3" stroke-opacity="0.45"/>'
-            f'<circle cx="{x(median(line.values)):.1f}" cy="{y}" r="4.5" fill="{colour}"/></g>'
-        )
-    return f'<svg viewBox="0 0 {_WIDTH} {bottom + _BELOW}" role="img">{"".join(marks)}</svg>'
-
-
-def _widened(low: float, high: float) -> tuple[float, float]:
-    """Return limits with room beside the values, and at least a factor of two apart."""
-    room = max(1.1, math.sqrt(2.0 * low / high) if high < 2.0 * low else 1.1)
-    return low / room, high * room
-
-
-def _ticks(low: float, high: float) -> list[float]:
-    powers = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
-    fine = [m * 10.0**power for power in powers for m in (1, 2, 5) if low <= m * 10.0**power <= high]
-    if len(fine) < _FEWEST_TICKS:
-        rough = (high - low) / (_FEWEST_TICKS + 1)
-        scale = 10.0 ** math.floor(math.log10(rough))
-        step = scale * min(m for m in (1, 2, 5, 10) if m * scale >= rough)
-        return [n * step for n in range(math.ceil(low / step), math.floor(high / step) + 1)]
-    if len(fine) <= _MOST_TICKS:
-        return fine
-    coarse = [10.0**power for power in powers if low <= 10.0**power <= high]
-    return coarse[:: math.ceil(len(coarse) / _MOST_TICKS)]

@@ -5,7 +5,8 @@ driven through its objects: pyplot would keep global state and pick a GUI backen
 """
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -111,12 +112,20 @@ def new_figure(width_in: float, height_in: float, *, background: Rgb = PAPER) ->
 
 def save(figure: "Figure", path: Path) -> None:
     """Write a page as PNG, atomically."""
-    with atomic_file(path) as part, warnings.catch_warnings():
+    with atomic_file(path) as part:
+        part.write_bytes(png_of(figure))
+
+
+def png_of(figure: "Figure") -> bytes:
+    """Return a page as PNG."""
+    png = BytesIO()
+    with warnings.catch_warnings():
         # A log's name may have characters that the font has not: they are drawn as boxes.
         warnings.filterwarnings("ignore", message="Glyph", category=UserWarning)
         # Matplotlib would sign with its version: the same run must give the same bytes. The least compression
         # takes a fifth of the usual one's time, for a fifth more bytes.
-        figure.savefig(part, format="png", metadata={"Software": None}, pil_kwargs={"compress_level": 1})
+        figure.savefig(png, format="png", metadata={"Software": None}, pil_kwargs={"compress_level": 1})
+    return png.getvalue()
 
 
 def quiet_frame(axes: "Axes", *, label_size: int) -> None:
@@ -168,7 +177,8 @@ _COLORS: tuple[Rgb, ...] = (
     (30, 33, 41),
     (140, 146, 158),
 )
-_LEFT_IN = 0.85
+_LEFT_IN, _RIGHT_IN, _BELOW_IN, _ABOVE_IN = 0.85, 0.15, 0.45, 0.3
+_BOX_IN, _LETTER_IN = 0.3, 0.062
 _EXTENT_MARGIN = 0.15
 _WIDE = 1e3  # from here on ticks at 1, 2, 5 would be written over one another
 
@@ -178,64 +188,58 @@ def color_of(number: int) -> Rgb:
     return _COLORS[number % len(_COLORS)]
 
 
-def page(
+def panels(
     title: str,
+    count: int,
     *,
-    columns: int,
-    rows: int,
+    columns: int = COLUMNS,
     width_in: float = PANEL_IN,
-    height_in: float = PANEL_IN,
-    legend_in: float = 0.0,
-) -> "Figure":
-    """Return an empty page for panels of one size, with room for a headline and, at the right, a legend."""
-    figure = new_figure(width_in * columns + legend_in, height_in * rows + HEAD_IN)
-    _, page_in = figure.get_size_inches()
-    figure.text(0.02, 1.0 - 0.2 / page_in, title, fontsize=12, fontweight="bold", color=TEXT, va="top")
-    return figure
-
-
-def sheet(
-    title: str, panels: int, *, width_in: float = PANEL_IN, height_in: float = PANEL_IN
-) -> tuple["Figure", int, int]:
-    """Return an empty page for a number of panels, and its columns and rows."""
-    columns = min(panels, COLUMNS)
-    rows = -(-panels // columns)
-    return page(title, columns=columns, rows=rows, width_in=width_in, height_in=height_in), columns, rows
-
-
-def panel(
-    figure: "Figure",
-    number: int,
-    *,
-    columns: int,
-    rows: int,
-    legend_in: float = 0.0,
+    height_in: float | None = None,
     left_in: float = _LEFT_IN,
-) -> "Axes":
-    """Return the axes of a panel; panels are numbered from the upper left.
+    right_in: float = _RIGHT_IN,
+    legend_in: float = 0.0,
+) -> tuple["Figure", list["Axes"]]:
+    """Return a page with a headline, and its panels row by row from the upper left.
 
     Args:
-        figure: Page of as many columns and rows, from ``page``.
-        number: Number of the panel.
-        columns: Number of columns of panels.
-        rows: Number of rows of panels.
-        legend_in: The page's room for a legend.
+        title: Headline.
+        count: Number of panels, all of one size.
+        columns: Largest number of panels in a row.
+        width_in: Width of a panel.
+        height_in: Height of a panel; None is its width.
         left_in: Each panel's room for what stands at its left.
+        right_in: Each panel's room at its right.
+        legend_in: The page's room for a legend at the right.
     """
-    width_in, height_in = figure.get_size_inches()
-    row, column = divmod(number, columns)
-    cell_width_in, cell_height_in = (width_in - legend_in) / columns, (height_in - HEAD_IN) / rows
-    below_in, above_in, right_in = 0.45, 0.3, 0.15
-    axes = figure.add_axes(
-        (
-            (column * cell_width_in + left_in) / width_in,
-            ((rows - 1 - row) * cell_height_in + below_in) / height_in,
-            (cell_width_in - left_in - right_in) / width_in,
-            (cell_height_in - below_in - above_in) / height_in,
-        )
-    )
-    quiet_frame(axes, label_size=7)
-    return axes
+    height_in = height_in or width_in
+    columns = min(count, columns)
+    rows = -(-count // columns)
+    page_in = np.array([width_in * columns + legend_in, height_in * rows + HEAD_IN])
+    figure = new_figure(*page_in)
+    figure.text(0.02, 1.0 - 0.2 / page_in[1], title, fontsize=12, fontweight="bold", color=TEXT, va="top")
+    size = np.array([width_in - left_in - right_in, height_in - _BELOW_IN - _ABOVE_IN]) / page_in
+    drawn = []
+    for row, column in (divmod(number, columns) for number in range(count)):
+        corner_in = (column * width_in + left_in, (rows - 1 - row) * height_in + _BELOW_IN)
+        axes = figure.add_axes((*(corner_in / page_in), *size))
+        quiet_frame(axes, label_size=7)
+        drawn.append(axes)
+    return figure, drawn
+
+
+def image_panels(
+    title: str, count: int, shape: tuple[int, ...], *, width_in: float = PANEL_IN, right_in: float = 0.1
+) -> tuple["Figure", list["Axes"]]:
+    """Return a page of panels for images of one size, (H, W) or (H, W, 3)."""
+    height_in = (width_in - 0.1 - right_in) * shape[0] / shape[1] + _BELOW_IN + _ABOVE_IN
+    return panels(title, count, width_in=width_in, height_in=height_in, left_in=0.1, right_in=right_in)
+
+
+def box_panels(title: str, count: int, labels: Sequence[str]) -> tuple["Figure", list["Axes"]]:
+    """Return a page of panels for boxes, all with the same labels."""
+    left_in = 0.3 + _LETTER_IN * max(map(len, labels))
+    height_in = 0.9 + _BOX_IN * len(labels)
+    return panels(title, count, width_in=WIDE_IN, height_in=height_in, left_in=left_in)
 
 
 def caption(axes: "Axes", *, title: str = "", x: str = "", y: str = "") -> None:

@@ -1,5 +1,6 @@
 """Self-contained HTML pages: they load nothing."""
 
+import base64
 from collections.abc import Iterable
 from html import escape
 from importlib import resources
@@ -85,6 +86,12 @@ def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
     body = "".join(f"<tr>{''.join(map(_cell, range(len(row)), row))}</tr>" for row in map(list, rows))
     table = f"<table><thead><tr>{top}</tr></thead><tbody>{body}</tbody></table>"
     return f'<div class="scroll" tabindex="0">{table}</div>'
+
+
+def image(png: bytes, text: str) -> str:
+    """Return a picture, with the text for who cannot see it."""
+    data = base64.b64encode(png).decode("ascii")
+    return f'<p><img alt="{escape(text)}" style="max-width:100%" src="data:image/png;base64,{data}"></p>'
 
 
 def bullets(lines: Iterable[str]) -> str:
