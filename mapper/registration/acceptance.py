@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.core.geometry import Array, Transform, apply
+from mapper.core.geometry import Array, Transform
 from mapper.registration.base import Alignment
 from mapper.registration.config import AcceptanceConfig
 from mapper.registration.degeneracy import degeneracy_of
-from mapper.registration.refining import measured
+from mapper.registration.refining import measured_agreement
 from mapper.registration.surfaces import Prepared
 
 _FEW = 0.01  # of all surface; a direction that fewer face is left to the degeneracy check
@@ -32,12 +32,11 @@ def assess(
         config: Thresholds, in voxels of the source.
     """
     near_m, surface_m = config.near_voxels * source.voxel_m, config.surface_voxels * source.voxel_m
-    alignment = measured(
+    alignment, agree = measured_agreement(
         target, source, T_target_source, max_pair_distance_m=near_m, max_surface_distance_m=surface_m
     )
     if not alignment.converged:
         return alignment
-    agree = _agreeing(target, source, T_target_source, near_m, surface_m)
     share, direction = weakest_direction(source.normals, agree)
     if share < config.min_agreeing_ratio:
         reason = (
@@ -48,20 +47,6 @@ def assess(
     assert alignment.information is not None  # it converged
     degeneracy = degeneracy_of(alignment.information, points=source.points)
     return replace(alignment, converged=not degeneracy.reason, reason=degeneracy.reason)
-
-
-def _agreeing(
-    target: Prepared, source: Prepared, T_target_source: Transform, near_m: float, surface_m: float
-) -> NDArray[np.bool_]:
-    """Return which source points lie on the target's surfaces."""
-    points_target = apply(T_target_source, source.points)
-    indices, distances_m = target.nearest(points_target)
-    normals = target.normals[indices]
-    offsets_m = np.einsum("ni,ni->n", normals, points_target - target.points[indices])
-    agree: NDArray[np.bool_] = (
-        (distances_m <= near_m) & (np.abs(offsets_m) <= surface_m) & normals.any(axis=1)
-    )
-    return agree
 
 
 def weakest_direction(normals: Array, agree: NDArray[np.bool_]) -> tuple[float, Array]:

@@ -106,14 +106,22 @@ def _descended(
 
 
 def measured(
+    target: Prepared, source: Prepared, T_target_source: Transform, *, max_pair_distance_m: float
+) -> Alignment:
+    """Return ``measured_agreement`` without a limit of the distance from surfaces, and without the mask."""
+    limits = {"max_pair_distance_m": max_pair_distance_m, "max_surface_distance_m": np.inf}
+    return measured_agreement(target, source, T_target_source, **limits)[0]
+
+
+def measured_agreement(
     target: Prepared,
     source: Prepared,
     T_target_source: Transform,
     *,
     max_pair_distance_m: float,
-    max_surface_distance_m: float = np.inf,
-) -> Alignment:
-    """Return a motion with its assessment, by whatever method it was found.
+    max_surface_distance_m: float,
+) -> tuple[Alignment, NDArray[np.bool_]]:
+    """Return a motion with its assessment, by whatever method it was found, and (N,) which points agree.
 
     A pair is a source point and the target point nearest to it. The information is that of point-to-plane
     distances, Σ JᵀJ / σ² with J = [(s × m)ᵀ, mᵀ] and m = Rᵀn (the source's tangent, multiplied on the
@@ -133,17 +141,18 @@ def measured(
     indices, distances_m = target.nearest(apply(T_target_source, source.points))
     near = distances_m <= max_pair_distance_m
     if near.sum() < MIN_PAIRS:
-        return failed(
+        reason = (
             f"{near.sum()} of {len(source.points)} points have a partner within {max_pair_distance_m:g} m, "
             f"fewer than {MIN_PAIRS}: the clouds do not overlap"
         )
+        return failed(reason), np.zeros(len(near), np.bool_)
     jacobian, residuals_m = plane_rows(target, source.points[near], T_target_source, indices[near])
     has_normal = jacobian.any(axis=1)
     rms_m = float(np.sqrt((residuals_m**2).sum() / max(has_normal.sum(), 1)))
     sigma_m = max(rms_m, _MIN_SIGMA_VOXELS * source.voxel_m)
     agree = np.where(has_normal, np.abs(residuals_m), np.inf) <= max_surface_distance_m
     pairs = int(agree.sum())
-    return Alignment(
+    alignment = Alignment(
         T_target_source,
         converged=True,
         inlier_ratio=pairs / len(near),
@@ -151,6 +160,8 @@ def measured(
         pairs=pairs,
         information=_gram(jacobian) / (target.neighbours * sigma_m**2),
     )
+    near[near] = agree
+    return alignment, near
 
 
 def plane_rows(

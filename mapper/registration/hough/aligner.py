@@ -20,7 +20,7 @@ from mapper.registration.hough.refinement import (
     refine_planar,
     refinement_cloud,
 )
-from mapper.registration.hough.voting import Peak, vote
+from mapper.registration.hough.voting import Peak, distinct, vote
 from mapper.registration.refining import measured
 from mapper.runtime.progress import Stopwatch
 
@@ -203,15 +203,17 @@ class HoughAligner:
 
     def _verified(self, source: HoughDescription, peaks: Sequence[Peak]) -> list[Candidate]:
         """Return the distinct motions near the peaks that overlap most, the best score first."""
-        config, target = self._config, self._target
+        config, target, overlap = self._config, self._target, self._config.overlap
         fits = [refine_planar(target, source, (p.dx_m, p.dy_m, p.alpha_rad), config) for p in peaks]
-        chosen: list[PlanarFit] = []
-        for fit in sorted(fits, key=lambda fit: -fit.overlap):
-            if len(chosen) < config.overlap.candidates and not any(
-                fit.is_near(better, config.overlap) for better in chosen
-            ):
-                chosen.append(fit)
-        candidates = [self._candidate(source, self._in_space(source, fit)) for fit in chosen]
+        fits.sort(key=lambda fit: -fit.overlap)
+        chosen = distinct(
+            np.array([(fit.dx_m, fit.dy_m) for fit in fits]).reshape(-1, 2),
+            np.array([fit.alpha_rad for fit in fits]),
+            overlap.candidates,
+            far_m=overlap.distinct_m,
+            far_rad=overlap.distinct_rad,
+        )
+        candidates = [self._candidate(source, self._in_space(source, fits[k])) for k in chosen]
         return sorted(candidates, key=lambda candidate: -candidate.score)
 
     def _in_space(self, source: HoughDescription, fit: PlanarFit) -> Transform:

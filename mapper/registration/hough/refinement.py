@@ -9,7 +9,7 @@ import numpy as np
 
 from mapper.core.frames import Scan
 from mapper.core.geometry import Points, Transform, apply, planar_motion, rotation_exp, transform
-from mapper.registration.hough.config import HoughConfig, NdtStagesConfig, OverlapConfig
+from mapper.registration.hough.config import HoughConfig, NdtStagesConfig
 from mapper.registration.hough.description import DIRECTION_RAD, HoughDescription
 from mapper.registration.hough.ground import FITS, Ground
 from mapper.registration.hough.search_kernels import FULL_OVERLAP, hill_climb
@@ -38,14 +38,6 @@ class PlanarFit:
     dy_m: float
     alpha_rad: float
     overlap: float
-
-    def is_near(self, other: "PlanarFit", config: OverlapConfig) -> bool:
-        """Return whether two are the same motion."""
-        turn = np.angle(np.exp(1j * (self.alpha_rad - other.alpha_rad)))
-        return bool(
-            np.hypot(self.dx_m - other.dx_m, self.dy_m - other.dy_m) <= config.distinct_m
-            and abs(turn) <= config.distinct_rad
-        )
 
 
 def refine_planar(

@@ -127,38 +127,6 @@ def _summit(line, k):
 
 
 @njit(cache=True, nogil=True)
-def distinct(offsets, turns, most, distance, angle):
-    """Return the indices, at most ``most``, of the motions that are not near a kept one before them.
-
-    Args:
-        offsets: (N, 2), the best first.
-        turns: (N,) radians.
-        most: Largest number kept.
-        distance: Offsets farther apart are distinct.
-        angle: Turns farther apart, in radians, are distinct.
-    """
-    kept = np.empty(most, int64)
-    count = 0
-    for i in range(len(offsets)):
-        near = False
-        for k in kept[:count]:
-            gap = abs(turns[i] - turns[k]) % (2.0 * np.pi)
-            gap = min(gap, 2.0 * np.pi - gap)
-            if (
-                gap <= angle
-                and np.hypot(offsets[i, 0] - offsets[k, 0], offsets[i, 1] - offsets[k, 1]) <= distance
-            ):
-                near = True
-                break
-        if not near:
-            kept[count] = i
-            count += 1
-            if count == most:
-                break
-    return kept[:count]
-
-
-@njit(cache=True, nogil=True)
 def draw_volume(obstacles, heights, voxel_m, edge, low_m, layers):
     """Return (layers, edge, edge) uint8: ``FULL_OVERLAP`` where obstacles are, less in the voxels around.
 

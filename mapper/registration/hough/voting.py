@@ -6,7 +6,7 @@ import numpy as np
 
 from mapper.core.geometry import Array, Transform, planar_motion
 from mapper.registration.hough.config import VotingConfig
-from mapper.registration.hough.search_kernels import distinct, vote_slices
+from mapper.registration.hough.search_kernels import vote_slices
 
 _PER_ANGLE = 8
 
@@ -57,7 +57,8 @@ def vote(target: Array, source: Array, config: VotingConfig) -> list[Peak]:
         _PER_ANGLE,
     )
     order = np.argsort(-votes, axis=None, kind="stable")[: np.count_nonzero(votes)]
-    offsets_m, turns = config.bin_m * offsets.reshape(-1, 2)[order], alphas[order // _PER_ANGLE]
+    offsets_m = config.bin_m * offsets.reshape(-1, 2)[order]
+    turns = np.asarray(alphas[order // _PER_ANGLE], dtype=np.float64)
     heights = votes.ravel()[order]
     norm = np.sqrt(len(target) * len(source))
     return [
@@ -68,5 +69,26 @@ def vote(target: Array, source: Array, config: VotingConfig) -> list[Peak]:
             votes=int(heights[i]),
             score=float(heights[i] / norm),
         )
-        for i in distinct(offsets_m, turns, config.peaks, config.width_m, config.distinct_rad)
+        for i in distinct(offsets_m, turns, config.peaks, far_m=config.width_m, far_rad=config.distinct_rad)
     ]
+
+
+def distinct(offsets_m: Array, turns_rad: Array, most: int, *, far_m: float, far_rad: float) -> list[int]:
+    """Return the indices of the first planar motions that are not near one before them.
+
+    Args:
+        offsets_m: (N, 2), the best first.
+        turns_rad: (N,).
+        most: Largest number kept.
+        far_m: Offsets farther apart are distinct.
+        far_rad: Turns farther apart are distinct.
+    """
+    kept: list[int] = []
+    left = np.arange(len(turns_rad))
+    while len(left) and len(kept) < most:
+        best = int(left[0])
+        kept.append(best)
+        gaps_rad = np.abs(turns_rad[left] - turns_rad[best]) % (2.0 * np.pi)
+        gaps_m = np.hypot(*(offsets_m[left] - offsets_m[best]).T)
+        left = left[(np.minimum(gaps_rad, 2.0 * np.pi - gaps_rad) > far_rad) | (gaps_m > far_m)]
+    return kept
