@@ -13,7 +13,7 @@ import typer
 from mapper import __version__
 from mapper.cli import completion
 from mapper.cli.answer import Answer, verb
-from mapper.cli.build import build, demo
+from mapper.cli.build import build, demo, fuse
 from mapper.cli.console import EscapingStream, escaped
 from mapper.cli.convert import convert
 from mapper.cli.diff import diff
@@ -22,7 +22,6 @@ from mapper.cli.edit import edit
 from mapper.cli.environment import handle_interrupts, prepare_environment
 from mapper.cli.evaluate import evaluate
 from mapper.cli.export import export
-from mapper.cli.fuse import fuse
 from mapper.cli.groups import HELP, Verb, VerbGroup, show_help
 from mapper.cli.inspect import inspect
 from mapper.cli.localise import localise
@@ -30,13 +29,12 @@ from mapper.cli.loops import WithPairs, loops
 from mapper.cli.merge import merge
 from mapper.cli.plan import WithPoints, plan
 from mapper.cli.register import register
-from mapper.cli.report import report
 from mapper.cli.sensor import sensor
 from mapper.cli.show_config import show_config
 from mapper.cli.solve import solve
 from mapper.cli.studies import compare, reproduce, sweep
 from mapper.cli.synth import synth
-from mapper.cli.view import view
+from mapper.cli.view import report, view
 from mapper.cli.vocabulary import vocabulary
 from mapper.core.errors import MapperError, MapperWarning, Terminated
 

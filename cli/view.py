@@ -1,4 +1,4 @@
-"""``mapper view``: a finished run in Rerun, or runs as one page with the map in 3D."""
+"""``mapper view``: a run in Rerun, or runs as one page with the map in 3D; ``mapper report``: their page."""
 
 from contextlib import nullcontext
 from pathlib import Path
@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from mapper.cli.answer import Answer, Output, made
-from mapper.cli.options import RunFolders, refuse_several, refuse_without
+from mapper.cli.options import Overwrite, RunFolders, refuse_several, refuse_without
 from mapper.core.errors import ConfigError
 from mapper.runtime.atomic import refuse_existing
 
@@ -59,3 +59,24 @@ def view(
     with nullcontext() if rrd else built.changing({RERUN}), output.waiting("view"):
         show_run(built, str(path))
     return made(path)
+
+
+def report(
+    runs: RunFolders,
+    out: Annotated[
+        Path | None, typer.Option(help="HTML file to write.  [default: report.html, or with a number]")
+    ] = None,
+    overwrite: Overwrite = False,
+    *,
+    output: Output,
+) -> Answer:
+    """Write one self-contained page about a run, or about several side by side; it opens offline.
+
+    Example: mapper report runs/xyz runs/xyz-isvd --out report.html
+    """
+    from mapper.evaluators.pictures.run_report import report as report_on
+    from mapper.run.folder import open_run
+
+    loaded = [open_run(run) for run in runs]
+    with output.waiting("report"):
+        return made(report_on(loaded, out, overwrite=overwrite))

@@ -2,9 +2,10 @@
 
     python scripts/refresh_outputs.py --logs DIR [--work DIR] [--page NAME …] [--slow]
 
-DIR has the logs tum_fr1_xyz, kitti_00 and posegraph/sphere2500.g2o. Each page gets its own empty folder in
-the work folder, with these logs under the names that pages use. The blocks that the tests run and those
-marked "real logs" are run; blocks marked "slow", which take many minutes, only with --slow.
+DIR has the logs tum_fr1_xyz, kitti_00, mulran_kaist03 and posegraph/sphere2500.g2o. Each page gets its own
+empty folder in the work folder, with these logs under the names that pages use. The blocks that the tests
+run and those marked "real logs" are run; blocks marked "slow", which take many minutes, only with --slow. The
+runs of the gallery are built only where --page names it: their figures and pictures are written anew.
 
 A line "…" for omitted output stays, with as many rows before and after it as before. An output of ten lines
 or fewer, or of which only two rows would be left out, is shown in full. The exit status is 1 if a command
@@ -12,8 +13,10 @@ failed; its output is then not changed.
 """
 
 import argparse
+import json
 import os
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -21,6 +24,8 @@ import tempfile
 import time
 from collections.abc import Sequence
 from pathlib import Path
+
+import cv2
 
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
@@ -30,6 +35,7 @@ from tests.support.pages import OMITTED, PAGES, Block, Command, blocks_of, files
 LOGS = {
     "rgbd_dataset_freiburg1_xyz": "tum_fr1_xyz",
     "kitti_00": "kitti_00",
+    "mulran_kaist03": "mulran_kaist03",
     "sphere2500.g2o": "posegraph/sphere2500.g2o",
 }
 MAPPER = [sys.executable, "-c", "from mapper.cli.main import main; main()"]
@@ -37,6 +43,9 @@ FEWEST_OMITTED = 3
 """Fewer rows are shown instead of being left out."""
 MOST_SHORT_LINES = 10
 """An output of so few lines is shown whole."""
+GALLERY = ROOT / "docs" / "gallery.md"
+WIDTH_PX, QUALITY = 1000, 78
+"""Largest side of a picture of the gallery, and its quality as JPEG: all together have less than 3 MB."""
 
 
 def refresh(path: Path, logs: Path, work: Path, built: dict[tuple[str, ...], Path], *, slow: bool) -> int:
@@ -80,6 +89,41 @@ def refresh(path: Path, logs: Path, work: Path, built: dict[tuple[str, ...], Pat
         page = page[: block.start] + text + page[block.start + len(block.text) :]
     path.write_text(page, encoding="utf-8")
     return failed
+
+
+def refresh_gallery(logs: Path, work: Path) -> int:
+    """Build the runs of the gallery, write their pictures and counts, and return how many commands failed.
+
+    The page itself states the commands, and the pictures: ``gallery/xyz_cloud.jpg`` is cloud.png of runs/xyz.
+    """
+    page = GALLERY.read_text(encoding="utf-8")
+    folder, failed = _folder_for(GALLERY, page, logs, work), 0
+    sections = re.split(r"^(?=## )", page, flags=re.MULTILINE)
+    for number, section in enumerate(sections):
+        commands = [shlex.split(line) for line in re.findall(r"^mapper (.+)$", section, re.MULTILINE)]
+        if any(_run([*MAPPER, *words, "--quiet"], folder) is None for words in commands):
+            failed += 1
+            continue
+        for name, picture in re.findall(r"\(gallery/([^_)]+)_(\w+)\.jpg\)", section):
+            run = folder / "runs" / name
+            sections[number] = re.sub(r"^\d+ frames tracked.*$", _counts(run), section, flags=re.MULTILINE)
+            image = cv2.imread(str(run / f"{picture}.png"), cv2.IMREAD_COLOR)
+            if (scale := WIDTH_PX / max(image.shape[:2])) < 1.0:
+                image = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+            path = GALLERY.with_suffix("") / f"{name}_{picture}.jpg"
+            cv2.imwrite(str(path), image, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+    GALLERY.write_text("".join(sections), encoding="utf-8")
+    return failed
+
+
+def _counts(run: Path) -> str:
+    manifest = json.loads((run / "manifest.json").read_text(encoding="utf-8"))
+    counts, verdict = manifest["counts"], manifest["verdict"]
+    stated = ": ".join([verdict["state"], *verdict["sentences"][:1]])
+    return (
+        f"{counts['tracked']} frames tracked, {counts['loops']} loops, {counts['leaves']} octree leaves, "
+        f"{counts['cloud_points']} points in the cloud; {stated}."
+    )
 
 
 def _out_of(command: Command) -> str:
@@ -173,7 +217,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--logs", type=Path, required=True, help="folder with tum_fr1_xyz and kitti_00")
+    parser.add_argument("--logs", type=Path, required=True, help="folder with the recorded logs")
     parser.add_argument("--work", type=Path, help="folder to work in; a temporary one by default")
     parser.add_argument("--page", action="append", help="README.md or docs/NAME.md; may be given again")
     parser.add_argument("--slow", action="store_true", help="run blocks that take many minutes, too")
@@ -191,6 +235,8 @@ def main() -> int:
             for path, name in zip(PAGES, names, strict=True)
             if arguments.page is None or name in arguments.page
         )
+        if page_name(GALLERY) in (arguments.page or ()):
+            failed += refresh_gallery(arguments.logs, work)
     if failed:
         print(f"{failed} commands failed; their outputs stay as they were", file=sys.stderr)
     return min(failed, 1)
