@@ -1,18 +1,13 @@
-"""``python -m tests.fuzz --cases N [--seed S]``: read damaged inputs, and print those that end in a fault.
-
-``--peers`` reads those of some formats by other programs' readers too, and prints what they refuse.
-"""
+"""``python -m tests.fuzz --cases N [--seed S]``: read damaged inputs, and print those that end in a fault."""
 
 import argparse
 import sys
 import time
-from collections import Counter, defaultdict
+from collections import Counter
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from tests.fuzz.corpus import FORMATS
-from tests.fuzz.damage import BYTES
-from tests.fuzz.peers import PEER_OF
 from tests.fuzz.runner import Case, Runner, cases, for_each_case
 
 _REPORT_S = 10.0
@@ -56,52 +51,13 @@ def fuzz(runner: Runner, count: int, seed: int) -> int:
     return faults
 
 
-def compare(runner: Runner, count: int, seed: int) -> None:
-    """Print how often we and a peer read, note or refuse the same inputs, and why the peer alone refused."""
-    progress, reasons = Progress(count), defaultdict[tuple[str, str], Counter[str]](Counter)
-    table = defaultdict[str, Counter[tuple[str, bool]]](Counter)
-
-    def run(case: Case) -> None:
-        path, file = runner.damaged(case)
-        peer = PEER_OF[case.format]
-        ours, theirs = runner.run("all {}", path), runner.run(f"{peer} {{}}", path)
-        progress.add(ours.outcome)
-        table[case.format][ours.outcome, theirs.outcome == "read"] += 1
-        if ours.outcome == "read" and theirs.outcome != "read":
-            reasons[case.format, peer][f"{theirs.outcome}: {theirs.detail[:100]} ← {file}"] += 1
-
-    for_each_case(cases(PEER_OF, BYTES), count, seed, run)  # peers wait for pipes, and read devices
-    print(
-        "| format | peer | both read | only we read, with a note | without | only we refuse | both refuse |"
-    )
-    print("| --- | --- | --- | --- | --- | --- | --- |")
-    columns = (
-        (("read", "noted"), True),
-        (("noted",), False),
-        (("read",), False),
-        (("refused",), True),
-        (("refused",), False),
-    )
-    for name, peer in PEER_OF.items():
-        cells = (sum(table[name][ours, theirs] for ours in outcomes) for outcomes, theirs in columns)
-        print(f"| {name} | {peer} | {' | '.join(map(str, cells))} |")
-    for (name, peer), why in reasons.items():
-        print(f"\n{name}: read, though {peer} refuses")
-        for reason, times in why.most_common(8):
-            print(f"  {times} × {reason}")
-
-
 def main() -> int:
     """Run the cases; 1 if there are faults."""
     parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description=__doc__)
     parser.add_argument("--cases", type=int, default=1000, help="how many inputs to damage")
     parser.add_argument("--seed", type=int, default=0, help="of the cases; another seed is other damage")
-    parser.add_argument("--peers", action="store_true", help="compare with other programs' readers")
     options = parser.parse_args()
     with TemporaryDirectory(prefix="mapper-fuzz-") as scratch, Runner(Path(scratch)) as runner:
-        if options.peers:
-            compare(runner, options.cases, options.seed)
-            return 0
         print(f"{len(FORMATS)} formats, {options.cases} cases", file=sys.stderr)
         return 1 if fuzz(runner, options.cases, options.seed) else 0
 

@@ -23,7 +23,6 @@ from tests.support.street_scans import on_street, street, view
 
 STEP_M = 3.0
 LINK = PoseSigmas(rotation_rad=0.002, translation_m=0.05).information
-TURN_BACK = exp(np.array([0.0, 0.0, np.pi]), np.zeros(3))
 
 
 @cache

@@ -1,17 +1,12 @@
 """A walk before a desk as frames in memory, and how far a path lies from its truth."""
 
-from collections.abc import Sequence
 from functools import cache
-from typing import Any
 
 import numpy as np
 
 from mapper.core.frames import RgbdFrame
 from mapper.core.trajectory import Trajectory
 from mapper.evaluators.metrics.trajectory import align, associate, ate
-from mapper.odometry.base import FrameOdometry
-from mapper.odometry.config import LocalMapConfig
-from mapper.odometry.factory import build_frame_odometry
 from mapper.simulation.config import SynthConfig
 from mapper.simulation.source import CameraSimulator
 from mapper.sources.base import Log
@@ -31,14 +26,6 @@ def desk_walk() -> Log:
 def desk_frames() -> tuple[RgbdFrame, ...]:
     """Return all 46 frames of the walk, without colours."""
     return tuple(entry.load(colour=False) for entry in desk_walk().entries())
-
-
-def odometry_after(frames: Sequence[RgbdFrame]) -> FrameOdometry[Any]:
-    """Return the local map's odometry, by its defaults, after it has tracked some frames."""
-    odometry = build_frame_odometry(LocalMapConfig())
-    for frame in frames:
-        odometry.track(odometry.observe(frame))
-    return odometry
 
 
 def blank(frame: RgbdFrame) -> RgbdFrame:

@@ -38,11 +38,6 @@ def odometry_chain(truth: Sequence[Transform], measured: Measure, sigmas: PoseSi
     return graph
 
 
-def drifted_chain(truth: Sequence[Transform], drift: Transform, sigmas: PoseSigmas) -> PoseGraph:
-    """Return the same where every step is measured with one and the same error."""
-    return odometry_chain(truth, lambda i, j, _: inverse(truth[i]) @ truth[j] @ drift, sigmas)
-
-
 def wrong_alignment(
     truth: Sequence[Transform], i: int, j: int, T_i_j: Transform, size: int
 ) -> Iterator[tuple[int, int, Transform]]:
