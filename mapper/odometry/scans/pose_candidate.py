@@ -14,6 +14,7 @@ _LEAST_JUMP_M, _LEAST_JUMP_RAD = 0.15, 0.09
 _CONTRADICTION_WEIGHT = 15.0
 _UNSHOWN_VOXELS = 0.5  # error of a measured motion that next to no surface shows
 _MOST_SIGMAS = 3.0
+_SURE = 0.98  # probability that surfaces show a motion
 _UNKNOWN_PARTS = 0.1  # share of the extent by which a prediction is off before any could be compared
 
 
@@ -96,8 +97,8 @@ class PoseCandidate:
 
     @property
     def is_measured(self) -> bool:
-        """Whether surfaces show all of the motion."""
-        return bool(self.fit.observability.min() >= 1.0)
+        """Whether surfaces surely show all of the motion."""
+        return bool(self.fit.observability.min() >= _SURE)
 
     @property
     def score(self) -> float:
@@ -128,7 +129,8 @@ def fuse_with_prediction(
     """Return the found pose with its unobserved motions as predicted (Zhang, Kaess & Singh 2016, §IV).
 
     Unlike there a motion that is not shown is not dropped at once: it is weighed against the prediction with
-    an error of part of a voxel, since by hand at two scans a second a prediction is worth even less.
+    an error of part of a voxel, since by hand at two scans a second a prediction is worth even less. A motion
+    that surfaces show with some probability is the mean of both cases, with the variance of their mixture.
 
     Args:
         fit: Of the found pose.
@@ -156,5 +158,6 @@ def fuse_with_prediction(
     gains[np.abs(corrections_m) > _MOST_SIGMAS * np.hypot(predicted_m, found_m)] = 0.0
     weights = shown + (1.0 - shown) * gains
     kept = motions.T @ (weights * corrections_m)
-    open_m = (1.0 - shown) * np.sqrt(1.0 - gains) * predicted_m
+    left = (1.0 - shown) * (1.0 - gains)
+    open_m = np.sqrt(left * (predicted_m**2 + shown * (1.0 - gains) * corrections_m**2))
     return T_world_predicted @ exp(kept[:3], kept[3:]), open_m

@@ -20,19 +20,18 @@ _MARGIN_M = 0.2
 _CHECKED_POINTS = 2000
 _GRAZING = 0.01  # least sine of the angle between a ray and a surface
 _PIXELS = 1.5  # a ray that is compared with a point is off by up to so many
-_SMALL_SHARE = 0.03
-"""Share of a motion's displacements that goes along normals, below which the pairs that show it are counted.
-Streets and rooms have more."""
 _FACING = 0.3
 """Share of one point's displacement along its normals, from which on its pair shows the motion: more than
 the errors of normals make."""
-_OFF_VOXELS = 1.0  # nearer to the keyframe rings lie on the same places, and so errors of normals are alike
 _SAME_VOXELS = 0.25
 """So near the scan seems to stand where the keyframe was taken: in a corridor that is what its rings show of
 any motion along it."""
-_FEW_PAIRS, _ENOUGH_PAIRS = 8, 24
-"""Pairs that face a motion and agree: a bare tunnel has up to 11 by chance, a field with two trees 13 to 60.
-They measure it to σ/√pairs, with the 0.1 m that a point agrees within to 0.02 m."""
+_CHANCE, _CHANCE_NEAR = 0.006, 0.02
+"""Share of the pairs that seem to show a motion that nothing shows: of scans a voxel and more apart, and how
+much more of those at one place, where rings lie alike and so errors of normals do. Bare tunnels and corridors
+have up to 0.0056, and 0.016 at a third of a voxel."""
+_CHANCE_PAIRS = 4.0
+"""Mean of the pairs above that share in them; a tree in a field has 13."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +71,7 @@ class ScanFit:
         residuals_m: (M,) these distances.
         points: (M, 3) the paired points, scan's frame.
         degeneracy: Of what the normals of both scans show.
-        observability: (6,) of the degeneracy's motions: 1 if measured, 0 if not, and between.
+        observability: (6,) of the degeneracy's motions: probability that surfaces show it, not chance.
         unobservable: Names of the motions that are rather not measured, as in "translation along x".
     """
 
@@ -153,16 +152,14 @@ def fit_of(
     agree[near] = (np.abs(residuals_m) <= _SURFACE_VOXELS * source.voxel_m) & normals.any(axis=1)
     agreement, _ = weakest_direction(source.normals, agree)
     counts = FreeSpaceCheck(_MARGIN_M).count(keyframe.description, _checked(deskewed), T_key_scan)
-    degeneracy = degeneracy_of(0.5 * (shown + shown.T), points=source.points, min_share=_SMALL_SHARE)
-    observability = _observability(degeneracy, points, rows, own_rows, agree[near])
-    if moved_voxels < _OFF_VOXELS:
-        observability[: degeneracy.unobservable_count] = 0.0
+    information = 0.5 * (shown + shown.T)
+    degeneracy = degeneracy_of(information, points=source.points)
+    chance = len(near) * (_CHANCE + _CHANCE_NEAR * max(0.0, 1.0 - moved_voxels))
+    observability = _observability(degeneracy, points, rows, own_rows, agree[near], chance_pairs=chance)
     unobservable = ""
     if observability.min() < 0.5:
         least = 1.001 * float(degeneracy.shares[observability < 0.5].max())
-        unobservable = degeneracy_of(
-            0.5 * (shown + shown.T), points=source.points, min_share=max(least, 1e-9)
-        ).text
+        unobservable = degeneracy_of(information, points=source.points, min_share=max(least, 1e-9)).text
     return ScanFit(
         overlap=len(near) / len(source.points),
         rmse_m=float(np.sqrt(np.mean(distances_m[near] ** 2))),
@@ -184,20 +181,25 @@ def _towards(normals: Array, others: Array) -> Array:
 
 
 def _observability(
-    degeneracy: Degeneracy, points: Array, rows: Array, own_rows: Array, agree: NDArray[np.bool_]
+    degeneracy: Degeneracy,
+    points: Array,
+    rows: Array,
+    own_rows: Array,
+    agree: NDArray[np.bool_],
+    *,
+    chance_pairs: float,
 ) -> Array:
-    """Return (6,) whether enough pairs show a motion (as Tuna et al. 2024, §III, count contributions).
+    """Return (6,) probability that the pairs that show a motion are not there by chance.
 
-    Shares do not tell: normals off by a few degrees, a thousand times, make as large a share as one tree.
+    The pairs are counted (as Tuna et al. 2024, §III, count contributions), or, where all of them show a
+    little, as on slopes, the squared cosines summed. Shares alone do not tell: normals off by a few degrees,
+    a thousand times, make as large a share as one tree.
     """
-    observability = np.ones(6)
-    for k in range(degeneracy.unobservable_count):
-        motion = degeneracy.motions[k]
-        displacements = np.cross(motion[:3], points) + motion[3:]
-        along = (rows @ motion) * (own_rows @ motion)
-        facing = along > _FACING * np.einsum("ni,ni->n", displacements, displacements)
-        pairs = int((facing & agree).sum())
-        observability[k] = np.clip((pairs - _FEW_PAIRS) / (_ENOUGH_PAIRS - _FEW_PAIRS), 0.0, 1.0)
+    displacements = np.cross(degeneracy.motions[:, None, :3], points) + degeneracy.motions[:, None, 3:]
+    squares = np.maximum(np.einsum("kni,kni->kn", displacements, displacements), np.finfo(float).tiny)
+    along = agree * (degeneracy.motions @ rows.T) * (degeneracy.motions @ own_rows.T) / squares
+    pairs = np.maximum((along > _FACING).sum(axis=1), along.sum(axis=1))
+    observability: Array = 1.0 - np.exp(-np.maximum(pairs - chance_pairs, 0.0) / _CHANCE_PAIRS)
     return observability
 
 

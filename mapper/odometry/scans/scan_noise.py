@@ -102,8 +102,8 @@ class ScanNoise:
     """Noise of poses relative to the last keyframe, with what was predicted since then."""
 
     def __init__(self) -> None:
-        self._unseen = 0  # scans in a row that left a motion open
-        self._steps = 0.0
+        self._unseen = 0.0  # scans in a row that left a motion open, each by the probability that it did
+        self._steps = 0.0  # their sums since the keyframe
 
     def restart(self) -> None:
         """Begin at a new keyframe."""
@@ -131,11 +131,9 @@ class ScanNoise:
         least_rad = _LEAST_RAD + _MODEL_RAD_M * off_m
         least_m = np.hypot(_LEAST_M + _MODEL_M_M * off_m, _MODEL_SHARE_M * off_m * moved_m)
         covariance = covariance + np.diag(np.square([least_rad] * 3 + [least_m] * 3)) + at_stamps
-        if fit.observability.min() >= 1.0:
-            self._unseen = 0
-            return PoseNoise(covariance)
-        self._unseen += 1
-        self._steps += self._unseen
+        is_open = 1.0 - float(fit.observability.min())
+        self._unseen = 1.0 + is_open * self._unseen
+        self._steps = self._unseen + is_open * self._steps
         motions = fit.degeneracy.motions
         added_m = np.minimum(open_m * self._steps, fit.degeneracy.extent_m)
         predicted = np.einsum("ki,k,kj->ij", motions, added_m**2, motions)
