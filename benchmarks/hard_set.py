@@ -39,7 +39,7 @@ from mapper.core.errors import MapperError
 from mapper.core.trajectory import Trajectory
 from mapper.evaluators.metrics.loops import wrong_loops
 from mapper.evaluators.metrics.silent_failures import check_doubts
-from mapper.evaluators.metrics.trajectory import align, associate, ate
+from mapper.evaluators.metrics.trajectory import align, associate, ate_rmse_m
 from mapper.loops.closure import accepted_loops
 from mapper.pipeline.build import level_of
 from mapper.pipeline.components import largest_component
@@ -211,8 +211,7 @@ def compared(row: Row, log: Log, config: BuildConfig, tracking: TrackingResult, 
         MapperError: The path and the truth have too few times in common.
     """
     stored = from_tracking(tracking, truth)
-    matched = associate(stored.trajectory, truth)
-    rmse_m = ate(align(matched, "se3").moved(matched)).rmse
+    rmse_m = ate_rmse_m(stored.trajectory, truth)
     sure = associate(without_doubtful(stored.trajectory, stored.records), truth)
     sure = align(sure, "se3").moved(sure)
     turned = Rotation.from_matrix(

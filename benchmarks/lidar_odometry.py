@@ -16,7 +16,7 @@ from mapper.config.loading import load_config
 from mapper.core.frames import Scan
 from mapper.core.geometry import Transform
 from mapper.core.trajectory import Trajectory
-from mapper.evaluators.metrics.trajectory import align, associate, ate
+from mapper.evaluators.metrics.trajectory import ate_rmse_m
 from mapper.odometry.factory import build_frame_odometry
 from mapper.sources import open_source
 
@@ -68,8 +68,7 @@ def measured(log: Path, follow: Follow) -> tuple[float, float, int, int]:
             poses.append(T_world_body)
     if source.truth is None:
         raise SystemExit(f"{log}: has no truth to measure against")
-    matched = associate(Trajectory(np.array(stamps_ns), np.array(poses)), source.truth)
-    error_m = ate(align(matched, "se3").moved(matched)).rmse
+    error_m = ate_rmse_m(Trajectory(np.array(stamps_ns), np.array(poses)), source.truth)
     return error_m, 1e3 * seconds / scans, len(poses), scans
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 from mapper.config.loading import load_config, load_source_config
 from mapper.core.timebase import NS_PER_S
 from mapper.evaluators.metrics.consistency import Nees, factor_nees, window_nees
-from mapper.evaluators.metrics.trajectory import align, associate, ate
+from mapper.evaluators.metrics.trajectory import ate_rmse_m
 from mapper.pipeline.components import largest_component
 from mapper.pipeline.solve import solve
 from mapper.pipeline.track import track_log
@@ -53,8 +53,7 @@ def main() -> None:
             window_nees(trajectory, solved.graph, records, log.truth, window_ns=window_ns)
             for window_ns in (NS_PER_S, 1)
         )
-        matched = associate(trajectory, log.truth)
-        error_m = ate(align(matched, "se3").moved(matched)).rmse
+        error_m = ate_rmse_m(trajectory, log.truth)
         print(
             f"{path.name:24} {error_m:8.4f} {_text(windows)} {_text(steps)} "
             f"{_text(factors['odometry'])} "

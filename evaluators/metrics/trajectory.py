@@ -175,6 +175,16 @@ def ate(matched: Matched) -> Statistics:
     return statistics(matched.position_errors_m)
 
 
+def ate_rmse_m(estimate: Trajectory, truth: Trajectory) -> float:
+    """Return the RMSE of the absolute trajectory error in metres, SE(3)-aligned.
+
+    Raises:
+        DataError: Fewer than three stamps match.
+    """
+    matched = associate(estimate, truth)
+    return ate(align(matched, "se3").moved(matched)).rmse
+
+
 def rpe(matched: Matched, *, delta: float = 1.0, unit: DeltaUnit = "frames") -> RelativeErrors:
     """Return the relative pose error over steps of a fixed length (Sturm et al. 2012, eq. 2–3).
 

@@ -14,7 +14,6 @@ from typing import Any, Literal, NamedTuple
 from mapper.config.build import BuildConfig
 from mapper.core.errors import ConfigError, DataError, SourceError
 from mapper.core.trajectory import Trajectory
-from mapper.evaluators.metrics.trajectory import align, associate, ate
 from mapper.evaluators.papers.model import PaperCell, PaperPath, PaperTable
 from mapper.evaluators.study.engine import digest, versions
 from mapper.evaluators.study.table import Record
@@ -288,12 +287,6 @@ def filled(name: str, table: PaperTable, cells: Sequence[PaperCell], results: Re
     texts = (record["note"] for result in results.values() for _, record in _records_of(name, result))
     notes = dict.fromkeys(str(note) for note in texts if note)
     return replace(table, cells=(*table.cells, *cells), notes=(*table.notes, *notes))
-
-
-def ate_rmse_m(estimate: Trajectory, truth: Trajectory) -> float:
-    """Return the ATE RMSE after SE(3) alignment: the thesis's ATE, Zhao's APE (eq. 15, 16)."""
-    matched = associate(estimate, truth)
-    return ate(align(matched, "se3").moved(matched)).rmse
 
 
 _fingerprint = cache(fingerprint)  # of a large log it takes a while, and every measurement needs it

@@ -21,15 +21,14 @@ from mapper.simulation.boxes import write_scene
 from mapper.simulation.builder import FACES
 from mapper.simulation.config import LidarSynthConfig, SynthConfig, set_or_first
 from mapper.simulation.disturbances import between, disturbed, shown_frames
-from mapper.simulation.imu_readings import measure_imu
 from mapper.simulation.movers import Movers, make_movers
 from mapper.simulation.path import Motion, frame_stamps, make_motion, seconds_of
 from mapper.simulation.raycast import Rendering
+from mapper.simulation.readings import measure_imu, measure_wheels
 from mapper.simulation.scene import Scene, make_scene
 from mapper.simulation.sensor import observe, warp_of
 from mapper.simulation.shutter import Shutter
 from mapper.simulation.streams import Stream, noise_index, rng_of
-from mapper.simulation.wheel_readings import counted
 from mapper.sources.base import ImageFiles, Log
 from mapper.sources.calibration_file import calibration_text
 from mapper.sources.image_files.reading import TUM_UNITS_PER_M
@@ -98,23 +97,15 @@ def synthetic_log(
         poses: Maps (N,) seconds after the start to (N, 4, 4) exact T_world_body.
         simulate: Returns a frame by its number; an image is grey where the second argument is false.
     """
-    wheels = None
+    wheels = gyroscope = accelerations = None
+    last_s = float(seconds_of(truth.stamps_ns[-1:])[0])
     if config.wheels is not None:
-        wheels = counted(
-            config.wheels,
-            poses,
-            duration_s=float(seconds_of(truth.stamps_ns[-1:])[0]),
-            sensor=sensor,
-            rng=rng_of(config.seed, Stream.WHEELS),
-        )
-    gyroscope, accelerations = None, None
+        rng = rng_of(config.seed, Stream.WHEELS)
+        wheels = measure_wheels(config.wheels, poses, duration_s=last_s, sensor=sensor, rng=rng)
     if config.imu is not None:
-        gyroscope, accelerations = measure_imu(
-            config.imu,
-            poses,
-            duration_s=float(seconds_of(truth.stamps_ns[-1:])[0]) + _IMU_AFTER_S,
-            rng=rng_of(config.seed, Stream.IMU),
-        )
+        rng = rng_of(config.seed, Stream.IMU)
+        duration_s = last_s + _IMU_AFTER_S
+        gyroscope, accelerations = measure_imu(config.imu, poses, duration_s=duration_s, rng=rng)
     return Log(
         path=Path(name),
         name=name,

@@ -105,10 +105,8 @@ def test_verbose_prints_every_row_and_quiet_none(desk_run):
     assert both.stderr == "mapper: --verbose and --quiet: choose one\n"
 
 
-def test_a_build_tells_eight_lines_and_the_rest_with_verbose(desk_log, tmp_path):
-    short = mapper("build", desk_log, "--last", 11, "--out", tmp_path / "short").stdout.splitlines()
-    rest = mapper("build", desk_log, "--last", 11, "--out", tmp_path / "long", "--verbose").stdout
-    assert len(short) == 8
+def test_a_build_tells_the_rest_with_verbose(desk_log, tmp_path):
+    rest = mapper("build", desk_log, "--last", 11, "--out", tmp_path / "run", "--verbose").stdout
     for row in ("keyframes", "levelled by", "seconds", "peak memory", "trajectory.tum"):
         assert row in rest
 

@@ -9,13 +9,14 @@ from mapper.config.loading import load_config
 from mapper.core.frames import RgbdFrame
 from mapper.core.timebase import NS_PER_S
 from mapper.core.trajectory import Trajectory
+from mapper.evaluators.metrics.trajectory import ate_rmse_m
 from mapper.pipeline.components import largest_component
 from mapper.pipeline.solve import solve
 from mapper.pipeline.track import track_log
 from mapper.runtime.progress import SILENT
 from mapper.simulation.source import CameraSimulator, SyntheticEntry
 from mapper.sources.base import Log
-from tests.support.desk_frames import DESK_WALK, ate_rmse_m, desk_frames
+from tests.support.desk_frames import DESK_WALK, desk_frames
 
 APART_M = 10.0
 PAUSE_NS = 12 * NS_PER_S

@@ -1,12 +1,10 @@
-"""A walk before a desk as frames in memory, and how far a path lies from its truth."""
+"""A walk before a desk as frames in memory."""
 
 from functools import cache
 
 import numpy as np
 
 from mapper.core.frames import RgbdFrame
-from mapper.core.trajectory import Trajectory
-from mapper.evaluators.metrics.trajectory import align, associate, ate
 from mapper.simulation.config import SynthConfig
 from mapper.simulation.source import CameraSimulator
 from mapper.sources.base import Log
@@ -31,9 +29,3 @@ def desk_frames() -> tuple[RgbdFrame, ...]:
 def blank(frame: RgbdFrame) -> RgbdFrame:
     """Return the same moment with the lens covered."""
     return RgbdFrame(frame.stamp_ns, np.zeros_like(frame.image), np.zeros_like(frame.depth_m), frame.camera)
-
-
-def ate_rmse_m(trajectory: Trajectory, truth: Trajectory) -> float:
-    """Return the ATE after the best rigid alignment."""
-    matched = associate(trajectory, truth)
-    return ate(align(matched, "se3").moved(matched)).rmse

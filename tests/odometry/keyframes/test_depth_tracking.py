@@ -7,10 +7,10 @@ import pytest
 
 from mapper.core.geometry import exp, inverse
 from mapper.core.trajectory import Trajectory, trajectory_from
+from mapper.evaluators.metrics.trajectory import ate_rmse_m
 from mapper.odometry.config import LocalMapConfig
 from mapper.odometry.factory import build_frame_odometry
 from tests.support.depth_rooms import CORNER, white_frame
-from tests.support.desk_frames import ate_rmse_m
 
 ROOM = (1.6, 2.1, 1.3)
 FACING_Y = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])

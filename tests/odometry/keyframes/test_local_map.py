@@ -7,13 +7,14 @@ from mapper.core.errors import FrameError
 from mapper.core.frames import PinholeCamera, RgbdFrame, Scan
 from mapper.core.geometry import exp, inverse
 from mapper.core.trajectory import Trajectory, trajectory_from
+from mapper.evaluators.metrics.trajectory import ate_rmse_m
 from mapper.features.config import OrbConfig
 from mapper.graph.config import GraphConfig
 from mapper.graph.model import PoseGraph
 from mapper.graph.optimize import optimize
 from mapper.odometry.config import LocalMapConfig
 from mapper.odometry.factory import build_frame_odometry
-from tests.support.desk_frames import ate_rmse_m, blank
+from tests.support.desk_frames import blank
 
 
 def track(frames, config=None):

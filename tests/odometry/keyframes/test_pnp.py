@@ -6,10 +6,10 @@ import pytest
 from mapper.config.loading import load_config
 from mapper.core.geometry import angle_between, apply, exp, inverse
 from mapper.core.trajectory import trajectory_from
+from mapper.evaluators.metrics.trajectory import ate_rmse_m
 from mapper.odometry.config import PnpConfig
 from mapper.odometry.factory import build_frame_odometry
 from mapper.registration.reprojection import ransac_p3p
-from tests.support.desk_frames import ate_rmse_m
 from tests.support.paths import CONFIGS
 
 INTRINSICS = np.array([525.0, 525.0, 319.5, 239.5])
