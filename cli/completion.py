@@ -9,11 +9,10 @@ import re
 import shlex
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from mapper.core.errors import ConfigError, MapperError
+from mapper.core.errors import ConfigError
 
 ASKED_BY = "_MAPPER_COMPLETE"
 """Environment variable that holds the shell's name."""
@@ -186,38 +185,13 @@ def export_kinds() -> list[tuple[str, str]]:
     return [(kind, exporter.summary) for kind, exporter in EXPORTERS.items()]
 
 
-def _settings() -> list[tuple[str, str, list[str]]]:
-    """Return name, meaning and choices of every setting, from a file: reading the models takes a second."""
-    import json
-
-    import mapper
-    from mapper.runtime.atomic import write_text
-
-    package = Path(mapper.__file__).parent
-    sources = [*package.glob("*/config.py"), *package.glob("*/*/config.py"), *package.glob("config/*.py")]
-    mark = f"{mapper.__version__} {max(path.stat().st_mtime_ns for path in sources)} {package}"
-    kept = cache_folder() / "settings.json"
-    try:
-        found = json.loads(kept.read_bytes())
-        if found["mark"] == mark:
-            return [(name, meaning, choices) for name, meaning, choices in found["settings"]]
-    except (OSError, ValueError, KeyError, TypeError):
-        pass
+def _settings() -> Iterator[tuple[str, str, Sequence[str]]]:
+    """Yield name, meaning and choices of every setting."""
     from mapper.config.describe import settings
 
-    known = {
-        each.key: (each.key, each.doc.partition(". ")[0], list(each.choices))
-        for each in settings()
-        if not each.is_table
-    }
-    with suppress(OSError, MapperError):  # without it the next time is slower, no more
-        write_text(kept, json.dumps({"mark": mark, "settings": list(known.values())}))
-    return list(known.values())
-
-
-def cache_folder() -> Path:
-    """Return the folder of what is kept between calls."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mapper"
+    for each in settings():
+        if not each.is_table:
+            yield each.key, each.doc.partition(". ")[0], each.choices
 
 
 def detected_shell() -> str:
@@ -258,5 +232,4 @@ def install(shell: str) -> Path:
         if line not in text.splitlines():
             with start.open("a", encoding="utf-8") as file:
                 file.write(f"{'' if text.endswith(chr(10)) or not text else chr(10)}{line}\n")
-    _settings()
     return path

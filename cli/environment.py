@@ -7,7 +7,6 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING
 
-from mapper.cli.completion import cache_folder
 from mapper.core.errors import Terminated
 
 if TYPE_CHECKING:
@@ -24,7 +23,8 @@ def prepare_environment() -> None:
     os.environ.setdefault("RUST_LOG", "off")  # Rerun would print lines of its own beside our errors
     package = Path(mapper.__file__).parent
     if not os.access(package, os.W_OK):  # numba keeps its code beside ours, and refuses to work if it cannot
-        os.environ.setdefault("NUMBA_CACHE_DIR", str(cache_folder() / "numba"))
+        cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mapper"
+        os.environ.setdefault("NUMBA_CACHE_DIR", str(cache / "numba"))
     drop_stale_kernels()
 
 

@@ -83,9 +83,8 @@ def test_an_array_in_a_file_grows_without_reserved_pages(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("absent", [MAC, MAC + WINDOWS], ids=["macos", "windows"])
-def test_every_module_can_be_imported(absent):
-    ended = run(absent + IMPORT_ALL)
+def test_every_module_can_be_imported():
+    ended = run(MAC + WINDOWS + IMPORT_ALL)  # a build does without the first alone
     assert ended.returncode == 0, ended.stderr
 
 
