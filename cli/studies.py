@@ -49,8 +49,8 @@ def compare(
 
     Example: mapper compare rgbd_dataset_freiburg1_xyz --method isvd --method gicp --out runs/compared
     """
-    from mapper.evaluators.compare.api import compare as compare_methods
     from mapper.evaluators.compare.files import REPORT, tables_text
+    from mapper.evaluators.compare.files import compare as compare_methods
 
     short_options = [*selection(first, last, stride, None), *assignments({"pairs": pairs, "seed": seed})]
     comparison = compare_methods(

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from mapper.api.register import register
     from mapper.config.loading import load_config
     from mapper.core.errors import MapperError
-    from mapper.evaluators.compare.api import compare
+    from mapper.evaluators.compare.files import compare
     from mapper.evaluators.metrics.evaluate import evaluate
     from mapper.octree.map import OctreeMap
     from mapper.run.folder import Run, open_run
@@ -53,7 +53,7 @@ _HOMES = {
     "OctreeMap": "mapper.octree.map",
     "Run": "mapper.run.folder",
     "build": "mapper.api.build",
-    "compare": "mapper.evaluators.compare.api",
+    "compare": "mapper.evaluators.compare.files",
     "diff": "mapper.api.merging",
     "evaluate": "mapper.evaluators.metrics.evaluate",
     "inspect": "mapper.api.logs",

@@ -3,13 +3,17 @@
 import json
 import math
 import shutil
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import mapper
+from mapper.api.progress import AnyProgress, receiver_of
+from mapper.config.loading import Settings, overridden
 from mapper.core.geometry import Array
-from mapper.evaluators.compare.comparison import Comparison, compare
+from mapper.evaluators.compare.comparison import Comparison
+from mapper.evaluators.compare.comparison import compare as compare_methods
 from mapper.evaluators.compare.config import CompareConfig
 from mapper.evaluators.compare.pairwise import NO_GUESS, registration_records
 from mapper.evaluators.metrics.odometry import OdometryRun
@@ -24,6 +28,8 @@ from mapper.evaluators.study.table import Column, Table, column, csv_text, decim
 from mapper.run.manifest import library_versions
 from mapper.runtime.atomic import MANIFEST_NAME, FolderKind, atomic_folder, write_json, write_text
 from mapper.runtime.progress import SILENT, Progress
+from mapper.runtime.regular_files import AnyPath
+from mapper.sources import open_source
 from mapper.sources.base import Log
 from mapper.sources.trajectory_files import write_tum
 
@@ -41,6 +47,38 @@ _FOLDER = FolderKind(
     ),
     kind="comparison",
 )
+
+
+def compare(
+    log: AnyPath,
+    *,
+    methods: Sequence[str] = (),
+    out: AnyPath = "compare",
+    overrides: Sequence[str] = (),
+    settings: Settings | None = None,
+    progress: AnyProgress = None,
+    overwrite: bool = False,
+) -> Comparison:
+    """Run every method over the same frames, as ``mapper compare`` does.
+
+    Args:
+        log: Recorded log.
+        methods: Methods to compare; none are all that fit the log.
+        out: Folder to create; a comparison that was stopped is resumed.
+        overrides: ``key.path=value`` as text, such as "pairs=10".
+        settings: The same as values by dotted name.
+        progress: As for ``mapper.build``.
+        overwrite: Replace OUT.
+
+    Raises:
+        ConfigError: There is no such method or setting.
+        RunError: OUT exists already.
+        MapperError: The log cannot be opened.
+    """
+    given = CompareConfig(methods=tuple(methods))
+    config = overridden(given, overrides, settings=settings)
+    source = open_source(Path(log), config.source)
+    return compare_into(Path(out), source, config, overwrite=overwrite, progress=receiver_of(progress))
 
 
 def compare_into(
@@ -70,7 +108,7 @@ def compare_into(
         out, _FOLDER, overwrite=overwrite, keeps=lambda partial: _kept_of(partial, plan)
     ) as folder:
         write_text(folder / MANIFEST_NAME, plan)
-        comparison = compare(source, config, folder / CELLS, progress=progress)
+        comparison = compare_methods(source, config, folder / CELLS, progress=progress)
         write_comparison(folder, comparison)
         shutil.rmtree(folder / CELLS)
     return comparison

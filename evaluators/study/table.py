@@ -186,16 +186,7 @@ def write_parquet(path: Path, records: Sequence[Record]) -> None:
         import pyarrow as pa  # takes a second
         from pyarrow import parquet
 
-    columns = {}
-    for name in records[0]:
-        values = [record[name] for record in records]
-        kinds = {type(value) for value in values if value is not None}
-        if kinds <= {str} and kinds:
-            kind = pa.string()
-        elif kinds <= {int} and kinds:
-            kind = pa.int64()
-        else:
-            kind = pa.float64()
-        columns[name] = pa.array(values, kind)
+    table = pa.Table.from_pylist(list(records))
+    fields = [one.with_type(pa.float64()) if pa.types.is_null(one.type) else one for one in table.schema]
     with atomic_file(path) as part:
-        parquet.write_table(pa.table(columns), part)
+        parquet.write_table(table.cast(pa.schema(fields)), part)

@@ -59,7 +59,7 @@ needs no tracking, a run needs no merging."""
 
 ASKS_UPWARDS = {
     ("mapper/run/folder.py", "mapper.export.picture"),
-    ("mapper/__init__.py", "mapper.evaluators.compare.api"),
+    ("mapper/__init__.py", "mapper.evaluators.compare.files"),
     ("mapper/__init__.py", "mapper.evaluators.metrics.evaluate"),
 }
 """Imports against the order, loaded when they are used: ``run.plot()`` and notebooks draw a run, and
