@@ -75,6 +75,8 @@ def _log_rows(log: "LogFacts") -> list[tuple[str, str]]:
     if log.calibration is not None:
         rows.append(("camera", log.calibration))
     rows.append(("truth", log.truth or "none"))
+    if log.device_poses is not None:
+        rows.append(("device poses", f"{log.device_poses}; --set odometry.kind=given maps by them"))
     if log.wheels is not None:
         rows.append(
             (

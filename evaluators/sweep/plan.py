@@ -230,8 +230,9 @@ def _misfit(config: BuildConfig, source: Log) -> str:
         return f"odometry.kind={odometry.kind} needs images"
     if odometry.kind == "wheels" and source.wheels is None:
         return "odometry.kind=wheels needs wheels"
-    if odometry.kind == "given" and odometry.path is None and source.truth is None:
-        return "odometry.kind=given needs truth"
+    has_poses = source.truth is not None or source.device_poses is not None
+    if odometry.kind == "given" and odometry.path is None and not has_poses:
+        return "odometry.kind=given needs truth or device poses"
     sees_scans = source.sensor == "lidar" or isinstance(odometry, ScanOdometryConfig)
     if sees_scans and isinstance(loops, _IMAGE_LOOPS):
         return f"loops.kind={loops.kind} needs images, odometry.kind={odometry.kind} takes scans"

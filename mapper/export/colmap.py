@@ -18,7 +18,8 @@ from mapper.run.folder import Run
 from mapper.runtime.atomic import write_bytes, write_json, write_text
 from mapper.runtime.progress import Progress
 from mapper.sources.base import FrameRef
-from mapper.sources.image_files.reading import encode_colour, image_bytes
+from mapper.sources.image_files.decoded import encode_colour
+from mapper.sources.image_files.reading import image_bytes
 
 _POINTS = "points.ply"
 _FILES = ("images", "sparse", "transforms.json", _POINTS)

@@ -1,4 +1,4 @@
-"""Known poses as an odometry: those of a file, or the log's own truth."""
+"""Known poses as an odometry: those of a file, the log's own truth, or its device's."""
 
 from pathlib import Path
 
@@ -41,7 +41,7 @@ def poses_for(config: OdometryConfig, log: Log) -> Trajectory | None:
     if not isinstance(config, GivenOdometryConfig):
         return log.wheels
     if config.path is None:
-        return log.truth
+        return log.device_poses if log.truth is None else log.truth
     path = _found(config.path, log)
     poses = read_tum(path)
     (first_ns, last_ns), (begin_ns, end_ns) = poses.stamps_ns[[0, -1]], log.stamps_ns[[0, -1]]

@@ -20,6 +20,7 @@ RECORDING = "ros.files"
 # The first that recognises a path reads it. Images of ICL-NUIM and Poznań are numbered too, and stamps are
 # numbers, so these come before numbered images; any log's folder may have clouds in it, so clouds come last.
 _FORMATS = (
+    "image_folders.posed_layouts",
     "image_folders.icl_nuim",
     "image_folders.tum",
     "image_folders.mbag",
@@ -40,13 +41,15 @@ def open_source(path: Path, config: SourceConfig = _DEFAULTS) -> "Log":
     """Return a recorded log, recognised by its files, with the configured selection of its frames.
 
     Args:
-        path: Folder of a TUM, ICL-NUIM, Poznań, 7-Scenes, Redwood or KITTI log or of clouds, an mbag file or
-            its folder, an MCAP file, or a ROS bag.
+        path: Folder of a TUM, ICL-NUIM, Poznań, 7-Scenes, Redwood, ScanNet, Replica or KITTI log, of an app's
+            export (Stray Scanner, Record3D, Polycam, nerfstudio) or of clouds, an mbag, .sens or .r3d file,
+            an MCAP file, or a ROS bag.
         config: Selection, pairing, camera, and what the files of a log do not state.
 
     Raises:
         SourceError: Nothing is there, no format fits, the log is malformed, nothing of it is selected, or it
             has no frame such as is to be its body.
+        DependencyError: A library that decodes it is not installed.
     """
     from mapper.sources.imu_files import read_imu
     from mapper.sources.listed_files import unused_note
@@ -82,7 +85,7 @@ def open_source(path: Path, config: SourceConfig = _DEFAULTS) -> "Log":
     hint = "; of clouds it has one, want two or more" if most_clouds(path) == 1 else _inner_hint(path)
     raise SourceError(
         f"{path}: not a log of a known format (TUM, ICL-NUIM, Poznań, 7-Scenes, Redwood, KITTI, clouds, "
-        ".mcap, .bag, .db3, .mbag); docs/your-sensor.md names the files of each"
+        ".mcap, .bag, .db3, .mbag, .sens, .r3d, exports of apps); docs/your-sensor.md names the files of each"
         f"{hint}"
     )
 

@@ -146,6 +146,7 @@ class Log:
         stamps_ns: (N,) time of every frame, nanoseconds, strictly increasing.
         entry_at: Returns the entry of frame 0 … N - 1; nothing is decoded yet.
         truth: True T_world_body, if the log has it.
+        device_poses: T_world_body as a phone or tablet estimated it, if the log has it.
         accelerations: Accelerometer readings, if the log has them.
         gyroscope: Gyroscope readings, if the log has them.
         T_base_body: Mounting of the body on the robot, whose base has x forward and z up (REP 103), if the
@@ -163,6 +164,7 @@ class Log:
     stamps_ns: Stamps
     entry_at: Callable[[int], FrameRef]
     truth: Trajectory | None = None
+    device_poses: Trajectory | None = None
     accelerations: Accelerations | None = None
     gyroscope: Gyroscope | None = None
     T_base_body: Transform | None = None

@@ -100,6 +100,7 @@ def _shifted(log: Log, shift_ns: int) -> Log:
         stamps_ns=log.stamps_ns + shift_ns,
         entry_at=lambda index: _ShiftedEntry(log.entry_at(index), shift_ns),
         truth=_later(log.truth, shift_ns),
+        device_poses=_later(log.device_poses, shift_ns),
         wheels=_later(log.wheels, shift_ns),
         accelerations=_later(log.accelerations, shift_ns),
         gyroscope=_later(log.gyroscope, shift_ns),

@@ -1,5 +1,6 @@
 """Inertial readings beside a log: ``imu.csv`` as of EuRoC, or angular velocities in ``gyroscope.txt``."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from mapper.sources.text import parse_numbers, parse_stamp, read_lines, table, t
 
 BOTH, RATES = "imu.csv", "gyroscope.txt"
 _COLUMNS = np.dtype([("stamp_ns", "<i8"), ("rates", "<f8", 3), ("accelerations", "<f8", 3)])
+_STRAY_COLUMNS = ("timestamp", "a_x", "a_y", "a_z", "alpha_x", "alpha_y", "alpha_z")
 BOTH_HEADER = (
     "#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],"
     "a_RS_S_x [m s^-2],a_RS_S_y [m s^-2],a_RS_S_z [m s^-2]"
@@ -24,7 +26,8 @@ def read_imu(folder: Path) -> tuple[Gyroscope | None, Accelerations | None, list
     """Return angular velocities and accelerations of a log's folder, as far as it has them, and notes.
 
     Args:
-        folder: Folder that may hold ``imu.csv`` (``stamp_ns,wx,wy,wz,ax,ay,az``, its first line EuRoC's) or
+        folder: Folder that may hold ``imu.csv`` (``stamp_ns,wx,wy,wz,ax,ay,az``, its first line EuRoC's, or
+            Stray Scanner's, of which the angular velocities are read) or
             ``gyroscope.txt`` (``stamp wx wy wz``); rad/s and m/s², in the unit's own axes.
 
     Raises:
@@ -43,6 +46,8 @@ def read_imu(folder: Path) -> tuple[Gyroscope | None, Accelerations | None, list
     if not path.is_file():
         return None, None, []
     lines = read_lines(path)
+    if lines and all(name in lines[0] for name in _STRAY_COLUMNS):
+        return _stray_rates(path, lines)
     if not lines or "w_RS_S_x" not in lines[0]:
         return None, None, [f"{path.name}: its first line is not EuRoC's; not used"]
     try:
@@ -76,6 +81,24 @@ def write_imu(folder: Path, gyroscope: Gyroscope, accelerations: Accelerations) 
     ):
         lines.append(",".join([str(stamp_ns), *map(repr, rates), *map(repr, felt)]))
     (folder / BOTH).write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def _stray_rates(path: Path, lines: Sequence[str]) -> tuple[Gyroscope | None, None, list[str]]:
+    """Return the angular velocities of Stray Scanner's imu.csv, whose stamps are seconds.
+
+    Its accelerations point down at rest in some versions, and in others lack gravity.
+    """
+    at = [[word.strip() for word in lines[0].split(",")].index(name) for name in _STRAY_COLUMNS]
+    stamps_ns, rates = [], []
+    for number, line in enumerate(lines[1:], start=2):
+        words, where = line.split(","), f"{path}:{number}"
+        if len(words) <= max(at):
+            raise SourceError(f"{where}: {len(words)} columns, want {', '.join(_STRAY_COLUMNS)}")
+        stamps_ns.append(parse_stamp(words[at[0]].strip(), where=where))
+        rates.append(parse_numbers([words[i] for i in at[4:]], where=where))
+    stamps = np.array(stamps_ns, np.int64)
+    gyroscope, notes = _gyroscope(path, stamps, np.array(rates, np.float64).reshape(-1, 3))
+    return gyroscope, None, notes
 
 
 def _gyroscope(path: Path, stamps_ns: Stamps, rates_radps: Array) -> tuple[Gyroscope | None, list[str]]:

@@ -71,6 +71,7 @@ class LogFacts:
         content: The first frame that can be read, in words, or that none can.
         calibration: The camera, in words; None of a LiDAR.
         truth: Description of its truth; None without.
+        device_poses: Description of a phone's own estimate of its path; None without.
         wheels: Timing of its wheels' readings; None without.
         wheels_path_m: Length of their path, metres.
         readings: Number of accelerations.
@@ -88,6 +89,7 @@ class LogFacts:
     content: str
     calibration: str | None
     truth: str | None
+    device_poses: str | None
     wheels: Timing | None
     wheels_path_m: float
     readings: int
@@ -163,6 +165,9 @@ def _inspected(path: Path, topics: Sequence[TopicFacts], source: Log) -> Inspect
         content=problem if first is None else _content_text(first),
         calibration=_calibration_text(first.camera) if isinstance(first, RgbdFrame) else None,
         truth=None if source.truth is None else _truth_text(source.truth, source.stamps_ns),
+        device_poses=None
+        if source.device_poses is None
+        else _truth_text(source.device_poses, source.stamps_ns),
         wheels=None if source.wheels is None else timing_of(source.wheels.stamps_ns),
         wheels_path_m=0.0 if source.wheels is None else source.wheels.path_length_m,
         readings=0 if source.accelerations is None else len(source.accelerations.stamps_ns),

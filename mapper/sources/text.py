@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.errors import DataError, SourceError
-from mapper.core.geometry import Array, Transform, is_rigid
+from mapper.core.geometry import Array, Transform, is_rigid, nearest_rotation, transform
 from mapper.core.rotations import pose_of_row
 from mapper.core.timebase import Stamps, ns_from_date_text, ns_from_seconds_text
 from mapper.core.trajectory import Trajectory
@@ -127,6 +127,18 @@ def poses_from_numbers(numbers: Array) -> list[Transform | None]:
     return [next(poses) if is_usable else None for is_usable in usable]
 
 
+def pose_from_matrix(matrix: Sequence[Sequence[float]] | Array) -> Transform | None:
+    """Return the pose of three or four rows of four numbers, its rotation made exact; None of no pose.
+
+    Files say that a camera was lost by numbers that are not finite, or by zeros.
+    """
+    T = np.asarray(matrix, np.float64)
+    if T.ndim != 2 or T.shape[0] not in (3, 4) or T.shape[1] != 4 or not np.isfinite(T).all():
+        return None
+    R = nearest_rotation(T[:3, :3])
+    return transform(R, T[:3, 3]) if np.abs(R - T[:3, :3]).max() < ROUNDING else None
+
+
 def truth_from(
     poses: Sequence[tuple[int, Transform | None]], *, what: str
 ) -> tuple[Trajectory | None, list[str]]:
@@ -141,7 +153,7 @@ def truth_from(
     if dropped := len(poses) - len(usable):
         notes.append(f"{what}: {dropped} of {len(poses)} poses are not finite rigid motions; dropped")
     if not usable:
-        return None, [*notes, f"{what}: no usable ground truth"]
+        return None, [*notes, f"{what}: no usable pose"]
     stamps_ns = np.array([stamp_ns for stamp_ns, _ in usable], dtype=np.int64)
     order, more = time_order(stamps_ns, what=what)
     T_world_body = np.array([T for _, T in usable])[order]

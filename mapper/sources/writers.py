@@ -16,8 +16,10 @@ from mapper.core.trajectory import Trajectory
 from mapper.runtime.atomic import new_folder, write_bytes, write_text
 from mapper.sources.base import Accelerations, FrameRef, Log, Skipped
 from mapper.sources.calibration_file import calibration_text
-from mapper.sources.image_files.reading import TUM_UNITS_PER_M, encode_colour, encode_depth, image_bytes
+from mapper.sources.image_files.decoded import encode_colour, encode_depth
+from mapper.sources.image_files.reading import TUM_UNITS_PER_M, image_bytes
 from mapper.sources.image_folders.mbag import HEADER
+from mapper.sources.image_folders.tum import DEVICE_POSES
 from mapper.sources.imu_files import write_gyroscope
 from mapper.sources.scan_folders.kitti_writing import write_kitti_log
 from mapper.sources.trajectory_files import write_tum
@@ -71,18 +73,21 @@ def left_out(source: Log, kind: LogKind) -> list[str]:
     """Return the parts of a log that a format has no place for, a sentence each."""
     has = {
         "wheel odometry": source.wheels is not None,
+        "device poses": source.device_poses is not None,
         "accelerations": source.accelerations is not None,
         "angular velocities": source.gyroscope is not None,
     }
     no_place: dict[LogKind, list[str]] = {
-        "mbag": ["wheel odometry", "angular velocities"],
+        "mbag": ["wheel odometry", "device poses", "angular velocities"],
+        "mcap": ["device poses"],
+        "bag": ["device poses"],
         "kitti": ["accelerations"],
     }
     missing = [what for what in no_place.get(kind, []) if has[what]]
     if kind == "mcap" or kind == "bag":
         from mapper.sources.ros.log_writing import early_readings  # loads rosbags
 
-        missing = [f"{count} {what} before the time 0" for what, count in early_readings(source).items()]
+        missing += [f"{count} {what} before the time 0" for what, count in early_readings(source).items()]
     return [f"{kind} has no place for {what}; left out" for what in missing]
 
 
@@ -118,6 +123,8 @@ def _write_images_log(
     else:
         if source.truth is not None:
             write_tum(out / "groundtruth.txt", source.truth)
+        if source.device_poses is not None:
+            write_tum(out / DEVICE_POSES, source.device_poses)
         if source.wheels is not None:
             write_wheels(out, source.wheels, sensor=source.sensor)
         if source.gyroscope is not None:

@@ -91,6 +91,7 @@ HOMES = {
     "evo": (),
     "rerun": ("mapper/export/rerun/",),
     "distributed": ("mapper/runtime/executor.py",),
+    "lzfse": ("mapper/sources/image_folders/record3d.py",),
     "velodyne_decoder": ("mapper/sources/ros/driver_messages.py",),
     "pyarrow": ("evaluators/study/table.py",),
 }

@@ -29,8 +29,10 @@ from mapper.sources.writers import LogKind, write_log
 from tests.support.clouds import save_cloud
 from tests.support.depth_cameras import write_unregistered
 from tests.support.desk import DESK, build_desk_run
+from tests.support.driver_recordings import street, write_livox, write_vlp16
 from tests.support.logs import MemoryEntry, log_in_memory
 from tests.support.octree_maps import COLORED, mapped
+from tests.support.posed_scans import WRITERS, shots_of
 from tests.support.recordings import CAMERA, add_messages, shots, write, write_folder
 from tests.support.tum_logs import FIRST_NS, picture
 
@@ -279,6 +281,23 @@ def _depth_camera(folder: Path) -> Path:
     return folder / "log"
 
 
+def _scan(kind: str) -> Maker:
+    def make(folder: Path) -> Path:
+        frames = [frame for frame in rgbd_log() if isinstance(frame, RgbdFrame)]
+        write_scan, name = WRITERS[kind]
+        return write_scan(folder / name, shots_of(frames, truth().T_world_body))
+
+    return make
+
+
+def _livox(folder: Path) -> Path:
+    return write_livox(folder / "log.bag", (scan for scan in lidar_log() if isinstance(scan, Scan)))
+
+
+def _velodyne(folder: Path) -> Path:
+    return write_vlp16(folder / "log.bag", street(azimuth_steps=90, duration_s=0.3), scans=2)[0]
+
+
 FORMATS: Mapping[str, Maker] = {
     "tum": _written(rgbd_log, "tum", "log"),
     "mbag": _written(rgbd_log, "mbag", "log"),
@@ -304,6 +323,10 @@ FORMATS: Mapping[str, Maker] = {
     "redwood, tiff": _numbered(".tiff", ".tiff"),
     "redwood, bmp": _numbered(".bmp", ".pgm"),
     "7-scenes": _seven_scenes,
+    **{kind: _scan(kind) for kind in WRITERS if kind != "redwood"},
+    "redwood, npy": _scan("redwood"),
+    "bag, livox": _livox,
+    "bag, velodyne": _velodyne,
     "poznan": _poznan,
     **{
         f"clouds, {ending[1:]}": _clouds(ending)

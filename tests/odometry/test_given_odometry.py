@@ -143,7 +143,7 @@ def test_a_path_starts_here_or_in_the_log_s_folder(flat, tmp_path, monkeypatch):
 
 def test_mistakes_are_named_with_the_remedy(flat, tmp_path):
     with pytest.raises(
-        ConfigError, match=r"the log has no truth; name a file .*--set odometry\.path=poses\.tum"
+        ConfigError, match=r"neither truth nor device poses; name a file .*--set odometry\.path=poses\.tum"
     ):
         track_log(replace(flat, truth=None), given(), progress=SILENT)
     with pytest.raises(

@@ -7,7 +7,7 @@ import pytest
 from mapper.core.errors import SourceError
 from mapper.export.mcap_log import McapLog
 from mapper.sources.config import SourceConfig
-from mapper.sources.image_files.reading import encode_depth
+from mapper.sources.image_files.decoded import encode_depth
 from mapper.sources.inspection import inspect_log, timing_of
 from tests.support.command_line import invoke
 from tests.support.recordings import CAMERA, COLOR, DEPTH, shots, write

@@ -140,7 +140,7 @@ def test_truth_without_a_single_pose_is_no_truth(tiny_tum_log, text):
     (log / "groundtruth.txt").write_text(text)
     source = open_source(log)
     assert source.truth is None
-    assert source.notes[-1] == "groundtruth.txt: no usable ground truth"
+    assert source.notes[-1] == "groundtruth.txt: no usable pose"
 
 
 def test_no_truth_file_is_no_truth(tiny_tum_log):

@@ -5,7 +5,7 @@ from mapper.core.errors import FrameError, SourceError
 from mapper.core.frames import PinholeCamera, RgbdFrame, Scan
 from mapper.core.trajectory import trajectory_from
 from mapper.sources import open_source
-from mapper.sources.image_files.reading import encode_depth
+from mapper.sources.image_files.decoded import encode_depth
 from mapper.sources.writers import left_out, write_log
 from tests.support.logs import MemoryEntry, log_in_memory
 from tests.support.tum_logs import FIRST_NS, PERIOD_NS, picture

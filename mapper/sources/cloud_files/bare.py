@@ -3,20 +3,23 @@
 import re
 from io import StringIO
 from pathlib import Path
-from threading import Lock
 
 import numpy as np
 
 from mapper.core.errors import FrameError
 from mapper.runtime.regular_files import HEAD_BYTES
-from mapper.sources.cloud_files.parsing import HEADER_LINES, MIN_POINTS, Column, Columns, refusing_damage
+from mapper.sources.cloud_files.parsing import (
+    HEADER_LINES,
+    MIN_POINTS,
+    Column,
+    Columns,
+    load_array,
+    refusing_damage,
+)
 from mapper.sources.cloud_files.records import KITTIS, other_width
 
 _FLOAT32 = np.dtype("<f4")
 _MAX_CLASS = 1000
-_ONE_HEADER = Lock()
-"""NumPy parses an array's header with ``ast``, which counts its recursion for all threads together in Python
-3.11 and may find it wrong."""
 EMPTY = "the file is empty"
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*([eE][-+]?\d+)?|\.\d+([eE][-+]?\d+)?|nan|inf)", re.IGNORECASE)
 
@@ -61,8 +64,8 @@ def read_npy(path: Path) -> Columns:
     Raises:
         FrameError: It is neither, or not an array's file.
     """
-    with path.open("rb") as stream, refusing_damage(path, what="npy"), _ONE_HEADER:
-        array = np.lib.format.read_array(stream, allow_pickle=False)
+    with path.open("rb") as stream:
+        array = load_array(stream, path)
     if array.dtype.names:
         return {name: array[name].ravel() for name in array.dtype.names if array[name].shape == array.shape}
     if array.ndim < 2 or array.shape[-1] < 3 or array.dtype.kind not in "fiu":

@@ -2,8 +2,8 @@
 
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from pathlib import Path
-from typing import Any
+from threading import Lock
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,8 +29,13 @@ _RUST_PANIC = "PanicException"
 """Name of the exception that a panic in a Rust library becomes; it derives from ``BaseException``."""
 
 
+_ONE_HEADER = Lock()
+"""NumPy parses an array's header with ``ast``, which counts its recursion for all threads together in Python
+3.11 and may find it wrong."""
+
+
 @contextmanager
-def refusing_damage(path: Path, *, what: str) -> Iterator[None]:
+def refusing_damage(path: object, *, what: str) -> Iterator[None]:
     """Turn whatever a parser raises on a damaged file into one line about it.
 
     Raises:
@@ -45,6 +50,16 @@ def refusing_damage(path: Path, *, what: str) -> Iterator[None]:
             raise
         reason = " ".join(str(error).split()) or type(error).__name__
         raise FrameError(f"{path}: not a sound {what} file: {reason}") from None
+
+
+def load_array(stream: BinaryIO, where: object) -> NDArray[Any]:
+    """Return the array of a .npy file; ``where`` names it in an error.
+
+    Raises:
+        FrameError: It is damaged, or holds objects.
+    """
+    with refusing_damage(where, what="npy"), _ONE_HEADER:
+        return np.lib.format.read_array(stream, allow_pickle=False)
 
 
 def parse_rows(lines: Iterable[bytes], dtype: np.dtype[np.void]) -> NDArray[np.void]:

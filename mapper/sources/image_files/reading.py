@@ -1,6 +1,7 @@
 """Image files as arrays: whole and of the right kind, or an error that names the file."""
 
 from collections.abc import Sequence
+from io import BytesIO
 from pathlib import Path
 from typing import cast
 
@@ -13,11 +14,10 @@ from mapper.core.errors import DataError, FrameError
 from mapper.core.frames import DepthImage, Image, PinholeCamera, RgbdFrame, Scan
 from mapper.runtime.regular_files import MOST_BYTES, read_regular
 from mapper.sources.base import ImageFile
+from mapper.sources.cloud_files.parsing import load_array
 from mapper.sources.image_files import jpeg, png
+from mapper.sources.image_files.decoded import SATURATED, DecodedColour, DecodedDepth
 from mapper.sources.image_files.size import check_pixels
-
-SATURATED = np.iinfo(np.uint16).max
-"""The largest 16-bit depth is a sensor's way to say "nothing" (7-Scenes) or "too far": no measurement."""
 
 TUM_UNITS_PER_M = 5000.0
 """16-bit units of a metre in which depth in metres goes into files: 0.2 mm (Sturm et al. 2012)."""
@@ -34,6 +34,8 @@ def read_colour(path: ImageFile) -> Image:
     Raises:
         FrameError: The file is missing, empty, cut short, damaged or not an image.
     """
+    if isinstance(path, DecodedColour):
+        return path.decode(True)
     return decode_colour(bytes_of(path), f"{path}")
 
 
@@ -46,23 +48,14 @@ def decode_colour(data: bytes, where: str) -> Image:
     return _eight_bit(_decoded(data, _RGB, where), where)
 
 
-def encode_colour(image: Image) -> bytes:
-    """Return an (H, W, 3) RGB or (H, W) grey image as a PNG file."""
-    return _png(image if image.ndim == 2 else np.ascontiguousarray(image[:, :, ::-1]))
-
-
-def encode_depth(depth_m: DepthImage, units_per_m: float) -> bytes:
-    """Return (H, W) depth as a PNG file of 16-bit units; what is too far for these is no measurement."""
-    units = np.rint(depth_m * units_per_m)
-    return _png(np.where(units < SATURATED, units, 0).astype(np.uint16))
-
-
 def read_grey(path: ImageFile) -> Image:
     """Return the (H, W) uint8 luminance of a file; cheaper than colour for a JPEG.
 
     Raises:
         FrameError: As :func:`read_colour`.
     """
+    if isinstance(path, DecodedColour):
+        return path.decode(False)
     return decode_grey(bytes_of(path), f"{path}")
 
 
@@ -82,13 +75,38 @@ def read_depth_m(path: ImageFile, units_per_m: float) -> DepthImage:
     """Return the (H, W) float32 depth in metres of a 16-bit image; 0 is no measurement.
 
     Args:
-        path: One-channel 16-bit image.
-        units_per_m: Image units per metre, e.g. 5000 for TUM and 1000 for millimetres.
+        path: One-channel 16-bit image, or one that its source decodes.
+        units_per_m: Units per metre of the 16-bit image, e.g. 5000 for TUM and 1000 for millimetres.
 
     Raises:
         FrameError: As :func:`read_colour`, or the image is not one channel of 16 bits.
     """
+    if isinstance(path, DecodedDepth):
+        return path.decode()
     return depth_m_from(decode_depth_units(bytes_of(path), f"{path}"), units_per_m)
+
+
+def read_array_m(path: ImageFile, units_per_m: float, float_units_per_m: float) -> DepthImage:
+    """Return the (H, W) float32 depth in metres of a .npy file; 0 is no measurement, and so is NaN.
+
+    Args:
+        path: Array of (H, W), (H, W, 1) or (1, H, W) numbers.
+        units_per_m: Units per metre of whole numbers.
+        float_units_per_m: Units per metre of others.
+
+    Raises:
+        FrameError: The file is missing, damaged or no such array.
+    """
+    array = load_array(BytesIO(bytes_of(path)), path)
+    if array.ndim == 3 and 1 in (array.shape[0], array.shape[2]):
+        array = array[0] if array.shape[0] == 1 else array[..., 0]
+    if array.ndim != 2 or array.dtype.kind not in "uif" or not array.size:
+        raise FrameError(f"{path}: array of {array.dtype} {array.shape}, want rows and columns of depth")
+    if array.dtype == np.uint16:
+        return depth_m_from(array, units_per_m)
+    unit = float_units_per_m if array.dtype.kind == "f" else units_per_m
+    depth_m: DepthImage = array.astype(np.float32) / np.float32(unit)
+    return np.where(np.isfinite(depth_m) & (depth_m > 0.0), depth_m, np.float32(0.0))
 
 
 def decode_depth_units(data: bytes, where: str) -> NDArray[np.uint16]:
@@ -155,11 +173,6 @@ def image_bytes(path: ImageFile) -> bytes:
     if not data.startswith((png.SIGNATURE, jpeg.START)):
         _decoded(data, cv2.IMREAD_UNCHANGED, f"{path}")
     return data
-
-
-def _png(pixels: NDArray[np.uint8] | NDArray[np.uint16]) -> bytes:
-    _, encoded = cv2.imencode(".png", pixels)
-    return encoded.tobytes()
 
 
 def _eight_bit(image: NDArray[np.uint8] | NDArray[np.uint16], where: str) -> Image:

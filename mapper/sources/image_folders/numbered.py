@@ -3,7 +3,8 @@
 7-Scenes keeps ``frame-000000.color.png``, ``.depth.png`` and ``.pose.txt`` together; Redwood keeps colour
 (``rgb*``, ``color*``, ``image*``) and depth (``depth*``) in two folders and the poses in one ``.log``. Names
 such as ``000001-000000033369.jpg`` carry a number and microseconds; others carry a number only, and stamps
-follow from the frame rate.
+follow from the frame rate. BundleFusion's are named as 7-Scenes', with info.txt; ScanNet's extracted folders
+are as Redwood's, with a pose file a frame. Depth may be .npy.
 """
 
 import re
@@ -15,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from mapper.core.errors import SourceError
-from mapper.core.geometry import Transform, nearest_rotation, transform
+from mapper.core.geometry import Transform
 from mapper.core.timebase import NS_PER_S
 from mapper.core.trajectory import Trajectory
 from mapper.core.units import MM_PER_M
@@ -25,13 +26,14 @@ from mapper.sources.calibration_file import calibration_file
 from mapper.sources.config import SourceConfig
 from mapper.sources.image_folders.pairing import ordered_pairs
 from mapper.sources.image_folders.rgbd import FramePair, assumed_camera_note, find_calibration, rgbd_log
-from mapper.sources.text import ROUNDING, parse_count, parse_numbers, rows, truth_from
+from mapper.sources.text import parse_count, parse_numbers, pose_from_matrix, rows, truth_from
 
 RATE_HZ = 30.0
 LOOKED_FOR = "frame-000000.color.png and .depth.png (7-Scenes), numbered images in rgb/ and depth/ (Redwood)"
 
 _COLOUR_FOLDER = re.compile(r"rgb|colou?r|image", re.IGNORECASE)
 _DEPTH_FOLDER = re.compile(r"(?:^|[^a-z])depth", re.IGNORECASE)
+_DEPTH_ENDINGS = frozenset({".npy"})
 _IMAGE_ENDINGS = frozenset({".png", ".jpg", ".jpeg", ".pgm", ".ppm", ".tif", ".tiff", ".bmp"})
 _NUMBERED = re.compile(r"\D*(?P<number>\d{1,18})(?:-(?P<microseconds>\d+))?\D*")
 _SEVEN_SCENES = re.compile(r"frame-\d+\.color\.\w+")
@@ -112,10 +114,16 @@ def read_log(path: Path, config: SourceConfig) -> Log:
         depth_units_per_m=MM_PER_M,
         path=path,
         name=path.resolve().name,
-        kind="7-scenes" if is_seven_scenes else "redwood",
-        truth=_read_truth(path, pairs),
+        kind=_kind(path, is_seven_scenes=is_seven_scenes),
+        truth=_read_truth(path, images.pairs, pairs),
         notes=[*notes, *stamp_notes, *order_notes],
     )
+
+
+def _kind(folder: Path, *, is_seven_scenes: bool) -> str:
+    if is_seven_scenes:
+        return "bundlefusion" if (folder / "info.txt").is_file() else "7-scenes"
+    return "scannet" if (folder / "intrinsic").is_dir() else "redwood"
 
 
 def find_images(folder: Path) -> NumberedImages | None:
@@ -157,7 +165,11 @@ def find_images(folder: Path) -> NumberedImages | None:
 def image_places(folder: Path) -> tuple[Sequence[Place], Sequence[Place], tuple[Place, Place]]:
     """Return a folder's folders of colour and those of depth images, and both kinds side by side in it."""
     inside = sorted((path for path in folder.iterdir() if path.is_dir()), key=lambda p: (len(p.name), p.name))
-    depth_places = [_in_folder(path) for path in inside if _DEPTH_FOLDER.search(path.name)]
+    depth_places = [
+        _in_folder(path, endings=_IMAGE_ENDINGS | _DEPTH_ENDINGS)
+        for path in inside
+        if _DEPTH_FOLDER.search(path.name)
+    ]
     colour_places = [
         _in_folder(path)
         for path in inside
@@ -211,12 +223,12 @@ def _sequences(path: Path) -> list[Path]:
     return sorted(folder for folder in path.glob("seq-*") if find_images(folder) is not None)
 
 
-def _in_folder(folder: Path, word: str = "") -> Place:
+def _in_folder(folder: Path, word: str = "", *, endings: Set[str] = _IMAGE_ENDINGS) -> Place:
     """Return the images of a folder whose names contain the word."""
     images = [
         path
         for path in sorted(folder.iterdir())
-        if path.suffix.lower() in _IMAGE_ENDINGS and re.search(word, path.stem, re.IGNORECASE)
+        if path.suffix.lower() in endings and re.search(word, path.stem, re.IGNORECASE)
     ]
     numbered: dict[int, tuple[Path, int | None]] = {}
     for path in images:
@@ -230,12 +242,14 @@ def _common(colour: Place, depth: Place) -> Set[int]:
     return colour.numbered.keys() & depth.numbered.keys()
 
 
-def _read_truth(folder: Path, pairs: Sequence[FramePair]) -> tuple[Trajectory | None, list[str]]:
+def _read_truth(
+    folder: Path, images: Sequence[NumberedPair], pairs: Sequence[FramePair]
+) -> tuple[Trajectory | None, list[str]]:
     """Read one pose file a frame if there are any, else a Redwood trajectory."""
     poses: list[tuple[int, Transform | None]] = []
-    for pair in pairs:
-        beside = pair.colour.with_name(f"{pair.colour.stem.split('.')[0]}.pose.txt")
-        path = beside if beside.is_file() else folder / "pose" / f"{pair.colour.stem}.txt"
+    for image, pair in zip(images, pairs, strict=True):
+        beside = image.colour.with_name(f"{image.colour.stem.split('.')[0]}.pose.txt")
+        path = beside if beside.is_file() else folder / "pose" / f"{image.colour.stem}.txt"
         if path.is_file():
             matrix = [_row_of_4(path, number, words) for number, words in rows(path)]
             poses.append((pair.stamp_ns, _pose_of(matrix, path)))
@@ -277,8 +291,4 @@ def _pose_of(matrix: list[list[float]], path: Path) -> Transform | None:
     """Return camera-to-world with a rotation made exact; None where the file says the camera was lost."""
     if len(matrix) != 4:
         raise SourceError(f"{path}: {len(matrix)} rows, want a 4×4 camera-to-world pose")
-    T = np.array(matrix)
-    if not np.isfinite(T).all():
-        return None
-    R = nearest_rotation(T[:3, :3])
-    return transform(R, T[:3, 3]) if np.abs(R - T[:3, :3]).max() < ROUNDING else None
+    return pose_from_matrix(matrix)

@@ -8,6 +8,7 @@ import numpy as np
 
 from mapper.core.errors import SourceError
 from mapper.core.timebase import NS_PER_S, Stamps, nearest
+from mapper.sources.base import ImageFile
 from mapper.sources.config import SourceConfig
 from mapper.sources.image_folders.rgbd import FramePair, unpaired_note
 from mapper.sources.listed_files import present
@@ -24,7 +25,7 @@ class ImageList:
     """
 
     stamps_ns: Stamps
-    paths: list[Path]
+    paths: Sequence[ImageFile]
 
 
 def usable_pairs(
@@ -35,8 +36,8 @@ def usable_pairs(
     Raises:
         SourceError: No pair has both images, or ``source.depth_offset_s`` leaves none.
     """
-    has_colour = present(pair.colour for pair in pairs)
-    has_depth = present(pair.depth for pair in pairs)
+    has_colour = present(Path(f"{pair.colour}") for pair in pairs)
+    has_depth = present(Path(f"{pair.depth}") for pair in pairs)
     kept = [pair for pair, *has in zip(pairs, has_colour, has_depth, strict=True) if all(has)]
     if not kept:
         raise SourceError(
@@ -104,9 +105,9 @@ def pair_images(
     pairs = [
         FramePair(
             stamp_ns=int(colour.stamps_ns[i]),
-            colour=colour.paths[i],
+            colour=colour.paths[int(i)],
             depth_stamp_ns=int(depth_stamps_ns[partner[i]]),
-            depth=depth.paths[partner[i]],
+            depth=depth.paths[int(partner[i])],
         )
         for i in paired
     ]

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from mapper.core.errors import FrameError, SourceError
 from mapper.core.frames import DepthImage, Image, RgbdFrame, Scan
 from mapper.core.timebase import NS_PER_S
 from mapper.core.trajectory import Trajectory
-from mapper.sources.base import Accelerations, ImageFiles, Log
+from mapper.sources.base import Accelerations, ImageFile, ImageFiles, Log
 from mapper.sources.calibration import (
     Calibration,
     DepthCamera,
@@ -21,8 +22,16 @@ from mapper.sources.calibration import (
 )
 from mapper.sources.calibration_file import calibration_file, read_calibration
 from mapper.sources.config import CameraConfig
+from mapper.sources.image_files.decoded import DecodedDepth
 from mapper.sources.image_files.image_sizes import RecordedCamera, Size, recorded_camera
-from mapper.sources.image_files.reading import read_colour, read_depth_m, read_grey, scan_of
+from mapper.sources.image_files.reading import (
+    TUM_UNITS_PER_M,
+    read_array_m,
+    read_colour,
+    read_depth_m,
+    read_grey,
+    scan_of,
+)
 from mapper.sources.listed_files import refuse_links_out
 from mapper.sources.text import parse_numbers, parse_stamp, table, time_order
 
@@ -37,15 +46,11 @@ class RgbdEntry:
         stamp_ns: Time of the colour image, nanoseconds.
         encoded: Both images as they are encoded.
         recorded: Camera of the frame, and the sizes of both images as recorded.
-        read_image: Returns the (H, W, 3) RGB image, or the grey one where its argument is false.
-        read_depth_m: Returns (H, W) depth in metres.
     """
 
     stamp_ns: int
     encoded: ImageFiles
     recorded: RecordedCamera
-    read_image: Callable[[bool], Image]
-    read_depth_m: Callable[[], DepthImage]
 
     @property
     def files(self) -> ImageFiles | None:
@@ -58,7 +63,8 @@ class RgbdEntry:
         Raises:
             FrameError: An image is missing, damaged, of the wrong kind or not as large as the log's first.
         """
-        image = self.recorded.image(self.read_image(colour), f"{self.encoded.colour}")
+        read_image = read_colour if colour else read_grey
+        image = self.recorded.image(read_image(self.encoded.colour), f"{self.encoded.colour}")
         delay_s = (self.encoded.depth_stamp_ns - self.stamp_ns) / NS_PER_S
         return RgbdFrame(self.stamp_ns, image, self._depth_m(), self.recorded.camera, depth_delay_s=delay_s)
 
@@ -71,7 +77,8 @@ class RgbdEntry:
         return scan_of(self._depth_m(), self.recorded.camera, stamp_ns=self.stamp_ns)
 
     def _depth_m(self) -> DepthImage:
-        return self.recorded.depth_m(self.read_depth_m(), f"{self.encoded.depth}")
+        depth_m = read_depth_m(self.encoded.depth, self.encoded.depth_units_per_m)
+        return self.recorded.depth_m(depth_m, f"{self.encoded.depth}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,9 +86,9 @@ class FramePair:
     """Stamps and files of one frame, before the log's camera is known."""
 
     stamp_ns: int
-    colour: Path
+    colour: ImageFile
     depth_stamp_ns: int
-    depth: Path
+    depth: ImageFile
 
 
 def rgbd_log(
@@ -120,8 +127,11 @@ def rgbd_log(
         poses = poses and replace(poses, T_world_body=_MIRROR_Y @ poses.T_world_body @ _MIRROR_Y)
         notes = [*notes, "fy < 0: the camera's y axis points up; y of camera and truth is mirrored"]
     folder = path if path.is_dir() else path.parent
-    refuse_links_out((file for pair in pairs for file in (pair.colour, pair.depth)), log=folder)
+    images = (image for pair in pairs for image in (pair.colour, pair.depth))
+    files = (image.where if isinstance(image, DecodedDepth) else image for image in images)
+    refuse_links_out((file for file in files if isinstance(file, Path)), log=folder)
     units_per_m = calibration.depth_units_per_m or depth_units_per_m
+    pairs = [_with_array(pair, units_per_m, calibration.depth_units_per_m or 1.0) for pair in pairs]
     camera = _camera_of(pairs, calibration, depth_units_per_m=units_per_m, path=path)
     accelerations, acceleration_notes = read_accelerations(folder)
 
@@ -131,17 +141,11 @@ def rgbd_log(
             pair.colour,
             pair.depth,
             pair.depth_stamp_ns,
-            units_per_m,
+            pair.depth.units_per_m if isinstance(pair.depth, DecodedDepth) else units_per_m,
             colour_px=camera.colour_px,
             depth_px=camera.depth_px,
         )
-        return RgbdEntry(
-            pair.stamp_ns,
-            files,
-            camera,
-            read_image=lambda colour: read_colour(files.colour) if colour else read_grey(files.colour),
-            read_depth_m=lambda: read_depth_m(files.depth, units_per_m),
-        )
+        return RgbdEntry(pair.stamp_ns, files, camera)
 
     return Log(
         path=path,
@@ -154,6 +158,14 @@ def rgbd_log(
         accelerations=accelerations,
         notes=[*notes, *camera.notes(), *calibration.notes(), *acceleration_notes],
     )
+
+
+def _with_array(pair: FramePair, units_per_m: float, float_units_per_m: float) -> FramePair:
+    """Return a pair whose depth is decoded if it is an array: whole numbers as in an image, else metres."""
+    if pair.depth.suffix != ".npy":
+        return pair
+    decode = partial(read_array_m, pair.depth, units_per_m, float_units_per_m)
+    return replace(pair, depth=DecodedDepth(pair.depth, decode, TUM_UNITS_PER_M))
 
 
 def find_calibration(folder: Path, config: CameraConfig | None, *, known: Calibration | None) -> Calibration:
@@ -225,7 +237,9 @@ def _camera_of(
     return recorded_camera(calibration, colour_px=colour_px, depth_px=depth_px or colour_px, where=f"{path}")
 
 
-def _first_size(files: Sequence[Path], read: Callable[[Path], Image | DepthImage]) -> tuple[Size | None, str]:
+def _first_size(
+    files: Sequence[ImageFile], read: Callable[[ImageFile], Image | DepthImage]
+) -> tuple[Size | None, str]:
     """Return width and height of the first image that can be read; None, and why not the first, without."""
     first_reason = ""
     for file in files:

@@ -1,6 +1,7 @@
 """TUM RGB-D folders: rgb.txt, depth.txt, groundtruth.txt (Sturm et al. 2012).
 
-Without these lists the pairs of associations.txt are read: ``stamp rgb/name stamp depth/name``.
+Without these lists the pairs of associations.txt are read: ``stamp rgb/name stamp depth/name``. OpenLORIS
+(Shi et al. 2020) calls the lists color.txt and aligned_depth.txt.
 """
 
 import math
@@ -31,15 +32,19 @@ from mapper.sources.text import (
     truth_from,
 )
 
+DEVICE_POSES = "device_poses.txt"
+"""File of a phone's own poses in a converted log, as its groundtruth.txt."""
 MILLIMETRES_NOTE = "depth taken to be in millimetres; if not, source.camera.depth_factor (TUM's is 5000)"
 UNITS_NOTE = "depth taken as TUM's 5000 units a metre; source.camera.depth_factor=1000 reads millimetres"
-_LIST = "rgb.txt"
+_LISTS = (("rgb.txt", "depth.txt"), ("color.txt", "aligned_depth.txt"))
+"""Lists of colour and of depth images, of TUM and of OpenLORIS."""
+_BASE_NOTE = ("the truth of OpenLORIS is that of the robot's base, not of the camera",)
 _ASSOCIATIONS = ("associations.txt", "associated.txt", "association.txt", "associate.txt", "assoc.txt")
 
 
 def recognise(path: Path) -> bool:
     """Return whether a path is a folder with TUM's list of colour images, or with a list of pairs."""
-    return (path / _LIST).is_file() or _associations(path) is not None
+    return _lists(path) is not None or _associations(path) is not None
 
 
 def read_log(path: Path, config: SourceConfig) -> Log:
@@ -51,14 +56,17 @@ def read_log(path: Path, config: SourceConfig) -> Log:
     """
     notes: list[str] = []
     name = path.resolve().name
-    if (associations := _associations(path)) and not (path / _LIST).is_file():
+    lists, units_per_m = _lists(path) or _LISTS[0], TUM_UNITS_PER_M
+    if (associations := _associations(path)) and not (path / lists[0]).is_file():
         colour, depth = _read_associations(associations, notes)
     else:
-        colour, depth = (_read_list(path, one, notes) for one in (_LIST, "depth.txt"))
-        name = _name_of(path)
-    return log_of_images(
-        path, colour, depth, config, depth_units_per_m=TUM_UNITS_PER_M, name=name, notes=notes
-    )
+        colour, depth = (_read_list(path, one, notes) for one in lists)
+        name = _name_of(path / lists[0])
+        units_per_m = TUM_UNITS_PER_M if lists == _LISTS[0] else MM_PER_M
+    log = log_of_images(path, colour, depth, config, depth_units_per_m=units_per_m, name=name, notes=notes)
+    if lists == _LISTS[0]:
+        return log
+    return replace(log, kind="openloris", notes=[*log.notes, *_BASE_NOTE] if log.truth else log.notes)
 
 
 def log_of_images(
@@ -101,7 +109,8 @@ def log_of_images(
         truth=read_truth(path / "groundtruth.txt"),
         notes=[*notes, *pair_notes],
     )
-    return replace(log, are_units_assumed=are_units_assumed)
+    device_poses, _ = read_truth(path / DEVICE_POSES)
+    return replace(log, are_units_assumed=are_units_assumed, device_poses=device_poses)
 
 
 def read_truth(path: Path) -> tuple[Trajectory | None, list[str]]:
@@ -127,6 +136,10 @@ def _read_list(folder: Path, name: str, notes: list[str]) -> ImageList:
     path = folder / name
     rows = [(where, *words) for where, words in table(path, "stamp", "filename")]
     return _images(folder, rows, notes, path=path)
+
+
+def _lists(folder: Path) -> tuple[str, str] | None:
+    return next((lists for lists in _LISTS if (folder / lists[0]).is_file()), None)
 
 
 def _associations(folder: Path) -> Path | None:
@@ -169,9 +182,9 @@ def _images(folder: Path, rows: Sequence[tuple[str, ...]], notes: list[str], *, 
 
 def _name_of(path: Path) -> str:
     """Return the recording that TUM's list names, ``# file: 'rgbd_…_xyz.bag'``, or else the folder."""
-    for line in read_lines(path / "rgb.txt"):
+    for line in read_lines(path):
         if not line.startswith("#"):
             break
         if found := re.match(r"#\s*file:\s*'(.+)'", line):
             return found[1]
-    return path.resolve().name
+    return path.resolve().parent.name

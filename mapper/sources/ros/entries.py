@@ -5,10 +5,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mapper.core.errors import DataError, FrameError
-from mapper.core.frames import DepthImage, Scan
+from mapper.core.frames import DepthImage, Image, Scan
 from mapper.sources.base import ImageFiles
+from mapper.sources.image_files.decoded import DecodedColour, DecodedDepth
 from mapper.sources.image_files.image_sizes import RecordedCamera
-from mapper.sources.image_files.reading import encode_colour, encode_depth
 from mapper.sources.image_folders.rgbd import RgbdEntry
 from mapper.sources.ros.cloud_messages import scan_from
 from mapper.sources.ros.decode import decode
@@ -75,12 +75,23 @@ def rgbd_entry(
         float_units_per_m: Units per metre of depth that is recorded as 32-bit numbers; None if it is not.
         colour_suffix: Ending of a colour image's file.
     """
-    depth_file = _DepthFile(depth, units_per_m, float_units_per_m or 1.0)
+
+    def depth_m() -> DepthImage:
+        return depth_m_of(
+            depth.image(),
+            units_per_m=units_per_m,
+            float_units_per_m=float_units_per_m or 1.0,
+            where=f"{depth}",
+        )
+
+    def image(in_colour: bool) -> Image:
+        return image_of(colour.image(), colour=in_colour, where=f"{colour}")
+
     return RgbdEntry(
         colour.stamp_ns,
         ImageFiles(
-            _ColourFile(colour, colour_suffix),
-            depth_file,
+            DecodedColour(colour, image, lambda: _file_of(colour.image()), colour_suffix),
+            DecodedDepth(depth, depth_m, units_per_m, lambda: depth_file_of(depth.image())),
             depth.stamp_ns,
             units_per_m,
             colour_px=recorded.colour_px,
@@ -88,9 +99,11 @@ def rgbd_entry(
             recorded_units_per_m=float_units_per_m,
         ),
         recorded,
-        read_image=lambda in_colour: image_of(colour.image(), colour=in_colour, where=f"{colour}"),
-        read_depth_m=lambda: depth_file.depth_m_of(depth.image()),
     )
+
+
+def _file_of(message: ImageMessage) -> bytes | None:
+    return bytes(message.data) if isinstance(message, FileMessage) else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,49 +166,3 @@ class CloudEntry:
             FrameError: As ``load``.
         """
         return self.load(colour=False)
-
-
-@dataclass(frozen=True, slots=True)
-class _ColourFile:
-    """A colour image as a file; see :class:`mapper.sources.base.ImageFile`."""
-
-    message: Located
-    suffix: str
-
-    def __str__(self) -> str:
-        return f"{self.message}"
-
-    def read_bytes(self) -> bytes:
-        message = self.message.image()
-        if isinstance(message, FileMessage):
-            return bytes(message.data)
-        return encode_colour(image_of(message, colour=True, where=f"{self.message}"))
-
-
-@dataclass(frozen=True, slots=True)
-class _DepthFile:
-    """A depth image as a PNG of 16 bits; see :class:`mapper.sources.base.ImageFile`."""
-
-    message: Located
-    units_per_m: float
-    float_units_per_m: float
-    suffix: str = ".png"
-
-    def __str__(self) -> str:
-        return f"{self.message}"
-
-    def read_bytes(self) -> bytes:
-        message = self.message.image()
-        file = depth_file_of(message)
-        if file is not None:
-            return file
-        return encode_depth(self.depth_m_of(message), self.units_per_m)
-
-    def depth_m_of(self, message: ImageMessage) -> DepthImage:
-        """Return (H, W) depth in metres of the message."""
-        return depth_m_of(
-            message,
-            units_per_m=self.units_per_m,
-            float_units_per_m=self.float_units_per_m,
-            where=f"{self.message}",
-        )

@@ -1,0 +1,76 @@
+"""transforms.json with depth (nerfstudio, and apps that export it): two paths and a pose a frame.
+
+The pose is of a camera with y up and z backward. Depth is PNG of millimetres, or of ``integer_depth_scale``
+metres a unit, or .npy. https://docs.nerf.studio/quickstart/data_conventions.html
+"""
+
+import re
+from contextlib import suppress
+from pathlib import Path
+
+from pydantic import BaseModel, PositiveFloat
+
+from mapper.core.errors import SourceError
+from mapper.core.units import MM_PER_M
+from mapper.runtime.regular_files import read_text
+from mapper.sources.calibration_file import read_calibration
+from mapper.sources.config import SourceConfig
+from mapper.sources.image_folders.json_files import read_json
+from mapper.sources.image_folders.numbered import RATE_HZ, NumberedPair, stamped
+from mapper.sources.image_folders.posed import PosedFrame, PosedFrames, camera_of, pose_of_opengl
+from mapper.sources.listed_files import within
+
+FILES = ("transforms.json",)
+_LIST = "transforms.json"
+_NUMBER = re.compile(r"\d{1,18}(?=\D*$)")
+
+
+class _Frame(BaseModel):
+    file_path: str
+    depth_file_path: str | None = None
+    transform_matrix: list[list[float]]
+
+
+class _Transforms(BaseModel):
+    frames: list[_Frame]
+    integer_depth_scale: PositiveFloat | None = None
+
+
+def has_depth(folder: Path) -> bool:
+    """Return whether frames of the list have depth images."""
+    with suppress(SourceError):
+        return '"depth_file_path"' in read_text(folder / _LIST, error=SourceError)
+    return False
+
+
+def read_frames(folder: Path, config: SourceConfig) -> PosedFrames:
+    """Return the frames that have depth, in the order of the numbers in their names, if they have any.
+
+    Raises:
+        SourceError: The list is malformed, or names a file out of the folder.
+    """
+    path = folder / _LIST
+    listed = read_json(path, _Transforms)
+    with_depth = [frame for frame in listed.frames if frame.depth_file_path]
+    if not with_depth:
+        raise SourceError(f"{path}: no frame of {len(listed.frames)} has a depth_file_path")
+    colours = [within(folder, frame.file_path, where=f"{path}") for frame in with_depth]
+    depths = [within(folder, f"{frame.depth_file_path}", where=f"{path}") for frame in with_depth]
+    found = [_NUMBER.search(colour.stem) for colour in colours]
+    numbers = [int(one[0]) for one in found if one]
+    if len(set(numbers)) < len(colours):
+        numbers = list(range(len(colours)))
+    order = sorted(range(len(numbers)), key=numbers.__getitem__)
+    pairs, notes = stamped(
+        [NumberedPair(numbers[i], colours[i], depths[i], None) for i in order],
+        rate_hz=config.rate_hz or RATE_HZ,
+    )
+    if len(with_depth) < len(listed.frames):
+        notes.append(f"{len(listed.frames) - len(with_depth)} frames of {_LIST} have no depth; left out")
+    frames = [
+        PosedFrame(pair.stamp_ns, pair.colour, pair.depth, pose_of_opengl(with_depth[i].transform_matrix))
+        for i, pair in zip(order, pairs, strict=True)
+    ]
+    scale = listed.integer_depth_scale
+    camera = camera_of(folder, config, read_calibration(path))
+    return PosedFrames(frames, camera, 1.0 / scale if scale else MM_PER_M, notes)

@@ -1,0 +1,188 @@
+"""Record3D's recordings (iOS): .r3d, a ZIP archive of metadata, rgbd/N.jpg, N.depth and N.conf; or unpacked.
+
+``metadata`` is JSON: w, h and K (column by column) of the images, dw, dh of depth, fps or frameTimestamps,
+and poses of ARKit's camera as qx qy qz qw x y z. Depth is float32 metres, confidence a byte, both by LZFSE.
+"""
+
+import zipfile
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, PositiveFloat, PositiveInt
+
+from mapper.core.errors import FrameError, SourceError
+from mapper.core.frames import DepthImage
+from mapper.core.timebase import NS_PER_S
+from mapper.runtime.extras import extra
+from mapper.runtime.regular_files import MOST_BYTES
+from mapper.sources.config import SourceConfig
+from mapper.sources.image_files.confidence import NOTE, without_low_confidence
+from mapper.sources.image_files.decoded import DecodedColour, DecodedDepth
+from mapper.sources.image_files.reading import TUM_UNITS_PER_M, decode_colour, decode_grey
+from mapper.sources.image_folders.json_files import parse_json
+from mapper.sources.image_folders.posed import (
+    PosedFrame,
+    PosedFrames,
+    camera_of,
+    median_camera,
+    pose_of_opengl,
+)
+from mapper.sources.text import poses_from_numbers
+
+FILES = (".r3d", "metadata", "rgbd/*.jpg")
+_FPS = 60.0
+_EXTRA, _PURPOSE = "record3d", "reading Record3D's depth"
+
+
+class _Metadata(BaseModel):
+    w: PositiveInt
+    h: PositiveInt
+    K: list[float]
+    dw: PositiveInt | None = None
+    dh: PositiveInt | None = None
+    fps: PositiveFloat = _FPS
+    frameTimestamps: list[float] | None = None  # noqa: N815
+    perFrameIntrinsicCoeffs: list[list[float]] | None = None  # noqa: N815
+    poses: list[list[float]] | None = None
+
+
+class _Members:
+    """Files of a recording, by their names within it; safe in any thread."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._archive: zipfile.ZipFile | None = None
+        if not path.is_dir():
+            try:
+                self._archive = zipfile.ZipFile(path)
+            except (OSError, zipfile.BadZipFile) as error:
+                raise SourceError(f"{path}: no Record3D recording: {error}") from None
+
+    def names(self) -> list[str]:
+        if self._archive is not None:
+            return self._archive.namelist()
+        return [path.relative_to(self._path).as_posix() for path in self._path.glob("rgbd/*")]
+
+    def read(self, name: str) -> bytes:
+        try:
+            if self._archive is None:
+                return (self._path / name).read_bytes()
+            if (size := self._archive.getinfo(name).file_size) > MOST_BYTES:
+                raise FrameError(f"{self._path}: {name} has {size} bytes; {MOST_BYTES} are read at most")
+            return self._archive.read(name)
+        except (OSError, KeyError, zipfile.BadZipFile, RuntimeError, ValueError, EOFError) as error:
+            raise FrameError(f"{self._path}: {name} cannot be read: {error}") from None
+
+
+def read_frames(path: Path, config: SourceConfig) -> PosedFrames:
+    """Return the frames of a recording.
+
+    Raises:
+        SourceError: It is no such archive, or its metadata are malformed.
+        DependencyError: The library that unpacks depth is not installed.
+    """
+    with extra(_EXTRA, _PURPOSE):
+        import lzfse  # noqa: F401
+    members = _Members(path)
+    where = f"{path}: metadata"
+    metadata = parse_json(members.read("metadata").decode(errors="replace"), _Metadata, where=where)
+    if len(metadata.K) != 9:
+        raise SourceError(f"{where}: K has {len(metadata.K)} numbers, want 9")
+    K = metadata.K
+    stated, notes = median_camera(
+        metadata.perFrameIntrinsicCoeffs or [[K[0], K[4], K[6], K[7]]],
+        origin="metadata",
+        size_px=(metadata.w, metadata.h),
+    )
+    names = set(members.names())
+    numbers = sorted(
+        int(name[5:-4])
+        for name in names
+        if name.startswith("rgbd/") and name.endswith(".jpg") and name[5:-4].isdecimal()
+    )
+    has_confidence = any(name.endswith(".conf") for name in names)
+    frames = [
+        PosedFrame(
+            _stamp_ns(metadata, number),
+            _colour(members, path, f"rgbd/{number}.jpg"),
+            _depth(members, path, f"rgbd/{number}", metadata, f"rgbd/{number}.conf" in names),
+            _pose(metadata, number),
+        )
+        for number in numbers
+        if f"rgbd/{number}.depth" in names
+    ]
+    if len(frames) < len(numbers):
+        notes.append(f"{len(numbers) - len(frames)} of {len(numbers)} frames have no depth; left out")
+    if metadata.frameTimestamps is None:
+        notes.append(f"metadata has no times of frames; its rate of {metadata.fps:g} a second is taken")
+    return PosedFrames(
+        frames,
+        camera_of(path, config, stated),
+        TUM_UNITS_PER_M,
+        [*notes, *([NOTE] if has_confidence else [])],
+    )
+
+
+def _stamp_ns(metadata: _Metadata, number: int) -> int:
+    stamps = metadata.frameTimestamps
+    if stamps is None or number >= len(stamps):
+        return round(number * NS_PER_S / metadata.fps)
+    return round(stamps[number] * NS_PER_S)
+
+
+def _pose(metadata: _Metadata, number: int) -> NDArray[np.float64] | None:
+    poses = metadata.poses or []
+    if number >= len(poses) or len(poses[number]) != 7:
+        return None
+    qx, qy, qz, qw, *position = poses[number]
+    T = poses_from_numbers(np.array([[*position, qx, qy, qz, qw]], np.float64))[0]
+    return None if T is None else pose_of_opengl(T)
+
+
+def _colour(members: _Members, path: Path, name: str) -> DecodedColour:
+    where = f"{path}: {name}"
+    file: Callable[[], bytes] = partial(members.read, name)
+    return DecodedColour(
+        where, lambda in_colour: (decode_colour if in_colour else decode_grey)(file(), where), file, ".jpg"
+    )
+
+
+def _depth(members: _Members, path: Path, stem: str, metadata: _Metadata, is_confident: bool) -> DecodedDepth:
+    where = f"{path}: {stem}.depth"
+
+    def decode() -> DepthImage:
+        numbers = np.frombuffer(_unpack(members.read(f"{stem}.depth"), where), np.uint8)
+        shape = _shape(metadata, len(numbers) // 4)
+        if shape is None or len(numbers) != 4 * shape[0] * shape[1]:
+            raise FrameError(f"{where}: {len(numbers)} bytes are no image of 32-bit depth of the stated size")
+        depth_m: DepthImage = np.nan_to_num(
+            numbers.view("<f4").reshape(shape), nan=0.0, posinf=0.0, neginf=0.0
+        )
+        if is_confident:
+            levels = np.frombuffer(_unpack(members.read(f"{stem}.conf"), f"{stem}.conf"), np.uint8)
+            if len(levels) != depth_m.size:
+                raise FrameError(f"{where}: {len(levels)} bytes of confidence for {depth_m.size} pixels")
+            depth_m = without_low_confidence(depth_m, levels.reshape(shape), where)
+        return depth_m
+
+    return DecodedDepth(where, decode, TUM_UNITS_PER_M)
+
+
+def _unpack(data: bytes, where: str) -> bytes:
+    import lzfse
+
+    try:
+        return bytes(lzfse.decompress(data))
+    except (lzfse.error, ValueError, MemoryError) as error:
+        raise FrameError(f"{where}: cannot be unpacked: {error}") from None
+
+
+def _shape(metadata: _Metadata, pixels: int) -> tuple[int, int] | None:
+    """Return rows and columns of depth: stated, or those of so many pixels with the images' aspect ratio."""
+    if metadata.dw and metadata.dh:
+        return metadata.dh, metadata.dw
+    columns = round((pixels * metadata.w / metadata.h) ** 0.5)
+    return (pixels // columns, columns) if columns and pixels % columns == 0 else None

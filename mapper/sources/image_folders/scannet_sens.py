@@ -1,0 +1,158 @@
+"""ScanNet's .sens files (Dai et al. 2017), version 4: a header, then pose, stamps and images of each frame.
+
+https://github.com/ScanNet/ScanNet/tree/master/SensReader
+"""
+
+import zlib
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from mapper.core.errors import FrameError, SourceError
+from mapper.core.frames import DepthImage
+from mapper.core.timebase import NS_PER_S
+from mapper.core.units import MM_PER_M
+from mapper.runtime.regular_files import MOST_BYTES
+from mapper.sources.calibration import Calibration
+from mapper.sources.config import SourceConfig
+from mapper.sources.image_files.decoded import DecodedDepth
+from mapper.sources.image_files.reading import depth_m_from
+from mapper.sources.image_folders.numbered import RATE_HZ
+from mapper.sources.image_folders.posed import PosedFrame, PosedFrames, camera_of
+from mapper.sources.text import pose_from_matrix
+
+FILES = (".sens", "*.sens")
+_VERSION = 4
+_MOST_NAME_BYTES = 1000
+_CAMERAS = [
+    (f"{what}_{of}", "<f4", (4, 4)) for of in ("color", "depth") for what in ("intrinsic", "extrinsic")
+]
+_HEADER = np.dtype(
+    [
+        *_CAMERAS,
+        *[("color_compression", "<i4"), ("depth_compression", "<i4")],
+        *[("color_px", "<u4", 2), ("depth_px", "<u4", 2), ("depth_shift", "<f4"), ("frames", "<u8")],
+    ]
+)
+_FRAME = np.dtype([("pose", "<f4", (4, 4)), ("stamps_us", "<u8", 2), ("bytes", "<u8", 2)])
+_COLOUR_ENDINGS = {1: ".png", 2: ".jpg"}
+_RAW, _ZLIB = 0, 1
+
+
+@dataclass(frozen=True, slots=True)
+class FilePart:
+    """Bytes of a file that are an image; see :class:`mapper.sources.base.ImageFile`."""
+
+    path: Path
+    offset: int
+    size: int
+    suffix: str
+
+    def __str__(self) -> str:
+        return f"{self.path}, byte {self.offset}"
+
+    def read_bytes(self) -> bytes:
+        """Return them.
+
+        Raises:
+            OSError: The file cannot be read.
+        """
+        with self.path.open("rb") as file:
+            file.seek(self.offset)
+            return file.read(self.size)
+
+
+def read_frames(path: Path, config: SourceConfig) -> PosedFrames:
+    """Return the frames of a file, or of the only one in a folder.
+
+    Raises:
+        SourceError: There are several files, or it is of another version or damaged.
+    """
+    if path.is_dir():
+        files = sorted(path.glob("*.sens"))
+        if len(files) > 1:
+            raise SourceError(f"{path}: holds {len(files)} .sens files; open one of them")
+        path = files[0]
+    try:
+        with path.open("rb") as file:
+            return _read(file, path, config)
+    except OSError as error:
+        raise SourceError(f"{path}: cannot be read: {error.strerror}") from None
+
+
+def _read(file: BinaryIO, path: Path, config: SourceConfig) -> PosedFrames:
+    version, name_bytes = np.frombuffer(file.read(12).ljust(12, b"\0"), "<u4,<u8")[0].tolist()
+    if version != _VERSION or name_bytes > _MOST_NAME_BYTES:
+        raise SourceError(f"{path}: no .sens file of version {_VERSION}: it begins with {version}")
+    file.read(name_bytes)
+    if len(data := file.read(_HEADER.itemsize)) < _HEADER.itemsize:
+        raise SourceError(f"{path}: ends within its header")
+    header = np.frombuffer(data, _HEADER)[0]
+    suffix = _COLOUR_ENDINGS.get(int(header["color_compression"]))
+    depth_compression = int(header["depth_compression"])
+    if suffix is None or depth_compression not in (_RAW, _ZLIB):
+        raise SourceError(
+            f"{path}: colour compressed by method {header['color_compression']} and depth by "
+            f"{depth_compression}; read are PNG (1) and JPEG (2), and raw (0) and zlib (1)"
+        )
+    (fx, _, cx, _), (_, fy, cy, _) = header["intrinsic_color"][:2].tolist()
+    width_px, height_px = header["color_px"].tolist()
+    stated = Calibration(path.name, fx, fy, cx, cy, size_px=(width_px, height_px))
+    shift = float(header["depth_shift"])
+    camera = camera_of(path, config, stated)
+    units_per_m = camera.depth_units_per_m or (shift if shift > 0.0 else MM_PER_M)
+    frames: list[PosedFrame] = []
+    notes: list[str] = []
+    count, size = int(header["frames"]), path.stat().st_size
+    depth_px = tuple(header["depth_px"].tolist())
+    stamps_us = []
+    while len(frames) < count:
+        data = file.read(_FRAME.itemsize)
+        record = np.frombuffer(data, _FRAME)[0] if len(data) == _FRAME.itemsize else None
+        start = file.tell()
+        colour_bytes, depth_bytes = (0, size) if record is None else record["bytes"].tolist()
+        if (
+            record is None
+            or start + colour_bytes + depth_bytes > size
+            or max(colour_bytes, depth_bytes) > MOST_BYTES
+        ):
+            notes.append(f"{path.name}: cut off after {len(frames)} of {count} frames")
+            break
+        stamps_us.append(int(record["stamps_us"][0]))
+        part = FilePart(path, start + colour_bytes, depth_bytes, ".png")
+        decode = partial(_depth_m, part, depth_px, depth_compression == _ZLIB, units_per_m)
+        frames.append(
+            PosedFrame(
+                stamps_us[-1] * 1000,
+                FilePart(path, start, colour_bytes, suffix),
+                DecodedDepth(part, decode, units_per_m),
+                pose_from_matrix(record["pose"].astype(np.float64)),
+            )
+        )
+        file.seek(start + colour_bytes + depth_bytes)
+    if len(set(stamps_us)) < len(stamps_us):
+        rate_hz = config.rate_hz or RATE_HZ
+        notes.append(
+            f"{path.name} has no times of frames; {rate_hz:g} frames a second assumed (source.rate_hz)"
+        )
+        frames = [
+            PosedFrame(round(i * NS_PER_S / rate_hz), frame.colour, frame.depth, frame.T_world_camera)
+            for i, frame in enumerate(frames)
+        ]
+    return PosedFrames(frames, camera, units_per_m, notes)
+
+
+def _depth_m(part: FilePart, size_px: tuple[int, int], is_packed: bool, units_per_m: float) -> DepthImage:
+    width_px, height_px = size_px
+    try:
+        data = part.read_bytes()
+        if is_packed:
+            data = zlib.decompressobj().decompress(data, 2 * width_px * height_px + 1)
+        return depth_m_from(np.frombuffer(data, "<u2").reshape(height_px, width_px), units_per_m)
+    except OSError as error:
+        raise FrameError(f"{part}: cannot be read: {error.strerror}") from None
+    except (ValueError, zlib.error) as error:
+        raise FrameError(f"{part}: no depth image of {width_px}×{height_px} px: {error}") from None

@@ -1,0 +1,75 @@
+"""Stray Scanner's exports (iOS): rgb.mp4, depth/ and confidence/ of numbered PNG, odometry.csv.
+
+Lines of ``odometry.csv`` are ``timestamp, frame, x, y, z, qx, qy, qz, qw``, by later versions also ``fx, fy,
+cx, cy``; ``camera_matrix.csv`` has three rows of the matrix of the video's frames. Depth is in millimetres.
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from mapper.core.errors import SourceError
+from mapper.core.units import MM_PER_M
+from mapper.sources.config import SourceConfig
+from mapper.sources.image_files.confidence import confident_depths
+from mapper.sources.image_files.video import Video
+from mapper.sources.image_folders.posed import PosedFrame, PosedFrames, camera_of, median_camera
+from mapper.sources.listed_files import refuse_links_out
+from mapper.sources.text import parse_count, parse_numbers, parse_stamp, pose_from_numbers, rows
+
+_VIDEO = "rgb.mp4"
+FILES = (_VIDEO, "odometry.csv", "depth/*.png")
+_COLUMNS = ("timestamp", "frame", "x", "y", "z", "qx", "qy", "qz", "qw")
+_INTRINSICS = ("fx", "fy", "cx", "cy")
+
+
+def read_frames(folder: Path, config: SourceConfig) -> PosedFrames:
+    """Return the frames of an export.
+
+    Raises:
+        SourceError: A table or the video is malformed.
+    """
+    path = folder / "odometry.csv"
+    lines = list(rows(path, separator=","))
+    header = lines[0][1] if lines else []
+    if not set(_COLUMNS) <= set(header):
+        raise SourceError(f"{path}: columns {', '.join(header)}; want {', '.join(_COLUMNS)}")
+    at = {name: header.index(name) for name in header}
+    numbers, stamps_ns, poses, intrinsics = [], [], [], []
+    for number, words in lines[1:]:
+        where = f"{path}:{number}"
+        if len(words) != len(header):
+            raise SourceError(f"{where}: {len(words)} columns, want {len(header)}")
+        numbers.append(parse_count(words[at["frame"]], where=where))
+        stamps_ns.append(parse_stamp(words[at["timestamp"]], where=where))
+        poses.append(
+            pose_from_numbers(parse_numbers([words[at[name]] for name in _COLUMNS[2:]], where=where))
+        )
+        if set(_INTRINSICS) <= set(header):
+            intrinsics.append(parse_numbers([words[at[name]] for name in _INTRINSICS], where=where))
+    if not intrinsics:
+        intrinsics = [_matrix(folder / "camera_matrix.csv")]
+    camera, notes = median_camera(np.array(intrinsics), origin=path.name)
+    camera = camera_of(folder, config, camera)
+    names = [f"{number:06}.png" for number in numbers]
+    depths, depth_notes = confident_depths(
+        [folder / "depth" / name for name in names],
+        [folder / "confidence" / name for name in names],
+        camera.depth_units_per_m or MM_PER_M,
+    )
+    refuse_links_out([folder / _VIDEO, *(folder / "confidence" / name for name in names)], log=folder)
+    video = Video(folder / _VIDEO)
+    frames = [
+        PosedFrame(stamp_ns, video.frame(number), depth, T)
+        for stamp_ns, number, depth, T in zip(stamps_ns, numbers, depths, poses, strict=True)
+    ]
+    return PosedFrames(frames, camera, MM_PER_M, [*notes, *depth_notes])
+
+
+def _matrix(path: Path) -> np.ndarray:
+    """Return fx, fy, cx, cy of three rows of three numbers."""
+    matrix = [parse_numbers(words, where=f"{path}:{number}") for number, words in rows(path, separator=",")]
+    if [len(row) for row in matrix] != [3, 3, 3]:
+        raise SourceError(f"{path}: want three rows of three numbers, the camera's matrix")
+    K = np.array(matrix)
+    return np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2]])

@@ -1,0 +1,134 @@
+"""Exports of phones and published scans are read as they lie, and mapped."""
+
+import contextlib
+import sys
+
+import numpy as np
+import pytest
+
+from mapper.config.loading import load_config
+from mapper.core.errors import DependencyError, FrameError, SourceError
+from mapper.evaluators.metrics.evaluate import evaluate
+from mapper.pipeline.build import build
+from mapper.sources import open_source
+from mapper.sources.config import SourceConfig
+from mapper.sources.inspection import inspect_log
+from mapper.sources.writers import write_log
+from tests.support.desk import write_desk_log
+from tests.support.posed_scans import WRITERS, Shots, shots_of, write_record3d
+
+DEVICE = {"stray-scanner", "record3d", "polycam", "nerfstudio"}
+CONFIDENT = {"stray-scanner", "record3d", "polycam"}
+UNTIMED = {"nerfstudio", "replica", "scannet", "bundlefusion", "redwood"}
+LOSSLESS = {"nerfstudio", "redwood", "openloris"}
+
+
+@pytest.fixture(scope="module")
+def shots(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("desk") / "log"
+    write_desk_log(folder)
+    log = open_source(folder, SourceConfig(stride=2))
+    frames = list(log)
+    at = np.searchsorted(log.truth.stamps_ns, [frame.stamp_ns for frame in frames])
+    return shots_of(frames, log.truth.T_world_body[at])
+
+
+@pytest.fixture(scope="module", params=sorted(WRITERS))
+def written(request, shots, tmp_path_factory):
+    write, name = WRITERS[request.param]
+    folder = tmp_path_factory.mktemp("scan")
+    return request.param, write(folder / name, shots)
+
+
+def test_every_layout_is_read_as_it_was_taken(written, shots):
+    kind, path = written
+    log = open_source(path)
+    assert (log.kind, log.sensor, len(log)) == (kind.removesuffix("-sens"), "rgbd", len(shots.frames))
+    np.testing.assert_allclose(
+        np.diff(log.stamps_ns) / 1e9, 1.0 / (30.0 if kind in UNTIMED else 15.0), atol=1e-3
+    )
+    for frame, shot in zip(log, shots.frames, strict=True):
+        assert (frame.camera.width_px, frame.camera.height_px) == (320, 240)
+        np.testing.assert_allclose(frame.camera.intrinsics, shots.camera.intrinsics, rtol=1e-6)
+        expected_mm = shot.depth_mm * (shot.confidence > 0) if kind in CONFIDENT else shot.depth_mm
+        np.testing.assert_allclose(frame.depth_m[::2, ::2] * 1000.0, expected_mm, atol=0.1)
+        difference = np.abs(frame.image.astype(int) - shot.rgb.astype(int))
+        assert difference.max() == 0 if kind in LOSSLESS else difference.mean() < 6.0
+    poses = log.device_poses if kind in DEVICE else log.truth
+    assert (log.truth is None) == (kind in DEVICE)
+    np.testing.assert_allclose(poses.T_world_body, [shot.T_world_camera for shot in shots.frames], atol=1e-5)
+
+
+def test_every_layout_is_mapped(written, shots, tmp_path):
+    kind, path = written
+    log = open_source(path)
+    run = build(log, load_config(None), tmp_path / "run")
+    assert run.manifest.counts.tracked == len(shots.frames)
+    assert evaluate(run.trajectory, log.device_poses if kind in DEVICE else log.truth).ate_m < 0.02
+
+
+@pytest.mark.parametrize("kind", ["polycam", "record3d"])
+def test_device_poses_can_replace_the_odometry(shots, tmp_path, kind):
+    write, name = WRITERS[kind]
+    log = open_source(write(tmp_path / name, shots))
+    run = build(log, load_config(None, ["odometry.kind=given", "loops.kind=none"]), tmp_path / "run")
+    assert run.truth is None
+    assert evaluate(run.trajectory, log.device_poses).ate_m < 1e-6
+    assert inspect_log(log.path, SourceConfig()).log.device_poses.startswith(f"{len(shots.frames)} poses")
+
+
+@pytest.mark.parametrize("kind", sorted(WRITERS))
+def test_every_layout_is_converted_without_loss(shots, tmp_path, kind):
+    write, name = WRITERS[kind]
+    log = open_source(write(tmp_path / name, Shots(shots.camera, shots.frames[:3])))
+    assert write_log(log, tmp_path / "tum", kind="tum") == []
+    again = open_source(tmp_path / "tum")
+    for frame, expected in zip(again, log, strict=True):
+        np.testing.assert_array_equal(frame.image, expected.image)
+        np.testing.assert_allclose(frame.depth_m, expected.depth_m, atol=1.01e-4)
+    for name in ("truth", "device_poses"):
+        found, wanted = getattr(again, name), getattr(log, name)
+        assert (found is None) == (wanted is None)
+        if wanted is not None:
+            np.testing.assert_allclose(found.T_world_body, wanted.T_world_body, atol=1e-6)
+
+
+def test_a_record3d_recording_may_be_unpacked_and_without_confidence(shots, tmp_path):
+    log = open_source(write_record3d(tmp_path / "scan", shots, confidence=False))
+    assert log.kind == "record3d"
+    assert (log[0].depth_m[0] > 0.0).any()
+
+
+def test_without_its_library_a_record3d_recording_is_refused(shots, tmp_path, monkeypatch):
+    path = write_record3d(tmp_path / "scan.r3d", Shots(shots.camera, shots.frames[:2]))
+    monkeypatch.setitem(sys.modules, "lzfse", None)
+    with pytest.raises(DependencyError, match=r"pip install .*\[record3d\]"):
+        open_source(path)
+
+
+@pytest.mark.parametrize("kind", sorted(WRITERS))
+def test_damage_is_one_line_or_lost_frames(shots, tmp_path, kind):
+    """Every file in turn is cut in half, emptied or made of other bytes."""
+    write, name = WRITERS[kind]
+    path = write(tmp_path / name, Shots(shots.camera, shots.frames[:2]))
+    files = [path] if path.is_file() else [one for one in sorted(path.rglob("*")) if one.is_file()]
+    rng = np.random.default_rng(0)
+    for file in files:
+        whole = file.read_bytes()
+        noise = rng.integers(0, 256, len(whole), dtype=np.uint8).tobytes()
+        for damaged in (whole[: len(whole) // 2], b"", noise, whole[:40] + noise[40:]):
+            file.write_bytes(damaged)
+            assert "\n" not in _read_all(path)
+        file.write_bytes(whole)
+
+
+def _read_all(path):
+    """Load what can be loaded; return why the log cannot be opened, if so."""
+    try:
+        log = open_source(path)
+    except SourceError as error:
+        return str(error)
+    for entry in log.entries():
+        with contextlib.suppress(FrameError):
+            entry.load()
+    return ""
