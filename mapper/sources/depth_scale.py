@@ -22,8 +22,8 @@ _MIN_MEASURED_SHARE = 0.05
 _NEAR_M, _FAR_M = 0.1, 8.0
 """Least median and largest 90th percentile of depth that cameras deliver; farther surfaces return little."""
 _USUALLY_NEAR_M = 0.3
-"""Least depth of most cameras and ways to hold them: where nothing states the units, nearer values may be
-millimetres taken for TUM's fifths of these."""
+"""Least depth of most cameras and ways to hold them: nearer values may be millimetres taken for TUM's fifths of
+these, unless units are stated and the values are whole millimetres in them."""
 _DESK_M = 1.5
 """Depth of most of a desk or an object; nearer than that a whole room is not."""
 _USUAL_UNITS_PER_M = (MM_PER_M, TUM_UNITS_PER_M)
@@ -94,7 +94,7 @@ def _range_warning(log: Log, frames: Collection[RgbdFrame]) -> list[str]:
     least_m = _NEAR_M
     if median_m < _NEAR_M:
         found = f"half of it is within {median_m:.2g} m"
-    elif log.are_units_assumed and near_m < _USUALLY_NEAR_M:
+    elif near_m < _USUALLY_NEAR_M and (log.are_units_assumed or not _are_whole_millimetres(log, frames)):
         found, least_m = f"a twentieth of it is within {near_m:.2g} m", _USUALLY_NEAR_M
     elif log.are_units_assumed and far_m < _DESK_M and not _are_whole_millimetres(log, frames):
         found = f"nine tenths of it is within {far_m:.2g} m and it is no whole millimetres"

@@ -123,8 +123,9 @@ def test_a_walk_from_near_to_far_is_no_change_of_units():
     ("factor", "fitting"), [(25_000, "5000 reads it 5 times farther"), (1000, "5000 reads it 5 times nearer")]
 )
 def test_units_that_fit_are_named(desk_log, factor, fitting):
-    log = replace(desk(desk_log, factor), truth=None, are_units_assumed=True)
-    assert depth_warnings(log)[0].endswith(fitting)
+    for is_assumed in (True, False):
+        log = replace(desk(desk_log, factor), truth=None, are_units_assumed=is_assumed)
+        assert depth_warnings(log)[0].endswith(fitting)
 
 
 def test_motion_that_no_scale_fits_says_nothing_of_depth(desk_log):
