@@ -29,6 +29,7 @@ from mapper.runtime.progress import Progress
 from mapper.sources.base import FrameRef, Log, Skipped
 from mapper.sources.depth_scale import depth_warnings
 from mapper.sources.reading_checks import ReadingChecks
+from mapper.sources.scan_frame import scan_frame_warnings
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -287,8 +288,11 @@ def _wheel_measurements(source: Log, config: BuildConfig) -> WheelMeasurements:
 
 
 def noted_depth_warnings(source: Log, progress: Progress) -> list[RunWarning]:
-    """Return what is implausible about an RGB-D log's depth, before it is tracked, and note it."""
-    warnings = [RunWarning(kind="depth", sentence=text, weight="doubt") for text in depth_warnings(source)]
+    """Return what is implausible about a log's depth or scans, before it is tracked, and note it."""
+    warnings = [
+        *(RunWarning(kind="depth", sentence=text, weight="doubt") for text in depth_warnings(source)),
+        *(RunWarning(kind="frame", sentence=text, weight="doubt") for text in scan_frame_warnings(source)),
+    ]
     for warning in warnings:
         progress.note(warning.sentence)
     return warnings

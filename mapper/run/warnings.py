@@ -27,7 +27,20 @@ from mapper.run.timeline import TimeLine, counted
 
 FLOOR = "floor"
 INPUT_KINDS = frozenset(
-    {"log", "depth", "camera", "shutter", "imu", "sweep", "frozen", "far returns", "conflict", "level", FLOOR}
+    {
+        "log",
+        "depth",
+        "frame",
+        "camera",
+        "shutter",
+        "imu",
+        "sweep",
+        "frozen",
+        "far returns",
+        "conflict",
+        "level",
+        FLOOR,
+    }
 )
 """Kinds that are found while the log is read or fused; a finished run has them in its manifest alone."""
 

@@ -22,8 +22,8 @@ _MIN_MEASURED_SHARE = 0.05
 _NEAR_M, _FAR_M = 0.1, 8.0
 """Least median and largest 90th percentile of depth that cameras deliver; farther surfaces return little."""
 _USUALLY_NEAR_M = 0.3
-"""Least depth of most cameras and ways to hold them: nearer values may be millimetres taken for TUM's fifths of
-these, unless units are stated and the values are whole millimetres in them."""
+"""Least depth of most cameras and ways to hold them: nearer values may be millimetres taken for TUM's fifths
+of these, unless units are stated and the values are whole millimetres in them."""
 _DESK_M = 1.5
 """Depth of most of a desk or an object; nearer than that a whole room is not."""
 _USUAL_UNITS_PER_M = (MM_PER_M, TUM_UNITS_PER_M)

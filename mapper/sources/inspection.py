@@ -20,6 +20,7 @@ from mapper.sources.ros import files as recordings
 from mapper.sources.ros.index import Series
 from mapper.sources.ros.reader import RecordingReader
 from mapper.sources.ros.source import recording_log
+from mapper.sources.scan_frame import scan_frame_warnings
 from mapper.sources.selection import selected
 from mapper.sources.valid_returns import FARTHEST_M
 from mapper.sources.vehicle_box import Box, vehicle_box
@@ -77,7 +78,7 @@ class LogFacts:
         readings: Number of accelerations.
         gyroscope: Timing of its angular velocities; None without.
         notes: Sentences on what opening it left out or assumed.
-        warnings: Sentences on what is implausible about its depth.
+        warnings: Sentences on what is implausible about its depth or scans.
         vehicle: Box around the sensor's own vehicle, least x y z and largest, metres, body frame; None where
             none is seen.
     """
@@ -173,7 +174,7 @@ def _inspected(path: Path, topics: Sequence[TopicFacts], source: Log) -> Inspect
         readings=0 if source.accelerations is None else len(source.accelerations.stamps_ns),
         gyroscope=None if source.gyroscope is None else timing_of(source.gyroscope.stamps_ns),
         notes=[*source.notes, *damage, *checks.notes()],
-        warnings=depth_warnings(source),
+        warnings=[*depth_warnings(source), *scan_frame_warnings(source)],
         vehicle=vehicle_box(source),
     )
     return Inspection(path, topics, log, problem or _without_depth(source) or _unwritable(source))
