@@ -29,6 +29,7 @@ _FORMATS = (
     "image_folders.numbered",
     "scan_folders.kitti",
     RECORDING,
+    "scan_folders.velodyne_pcap",
     "scan_folders.clouds",
 )
 """Modules, imported one after the other when a log is opened, until one recognises it."""
@@ -42,8 +43,8 @@ def open_source(path: Path, config: SourceConfig = _DEFAULTS) -> "Log":
 
     Args:
         path: Folder of a TUM, ICL-NUIM, Poznań, 7-Scenes, Redwood, ScanNet, Replica or KITTI log, of an app's
-            export (Stray Scanner, Record3D, Polycam, nerfstudio) or of clouds, an mbag, .sens or .r3d file,
-            an MCAP file, or a ROS bag.
+            export (Stray Scanner, Record3D, Polycam, nerfstudio) or of clouds, an mbag, .sens, .r3d
+            or .pcap file, an MCAP file, or a ROS bag.
         config: Selection, pairing, camera, and what the files of a log do not state.
 
     Raises:
@@ -85,8 +86,8 @@ def open_source(path: Path, config: SourceConfig = _DEFAULTS) -> "Log":
     hint = "; of clouds it has one, want two or more" if most_clouds(path) == 1 else _inner_hint(path)
     raise SourceError(
         f"{path}: not a log of a known format (TUM, ICL-NUIM, Poznań, 7-Scenes, Redwood, KITTI, clouds, "
-        ".mcap, .bag, .db3, .mbag, .sens, .r3d, exports of apps); docs/your-sensor.md names the files of each"
-        f"{hint}"
+        ".mcap, .bag, .db3, .pcap, .mbag, .sens, .r3d, exports of apps); docs/your-sensor.md names the files "
+        f"of each{hint}"
     )
 
 

@@ -92,7 +92,8 @@ HOMES = {
     "rerun": ("mapper/export/rerun/",),
     "distributed": ("mapper/runtime/executor.py",),
     "lzfse": ("mapper/sources/image_folders/record3d.py",),
-    "velodyne_decoder": ("mapper/sources/ros/driver_messages.py",),
+    "velodyne_decoder": ("mapper/sources/velodyne_packets.py",),
+    "dpkt": ("mapper/sources/scan_folders/velodyne_pcap.py",),
     "pyarrow": ("evaluators/study/table.py",),
 }
 

@@ -4,10 +4,11 @@ The definitions are those of livox_ros_driver (its README) and velodyne_msgs; a 
 maker's manual (63-9243, chapter 9).
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import dpkt
 import numpy as np
 from rosbags.rosbag1 import Writer as Bag1Writer
 from rosbags.rosbag2 import StoragePlugin
@@ -30,7 +31,10 @@ _DEFINITIONS = {
     "VelodyneScan": "std_msgs/Header header\nVelodynePacket[] packets",
 }
 _VLP16_RINGS_DEG = np.array([-15, 1, -13, 3, -11, 5, -9, 7, -7, 9, -5, 11, -3, 13, -1, 15])
-_FIRING_S, _SEQUENCE_S = 2.304e-6, 55.296e-6
+_FIRING_S, _SEQUENCE_S, _SEQUENCES = 2.304e-6, 55.296e-6, 24
+_PACKET_S = _SEQUENCES * _SEQUENCE_S
+TURN = 75
+"""Packets of a turn, nearly."""
 
 
 class DriverRecording:
@@ -133,32 +137,14 @@ def write_vlp16(path: Path, simulator: LidarSimulator, *, scans: int) -> tuple[P
     A packet has 12 blocks of two sequences of 16 firings: distances of 2 mm, azimuths of 0.01° clockwise from
     ahead, and µs after the hour. The driver stamps a scan with its last packet's time.
     """
-    packets_per_scan, sequences_per_packet = 75, 24
-    elevations = np.radians(_VLP16_RINGS_DEG)
-    packet_s = sequences_per_packet * _SEQUENCE_S
     stamps_ns = []
     with DriverRecording(path, "velodyne_msgs") as recording:
         for scan in range(scans):
-            packets = []
-            for k in range(packets_per_scan):
-                start_s = (scan * packets_per_scan + k) * packet_s
-                sequence_s = start_s + np.arange(sequences_per_packet) * _SEQUENCE_S
-                fired_s = sequence_s[:, None] + np.arange(16) * _FIRING_S
-                azimuths = np.radians(fired_s * 3600.0)  # ten turns a second
-                flat = np.cos(elevations)
-                rays_lidar = np.stack(
-                    [flat * np.cos(azimuths), -flat * np.sin(azimuths), np.sin(elevations) + 0.0 * azimuths],
-                    axis=2,
-                )
-                poses = simulator.drive.poses(sequence_s)
-                rays = np.ascontiguousarray(rays_lidar @ poses[:, :3, :3].transpose(0, 2, 1))
-                ranges_m = cast(
-                    simulator.scene.world, np.ascontiguousarray(poses[:, :3, 3]), rays, 80.0, True
-                )
-                units = np.where(np.isfinite(ranges_m), np.rint(ranges_m / 0.002), 0).astype("<u2")
-                stamp_ns = FIRST_NS + round(start_s * 1e9)
-                data = _packet(units, np.degrees(azimuths[:, 0]), start_s)
-                packets.append(recording.make("VelodynePacket", stamp=recording.stamp(stamp_ns), data=data))
+            packets = [
+                recording.make("VelodynePacket", stamp=recording.stamp(stamp_ns), data=data)
+                for stamp_ns, data in vlp16_packets(simulator, range(scan * TURN, (scan + 1) * TURN))
+            ]
+            stamp_ns = FIRST_NS + round(((scan + 1) * TURN - 1) * _PACKET_S * 1e9)
             stamps_ns.append(stamp_ns)
             message = recording.make(
                 "VelodyneScan", header=recording.header(stamp_ns, "velodyne"), packets=packets
@@ -166,6 +152,43 @@ def write_vlp16(path: Path, simulator: LidarSimulator, *, scans: int) -> tuple[P
             recording.write(stamp_ns, "/velodyne_packets", message)
     stamps = np.array(stamps_ns, np.int64)
     return path, Trajectory(stamps, simulator.drive.poses((stamps - FIRST_NS) / 1e9))
+
+
+def write_pcap(path: Path, simulator: LidarSimulator, *, packets: int) -> Path:
+    """Write what a VLP-16 sends in a street, and its position packets, as tcpdump captures them."""
+    with path.open("wb") as file:
+        writer = (dpkt.pcapng.Writer if path.suffix == ".pcapng" else dpkt.pcap.Writer)(file)
+        for number, (stamp_ns, data) in enumerate(vlp16_packets(simulator, range(packets))):
+            if number % 50 == 0:
+                writer.writepkt(_ethernet(bytes(512), port=8308), ts=stamp_ns / 1e9)
+            writer.writepkt(_ethernet(data.tobytes(), port=2368), ts=stamp_ns / 1e9)
+    return path
+
+
+def _ethernet(payload: bytes, *, port: int) -> bytes:
+    udp = dpkt.udp.UDP(sport=443, dport=port, ulen=8 + len(payload), data=payload)
+    ip = dpkt.ip.IP(src=bytes([192, 168, 1, 201]), dst=bytes([255] * 4), p=dpkt.ip.IP_PROTO_UDP, data=udp)
+    ip.len = len(ip)
+    return bytes(dpkt.ethernet.Ethernet(src=bytes(6), dst=bytes([255] * 6), data=ip))
+
+
+def vlp16_packets(simulator: LidarSimulator, numbers: Iterable[int]) -> Iterator[tuple[int, np.ndarray]]:
+    """Yield the time in nanoseconds and the content of the packets of some numbers."""
+    elevations = np.radians(_VLP16_RINGS_DEG)
+    for number in numbers:
+        start_s = number * _PACKET_S
+        sequence_s = start_s + np.arange(_SEQUENCES) * _SEQUENCE_S
+        fired_s = sequence_s[:, None] + np.arange(16) * _FIRING_S
+        azimuths = np.radians(fired_s * 3600.0)  # ten turns a second
+        flat = np.cos(elevations)
+        rays_lidar = np.stack(
+            [flat * np.cos(azimuths), -flat * np.sin(azimuths), np.sin(elevations) + 0.0 * azimuths], axis=2
+        )
+        poses = simulator.drive.poses(sequence_s)
+        rays = np.ascontiguousarray(rays_lidar @ poses[:, :3, :3].transpose(0, 2, 1))
+        ranges_m = cast(simulator.scene.world, np.ascontiguousarray(poses[:, :3, 3]), rays, 80.0, True)
+        units = np.where(np.isfinite(ranges_m), np.rint(ranges_m / 0.002), 0).astype("<u2")
+        yield FIRST_NS + round(start_s * 1e9), _packet(units, np.degrees(azimuths[:, 0]), start_s)
 
 
 def _packet(units: np.ndarray, azimuths_deg: np.ndarray, start_s: float) -> np.ndarray:

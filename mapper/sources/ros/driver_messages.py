@@ -9,13 +9,11 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.core.errors import DataError
 from mapper.core.timebase import NS_PER_S
-from mapper.runtime.extras import extra
-from mapper.sources.point_times import MAX_SWEEP_S
 from mapper.sources.ros.cloud_messages import without_noise
 from mapper.sources.ros.messages import LIVOX, CloudMessage
 from mapper.sources.ros.recording import Topic
+from mapper.sources.velodyne_packets import PACKET_BYTES, decode_packets
 
 _HEADER_BYTES = 16
 """Four of the encapsulation (CDR) or of a counter (ROS 1), then seconds, nanoseconds, the frame's length."""
@@ -25,7 +23,7 @@ _LIVOX_POINT = [
     *[("offset_time", "u4"), ("x", "f4"), ("y", "f4"), ("z", "f4")],
     *[("reflectivity", "u1"), ("tag", "u1"), ("line", "u1")],
 ]
-_VELODYNE_PACKET = [("sec", "u4"), ("nanosec", "u4"), ("data", "u1", 1206)]
+_VELODYNE_PACKET = [("sec", "u4"), ("nanosec", "u4"), ("data", "u1", PACKET_BYTES)]
 
 
 def decode_driver_message(topic: Topic, data: memoryview) -> CloudMessage:
@@ -41,7 +39,9 @@ def decode_driver_message(topic: Topic, data: memoryview) -> CloudMessage:
         points, notes = without_noise(points)
         return CloudMessage(stamp_ns, frame, points, notes=notes)
     stamp_ns, frame, packets = _unpack(topic, data, [_COUNT], _VELODYNE_PACKET)
-    return CloudMessage(stamp_ns, frame, _decode_packets(packets, stamp_ns))
+    received_ns = packets["sec"].astype(np.int64) * NS_PER_S + packets["nanosec"]
+    payloads = [packet.tobytes() for packet in packets["data"]]
+    return CloudMessage(stamp_ns, frame, decode_packets(payloads, received_ns, stamp_ns))
 
 
 def _unpack(
@@ -60,30 +60,3 @@ def _unpack(
     elements = bytes(data[start + head_type.itemsize :]) + b"\0\0\0"  # the last one is not padded
     element_type = np.dtype(element, align=is_cdr).newbyteorder(order)
     return sec * NS_PER_S + nanosec, frame, np.frombuffer(elements, element_type, count=count)
-
-
-def _decode_packets(packets: NDArray[np.void], stamp_ns: int) -> NDArray[np.void]:
-    """Return the points of Velodyne's packets, whose times are made seconds after a stamp.
-
-    The library tells the model by the packets, and has the makers' calibration of each but the HDL-64E.
-    """
-    with extra("velodyne", "reading a Velodyne's packets"):
-        import velodyne_decoder
-
-    if len(packets) == 0:
-        raise DataError("a message without packets")
-    received_ns = packets["sec"].astype(np.int64) * NS_PER_S + packets["nanosec"]
-    first_ns = int(received_ns.min())  # the library's times are unsigned, and float64
-    recorded = [
-        velodyne_decoder.VelodynePacket(after_first_ns / NS_PER_S, packet.tobytes())
-        for after_first_ns, packet in zip((received_ns - first_ns).tolist(), packets["data"], strict=True)
-    ]
-    try:
-        decoder = velodyne_decoder.ScanDecoder(velodyne_decoder.Config())
-        last, points = decoder.decode(velodyne_decoder.PacketVector(recorded), as_pcl_structs=True)
-    except RuntimeError as error:
-        raise DataError(f"packets that cannot be decoded: {error}") from None
-    last_s = last.host + (first_ns - stamp_ns) / NS_PER_S
-    if abs(last_s) <= MAX_SWEEP_S:  # else packets have no times of the host
-        points["time"] += np.float32(last_s)
-    return np.asarray(points)

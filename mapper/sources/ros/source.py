@@ -9,7 +9,6 @@ from mapper.core.errors import SourceError
 from mapper.core.frames import Sensor
 from mapper.core.timebase import NS_PER_S, Stamps
 from mapper.core.units import MM_PER_M
-from mapper.runtime.extras import require
 from mapper.sources.base import FrameRef, Log
 from mapper.sources.config import SourceConfig
 from mapper.sources.image_files.image_sizes import recorded_camera
@@ -32,6 +31,7 @@ from mapper.sources.ros.messages import (
 )
 from mapper.sources.ros.reader import SAME_CLOCK_NS, RecordingReader
 from mapper.sources.ros.topics import CameraTopics, Choice, choose
+from mapper.sources.velodyne_packets import require_decoder
 
 _JPEG_START = b"\xff\xd8"
 
@@ -173,7 +173,7 @@ def _rgbd(reader: RecordingReader, topics: CameraTopics, config: SourceConfig) -
 
 def _lidar(reader: RecordingReader, clouds: Series, config: SourceConfig) -> _Frames:
     if clouds.topic.type in VELODYNE:
-        require("velodyne_decoder", "velodyne", f"{reader.recording.path}: reading {clouds.topic.name}")
+        require_decoder()
     i, notes = ordered(clouds)
     first = reader.firsts.get(clouds.topic.name)
     if isinstance(first, CloudMessage):

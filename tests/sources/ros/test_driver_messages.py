@@ -85,7 +85,7 @@ def test_packets_without_their_library_are_refused_with_the_install_line(tmp_pat
     path, _ = write_vlp16(tmp_path / "a.bag", simulator, scans=2)
     monkeypatch.setitem(sys.modules, "velodyne_decoder", None)
     monkeypatch.setattr("mapper.runtime.extras.find_spec", lambda _: None)
-    with pytest.raises(DependencyError, match=r"/velodyne_packets needs .*pip install .*\[velodyne\]"):
+    with pytest.raises(DependencyError, match=r"packets needs .*pip install .*\[velodyne\]"):
         open_source(path)
     assert "[velodyne]" in inspect_log(path, config=load_config(None).source).problem
 

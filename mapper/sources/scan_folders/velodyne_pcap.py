@@ -1,0 +1,182 @@
+"""Captures of a Velodyne's packets (.pcap, .pcapng), as VeloView, tcpdump and Wireshark write them."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from mapper.core.errors import DataError, FrameError, SourceError
+from mapper.core.frames import Scan
+from mapper.core.timebase import NS_PER_S
+from mapper.runtime.extras import extra
+from mapper.sources.base import ImageFiles, Log
+from mapper.sources.config import SourceConfig
+from mapper.sources.ros.cloud_messages import scan_from
+from mapper.sources.ros.messages import CloudMessage
+from mapper.sources.text import time_order
+from mapper.sources.velodyne_packets import PACKET_BYTES, decode_packets, require_decoder
+
+_ENDINGS = (".pcap", ".pcapng")
+_LEAST_SHARE = 0.5
+"""Share of the usual number of packets that a turn must have: the first and the last one are cut."""
+
+
+class _Packet(NamedTuple):
+    received_ns: int
+    sender: bytes
+    payload: bytes
+
+
+class _Turn(NamedTuple):
+    """Packets of a turn: where they begin, how many were captured until its last, how many are its own."""
+
+    offset: int
+    captured: int
+    packets: int
+    stamp_ns: int
+
+
+def recognise(path: Path) -> bool:
+    """Return whether a path is named as a capture."""
+    return path.suffix.lower() in _ENDINGS and path.is_file()
+
+
+def read_log(path: Path, config: SourceConfig) -> Log:
+    """Return the log of a capture: a scan for each turn of the sensor that sent most packets.
+
+    Raises:
+        SourceError: It is no capture, or has no packets of a Velodyne.
+        DependencyError: The library that decodes packets is not installed.
+    """
+    require_decoder()
+    by_sender = _turns(path)
+    if not by_sender:
+        raise SourceError(
+            f"{path}: no packets of a Velodyne in it (UDP, {PACKET_BYTES} bytes); play those of another "
+            "LiDAR through its driver and record the clouds"
+        )
+    sender = max(by_sender, key=lambda one: sum(turn.packets for turn in by_sender[one]))
+    turns, notes = by_sender[sender], []
+    if len(by_sender) > 1:
+        address = ".".join(map(str, sender))
+        notes.append(f"packets of {len(by_sender)} sensors; those of {address}, the most, are mapped")
+    usual = np.median([turn.packets for turn in turns])
+    whole = [turn for turn in turns if turn.packets >= _LEAST_SHARE * usual]
+    if len(whole) < len(turns):
+        notes.append(f"{len(turns) - len(whole)} of {len(turns)} turns are cut; left out")
+    stamps_ns = np.array([turn.stamp_ns for turn in whole], np.int64)
+    order, order_notes = time_order(stamps_ns, what=path.name)
+    return Log(
+        path=path,
+        name=path.resolve().stem,
+        kind="velodyne-pcap",
+        sensor="lidar",
+        stamps_ns=stamps_ns[order],
+        entry_at=lambda index: _TurnEntry(path, sender, whole[int(order[index])], config.cloud_scale),
+        notes=[*notes, *order_notes],
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _TurnEntry:
+    """Turn that has not been read yet; the body is the LiDAR."""
+
+    path: Path
+    sender: bytes
+    turn: _Turn
+    scale: float | None
+    files: ImageFiles | None = None
+
+    @property
+    def stamp_ns(self) -> int:
+        """Return the time of the last packet."""
+        return self.turn.stamp_ns
+
+    def load(self, *, colour: bool = True) -> Scan:
+        """Read and decode the packets.
+
+        Raises:
+            FrameError: They are damaged, or the file has changed.
+        """
+        where = f"{self.path}: turn at {self.stamp_ns}"
+        captured = islice(_captured(self.path, self.turn.offset), self.turn.captured)
+        packets = [packet for _, packet in captured if packet is not None and packet.sender == self.sender]
+        received_ns = np.array([packet.received_ns for packet in packets], np.int64)
+        try:
+            points = decode_packets([packet.payload for packet in packets], received_ns, self.stamp_ns)
+        except DataError as error:
+            raise FrameError(f"{where}: {error}") from None
+        message = CloudMessage(self.stamp_ns, "", points)
+        return scan_from(message, T_body_frame=np.eye(4), with_colours=colour, where=where, scale=self.scale)
+
+    def scan(self) -> Scan:
+        """Read and decode the packets.
+
+        Raises:
+            FrameError: As ``load``.
+        """
+        return self.load()
+
+
+def _turns(path: Path) -> dict[bytes, list[_Turn]]:
+    """Return the turns of each sensor, by its address: a turn ends where the azimuth of a packet falls."""
+    turns: dict[bytes, list[_Turn]] = {}
+    last: dict[bytes, tuple[int, int]] = {}
+    for number, (offset, packet) in enumerate(_captured(path)):
+        if packet is None:
+            continue
+        azimuth = int.from_bytes(packet.payload[2:4], "little")
+        of_sender = turns.setdefault(packet.sender, [])
+        last_azimuth, first_number = last.get(packet.sender, (azimuth, number))
+        if not of_sender or azimuth < last_azimuth:
+            first_number = number
+            of_sender.append(_Turn(offset, 0, 0, 0))
+        begun = of_sender[-1]
+        of_sender[-1] = _Turn(begun.offset, number - first_number + 1, begun.packets + 1, packet.received_ns)
+        last[packet.sender] = azimuth, first_number
+    return turns
+
+
+def _captured(path: Path, offset: int | None = None) -> Iterator[tuple[int, _Packet | None]]:
+    """Yield the place of every captured packet from one on, and what it is if it has a data packet's size.
+
+    Raises:
+        SourceError: It is no capture.
+    """
+    with extra("velodyne", "reading captured packets"):
+        from dpkt.pcap import UniversalReader
+    try:
+        with path.open("rb") as file:
+            try:
+                packets = iter(UniversalReader(file))
+            except Exception as error:  # the library raises whatever the bytes that it meets raise
+                raise SourceError(f"{path}: no capture of packets: {error}") from None
+            if offset is not None:
+                file.seek(offset)
+            while True:
+                place = file.tell()
+                try:
+                    received_s, data = next(packets)
+                except Exception:  # it ends, is cut off, or damaged from here on
+                    return
+                yield place, _unwrap(received_s, data)
+    except OSError as error:
+        raise SourceError(f"{path}: cannot be read: {error.strerror}") from None
+
+
+def _unwrap(received_s: float, data: bytes) -> _Packet | None:
+    """Return a UDP packet of the size of a data packet; None of any other."""
+    from dpkt.ethernet import Ethernet
+    from dpkt.ip import IP
+    from dpkt.udp import UDP
+
+    try:
+        ip = Ethernet(data).data
+    except Exception:  # damaged
+        return None
+    if not (isinstance(ip, IP) and isinstance(ip.data, UDP) and len(ip.data.data) == PACKET_BYTES):
+        return None
+    return _Packet(round(received_s * NS_PER_S), bytes(ip.src), bytes(ip.data.data))
