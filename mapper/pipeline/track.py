@@ -28,6 +28,7 @@ from mapper.runtime.ordered_map import ordered_map
 from mapper.runtime.progress import Progress
 from mapper.sources.base import FrameRef, Log, Skipped
 from mapper.sources.depth_scale import depth_warnings
+from mapper.sources.image_order import time_warnings
 from mapper.sources.reading_checks import ReadingChecks
 from mapper.sources.scan_frame import scan_frame_warnings
 
@@ -288,8 +289,9 @@ def _wheel_measurements(source: Log, config: BuildConfig) -> WheelMeasurements:
 
 
 def noted_depth_warnings(source: Log, progress: Progress) -> list[RunWarning]:
-    """Return what is implausible about a log's depth or scans, before it is tracked, and note it."""
+    """Return what is implausible about a log's stamps, depth or scans, before it is tracked, and note it."""
     warnings = [
+        *(RunWarning(kind="stamps", sentence=text, weight="doubt") for text in time_warnings(source)),
         *(RunWarning(kind="depth", sentence=text, weight="doubt") for text in depth_warnings(source)),
         *(RunWarning(kind="frame", sentence=text, weight="doubt") for text in scan_frame_warnings(source)),
     ]

@@ -29,6 +29,7 @@ FLOOR = "floor"
 INPUT_KINDS = frozenset(
     {
         "log",
+        "stamps",
         "depth",
         "frame",
         "camera",

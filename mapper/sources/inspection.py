@@ -15,6 +15,7 @@ from mapper.sources import RECORDING, format_of, open_source
 from mapper.sources.base import Log, read_depth
 from mapper.sources.config import SourceConfig
 from mapper.sources.depth_scale import LOOKED_AT, depth_warnings
+from mapper.sources.image_order import time_warnings
 from mapper.sources.reading_checks import ReadingChecks
 from mapper.sources.ros import files as recordings
 from mapper.sources.ros.index import Series
@@ -78,7 +79,7 @@ class LogFacts:
         readings: Number of accelerations.
         gyroscope: Timing of its angular velocities; None without.
         notes: Sentences on what opening it left out or assumed.
-        warnings: Sentences on what is implausible about its depth or scans.
+        warnings: Sentences on what is implausible about its stamps, depth or scans.
         vehicle: Box around the sensor's own vehicle, least x y z and largest, metres, body frame; None where
             none is seen.
     """
@@ -174,7 +175,7 @@ def _inspected(path: Path, topics: Sequence[TopicFacts], source: Log) -> Inspect
         readings=0 if source.accelerations is None else len(source.accelerations.stamps_ns),
         gyroscope=None if source.gyroscope is None else timing_of(source.gyroscope.stamps_ns),
         notes=[*source.notes, *damage, *checks.notes()],
-        warnings=[*depth_warnings(source), *scan_frame_warnings(source)],
+        warnings=[*time_warnings(source), *depth_warnings(source), *scan_frame_warnings(source)],
         vehicle=vehicle_box(source),
     )
     return Inspection(path, topics, log, problem or _without_depth(source) or _unwritable(source))

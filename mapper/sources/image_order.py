@@ -1,0 +1,82 @@
+"""Plausibility of a log's stamps: their rate, and the order in which they put the images."""
+
+from functools import cache
+
+import cv2
+import numpy as np
+
+from mapper.core.errors import FrameError
+from mapper.core.frames import RgbdFrame
+from mapper.core.geometry import Array
+from mapper.core.timebase import NS_PER_S
+from mapper.sources.base import Log
+
+_MAX_RATE_HZ = 1000.0
+_PLACES, _ALL_PLACES = 6, 100
+"""Places of the log at which two consecutive images are compared; more where these are unlike."""
+_SIZE_PX = (32, 24)
+_UNLIKE = 0.9
+"""Difference of consecutive images in that of any two: 0.2 to 0.6 down to 1.5 Hz, 0.84 of every 15th of 30 Hz
+while the camera is shaken, and 0.96 to 1.05 where stamps are shuffled."""
+_LESS_ALIKE = 2.0
+"""Difference of consecutive images in that from the one most alike: an order exists, and it is another."""
+
+
+def time_warnings(log: Log) -> list[str]:
+    """Return what is implausible about a log's stamps, a sentence each; a few images are read."""
+    return [*_rate_warnings(log), *_order_warnings(log)]
+
+
+def _rate_warnings(log: Log) -> list[str]:
+    usual_ns = float(np.median(np.diff(log.stamps_ns))) if len(log) > 1 else np.inf
+    if usual_ns * _MAX_RATE_HZ >= NS_PER_S:
+        return []
+    return [
+        f"stamps: frames come every {usual_ns / NS_PER_S:.2g} s, which no camera or LiDAR does; are they of "
+        "another unit, or those of the file system?"
+    ]
+
+
+def _order_warnings(log: Log) -> list[str]:
+    """Return that consecutive images are no more alike than any two, while others are."""
+    if log.sensor != "rgbd" or len(log) < 4 * _PLACES:
+        return []
+
+    @cache
+    def view(index: int) -> Array | None:
+        return _view(log, index)
+
+    def differences(places: int) -> tuple[Array, Array, Array]:
+        """Return the (N,) differences of consecutive images, and those of any two."""
+        first = np.unique(np.linspace(0, len(log) - 2, places).astype(int)).tolist()
+        pairs = [(k, k + 1) for k in first if view(k) is not None and view(k + 1) is not None]
+        indices = np.unique(np.array(pairs, dtype=int).reshape(-1, 2))
+        views = np.array([view(k) for k in indices.tolist()])
+        between = np.array([np.sqrt(((views - one) ** 2).mean(axis=1)) for one in views])
+        ends = np.searchsorted(indices, pairs).T
+        return between[ends[0], ends[1]], between, np.subtract.outer(indices, indices)
+
+    for places in (_PLACES, _ALL_PLACES):
+        consecutive, between, apart = differences(places)
+        others = between[np.abs(apart) > 1]
+        if len(consecutive) < _PLACES - 1 or np.median(consecutive) < _UNLIKE * np.median(others):
+            return []
+    nearest = np.where(np.abs(apart) > 1, between, np.inf).min(axis=1)
+    ratio = float(np.median(consecutive) / max(np.median(nearest), 1e-9))
+    if ratio < _LESS_ALIKE:
+        return []
+    return [
+        f"stamps: consecutive images are no more alike than any two, and each is {ratio:.1f} times as like "
+        "another; are the stamps those of other images (a list sorted by text, or shuffled)?"
+    ]
+
+
+def _view(log: Log, index: int) -> Array | None:
+    """Return a small image without its mean and contrast; None where it cannot be read."""
+    try:
+        frame = log.entry_at(index).load(colour=False)
+    except FrameError:
+        return None
+    assert isinstance(frame, RgbdFrame)
+    small = cv2.resize(frame.gray, _SIZE_PX, interpolation=cv2.INTER_AREA).astype(np.float64).ravel()
+    return np.asarray((small - small.mean()) / max(float(small.std()), 1.0), np.float64)

@@ -1,0 +1,47 @@
+"""Stamps of other images: told by how alike consecutive images are."""
+
+import cv2
+import numpy as np
+import pytest
+
+from mapper.core.frames import PinholeCamera, RgbdFrame
+from mapper.sources.image_order import time_warnings
+from tests.support.logs import MemoryEntry, log_in_memory
+
+WALL = cv2.resize(
+    np.random.default_rng(4).integers(0, 255, (4, 40)).astype(np.uint8),
+    (1280, 96),
+    interpolation=cv2.INTER_CUBIC,
+)
+CAMERA = PinholeCamera(width_px=128, height_px=96, fx_px=100.0, fy_px=100.0, cx_px=64.0, cy_px=48.0)
+
+
+def passing(order, *, period_ns=10**8, step_px=8):
+    """Return a log of images that pass a wall, the k-th from place order[k] on."""
+    random = np.random.default_rng(5)
+    entries = []
+    for k, place in enumerate(order):
+        seen = WALL[:, step_px * place : step_px * place + 128]
+        image = np.clip(seen + random.normal(0.0, 3.0, seen.shape), 0, 255).astype(np.uint8)
+        entries.append(
+            MemoryEntry(
+                k * period_ns, RgbdFrame(k * period_ns, image, np.ones(image.shape, np.float32), CAMERA)
+            )
+        )
+    return log_in_memory(entries)
+
+
+def test_shuffled_images_are_told_and_those_in_order_are_not():
+    shuffled = np.random.default_rng(6).permutation(140)
+
+    assert len(time_warnings(passing(shuffled))) == 1
+    assert time_warnings(passing(np.arange(140))) == []
+
+
+@pytest.mark.parametrize("places", [np.zeros(60, int), np.tile(np.arange(0, 130, 3), 6)])
+def test_a_camera_that_stands_and_one_that_goes_round_with_few_images_are_in_order(places):
+    assert time_warnings(passing(places)) == []
+
+
+def test_frames_that_come_every_few_microseconds_are_told():
+    assert len(time_warnings(passing(np.arange(60), period_ns=28_000))) == 1
