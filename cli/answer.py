@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer.models import OptionInfo
 
 from mapper.cli.console import print_text, progress_for
 from mapper.cli.options import refuse_several
@@ -104,6 +105,9 @@ def verb(function: Callable[..., Answer]) -> Callable[..., None]:
             raise answer.error
 
     own = [p for p in inspect.signature(function).parameters.values() if p.name != "output"]
+    for parameter in own:
+        if parameter.name == "out" and isinstance(option := parameter.annotation.__metadata__[0], OptionInfo):
+            option.param_decls = ("--out", "-o")
     own = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in own]
     options = [
         inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=False, annotation=annotation)
@@ -119,8 +123,8 @@ _RESULTS = frozenset({"out", "plot"})
 """Parameters of verbs that name what they write."""
 _COMMON = {
     "json": Annotated[bool, typer.Option("--json", help="Print one JSON document.")],
-    "verbose": Annotated[bool, typer.Option("--verbose", help="Print every row and every note.")],
-    "quiet": Annotated[bool, typer.Option("--quiet", help="Print errors only.")],
+    "verbose": Annotated[bool, typer.Option("--verbose", "-v", help="Print every row and every note.")],
+    "quiet": Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")],
 }
 
 

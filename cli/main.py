@@ -48,6 +48,15 @@ _USER_CAN_HELP = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EACCES, errno.E
 class Guarded(VerbGroup):
     """Turns a user's mistake into one line; a bug keeps its traceback."""
 
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Take ``help VERB`` and ``version`` as the options of these names."""
+        match args:
+            case ["help", *verbs]:
+                args = [*verbs, "--help"]
+            case ["version"]:
+                args = ["--version"]
+        return super().parse_args(ctx, args)
+
     def invoke(self, ctx: Any) -> object:
         """Run the verb."""
         try:

@@ -63,7 +63,12 @@ def _text(value: object) -> str:
 
 ConfigFile = Annotated[
     Path | None,
-    typer.Option("--config", help="TOML file, or a run's config.json; omit for the defaults."),
+    typer.Option(
+        "--config",
+        "--preset",
+        help="TOML file, a preset (lidar-indoor, lidar-outdoor, rgbd-indoor, wheels, zhao), or a run's "
+        "config.json; omit for the defaults.",
+    ),
 ]
 Overrides = Annotated[
     list[str] | None,

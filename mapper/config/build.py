@@ -1,8 +1,8 @@
 """Configuration of a build, and of products that are made on demand: meshes and viewer recordings."""
 
-from typing import Annotated
+from typing import Annotated, Self
 
-from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt
+from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt, model_validator
 
 from mapper.core.config import Config, Ratio
 from mapper.graph.config import GraphConfig
@@ -73,3 +73,13 @@ class BuildConfig(Config):
     """With a smaller share of the readable frames tracked no map is made, and the build ends in an error."""
     workers: NonNegativeInt = 2
     """Threads that read, decode and detect features ahead; the result does not depend on their number."""
+
+    @model_validator(mode="after")
+    def _voxels_fit_the_slice(self) -> Self:
+        most_m = 2.0 * self.slice.max_height_m  # the floor is a border of voxels
+        if self.octree.resolution_m > most_m:
+            raise ValueError(
+                f"octree.resolution_m is {self.octree.resolution_m:g} m, so no voxel has its centre below "
+                f"slice.max_height_m; want at most {most_m:g}; 0.05 is 5 cm"
+            )
+        return self

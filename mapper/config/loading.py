@@ -36,6 +36,7 @@ DEFAULTS: "Mapping[Sensor, Mapping[str, Any]]" = {
 """Default settings per sensor, where they differ from the classes' own. A street is coarser than a room: what
 would be a step indoors is within the noise of the road."""
 
+_PRESETS = Path(__file__).with_name("presets")
 
 AnyConfig = TypeVar("AnyConfig", bound=Config)
 Settings = Mapping[str, Any]
@@ -52,7 +53,7 @@ def load_config(
     """Return the configuration of a TOML file, or a run's JSON, with single settings on top.
 
     Args:
-        path: The file, or settings by name; None begins with the defaults.
+        path: The file, a preset's name, or settings by name; None begins with the defaults.
         overrides: ``key.path=value`` as text, parsed by the model.
         settings: The same as values by dotted name; they come last.
         sensor: Sensor whose defaults hold where nothing else is set.
@@ -68,7 +69,7 @@ def load_config(
     """
     if isinstance(path, Mapping):
         settings, path = {**flattened(path), **flattened(settings or {})}, None
-    path = None if path is None else Path(path)
+    path = None if path is None else _preset_or_file(Path(path))
     tree = {} if path is None else _read(path)
     if path is not None:
         if _is_of_a_run(path):
@@ -133,6 +134,17 @@ def parse_config(text: str, path: Path, model: type[AnyConfig]) -> AnyConfig:
         ConfigError: As :func:`read_config`.
     """
     return checked_config(_parsed(text, path), model, str(path))
+
+
+def _preset_or_file(path: Path) -> Path:
+    """Return the file of a preset, such as "lidar-indoor", where there is no file of that name."""
+    if path.suffix or path.name != f"{path}" or path.exists():
+        return path
+    preset = _PRESETS / f"{path.name.replace('-', '_')}.toml"
+    if not preset.is_file():
+        names = ", ".join(sorted(one.stem.replace("_", "-") for one in _PRESETS.glob("*.toml")))
+        raise ConfigError(f"{path}: no such file, and no preset; these are {names}")
+    return preset
 
 
 def _read(path: Path) -> dict[str, Any]:

@@ -338,3 +338,11 @@ def test_bars_end_full(monkeypatch, capsys):
 
 def test_the_version_is_printed():
     assert mapper("--version").stdout.startswith("mapper ")
+
+
+def test_help_version_and_short_options_are_as_elsewhere(run_folder, tmp_path):
+    assert mapper("version").output == mapper("--version").output
+    assert mapper("help", "sensor", "depth").output == mapper("sensor", "depth", "--help").output
+    out = tmp_path / "map.bt"
+    assert mapper("export", run_folder, "--as", "octomap", "-o", out, "-q").output == ""
+    assert out.exists()

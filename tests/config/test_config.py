@@ -120,6 +120,7 @@ def test_a_run_s_own_json_gives_the_same_configuration(tmp_path):
         ("source.camera.depth_in_color=0,0,0,0,0,0,0", "source.camera: .*quaternion is zero"),
         ("source.camera.depth_distortion=0.1,0,0,0,0", "source.camera: .*without depth_intrinsics_px"),
         ("slice.min_height_m=1.2", "slice: .*max_height_m 1.2 must be above min_height_m 1.2"),
+        ("octree.resolution_m=5", "octree.resolution_m is 5 m, .* want at most 2.4"),
     ],
 )
 def test_values_that_would_fail_late_are_refused_early(override, message):
@@ -217,6 +218,17 @@ def test_a_list_that_is_none_is_refused_with_the_reason(text, why):
 @pytest.mark.parametrize("path", sorted(CONFIGS.rglob("*.toml")), ids=lambda p: p.stem)
 def test_every_shipped_configuration_is_valid(path):
     assert load_config(path) != BuildConfig()
+
+
+@pytest.mark.parametrize("name", ["lidar-indoor", "lidar_indoor"])
+def test_a_preset_is_the_shipped_file_of_its_name(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    preset = load_config(name, sensor="lidar")
+    assert preset == load_config(CONFIGS / "lidar_indoor.toml", sensor="lidar") != load_config(sensor="lidar")
+    (tmp_path / name).write_text("[octree]\nresolution_m = 0.3\n")
+    assert load_config(name, sensor="lidar").octree.resolution_m == 0.3, "a file comes first"
+    with pytest.raises(ConfigError, match="lidar-outdoor"):
+        load_config("lidar-indor")
 
 
 def test_turning_one_knob_leaves_the_others_of_its_part():
