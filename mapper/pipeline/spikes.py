@@ -15,6 +15,8 @@ _MOST_FRAMES = 5
 _RATIO = 8.0
 """Steps off the path and back, in the log's median ones over as many frames: as for jumps while tracking."""
 _LEAST_M, _LEAST_RAD = 0.1, np.radians(5.0)
+_CARRIED_MPS2, _CARRIED_RADPS2 = 4.0, 10.0
+"""Accelerations with which sensors are carried: within seconds a car swerves, and a head looks aside."""
 
 
 class _Spike(NamedTuple):
@@ -50,8 +52,8 @@ def with_doubtful_spikes(tracks: Sequence[FrameResult]) -> list[FrameResult]:
         *(log(transform(b[:3, :3] @ a[:3, :3].T, np.zeros(3)))[0] for a, b in pairwise(T_world_body)),
     ]
     found = [
-        *_spikes(positions, times_s, _LEAST_M, is_turn=False),
-        *_spikes(np.cumsum(turns, axis=0), times_s, _LEAST_RAD, is_turn=True),
+        *_spikes(positions, times_s, _LEAST_M, _CARRIED_MPS2, is_turn=False),
+        *_spikes(np.cumsum(turns, axis=0), times_s, _LEAST_RAD, _CARRIED_RADPS2, is_turn=True),
     ]
     changed, taken = list(tracks), np.zeros(len(placed), np.bool_)
     for spike in sorted(found, reverse=True):
@@ -71,8 +73,8 @@ def _doubted(track: FrameResult, spike: _Spike) -> FrameResult:
     return replace(track, doubts=(Doubt("jump", spike.text),), covariance=covariance)
 
 
-def _spikes(path: Array, times_s: Array, least: float, *, is_turn: bool) -> Iterator[_Spike]:
-    """Yield the spikes of an (N, 3) path, of each number of frames."""
+def _spikes(path: Array, times_s: Array, least: float, carried: float, *, is_turn: bool) -> Iterator[_Spike]:
+    """Yield the spikes of an (N, 3) path, of each number of frames, beyond an acceleration."""
     for frames in range(1, _MOST_FRAMES + 1):
         a = np.arange(1, len(path) - frames - 2)  # each end has a neighbour outside, which tells the motion
         b = a + frames + 1
@@ -89,10 +91,10 @@ def _spikes(path: Array, times_s: Array, least: float, *, is_turn: bool) -> Iter
             (off * back).sum(axis=1) < 0.0
         )
         usual = float(np.median(size))
-        limit = max(_RATIO * usual, least)
-        for k in np.flatnonzero((size > limit) & returns).tolist():
+        limits = np.maximum(max(_RATIO * usual, least), 0.125 * carried * gap_s[:, 0] ** 2)
+        for k in np.flatnonzero((size > limits) & returns).tolist():
             step = float(size[k])
             named = [f"{np.degrees(x):.1f}°" if is_turn else f"{x:.2f} m" for x in (step, usual)]
             text = f"{named[0]} off the path and back within {frames + 1} frames, {named[1]} is usual"
             sigmas = (step, 0.0) if is_turn else (0.0, step)
-            yield _Spike(step / limit, k + 2, k + 1 + frames, sigmas, text)
+            yield _Spike(step / float(limits[k]), k + 2, k + 1 + frames, sigmas, text)

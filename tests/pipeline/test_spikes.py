@@ -11,7 +11,7 @@ HOW = Diagnostics(100, 50, 40, 0.5, "px", "map")
 STEP_NS = 66_666_667
 
 
-def walk(offs_m=(), offs_rad=(), *, count=120, seed=0):
+def walk(offs_m=(), offs_rad=(), *, count=120, seed=0, step_ns=STEP_NS):
     """Results of a shaking walk; frames are off by some metres across it, or turned by some radians."""
     rng = np.random.default_rng(seed)
     off_m, off_rad = dict(offs_m), dict(offs_rad)
@@ -22,7 +22,7 @@ def walk(offs_m=(), offs_rad=(), *, count=120, seed=0):
         T = exp(turn + rng.normal(0.0, 1e-3, 3), place + rng.normal(0.0, 2e-3, 3))
         tracks.append(
             FrameResult(
-                stamp_ns=k * STEP_NS, node=k // 10, T_node_body=np.eye(4), T_world_body=T,
+                stamp_ns=k * step_ns, node=k // 10, T_node_body=np.eye(4), T_world_body=T,
                 is_keyframe=k % 10 == 0, diagnostics=HOW, covariance=1e-6 * np.eye(6),
             )
         )  # fmt: skip
@@ -51,6 +51,16 @@ def test_a_step_aside_and_back_is_a_spike_keyframes_included(frames):
 
 def test_one_turned_frame_is_a_spike():
     assert doubted(walk(offs_rad={33: np.radians(9.6)}.items())) == [33]
+
+
+@pytest.mark.parametrize(("step_ns", "are_spikes"), [(STEP_NS, True), (500_000_000, False)])
+def test_what_a_sensor_can_be_carried_along_is_none(step_ns, are_spikes):
+    """Half a metre and 10° aside in three frames are a spike at 15 Hz, and a swerve at 2 Hz."""
+    frames = [50, 51, 52]
+    aside = walk(dict.fromkeys(frames, 0.5).items(), step_ns=step_ns)
+    turned = walk(offs_rad=dict.fromkeys(frames, np.radians(10.0)).items(), step_ns=step_ns)
+
+    assert doubted(aside) == doubted(turned) == (frames if are_spikes else [])
 
 
 def test_a_step_that_stays_is_none():
