@@ -15,13 +15,12 @@ from mapper.cli import completion
 from mapper.cli.answer import Answer, verb
 from mapper.cli.build import build, demo, fuse
 from mapper.cli.console import EscapingStream, escaped
-from mapper.cli.convert import convert
+from mapper.cli.convert import convert, export
 from mapper.cli.diff import diff
 from mapper.cli.doctor import doctor
 from mapper.cli.edit import edit
 from mapper.cli.environment import handle_interrupts, prepare_environment
 from mapper.cli.evaluate import evaluate
-from mapper.cli.export import export
 from mapper.cli.groups import HELP, Verb, VerbGroup, show_help
 from mapper.cli.inspect import inspect
 from mapper.cli.localise import localise

@@ -1,11 +1,14 @@
 """Fixtures for all tests: tiny recorded logs, a built run of one, a Dask scheduler."""
 
+import fcntl
 import json
 import os
+import shutil
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,8 +17,8 @@ import hypothesis
 import pytest
 
 from mapper.runtime.kernels import drop_stale_kernels
+from tests.support.files import digest_of
 from tests.support.paths import ROOT
-from tests.support.shared_folders import shared_folder
 from tests.support.tum_logs import write_tiny_log
 
 if TYPE_CHECKING:
@@ -30,6 +33,35 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Put files with slow tests first: begun last, they would leave the other worker processes idle."""
     slow = {item.path for item in items if item.get_closest_marker("slow")}
     items.sort(key=lambda item: item.path not in slow)
+
+
+@contextmanager
+def shared_folder(factory: pytest.TempPathFactory, name: str, fill: Callable[[Path], None]) -> Iterator[Path]:
+    """Give a folder that the first process to ask for it has filled, and which no test may change.
+
+    Args:
+        factory: Pytest's; a worker's own folder of it lies in the session's.
+        name: The folder's path within the session's shared folder.
+        fill: Makes the folder at the path it is given, which does not exist; other processes wait for it.
+
+    Yields:
+        The folder. Whoever needs to change something works on a copy.
+
+    Raises:
+        AssertionError: On leaving, if a file of the folder has changed since it was filled.
+    """
+    own = factory.getbasetemp()
+    folder = (own.parent if "PYTEST_XDIST_WORKER" in os.environ else own) / "shared" / name
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    filled = folder.with_name(f"{folder.name}.sha256")
+    with folder.with_name(f"{folder.name}.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)  # until it is closed
+        if not filled.exists():
+            shutil.rmtree(folder, ignore_errors=True)  # of a process that failed half-way
+            fill(folder)
+            filled.write_text(digest_of(folder))
+    yield folder
+    assert digest_of(folder) == filled.read_text(), f"a test has changed {folder}, which others read"
 
 
 @pytest.fixture

@@ -180,12 +180,12 @@ def assess(
     Raises:
         DataError: The estimate is empty, no stamps match, too few do, or a length is not > 0.
     """
-    offset = start_end_offset(estimate)
+    offset_m, offset_rad = start_end_offset(estimate)
     own = [
         *_coverage(estimate, truth, frames_ns),
         Metric(PATH_LENGTH, estimate.path_length_m, "m"),
-        Metric(START_TO_END, offset.translation_m, "m"),
-        Metric("start-to-end rotation", offset.rotation_rad, "rad"),
+        Metric(START_TO_END, offset_m, "m"),
+        Metric("start-to-end rotation", offset_rad, "rad"),
     ]
     if truth is None:
         return Assessment(tuple(own))

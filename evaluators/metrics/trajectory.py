@@ -14,6 +14,7 @@ from mapper.core.geometry import (
     angle_between,
     distances_along,
     fit_rigid,
+    length_and_angle,
     rotation_exp,
     transform,
 )
@@ -94,14 +95,6 @@ class RelativeErrors:
     translation_m: Statistics
     rotation_rad: Statistics
     pairs: int
-
-
-@dataclass(frozen=True, slots=True)
-class Offset:
-    """Offset of one pose from another."""
-
-    translation_m: float
-    rotation_rad: float
 
 
 def associate(
@@ -227,19 +220,15 @@ def motion_errors(matched: Matched, i: NDArray[np.intp], j: NDArray[np.intp]) ->
     return _lengths(T_error[:, :3, 3]), _angles_rad(T_error[:, :3, :3])
 
 
-def start_end_offset(trajectory: Trajectory) -> Offset:
-    """Return how far the last pose is from the first: the error of a log that ends where it began.
+def start_end_offset(trajectory: Trajectory) -> tuple[float, float]:
+    """Return metres and radians from the first pose to the last: the error of a log that ends where it began.
 
     Raises:
         DataError: The trajectory has no poses.
     """
     if not len(trajectory):
         raise DataError("start-to-end offset: the trajectory has no poses")
-    T_start_end = start_to_end(trajectory)
-    return Offset(
-        translation_m=float(np.linalg.norm(T_start_end[:3, 3])),
-        rotation_rad=angle_between(np.eye(3), T_start_end[:3, :3]),
-    )
+    return length_and_angle(start_to_end(trajectory))
 
 
 def progress_of(matched: Matched, unit: DeltaUnit) -> Array:

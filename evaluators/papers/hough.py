@@ -8,7 +8,7 @@ from statistics import mean, median
 
 import numpy as np
 
-from mapper.core.geometry import Transform, angle_between, inverse
+from mapper.core.geometry import Transform, inverse, length_and_angle
 from mapper.core.rotations import euler_from_rotation
 from mapper.evaluators.compare.registration import distance_to, register
 from mapper.evaluators.papers.hough_pairs import (
@@ -119,9 +119,8 @@ class HoughTrial:
         distance = distance_to(clouds.target).of(clouds.source.points_body, truth)
         values |= {"mpd_truth_m": distance.mpd_m, "right": 0}
         if final is not None:
-            miss = inverse(truth) @ final
-            error_m = float(np.linalg.norm(miss[:3, 3]))
-            error_deg = float(np.degrees(angle_between(miss[:3, :3], np.eye(3))))
+            error_m, error_rad = length_and_angle(inverse(truth) @ final)
+            error_deg = float(np.degrees(error_rad))
             within_m, within_deg = self.pair.within
             is_right = error_m < within_m and error_deg < within_deg
             values |= {"error_m": error_m, "error_deg": error_deg, "right": int(is_right)}

@@ -46,7 +46,7 @@ def summary(run: Run) -> dict[str, Value]:
         "relative_translation_ratio": relative[0],
         "relative_rotation_radpm": relative[1],
         "path_m": trajectory.path_length_m,
-        "start_to_end_m": start_end_offset(trajectory).translation_m,
+        "start_to_end_m": start_end_offset(trajectory)[0],
         "loops": counts.loops,
     }
 

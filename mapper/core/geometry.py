@@ -163,6 +163,11 @@ def angle_between(R_a: Array, R_b: Array) -> float:
     return float(np.linalg.norm(rotation_log(R_a.T @ R_b)))
 
 
+def length_and_angle(T_a_b: Transform) -> tuple[float, float]:
+    """Return how far a motion goes, in metres, and how far it turns, in radians, 0 … π."""
+    return float(np.linalg.norm(T_a_b[:3, 3])), float(np.linalg.norm(rotation_log(T_a_b[:3, :3])))
+
+
 def nearest_rotation(M: Array) -> Array:
     """Return the rotations closest to (…, 3, 3) matrices in the Frobenius norm (Umeyama 1991, lemma)."""
     U, _, Vt = np.linalg.svd(M)

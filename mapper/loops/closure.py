@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 
 from mapper.core.errors import DataError, RunError
-from mapper.core.geometry import Array, Transform, inverse, rotation_log, transform
+from mapper.core.geometry import Array, Transform, inverse, length_and_angle, transform
 from mapper.core.rotations import quaternion_from_rotation, rotation_from_quaternion
 from mapper.graph.model import BetweenFactor, Solution
 from mapper.loops.config import KeyframeLoopsConfig
@@ -114,8 +114,7 @@ class LoopClosure:
 
 def discrepancy(T_i_j: Transform, T_world_i: Transform, T_world_j: Transform) -> Discrepancy:
     """Return the distance of node j from the pose that a measurement from node i gives it."""
-    miss = inverse(T_i_j) @ inverse(T_world_i) @ T_world_j
-    return Discrepancy(float(np.linalg.norm(miss[:3, 3])), float(np.linalg.norm(rotation_log(miss[:3, :3]))))
+    return Discrepancy(*length_and_angle(inverse(T_i_j) @ inverse(T_world_i) @ T_world_j))
 
 
 def exceeds(miss: Discrepancy, limit: Discrepancy) -> bool:

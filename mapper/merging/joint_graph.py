@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.config import Config
-from mapper.core.geometry import Array, Transform, adjoint, angle_between, inverse
+from mapper.core.geometry import Array, Transform, adjoint, inverse, length_and_angle
 from mapper.graph.components import components
 from mapper.graph.config import GraphConfig
 from mapper.graph.model import BetweenFactor, PoseGraph, PoseSigmas
@@ -124,9 +124,9 @@ def _agreement(places: Sequence[SharedPlace], gate: GateConfig) -> NDArray[np.bo
     agree = np.eye(len(places), dtype=bool)
     for (a, one), (b, other) in combinations(enumerate(places), 2):
         in_second = inverse(one.T_second_body) @ other.T_second_body
-        path = NodePath(float(np.linalg.norm(in_second[:3, 3])), angle_between(np.eye(3), in_second[:3, :3]))
+        limits = allowed(gate, NodePath(*length_and_angle(in_second)))
         miss = discrepancy(in_second, one.T_first_body, other.T_first_body)
-        agree[a, b] = agree[b, a] = not exceeds(miss, allowed(gate, path))
+        agree[a, b] = agree[b, a] = not exceeds(miss, limits)
     return agree
 
 
