@@ -107,7 +107,7 @@ def load_source_config(
     Raises:
         ConfigError: As ``load_config``, of that part alone.
     """
-    tree = {} if path is None else _read(Path(path))
+    tree = {} if path is None else _read(_preset_or_file(Path(path)))
     _put_all(
         tree,
         [override for override in overrides if override.startswith("source.")],

@@ -1,5 +1,6 @@
 """Recorded logs as sequences of frames."""
 
+import re
 from contextlib import suppress
 from dataclasses import replace
 from importlib import import_module
@@ -36,6 +37,16 @@ _FORMATS = (
 _MOST_TRIED = 20
 """Folders within a folder that are looked at, to say which is the log."""
 _DEFAULTS = SourceConfig()
+_ADDRESS = re.compile(r"\w+:/")
+_IMAGES = {".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff", ".ppm"}
+_ARCHIVES = (".zip", ".tar", ".tgz", ".gz", ".bz2", ".xz", ".zst", ".7z", ".rar")
+_VIDEOS = (".mp4", ".mov", ".avi", ".webm", ".m4v")
+_OTHER_FILES = {
+    **dict.fromkeys(_ARCHIVES, "an archive; unpack it, and open the folder"),
+    **dict.fromkeys(_VIDEOS, "a video, which has no depth; open the folder of its log"),
+    **dict.fromkeys(_IMAGES, "one image; open the folder of its log"),
+}
+"""What files are that are no logs, and what to do, by their ending."""
 
 
 def open_source(path: Path, config: SourceConfig = _DEFAULTS) -> "Log":
@@ -59,7 +70,9 @@ def open_source(path: Path, config: SourceConfig = _DEFAULTS) -> "Log":
     from mapper.sources.wheel_files import read_wheels
 
     if not path.exists():
-        raise SourceError(f"{path}: no such file or folder")
+        address = _ADDRESS.match(f"{path}")
+        what = "an address; download it, and open the file" if address else "no such file or folder"
+        raise SourceError(f"{path}: {what}")
     if not (path.is_dir() or path.is_file()):
         raise SourceError(f"{path}: a device or a pipe; want a file or a folder")
     if name := format_of(path):
@@ -83,12 +96,24 @@ def open_source(path: Path, config: SourceConfig = _DEFAULTS) -> "Log":
         return selected(log, config)
     if (path / MANIFEST_NAME).is_file():
         raise SourceError(f"{path}: holds what mapper made, not a log; mapper eval {path} judges it")
+    if what := _other_data(path):
+        raise SourceError(f"{path}: {what}")
     hint = "; of clouds it has one, want two or more" if most_clouds(path) == 1 else _inner_hint(path)
     raise SourceError(
         f"{path}: not a log of a known format (TUM, ICL-NUIM, Poznań, 7-Scenes, Redwood, KITTI, clouds, "
         ".mcap, .bag, .db3, .pcap, .mbag, .sens, .r3d, exports of apps); docs/your-sensor.md names the files "
         f"of each{hint}"
     )
+
+
+def _other_data(path: Path) -> str:
+    """Return what a file or folder of other data is and what to do; empty if its name does not say."""
+    if path.is_file():
+        return _OTHER_FILES.get(path.suffix.lower(), "")
+    endings = {inner.suffix.lower() for inner in path.iterdir() if inner.is_file()}
+    if endings and endings <= _IMAGES:
+        return "images alone; depth images belong beside them, as in rgb/ and depth/"
+    return ""
 
 
 def format_of(path: Path) -> str | None:

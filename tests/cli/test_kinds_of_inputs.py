@@ -85,3 +85,18 @@ def test_a_verb_answers_to_each_kind_of_input(verb, kind, inputs, options):
         assert result.stderr.startswith("mapper: ")
         assert str(inputs[kind]) in result.stderr
         assert result.stderr.count("\n") == 1
+
+
+def test_data_that_are_no_logs_are_named(tmp_path):
+    images = tmp_path / "images"
+    images.mkdir()
+    for name in ("a.jpg", "b.jpg"):
+        (images / name).write_bytes(b"")
+    named = {images: "depth", images / "a.jpg": "one image"}
+    for name, what in (("walk.mp4", "video"), ("log.zip", "archive"), ("log.tar.gz", "archive")):
+        (tmp_path / name).write_bytes(b"")
+        named[tmp_path / name] = what
+    named["https://example.org/log.bag"] = "download"
+    for path, what in named.items():
+        said = invoke("inspect", path)
+        assert (said.exit_code, what in said.stderr, UNKNOWN in said.stderr) == (1, True, False), said.stderr
