@@ -29,7 +29,7 @@ from mapper.sources.writers import LogKind, write_log
 from tests.support.clouds import save_cloud
 from tests.support.depth_cameras import write_unregistered
 from tests.support.desk import DESK, build_desk_run
-from tests.support.driver_recordings import street, write_livox, write_vlp16
+from tests.support.driver_recordings import street, write_livox, write_pcap, write_vlp16
 from tests.support.logs import MemoryEntry, log_in_memory
 from tests.support.octree_maps import COLORED, mapped
 from tests.support.posed_scans import WRITERS, shots_of
@@ -298,6 +298,10 @@ def _velodyne(folder: Path) -> Path:
     return write_vlp16(folder / "log.bag", street(azimuth_steps=90, duration_s=0.3), scans=2)[0]
 
 
+def _pcap(folder: Path) -> Path:
+    return write_pcap(folder / "log.pcap", street(azimuth_steps=90, duration_s=0.3), packets=200)
+
+
 FORMATS: Mapping[str, Maker] = {
     "tum": _written(rgbd_log, "tum", "log"),
     "mbag": _written(rgbd_log, "mbag", "log"),
@@ -327,6 +331,7 @@ FORMATS: Mapping[str, Maker] = {
     "redwood, npy": _scan("redwood"),
     "bag, livox": _livox,
     "bag, velodyne": _velodyne,
+    "pcap": _pcap,
     "poznan": _poznan,
     **{
         f"clouds, {ending[1:]}": _clouds(ending)

@@ -1,5 +1,7 @@
 """Captures of a Velodyne's packets become scans, a turn each."""
 
+import os
+
 import numpy as np
 import pytest
 
@@ -38,6 +40,9 @@ def test_turns_that_are_cut_and_a_damaged_end_are_left_out(tmp_path, simulator):
     assert any("1 of 4 turns are cut" in note for note in log.notes)
     path.write_bytes(data[: int(0.7 * len(data))])
     assert len(open_source(path)) == 2
+    path.write_bytes(data)
+    os.truncate(path, 1 << 40)  # a hole behind it
+    assert len(open_source(path)) == 3
 
 
 @pytest.mark.parametrize("data", [b"", b"x" * 100, bytes(24)])

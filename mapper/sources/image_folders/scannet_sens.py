@@ -116,6 +116,7 @@ def _read(file: BinaryIO, path: Path, config: SourceConfig) -> PosedFrames:
         colour_bytes, depth_bytes = (0, size) if record is None else record["bytes"].tolist()
         if (
             record is None
+            or colour_bytes == 0  # zeros: a file system's hole may have terabytes of them
             or start + colour_bytes + depth_bytes > size
             or max(colour_bytes, depth_bytes) > MOST_BYTES
         ):

@@ -162,6 +162,8 @@ def _captured(path: Path, offset: int | None = None) -> Iterator[tuple[int, _Pac
                     received_s, data = next(packets)
                 except Exception:  # it ends, is cut off, or damaged from here on
                     return
+                if not data:  # zeros: a file system's hole may have terabytes of them
+                    return
                 yield place, _unwrap(received_s, data)
     except OSError as error:
         raise SourceError(f"{path}: cannot be read: {error.strerror}") from None
