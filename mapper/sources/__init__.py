@@ -100,9 +100,8 @@ def open_source(path: Path, config: SourceConfig = _DEFAULTS) -> "Log":
         raise SourceError(f"{path}: {what}")
     hint = "; of clouds it has one, want two or more" if most_clouds(path) == 1 else _inner_hint(path)
     raise SourceError(
-        f"{path}: not a log of a known format (TUM, ICL-NUIM, Poznań, 7-Scenes, Redwood, KITTI, clouds, "
-        ".mcap, .bag, .db3, .pcap, .mbag, .sens, .r3d, exports of apps); docs/your-sensor.md names the files "
-        f"of each{hint}"
+        f"{path}: not a log of a known format (TUM, 7-Scenes, KITTI, clouds, exports of apps, .mcap, .bag, "
+        f".db3, .pcap, .mbag, .sens, .r3d); docs/your-sensor.md has them all{hint}"
     )
 
 

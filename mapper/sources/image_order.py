@@ -46,28 +46,26 @@ def _order_warnings(log: Log) -> list[str]:
     def view(index: int) -> Array | None:
         return _view(log, index)
 
-    def differences(places: int) -> tuple[Array, Array, Array]:
-        """Return the (N,) differences of consecutive images, and those of any two."""
+    for places in (_PLACES, _ALL_PLACES):
         first = np.unique(np.linspace(0, len(log) - 2, places).astype(int)).tolist()
         pairs = [(k, k + 1) for k in first if view(k) is not None and view(k + 1) is not None]
-        indices = np.unique(np.array(pairs, dtype=int).reshape(-1, 2))
+        if len(pairs) < _PLACES - 1:
+            return []
+        indices = np.unique(pairs)
         views = np.array([view(k) for k in indices.tolist()])
         between = np.array([np.sqrt(((views - one) ** 2).mean(axis=1)) for one in views])
-        ends = np.searchsorted(indices, pairs).T
-        return between[ends[0], ends[1]], between, np.subtract.outer(indices, indices)
-
-    for places in (_PLACES, _ALL_PLACES):
-        consecutive, between, apart = differences(places)
-        others = between[np.abs(apart) > 1]
-        if len(consecutive) < _PLACES - 1 or np.median(consecutive) < _UNLIKE * np.median(others):
+        apart = np.abs(np.subtract.outer(indices, indices))
+        begins, ends = np.searchsorted(indices, pairs).T
+        consecutive = between[begins, ends]
+        if np.median(consecutive) < _UNLIKE * np.median(between[apart > 1]):
             return []
-    nearest = np.where(np.abs(apart) > 1, between, np.inf).min(axis=1)
+    nearest = np.where(apart > 1, between, np.inf).min(axis=1)
     ratio = float(np.median(consecutive) / max(np.median(nearest), 1e-9))
     if ratio < _LESS_ALIKE:
         return []
     return [
-        f"stamps: consecutive images are no more alike than any two, and each is {ratio:.1f} times as like "
-        "another; are the stamps those of other images (a list sorted by text, or shuffled)?"
+        "stamps: consecutive images are no more alike than any two, though each has another that is "
+        f"{ratio:.1f} times as like it; are the stamps those of other images (sorted by text, or shuffled)?"
     ]
 
 
