@@ -45,7 +45,7 @@ from mapper.pipeline.build import level_of
 from mapper.pipeline.components import largest_component
 from mapper.pipeline.joined_components import joined
 from mapper.pipeline.solve import solve
-from mapper.pipeline.track import noted_depth_warnings, track_log
+from mapper.pipeline.track import noted_log_warnings, track_log
 from mapper.pipeline.tracking_result import TrackingResult, from_tracking, refuse_a_fragment
 from mapper.run.doubtful_frames import without_doubtful
 from mapper.run.manifest import Levelling, Verdict
@@ -245,7 +245,7 @@ def verdict(log: Log, config: BuildConfig, tracking: TrackingResult, stored: Sto
     """Return the verdict on a run of a solved log, with no warning that rests on the truth."""
     level = level_of(log, tracking, config)
     levelling = Levelling(method=level.method, detail=level.detail, has_floor=level.has_floor)
-    warnings = (*noted_depth_warnings(log, SILENT), *tracking.warnings)
+    warnings = (*noted_log_warnings(log, SILENT), *tracking.warnings)
     manifest = first_manifest(log).model_copy(update={"warnings": warnings, "levelling": levelling})
     poses = uncertain_poses(stored.trajectory, stored.graph, stored.records)
     results = RunResults(

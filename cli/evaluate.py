@@ -181,7 +181,7 @@ def _answer(run: "Run | None", metrics: "list[Metric]", found: "Assessment", for
 
     text = _text(metrics, found, format_)
     if found.matched is None and format_ in ("text", "markdown"):
-        text += "\n\nno ground truth, so no errors: --truth FILE gives one"
+        text += "\n\nno ground truth, so no errors: --truth FILE compares with one"
     document: dict[str, Any] = {"metrics": records_of(_every_metric(metrics, found))}
     if run is not None:
         from mapper.cli.summary import verdict_text

@@ -17,7 +17,7 @@ from mapper.pipeline.fuse import carry_times, fuse_into
 from mapper.pipeline.joined_components import joined
 from mapper.pipeline.reobserve import reobserve
 from mapper.pipeline.solve import solve
-from mapper.pipeline.track import Start, noted_depth_warnings, session_odometry, track_log
+from mapper.pipeline.track import Start, noted_log_warnings, session_odometry, track_log
 from mapper.pipeline.tracking_result import TrackingResult, from_tracking, refuse_a_fragment, save_places
 from mapper.run.edits_file import edits_text, parse_edits, write_edits
 from mapper.run.folder import Run, open_run
@@ -72,7 +72,7 @@ def append(
     source = chained(first, second)
     for note in source.notes:
         progress.note(note)
-    warnings = noted_depth_warnings(second, progress)
+    warnings = noted_log_warnings(second, progress)
     whole = config.model_copy(update={"source": run.config.source})
     with write_run(out, _manifest(run, source, config.source), whole, overwrite=overwrite) as writer:
         carry_times(writer, run.manifest.timing)

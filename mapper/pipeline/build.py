@@ -29,7 +29,7 @@ from mapper.pipeline.checkpoints import (
 from mapper.pipeline.components import largest_component
 from mapper.pipeline.joined_components import joined
 from mapper.pipeline.solve import solve
-from mapper.pipeline.track import first_session, noted_depth_warnings, track_log
+from mapper.pipeline.track import first_session, noted_log_warnings, track_log
 from mapper.pipeline.tracking_checkpoints import TrackingCheckpoints
 from mapper.pipeline.tracking_result import TrackingResult, from_tracking, refuse_a_fragment, save_places
 from mapper.run import files
@@ -81,7 +81,7 @@ def build(
             by another version was not finished there.
     """
     check_stamps(source.stamps_ns)
-    warnings = noted_depth_warnings(source, progress)
+    warnings = noted_log_warnings(source, progress)
     poses = odometry if isinstance(odometry, Trajectory) else None
     if odometry is not None and poses is None:
         checkpoint_s = None  # the state of a caller's own class cannot be kept

@@ -35,7 +35,7 @@ from mapper.odometry.node_offset import NodeOffset
 from mapper.pipeline.components import component_of, disconnected
 from mapper.pipeline.known_map import KnownMap, detector_of, loops_between_days
 from mapper.pipeline.solve import solve
-from mapper.pipeline.track import Start, noted_depth_warnings, session_odometry, track_log
+from mapper.pipeline.track import Start, noted_log_warnings, session_odometry, track_log
 from mapper.pipeline.tracking_result import TrackingResult, from_tracking
 from mapper.run import files
 from mapper.run.frame_outcomes import FrameRecord
@@ -185,7 +185,7 @@ def localise(
         RunError: OUT is there already.
     """
     _refuse_unfit(source, known, config)
-    warnings = noted_depth_warnings(source, progress)
+    warnings = noted_log_warnings(source, progress)
     start = first_manifest(source)
     manifest = LocalisedManifest(map=str(known.path.resolve()), **dict(start))
     with write_run(out, manifest, config, overwrite=overwrite, kind=files.LOCALISED_LOG) as writer:

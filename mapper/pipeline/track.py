@@ -288,7 +288,7 @@ def _wheel_measurements(source: Log, config: BuildConfig) -> WheelMeasurements:
     return WheelMeasurements(wheels, config.graph.wheels)
 
 
-def noted_depth_warnings(source: Log, progress: Progress) -> list[RunWarning]:
+def noted_log_warnings(source: Log, progress: Progress) -> list[RunWarning]:
     """Return what is implausible about a log's stamps, depth or scans, before it is tracked, and note it."""
     warnings = [
         *(RunWarning(kind="stamps", sentence=text, weight="doubt") for text in time_warnings(source)),

@@ -1,6 +1,7 @@
 """Exports of phones and published scans are read as they lie, and mapped."""
 
 import contextlib
+import os
 import sys
 
 import numpy as np
@@ -120,6 +121,38 @@ def test_damage_is_one_line_or_lost_frames(shots, tmp_path, kind):
             file.write_bytes(damaged)
             assert "\n" not in _read_all(path)
         file.write_bytes(whole)
+
+
+@pytest.mark.parametrize("kind", sorted(WRITERS))
+def test_links_out_are_refused_and_pipes_are_no_images(shots, tmp_path, kind):
+    """Each image, video and packed file is in turn a link to a file elsewhere, and a pipe."""
+    (tmp_path / "log").mkdir()
+    write, name = WRITERS[kind]
+    path = write(tmp_path / "log" / name, Shots(shots.camera, shots.frames[:2]))
+    if path.suffix == ".r3d":
+        path = write_record3d(tmp_path / "log" / "unpacked", Shots(shots.camera, shots.frames[:2]))
+    folder = path.parent if path.is_file() else path
+    images = {".png", ".jpg", ".npy", ".mp4", ".sens", ".depth", ".conf"}
+    for file in [one for one in sorted(folder.rglob("*")) if one.suffix in images]:
+        moved = file.rename(tmp_path / "elsewhere")
+        file.symlink_to(moved)
+        with pytest.raises(SourceError, match="out of the log"):
+            open_source(folder)
+        file.unlink()
+        os.mkfifo(file)
+        _read_all(folder)
+        file.unlink()
+        moved.rename(file)
+
+
+@pytest.mark.parametrize("part", ["depth", "conf"])
+def test_what_a_record3d_recording_packs_has_a_limit(shots, tmp_path, part):
+    import lzfse
+
+    path = write_record3d(tmp_path / "scan", Shots(shots.camera, shots.frames[:2]))
+    (path / f"rgbd/0.{part}").write_bytes(lzfse.compress(bytes(2**28)))
+    with pytest.raises(FrameError, match="more than"):
+        open_source(path).entry_at(0).load()
 
 
 def _read_all(path):

@@ -82,7 +82,8 @@ class Layout:
         if path.is_file():
             return path.suffix.lower() in self.files
         globs = [glob for glob in self.files if not glob.startswith(".")]
-        return bool(globs) and all(any(path.glob(glob)) for glob in globs) and self.holds_too(path)
+        found = all(any(map(Path.is_file, path.glob(glob))) for glob in globs)  # opening a pipe would wait
+        return bool(globs) and found and self.holds_too(path)
 
 
 def log_of(layout: Layout, path: Path, config: SourceConfig) -> Log:
@@ -155,8 +156,8 @@ def _whole(frames: Sequence[PosedFrame], path: Path) -> tuple[Sequence[PosedFram
         raise SourceError(f"{path}: no frame in it")
     missing = np.zeros(len(frames), bool)
     for files in ([frame.colour for frame in frames], [frame.depth for frame in frames]):
-        at = [i for i, file in enumerate(files) if isinstance(file, Path)]
-        missing[at] |= ~np.array(present(Path(f"{files[i]}") for i in at), bool)
+        paths = {i: file for i, file in enumerate(files) if isinstance(file, Path)}
+        missing[list(paths)] |= ~np.array(present(paths.values()), bool)
     whole = [frame for frame, is_missing in zip(frames, missing.tolist(), strict=True) if not is_missing]
     if not whole:
         raise SourceError(

@@ -21,8 +21,10 @@ from mapper.runtime.regular_files import MOST_BYTES
 from mapper.sources.config import SourceConfig
 from mapper.sources.image_files.confidence import NOTE, without_low_confidence
 from mapper.sources.image_files.decoded import DecodedColour, DecodedDepth
-from mapper.sources.image_files.reading import TUM_UNITS_PER_M, decode_colour, decode_grey
+from mapper.sources.image_files.reading import TUM_UNITS_PER_M, bytes_of, decode_colour, decode_grey
+from mapper.sources.image_files.size import MOST_MEGAPIXELS
 from mapper.sources.image_folders.json_files import parse_json
+from mapper.sources.image_folders.numbered import stamp_at
 from mapper.sources.image_folders.posed import (
     PosedFrame,
     PosedFrames,
@@ -30,10 +32,14 @@ from mapper.sources.image_folders.posed import (
     median_camera,
     pose_of_opengl,
 )
+from mapper.sources.listed_files import refuse_links_out
 from mapper.sources.text import poses_from_numbers
 
 FILES = (".r3d", "metadata", "rgbd/*.jpg")
 _FPS = 60.0
+_BLOCK = b"bvx"
+_LEAST_BLOCK_BYTES = 20_000
+"""A block but the last has 40 000 bytes or more, and unpacks to 27 MB at most."""
 _EXTRA, _PURPOSE = "record3d", "reading Record3D's depth"
 
 
@@ -48,6 +54,10 @@ class _Metadata(BaseModel):
     perFrameIntrinsicCoeffs: list[list[float]] | None = None  # noqa: N815
     poses: list[list[float]] | None = None
 
+    def pixels(self) -> int:
+        """Return the largest number of pixels of depth, which is not finer than colour."""
+        return min((self.dw or self.w) * (self.dh or self.h), MOST_MEGAPIXELS * 10**6)
+
 
 class _Members:
     """Files of a recording, by their names within it; safe in any thread."""
@@ -55,11 +65,13 @@ class _Members:
     def __init__(self, path: Path) -> None:
         self._path = path
         self._archive: zipfile.ZipFile | None = None
-        if not path.is_dir():
-            try:
-                self._archive = zipfile.ZipFile(path)
-            except (OSError, zipfile.BadZipFile) as error:
-                raise SourceError(f"{path}: no Record3D recording: {error}") from None
+        if path.is_dir():
+            refuse_links_out([path / "metadata", *path.glob("rgbd/*")], log=path)
+            return
+        try:
+            self._archive = zipfile.ZipFile(path)
+        except (OSError, zipfile.BadZipFile) as error:
+            raise SourceError(f"{path}: no Record3D recording: {error}") from None
 
     def names(self) -> list[str]:
         if self._archive is not None:
@@ -67,9 +79,9 @@ class _Members:
         return [path.relative_to(self._path).as_posix() for path in self._path.glob("rgbd/*")]
 
     def read(self, name: str) -> bytes:
+        if self._archive is None:
+            return bytes_of(self._path / name)
         try:
-            if self._archive is None:
-                return (self._path / name).read_bytes()
             if (size := self._archive.getinfo(name).file_size) > MOST_BYTES:
                 raise FrameError(f"{self._path}: {name} has {size} bytes; {MOST_BYTES} are read at most")
             return self._archive.read(name)
@@ -129,7 +141,7 @@ def read_frames(path: Path, config: SourceConfig) -> PosedFrames:
 def _stamp_ns(metadata: _Metadata, number: int) -> int:
     stamps = metadata.frameTimestamps
     if stamps is None or number >= len(stamps):
-        return round(number * NS_PER_S / metadata.fps)
+        return stamp_at(number, rate_hz=metadata.fps)
     return round(stamps[number] * NS_PER_S)
 
 
@@ -154,7 +166,8 @@ def _depth(members: _Members, path: Path, stem: str, metadata: _Metadata, is_con
     where = f"{path}: {stem}.depth"
 
     def decode() -> DepthImage:
-        numbers = np.frombuffer(_unpack(members.read(f"{stem}.depth"), where), np.uint8)
+        most = metadata.pixels()
+        numbers = np.frombuffer(_unpack(members.read(f"{stem}.depth"), where, most_bytes=4 * most), np.uint8)
         shape = _shape(metadata, len(numbers) // 4)
         if shape is None or len(numbers) != 4 * shape[0] * shape[1]:
             raise FrameError(f"{where}: {len(numbers)} bytes are no image of 32-bit depth of the stated size")
@@ -162,7 +175,7 @@ def _depth(members: _Members, path: Path, stem: str, metadata: _Metadata, is_con
             numbers.view("<f4").reshape(shape), nan=0.0, posinf=0.0, neginf=0.0
         )
         if is_confident:
-            levels = np.frombuffer(_unpack(members.read(f"{stem}.conf"), f"{stem}.conf"), np.uint8)
+            levels = np.frombuffer(_unpack(members.read(f"{stem}.conf"), where, most_bytes=most), np.uint8)
             if len(levels) != depth_m.size:
                 raise FrameError(f"{where}: {len(levels)} bytes of confidence for {depth_m.size} pixels")
             depth_m = without_low_confidence(depth_m, levels.reshape(shape), where)
@@ -171,9 +184,12 @@ def _depth(members: _Members, path: Path, stem: str, metadata: _Metadata, is_con
     return DecodedDepth(where, decode, TUM_UNITS_PER_M)
 
 
-def _unpack(data: bytes, where: str) -> bytes:
+def _unpack(data: bytes, where: str, *, most_bytes: int) -> bytes:
+    """Return what LZFSE packed; its library has no limit, so the number of blocks is limited."""
     import lzfse
 
+    if data.count(_BLOCK) > 2 + most_bytes // _LEAST_BLOCK_BYTES:
+        raise FrameError(f"{where}: unpacks to more than the {most_bytes} bytes of an image")
     try:
         return bytes(lzfse.decompress(data))
     except (lzfse.error, ValueError, MemoryError) as error:

@@ -4,7 +4,7 @@ https://github.com/ScanNet/ScanNet/tree/master/SensReader
 """
 
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import BinaryIO
@@ -13,15 +13,15 @@ import numpy as np
 
 from mapper.core.errors import FrameError, SourceError
 from mapper.core.frames import DepthImage
-from mapper.core.timebase import NS_PER_S
 from mapper.core.units import MM_PER_M
 from mapper.runtime.regular_files import MOST_BYTES
 from mapper.sources.calibration import Calibration
 from mapper.sources.config import SourceConfig
 from mapper.sources.image_files.decoded import DecodedDepth
 from mapper.sources.image_files.reading import depth_m_from
-from mapper.sources.image_folders.numbered import RATE_HZ
+from mapper.sources.image_folders.numbered import RATE_HZ, stamp_at
 from mapper.sources.image_folders.posed import PosedFrame, PosedFrames, camera_of
+from mapper.sources.listed_files import refuse_links_out
 from mapper.sources.text import pose_from_matrix
 
 FILES = (".sens", "*.sens")
@@ -72,9 +72,10 @@ def read_frames(path: Path, config: SourceConfig) -> PosedFrames:
         SourceError: There are several files, or it is of another version or damaged.
     """
     if path.is_dir():
-        files = sorted(path.glob("*.sens"))
+        files = sorted(filter(Path.is_file, path.glob("*.sens")))
         if len(files) > 1:
             raise SourceError(f"{path}: holds {len(files)} .sens files; open one of them")
+        refuse_links_out(files, log=path)
         path = files[0]
     try:
         with path.open("rb") as file:
@@ -140,8 +141,7 @@ def _read(file: BinaryIO, path: Path, config: SourceConfig) -> PosedFrames:
             f"{path.name} has no times of frames; {rate_hz:g} frames a second assumed (source.rate_hz)"
         )
         frames = [
-            PosedFrame(round(i * NS_PER_S / rate_hz), frame.colour, frame.depth, frame.T_world_camera)
-            for i, frame in enumerate(frames)
+            replace(frame, stamp_ns=stamp_at(number, rate_hz=rate_hz)) for number, frame in enumerate(frames)
         ]
     return PosedFrames(frames, camera, units_per_m, notes)
 
