@@ -16,7 +16,8 @@ _RATIO = 8.0
 """Steps off the path and back, in the log's median ones over as many frames: as for jumps while tracking."""
 _LEAST_M, _LEAST_RAD = 0.1, np.radians(5.0)
 _CARRIED_MPS2, _CARRIED_RADPS2 = 4.0, 10.0
-"""Accelerations with which sensors are carried: within seconds a car swerves, and a head looks aside."""
+"""Accelerations with which sensors are carried: within seconds a car swerves, and a head looks aside. By an
+acceleration a, what has returned after a time t went at most a·t²/8 aside."""
 
 
 class _Spike(NamedTuple):
