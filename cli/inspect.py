@@ -88,6 +88,11 @@ def _log_rows(log: "LogFacts") -> list[tuple[str, str]]:
         rows.append(("accelerations", f"{log.readings} readings"))
     if log.gyroscope is not None:
         rows.append(("gyroscope", f"{log.gyroscope.count} readings: {_timing_text(log.gyroscope)}"))
+    if log.gnss is not None:
+        sigma = "not stated" if log.gnss_sigma_m is None else f"{log.gnss_sigma_m:.2g} m (median)"
+        rows.append(
+            ("gnss", f"{log.gnss.count} fixes ({log.gnss_status}), σ {sigma}: {_timing_text(log.gnss)}")
+        )
     if log.vehicle is not None:
         numbers = ",".join(f"{v:g}" for v in log.vehicle)
         rows.append(

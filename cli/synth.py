@@ -28,7 +28,7 @@ SceneName = Literal[
 ]
 
 _NOT_OF: Mapping[SensorKind, tuple[str, ...]] = {
-    "rgbd": ("--rings",),
+    "rgbd": ("--rings", "--gnss"),
     "lidar": ("--path", "--rooms", "--plane-at", "--uncalibrated"),
     "line-laser": (
         "--path",
@@ -38,6 +38,7 @@ _NOT_OF: Mapping[SensorKind, tuple[str, ...]] = {
         "--rings",
         "--wheels",
         "--imu",
+        "--gnss",
         "--moving",
         "--uncalibrated",
     ),
@@ -76,6 +77,9 @@ def synth(
     imu: Annotated[
         bool, typer.Option("--imu", help="imu.csv has the readings of an inertial measurement unit.")
     ] = False,
+    gnss: Annotated[
+        bool, typer.Option("--gnss", help="lidar: gnss.txt has the fixes of a GNSS receiver.")
+    ] = False,
     moving: Annotated[
         bool,
         typer.Option(
@@ -111,6 +115,7 @@ def synth(
         "--rings": rings,
         "--wheels": wheels,
         "--imu": imu,
+        "--gnss": gnss,
         "--moving": moving,
         "--uncalibrated": uncalibrated,
     }
@@ -170,6 +175,7 @@ def _write_lidar_log(
         SynthImuConfig,
         SynthWheelsConfig,
     )
+    from mapper.simulation.gnss_config import SynthGnssConfig
     from mapper.simulation.lidar import write_lidar_log
 
     start = _scene(LIDAR_SCENES, name, "lidar")
@@ -180,6 +186,8 @@ def _write_lidar_log(
         changed["wheels"] = SynthWheelsConfig()
     if options["--imu"]:
         changed["imu"] = SynthImuConfig()
+    if options["--gnss"]:
+        changed["gnss"] = SynthGnssConfig()
     config = overridden(start.model_copy(update=changed), overrides)
     with output.progress().stage("scan") as report:
         write_lidar_log(out, config, on_progress=report)

@@ -6,6 +6,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, model_validator
 
 from mapper.core.config import Config, Ratio
+from mapper.simulation.gnss_config import SynthGnssConfig
 
 
 class SensorConfig(Config):
@@ -297,6 +298,8 @@ class LidarSynthConfig(Config):
     """What is read of the vehicle's wheels."""
     imu: SynthImuConfig | None = None
     """Inertial readings of the log; None is none."""
+    gnss: SynthGnssConfig | None = None
+    """Fixes of a GNSS receiver; None is none."""
 
     sensor: LidarSensorConfig = LidarSensorConfig()
 
@@ -325,7 +328,7 @@ _LATER = {
     SensorConfig: {
         *("readout_s", "depth_delay_s", "radial_k1", "radial_k2", "depth_scale", "disparity_warp_px"),
     },
-    LidarSynthConfig: {"wheels", "imu", "cars", "cyclists", "pedestrians", "day"},
+    LidarSynthConfig: {"wheels", "imu", "gnss", "cars", "cyclists", "pedestrians", "day"},
     LidarSensorConfig: set(),
 }
 """Settings that came after the first logs."""

@@ -1,24 +1,31 @@
-"""Readings of a moving sensor's wheels and of its inertial measurement unit, with their errors."""
+"""Readings of a moving sensor's wheels, inertial measurement unit and GNSS receiver, with their errors."""
 
 from collections.abc import Callable
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from mapper.core.frames import Sensor
+from mapper.core.geodesy import GeodeticOrigin
 from mapper.core.geometry import Array, Transform, exp, inverse, transform
 from mapper.core.rotations import rotation_from_euler
 from mapper.core.timebase import NS_PER_S
 from mapper.core.trajectory import Trajectory
 from mapper.core.units import GRAVITY_MPS2
+from mapper.sensing.gnss import GnssFixes
 from mapper.sensing.gyroscope import Gyroscope
 from mapper.simulation.config import SynthImuConfig, SynthWheelsConfig
+from mapper.simulation.gnss_config import SynthGnssConfig
 from mapper.simulation.path import START_NS
 from mapper.sources.base import Accelerations
 from mapper.sources.wheel_files import LOOKING_FORWARD
 
-_IMU_NAME = "imu.csv"
+_IMU_NAME, _GNSS_NAME = "imu.csv", "gnss.txt"
+_AXES = np.array([1.0, 1.0, 2.0])
+"""Errors of a receiver along east, north and up."""
 _STEP_S = 2e-3  # of the differences by which the path's derivatives are taken
 
 
@@ -100,3 +107,48 @@ def measure_imu(
     stamps_ns = START_NS + np.round((times_s + config.offset_s) * NS_PER_S).astype(np.int64)
     unit_mps2 = GRAVITY_MPS2 if config.in_g else 1.0
     return Gyroscope(_IMU_NAME, stamps_ns, rates_imu), Accelerations(stamps_ns, felt_imu / unit_mps2)
+
+
+def measure_gnss(
+    config: SynthGnssConfig, poses: Callable[[Array], Array], *, duration_s: float, rng: np.random.Generator
+) -> GnssFixes:
+    """Return the fixes of a receiver whose antenna is on the body; an outage has none.
+
+    Noise is white, a bias is a Gauss-Markov process, and reflections add an offset of one direction. The
+    covariance that is stated is that of noise and bias.
+
+    Args:
+        config: Errors, antenna, and where the scene is on Earth.
+        poses: Maps (N,) seconds after the start to (N, 4, 4) exact T_world_body, z up.
+        duration_s: Length of the log.
+        rng: Source of the errors.
+    """
+    count = round(duration_s * config.rate_hz) + 1
+    times_s = np.arange(count) / config.rate_hz
+    T_world_body = poses(times_s)
+    antenna_body = np.array(config.antenna_body)
+    antenna_world = T_world_body[:, :3, :3] @ antenna_body + T_world_body[:, :3, 3]
+    points_enu = antenna_world @ rotation_from_euler(0.0, 0.0, config.heading_rad).T
+    kept_share = np.exp(-1.0 / (config.rate_hz * config.bias_s))
+    steps = np.sqrt(1.0 - kept_share**2) * rng.standard_normal((count, 3))
+    steps[0] = rng.standard_normal(3)
+    bias = lfilter([1.0], [1.0, -kept_share], steps, axis=0)
+    errors = config.noise_m * rng.standard_normal((count, 3)) + config.bias_m * bias
+    direction = rng.standard_normal(3)
+    is_reflected = _during(times_s, config.multipath_start_s, config.multipath_duration_s)
+    errors[is_reflected] += config.multipath_m * direction / np.linalg.norm(direction)
+    origin = GeodeticOrigin(config.latitude_deg, config.longitude_deg, config.height_m)
+    sigmas = np.hypot(config.noise_m, config.bias_m) * _AXES
+    fixes = GnssFixes(
+        _GNSS_NAME,
+        START_NS + np.round(times_s * NS_PER_S).astype(np.int64),
+        origin.geodetic(points_enu + _AXES * errors),
+        np.tile(np.diag(sigmas**2), (count, 1, 1)),
+        np.zeros(count, np.int8),
+        antenna_body,
+    )
+    return fixes.of(~_during(times_s, config.outage_start_s, config.outage_duration_s))
+
+
+def _during(times_s: Array, start_s: float, duration_s: float) -> NDArray[np.bool_]:
+    return np.asarray((times_s >= start_s) & (times_s < start_s + duration_s))

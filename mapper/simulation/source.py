@@ -24,7 +24,7 @@ from mapper.simulation.disturbances import between, disturbed, shown_frames
 from mapper.simulation.movers import Movers, make_movers
 from mapper.simulation.path import Motion, frame_stamps, make_motion, seconds_of
 from mapper.simulation.raycast import Rendering
-from mapper.simulation.readings import measure_imu, measure_wheels
+from mapper.simulation.readings import measure_gnss, measure_imu, measure_wheels
 from mapper.simulation.scene import Scene, make_scene
 from mapper.simulation.sensor import observe, warp_of
 from mapper.simulation.shutter import Shutter
@@ -87,7 +87,7 @@ def synthetic_log(
     poses: Callable[[Array], Array],
     simulate: Callable[[int, bool], Frame],
 ) -> Log:
-    """Return the log of a simulated sensor, with wheel odometry and inertial readings where configured.
+    """Return the log of a simulated sensor, with wheels, an IMU and GNSS where configured.
 
     Args:
         config: Settings of the log.
@@ -97,7 +97,7 @@ def synthetic_log(
         poses: Maps (N,) seconds after the start to (N, 4, 4) exact T_world_body.
         simulate: Returns a frame by its number; an image is grey where the second argument is false.
     """
-    wheels = gyroscope = accelerations = None
+    wheels = gyroscope = accelerations = gnss = None
     last_s = float(seconds_of(truth.stamps_ns[-1:])[0])
     if config.wheels is not None:
         rng = rng_of(config.seed, Stream.WHEELS)
@@ -106,6 +106,9 @@ def synthetic_log(
         rng = rng_of(config.seed, Stream.IMU)
         duration_s = last_s + _IMU_AFTER_S
         gyroscope, accelerations = measure_imu(config.imu, poses, duration_s=duration_s, rng=rng)
+    if isinstance(config, LidarSynthConfig) and config.gnss is not None:
+        rng = rng_of(config.seed, Stream.GNSS)
+        gnss = measure_gnss(config.gnss, poses, duration_s=last_s, rng=rng)
     return Log(
         path=Path(name),
         name=name,
@@ -117,6 +120,7 @@ def synthetic_log(
         wheels=wheels,
         gyroscope=gyroscope,
         accelerations=accelerations,
+        gnss=gnss,
     )
 
 

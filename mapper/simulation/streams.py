@@ -26,6 +26,7 @@ class Stream(IntEnum):
     WARP = 12
     DAY = 13
     IMU = 14
+    GNSS = 15
 
 
 def rng_of(seed: int, stream: Stream, index: int = 0) -> np.random.Generator:

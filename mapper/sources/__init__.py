@@ -63,6 +63,7 @@ def open_source(path: Path, config: SourceConfig = _DEFAULTS) -> "Log":
             has no frame such as is to be its body.
         DependencyError: A library that decodes it is not installed.
     """
+    from mapper.sources.gnss_files import read_gnss
     from mapper.sources.imu_files import read_imu
     from mapper.sources.listed_files import unused_note
     from mapper.sources.scan_folders.scan_folder import most_clouds
@@ -91,6 +92,9 @@ def open_source(path: Path, config: SourceConfig = _DEFAULTS) -> "Log":
                 log = replace(log, gyroscope=gyroscope, notes=[*log.notes, *notes])
                 if log.accelerations is None:
                     log = replace(log, accelerations=accelerations)
+            if log.gnss is None and path.is_dir():
+                gnss, notes = read_gnss(log.path)
+                log = replace(log, gnss=gnss, notes=[*log.notes, *notes])
         if name != RECORDING:
             log = replace(log, notes=[*log.notes, *unused_note(path, read)])
         return selected(log, config)

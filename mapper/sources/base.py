@@ -13,6 +13,7 @@ from mapper.core.frames import Frame, RgbdFrame, Scan, Sensor
 from mapper.core.geometry import Array, Transform
 from mapper.core.timebase import Stamps
 from mapper.core.trajectory import Trajectory
+from mapper.sensing.gnss import GnssFixes
 from mapper.sensing.gyroscope import Gyroscope
 
 SPREAD_FRAMES = 24
@@ -149,6 +150,7 @@ class Log:
         device_poses: T_world_body as a phone or tablet estimated it, if the log has it.
         accelerations: Accelerometer readings, if the log has them.
         gyroscope: Gyroscope readings, if the log has them.
+        gnss: Fixes of a GNSS receiver, if the log has them.
         T_base_body: Mounting of the body on the robot, whose base has x forward and z up (REP 103), if the
             log states it.
         wheels: T_odom_body by wheel odometry, in a frame of its own that drifts, if the log has it.
@@ -167,6 +169,7 @@ class Log:
     device_poses: Trajectory | None = None
     accelerations: Accelerations | None = None
     gyroscope: Gyroscope | None = None
+    gnss: GnssFixes | None = None
     T_base_body: Transform | None = None
     wheels: Trajectory | None = None
     are_units_assumed: bool = False

@@ -11,10 +11,11 @@ import numpy as np
 from mapper.core.frames import Frame, Scan
 from mapper.core.timebase import NS_PER_S
 from mapper.core.trajectory import Trajectory
+from mapper.sensing.gnss import GnssFixes
 from mapper.sensing.gyroscope import Gyroscope
 from mapper.sources.base import Accelerations, FrameRef, ImageFiles, Log, Session, WrappedEntry
 
-_Stamped = TypeVar("_Stamped", Trajectory, Accelerations, Gyroscope)
+_Stamped = TypeVar("_Stamped", Trajectory, Accelerations, Gyroscope, GnssFixes)
 
 _PAUSE_NS = NS_PER_S
 """Time between two logs whose own stamps are not in order."""
@@ -104,6 +105,7 @@ def _shifted(log: Log, shift_ns: int) -> Log:
         wheels=_later(log.wheels, shift_ns),
         accelerations=_later(log.accelerations, shift_ns),
         gyroscope=_later(log.gyroscope, shift_ns),
+        gnss=_later(log.gnss, shift_ns),
     )
 
 

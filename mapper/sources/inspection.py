@@ -78,6 +78,9 @@ class LogFacts:
         wheels_path_m: Length of their path, metres.
         readings: Number of accelerations.
         gyroscope: Timing of its angular velocities; None without.
+        gnss: Timing of its GNSS fixes; None without.
+        gnss_status: Number of fixes by their status, in words.
+        gnss_sigma_m: Median of their horizontal standard deviations, metres; None where none is stated.
         notes: Sentences on what opening it left out or assumed.
         warnings: Sentences on what is implausible about its stamps, depth or scans.
         vehicle: Box around the sensor's own vehicle, least x y z and largest, metres, body frame; None where
@@ -96,6 +99,9 @@ class LogFacts:
     wheels_path_m: float
     readings: int
     gyroscope: Timing | None
+    gnss: Timing | None
+    gnss_status: str
+    gnss_sigma_m: float | None
     notes: Sequence[str]
     warnings: Sequence[str]
     vehicle: Box | None
@@ -174,6 +180,9 @@ def _inspected(path: Path, topics: Sequence[TopicFacts], source: Log) -> Inspect
         wheels_path_m=0.0 if source.wheels is None else source.wheels.path_length_m,
         readings=0 if source.accelerations is None else len(source.accelerations.stamps_ns),
         gyroscope=None if source.gyroscope is None else timing_of(source.gyroscope.stamps_ns),
+        gnss=None if source.gnss is None else timing_of(source.gnss.stamps_ns),
+        gnss_status="" if source.gnss is None else source.gnss.status_text,
+        gnss_sigma_m=None if source.gnss is None else source.gnss.median_sigma_m,
         notes=[*source.notes, *damage, *checks.notes()],
         warnings=[*time_warnings(source), *depth_warnings(source), *scan_frame_warnings(source)],
         vehicle=vehicle_box(source),

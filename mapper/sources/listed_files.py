@@ -94,7 +94,7 @@ def unused_note(folder: Path, read: Collection[Path]) -> list[str]:
     return [
         f"files that are not used: {listed(unused)}; truth is read from the file that "
         "source.truth_file names (of scans) or groundtruth.txt, an IMU from imu.csv or accelerometer.txt, "
-        "wheels from wheels.txt or encoders.txt, the camera from calibration.toml"
+        "wheels from wheels.txt or encoders.txt, GNSS fixes from gnss.txt, the camera from calibration.toml"
     ]
 
 

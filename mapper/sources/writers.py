@@ -16,6 +16,7 @@ from mapper.core.trajectory import Trajectory
 from mapper.runtime.atomic import new_folder, write_bytes, write_text
 from mapper.sources.base import Accelerations, FrameRef, Log, Skipped
 from mapper.sources.calibration_file import calibration_text
+from mapper.sources.gnss_files import write_gnss
 from mapper.sources.image_files.decoded import encode_colour, encode_depth
 from mapper.sources.image_files.reading import TUM_UNITS_PER_M, image_bytes
 from mapper.sources.image_folders.mbag import HEADER
@@ -76,9 +77,10 @@ def left_out(source: Log, kind: LogKind) -> list[str]:
         "device poses": source.device_poses is not None,
         "accelerations": source.accelerations is not None,
         "angular velocities": source.gyroscope is not None,
+        "GNSS fixes": source.gnss is not None,
     }
     no_place: dict[LogKind, list[str]] = {
-        "mbag": ["wheel odometry", "device poses", "angular velocities"],
+        "mbag": ["wheel odometry", "device poses", "angular velocities", "GNSS fixes"],
         "mcap": ["device poses"],
         "bag": ["device poses"],
         "kitti": ["accelerations"],
@@ -129,6 +131,8 @@ def _write_images_log(
             write_wheels(out, source.wheels, sensor=source.sensor)
         if source.gyroscope is not None:
             write_gyroscope(out, source.gyroscope)
+        if source.gnss is not None:
+            write_gnss(out, source.gnss)
         depth_files = {frame.depth_stamp_ns: frame.depth for frame in written}
         colour_files = {frame.stamp_ns: frame.colour for frame in written}
         write_text(out / "depth.txt", _list_text("depth maps", source.name, depth_files))

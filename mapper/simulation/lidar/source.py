@@ -25,6 +25,7 @@ from mapper.simulation.path import seconds_of
 from mapper.simulation.source import synthetic_log
 from mapper.simulation.streams import Stream, noise_index, rng_of
 from mapper.sources.base import Log
+from mapper.sources.gnss_files import write_gnss
 from mapper.sources.imu_files import write_imu
 from mapper.sources.scan_folders.kitti_writing import save_scan
 from mapper.sources.trajectory_files import write_kitti
@@ -177,6 +178,8 @@ def write_lidar_log(
             write_wheels(folder, log.wheels, sensor=log.sensor)
         if log.gyroscope is not None and log.accelerations is not None:
             write_imu(folder, log.gyroscope, log.accelerations)
+        if log.gnss is not None:
+            write_gnss(folder, log.gnss)
         scene = {
             "config": set_or_first(config, exclude=set()),
             "ground": simulator.scene.ground.as_json(),

@@ -18,6 +18,7 @@ from mapper.sources.ros.messages import (
     CameraMessage,
     CloudMessage,
     FileMessage,
+    FixMessage,
     ImuMessage,
     Message,
     PixelsMessage,
@@ -114,6 +115,14 @@ def _imu(m: Any) -> ImuMessage:
     return ImuMessage(_ns(m.header.stamp), m.header.frame_id, np.array([a.x, a.y, a.z]))
 
 
+def _fix(m: Any) -> FixMessage:
+    covariance = np.asarray(m.position_covariance, np.float64).reshape(3, 3)
+    if m.position_covariance_type == m.COVARIANCE_TYPE_UNKNOWN:
+        covariance = np.full((3, 3), np.nan)
+    place = np.array([m.latitude, m.longitude, m.altitude])
+    return FixMessage(_ns(m.header.stamp), m.header.frame_id, m.status.status, place, covariance)
+
+
 def _pose_stamped(m: Any) -> list[PoseMessage]:
     pose = getattr(m.pose, "pose", m.pose)  # with or without covariance
     return [_pose(m.header, getattr(m, "child_frame_id", ""), pose.position, pose.orientation)]
@@ -154,6 +163,7 @@ _READERS: Mapping[str, Callable[[Any], Message]] = {
     "sensor_msgs/msg/CameraInfo": _camera,
     "sensor_msgs/msg/PointCloud2": _cloud,
     "sensor_msgs/msg/Imu": _imu,
+    "sensor_msgs/msg/NavSatFix": _fix,
     "geometry_msgs/msg/PoseStamped": _pose_stamped,
     "geometry_msgs/msg/PoseWithCovarianceStamped": _pose_stamped,
     "nav_msgs/msg/Odometry": _pose_stamped,

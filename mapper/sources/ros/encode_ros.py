@@ -235,6 +235,27 @@ def imu_message(
     )
 
 
+def fix_message(
+    stamp_ns: int, topic: str, *, geodetic: Array, covariance_enu: Array, status: int, frame: str
+) -> SerializedMessage:
+    """Return a sensor_msgs/msg/NavSatFix; of a covariance with NaN the type is unknown."""
+    latitude_deg, longitude_deg, height_m = geodetic.tolist()
+    is_known = bool(np.isfinite(covariance_enu).all())
+    kind = make_message("sensor_msgs/msg/NavSatStatus", status=status, service=1)
+    return _serialized(
+        "sensor_msgs/msg/NavSatFix",
+        stamp_ns,
+        topic,
+        frame,
+        status=kind,
+        latitude=latitude_deg,
+        longitude=longitude_deg,
+        altitude=height_m,
+        position_covariance=covariance_enu.ravel() if is_known else np.zeros(9),
+        position_covariance_type=3 if is_known else 0,
+    )
+
+
 def _serialized(type_: str, stamp_ns: int, topic: str, frame: str, **fields: Any) -> SerializedMessage:
     message = make_message(type_, header=make_header(stamp_ns, frame), **fields)
     return SerializedMessage(stamp_ns, topic, type_, serialize(message))

@@ -9,6 +9,7 @@ import numpy as np
 
 from mapper.core.errors import FrameError, SourceError
 from mapper.core.frames import PinholeCamera, RgbdFrame, Scan
+from mapper.core.geometry import transform
 from mapper.core.units import MM_PER_M
 from mapper.sources.base import FrameRef, ImageFiles, Log, Skipped
 from mapper.sources.image_files.reading import image_bytes, read_colour, read_depth_m
@@ -17,19 +18,22 @@ from mapper.sources.ros.encode_ros import (
     camera_info_message,
     cloud_message,
     compressed_image_message,
+    fix_message,
     image_message,
     imu_message,
     odometry_message,
     pose_message,
+    transforms_message,
 )
 from mapper.sources.ros.image_messages import DEPTH_HEADER
 from mapper.sources.ros.message_writers import RecordingKind, message_writer
 from mapper.sources.ros.topics import TRUTH, WHEELS
 
 COLOR, DEPTH = "/camera/color", "/camera/aligned_depth_to_color"
-POINTS, IMU, GYROSCOPE = "/points", "/imu", "/gyroscope"
+POINTS, IMU, GYROSCOPE, FIX = "/points", "/imu", "/gyroscope", "/fix"
 
 _CAMERA_FRAME, _LIDAR_FRAME, _IMU_FRAME = "camera_color_optical_frame", "lidar", "imu"
+_ANTENNA_FRAME = "gnss"
 _WORLD, _ODOM = "world", "odom"
 _FORMATS = {".jpg": "jpeg", ".jpeg": "jpeg", ".png": "png"}
 
@@ -43,7 +47,7 @@ def write_recording(
     PNGs of millimetres as compressedDepth. Depth in other units is written as float32 metres, which loses
     nothing. Of scans, points, times and colours are written. Truth is on /ground_truth, wheel odometry, as
     poses of the sensor's own frame, on /wheel_odometry, accelerations and angular velocities on /imu, or the
-    latter on /gyroscope where their times differ.
+    latter on /gyroscope where their times differ, GNSS fixes on /fix, the antenna, if known, in /tf_static.
 
     Args:
         source: Log that is written.
@@ -67,6 +71,7 @@ def write_recording(
             _truth(source),
             _wheels(source),
             _imu(source),
+            _fixes(source),
             key=lambda message: message.stamp_ns,
         ):
             writer.write(message)
@@ -215,6 +220,25 @@ def _imu(source: Log) -> Iterator[SerializedMessage]:
             )
 
 
+def _fixes(source: Log) -> Iterator[SerializedMessage]:
+    if source.gnss is None:
+        return
+    body = _LIDAR_FRAME if source.sensor == "lidar" else _CAMERA_FRAME
+    fixes = source.gnss.of(source.gnss.stamps_ns >= 0)
+    for k, stamp_ns in enumerate(fixes.stamps_ns.tolist()):
+        if k == 0 and fixes.antenna_body is not None:
+            T_body_antenna = transform(np.eye(3), fixes.antenna_body)
+            yield transforms_message(stamp_ns, "/tf_static", [(body, _ANTENNA_FRAME, T_body_antenna)])
+        yield fix_message(
+            stamp_ns,
+            FIX,
+            geodetic=fixes.geodetic[k],
+            covariance_enu=fixes.covariances_enu[k],
+            status=int(fixes.status[k]),
+            frame=_ANTENNA_FRAME,
+        )
+
+
 def early_readings(source: Log) -> dict[str, int]:
     """Return how many readings of each kind are from before the time 0, where no recording can be."""
     kinds = {
@@ -222,6 +246,7 @@ def early_readings(source: Log) -> dict[str, int]:
         "wheel readings": source.wheels,
         "accelerations": source.accelerations,
         "angular velocities": source.gyroscope,
+        "GNSS fixes": source.gnss,
     }
     counts = {kind: int((held.stamps_ns < 0).sum()) for kind, held in kinds.items() if held is not None}
     return {kind: count for kind, count in counts.items() if count}

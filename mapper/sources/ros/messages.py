@@ -150,6 +150,25 @@ class ImuMessage:
     acceleration_mps2: Array
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class FixMessage:
+    """A fix of a GNSS receiver (sensor_msgs/NavSatFix).
+
+    Attributes:
+        stamp_ns: Time of the fix.
+        frame: The antenna's frame.
+        status: As of ``mapper.sensing.gnss.NO_FIX``.
+        geodetic: (3,) latitude and longitude in degrees, metres above the ellipsoid.
+        covariance_enu: (3, 3) m²; NaN where its type is unknown.
+    """
+
+    stamp_ns: int
+    frame: str
+    status: int
+    geodetic: Array
+    covariance_enu: Array
+
+
 def unit_mps2(acceleration: Array) -> float | None:
     """Return the unit in which a (3,) acceleration is as long as gravity: 1 m/s² or g; None where neither is.
 
@@ -161,7 +180,7 @@ def unit_mps2(acceleration: Array) -> float | None:
 
 
 ImageMessage = PixelsMessage | FileMessage
-Message = ImageMessage | CameraMessage | CloudMessage | ImuMessage | list[PoseMessage]
+Message = ImageMessage | CameraMessage | CloudMessage | ImuMessage | FixMessage | list[PoseMessage]
 
 
 def frame_of(message: Message | None) -> str:
@@ -180,6 +199,7 @@ VELODYNE = frozenset({"velodyne_msgs/msg/VelodyneScan"})
 DRIVER_CLOUDS = LIVOX | VELODYNE
 CLOUDS = frozenset({"sensor_msgs/msg/PointCloud2", "foxglove.PointCloud"}) | DRIVER_CLOUDS
 IMUS = frozenset({"sensor_msgs/msg/Imu"})
+FIXES = frozenset({"sensor_msgs/msg/NavSatFix"})
 POSES = frozenset(
     {
         "nav_msgs/msg/Odometry",
@@ -194,6 +214,6 @@ TRANSFORMS = frozenset(
 )
 EXTRINSICS = frozenset({"realsense2_camera_msgs/msg/Extrinsics", "realsense2_camera/msg/Extrinsics"})
 STREAM_POSES = frozenset({"geometry_msgs/msg/Transform"})
-WITH_HEADER = IMAGES | CAMERAS | CLOUDS | IMUS | POSES | {"foxglove.FrameTransform"}
+WITH_HEADER = IMAGES | CAMERAS | CLOUDS | IMUS | FIXES | POSES | {"foxglove.FrameTransform"}
 READ = WITH_HEADER | TRANSFORMS | EXTRINSICS | STREAM_POSES
-SMALL = POSES | TRANSFORMS | EXTRINSICS | STREAM_POSES
+SMALL = FIXES | POSES | TRANSFORMS | EXTRINSICS | STREAM_POSES

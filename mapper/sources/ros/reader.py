@@ -1,4 +1,4 @@
-"""Reader of a recording: an index from one pass over it, its poses, accelerations and angular velocities."""
+"""Reader of a recording: an index from one pass over it, its poses, inertial readings and GNSS fixes."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -15,6 +15,7 @@ from mapper.core.rotations import pose_of_row
 from mapper.core.timebase import NS_PER_S
 from mapper.core.trajectory import Trajectory
 from mapper.core.units import GRAVITY_MPS2
+from mapper.sensing.gnss import GnssFixes
 from mapper.sensing.gyroscope import Gyroscope
 from mapper.sources.base import Accelerations
 from mapper.sources.config import WheelsConfig
@@ -25,6 +26,7 @@ from mapper.sources.ros.index import Series, first_messages, index_of
 from mapper.sources.ros.message_order import ordered
 from mapper.sources.ros.messages import (
     TRANSFORMS,
+    FixMessage,
     Message,
     PoseMessage,
     frame_of,
@@ -151,6 +153,26 @@ class RecordingReader:
         )
         sound, more = gyroscope.without_saturation()
         return sound, [*notes, *more]
+
+    def gnss(self, series: Series | None, *, body: str) -> tuple[GnssFixes | None, list[str]]:
+        """Return the fixes of a topic, with the antenna's place if tf has one that stays, and notes."""
+        if series is None:
+            return None, []
+        order, notes = ordered(series)
+        found = [(ns, fix) for ns, fix in self._messages(series, order) if isinstance(fix, FixMessage)]
+        frame = next((fix.frame.lstrip("/") for _, fix in found), "")
+        tree = self.tree_of(body, frame)
+        T_body_antenna = None if tree.moves(body, frame) else tree.find(body, frame)
+        fixes = GnssFixes(
+            series.topic.name,
+            np.array([ns for ns, _ in found], np.int64),
+            np.array([fix.geodetic for _, fix in found]).reshape(-1, 3),
+            np.array([fix.covariance_enu for _, fix in found]).reshape(-1, 3, 3),
+            np.array([fix.status for _, fix in found], np.int8),
+            None if T_body_antenna is None else T_body_antenna[:3, 3],
+        )
+        kept, more = fixes.without_invalid()
+        return kept, [*notes, *more]
 
     def base_of(self, frame: str) -> str | None:
         """Return the frame of the robot that carries a frame; None where tf names none."""

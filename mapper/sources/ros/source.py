@@ -85,6 +85,7 @@ def recording_log(reader: RecordingReader, config: SourceConfig) -> Log:
     wheels, wheel_notes = reader.wheels(
         choice.wheels, body=frames.body, config=config.wheels, sensor=frames.sensor
     )
+    gnss, gnss_notes = reader.gnss(choice.gnss, body=frames.body)
     return Log(
         path=recording.path,
         name=recording.path.resolve().stem,
@@ -95,9 +96,19 @@ def recording_log(reader: RecordingReader, config: SourceConfig) -> Log:
         truth=truth,
         accelerations=accelerations,
         gyroscope=gyroscope,
+        gnss=gnss,
         T_base_body=reader.mounting(frames.body),
         wheels=wheels,
-        notes=[*choice.notes, *problems, *clock_notes, *frames.notes, *truth_notes, *wheel_notes, *imu_notes],
+        notes=[
+            *choice.notes,
+            *problems,
+            *clock_notes,
+            *frames.notes,
+            *truth_notes,
+            *wheel_notes,
+            *imu_notes,
+            *gnss_notes,
+        ],
     )
 
 
@@ -120,11 +131,12 @@ def _on_clock_of(main: Series, choice: Choice) -> tuple[Choice, list[str]]:
     frames = choice.frames
     if isinstance(frames, CameraTopics):
         frames = replace(frames, depth=moved(frames.depth))
-    others = (choice.imu, choice.gyroscope, choice.truth, choice.wheels)
-    imu, gyroscope, truth, wheels = (one and moved(one) for one in others)
-    return replace(choice, frames=frames, imu=imu, gyroscope=gyroscope, truth=truth, wheels=wheels), list(
-        dict.fromkeys(notes)
+    others = (choice.imu, choice.gyroscope, choice.gnss, choice.truth, choice.wheels)
+    imu, gyroscope, gnss, truth, wheels = (one and moved(one) for one in others)
+    followed = replace(
+        choice, frames=frames, imu=imu, gyroscope=gyroscope, gnss=gnss, truth=truth, wheels=wheels
     )
+    return followed, list(dict.fromkeys(notes))
 
 
 def _rgbd(reader: RecordingReader, topics: CameraTopics, config: SourceConfig) -> _Frames:

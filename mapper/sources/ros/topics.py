@@ -15,6 +15,7 @@ from mapper.sources.ros.index import Series
 from mapper.sources.ros.messages import (
     CAMERAS,
     CLOUDS,
+    FIXES,
     IMAGES,
     IMUS,
     POSES,
@@ -64,6 +65,7 @@ class Choice:
         frames: Topics that are mapped: images, or clouds.
         imu: Inertial readings, if there are any.
         gyroscope: Readings with angular velocities: the same topic, if it has them.
+        gnss: Fixes of a GNSS receiver, if there are any.
         truth: True poses, if there are any.
         wheels: Wheel odometry, if it was requested or is called so.
         notes: Guesses, a sentence each.
@@ -72,6 +74,7 @@ class Choice:
     frames: CameraTopics | Series
     imu: Series | None
     gyroscope: Series | None
+    gnss: Series | None
     truth: Series | None
     wheels: Series | None
     notes: Sequence[str]
@@ -104,6 +107,7 @@ def choose(
         gyroscope = pick.one(
             "gyroscope", config.gyroscope, IMUS, _plain_rank, where=lambda name: _turns(series[name])
         )
+    gnss = pick.one("gnss", config.gnss, FIXES, _fix_rank, where=lambda _name: True)
     truth = pick.one("truth", config.truth, POSES, _plain_rank, where=lambda name: name == TRUTH)
     wheels = pick.one("wheels", config.wheels, POSES, _plain_rank, where=lambda name: name == WHEELS)
     pick.refuse_own_runs()
@@ -135,9 +139,9 @@ def choose(
     if wheels is not None:
         notes.append(_choice_note(f"wheel odometry {wheels.topic.name}", config.wheels, "wheels"))
     is_chosen = bool(config.points or config.color or config.depth)
-    unused = [one for one in series.values() if one not in (*used, imu, gyroscope, truth, wheels)]
+    unused = [one for one in series.values() if one not in (*used, imu, gyroscope, gnss, truth, wheels)]
     notes += _unused_notes(unused, firsts, image_reason=None if is_chosen else image_reason)
-    return Choice(frames, imu, gyroscope, truth, wheels, notes)
+    return Choice(frames, imu, gyroscope, gnss, truth, wheels, notes)
 
 
 class _Picker:
@@ -254,6 +258,11 @@ def _plain_rank(name: str) -> tuple[int, ...]:
     return (name.count("/"),)
 
 
+def _fix_rank(name: str) -> tuple[int, ...]:
+    """Rank a receiver's fixes before those that a filter made of them and of other sensors."""
+    return int(any(word in name.lower() for word in ("filter", "fused", "odom"))), name.count("/")
+
+
 def _is_packed(name: str) -> bool:
     return name.endswith(_TRANSPORTS)
 
@@ -303,6 +312,8 @@ def _unused_notes(
             kind = "accelerations that are not used, as they are not as long as gravity"
         elif type_ in IMUS:
             kind = "accelerations that are not used, as one topic is enough (source.topics.imu)"
+        elif type_ in FIXES:
+            kind = "GNSS fixes that are not used, as one topic is enough (source.topics.gnss)"
         elif type_ in POSES:
             kind = "poses that are not used; source.topics.wheels reads those of wheels, .truth true ones"
         elif type_ in READ or _BOOKKEEPING.match(type_):

@@ -11,6 +11,7 @@ from mapper.core.timebase import MAX_TRUTH_GAP_NS, Stamps, nearest, seconds_text
 from mapper.core.trajectory import Trajectory
 from mapper.runtime.atomic import write_text
 from mapper.sources.base import Log, Skipped
+from mapper.sources.gnss_files import write_gnss
 from mapper.sources.imu_files import write_gyroscope
 from mapper.sources.trajectory_files import write_kitti
 from mapper.sources.wheel_files import write_wheels
@@ -59,6 +60,8 @@ def write_kitti_log(
         write_wheels(out, source.wheels, sensor=source.sensor)
     if source.gyroscope is not None:
         write_gyroscope(out, source.gyroscope)
+    if source.gnss is not None:
+        write_gnss(out, source.gnss)
     write_text(out / "times.txt", "".join(f"{seconds_text_from_ns(stamp_ns)}\n" for stamp_ns in stamps_ns))
     return skipped
 

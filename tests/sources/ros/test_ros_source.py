@@ -76,7 +76,7 @@ def test_topics_that_are_not_used_are_named_with_the_reason(tmp_path):
         "sensor_msgs/msg/NavSatFix",
         header=make_header(FIRST_NS, "gps"),
         status=make_message("sensor_msgs/msg/NavSatStatus", status=0, service=1),
-        latitude=0.0, longitude=0.0, altitude=0.0, position_covariance=np.zeros(9),
+        latitude=0.0, longitude=0.0, altitude=1.0, position_covariance=np.zeros(9),
         position_covariance_type=0,
     )  # fmt: skip
     text = make_message("std_msgs/msg/String", data="x")
@@ -91,6 +91,7 @@ def test_topics_that_are_not_used_are_named_with_the_reason(tmp_path):
         *(odometry(t, np.eye(4)) for t in stamps(3)),
         *(odometry(t, np.eye(4), topic="/vio") for t in stamps(3)),
         SerializedMessage(FIRST_NS, "/fix", "sensor_msgs/msg/NavSatFix", serialize(fix)),
+        SerializedMessage(FIRST_NS, "/nmea/fix", "sensor_msgs/msg/NavSatFix", serialize(fix)),
         SerializedMessage(FIRST_NS, "/rosout", "std_msgs/msg/String", serialize(text)),
         transforms(("lidar", "imu", np.eye(4))),
     ]
@@ -98,11 +99,13 @@ def test_topics_that_are_not_used_are_named_with_the_reason(tmp_path):
     named = [note.rpartition(": ")[2] for note in notes[1:]]
     assert sorted(named) == [
         "/fish/image_raw",
-        "/fix (sensor_msgs/msg/NavSatFix)",
         "/gyro",
         "/imu/other/data",
         "/map_cloud",
+        "/nmea/fix",
         "/odom, /vio",
+        "1 of 1 messages have no latitude, longitude and height (NaN, or zeros); left out",
+        "no fixes",
     ]
     damaged = [m._replace(cdr=m.cdr[:30]) if m.topic == "/fish/image_raw" else m for m in messages]
     assert any("/fish/image_raw: a damaged" in note for note in opened(tmp_path / "b.mcap", damaged).notes)
