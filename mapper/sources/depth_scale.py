@@ -235,6 +235,8 @@ def _features(frame: RgbdFrame) -> _Features:
 
 def _matched(one: _Features, other: _Features) -> Array:
     """Return (N, 2) indices of features that are each other's nearest."""
+    if not len(one.descriptors) or not len(other.descriptors):  # OpenCV refuses a black image's none
+        return np.empty((0, 2), int)
     matches = cv2.BFMatcher.create(cv2.NORM_HAMMING, crossCheck=True).match(
         one.descriptors, other.descriptors
     )

@@ -145,6 +145,20 @@ def test_frames_that_cannot_be_read_and_scans_are_left_alone():
     assert depth_warnings(log_in_memory([MemoryEntry(0, OSError())], sensor="lidar")) == []
 
 
+def test_black_images_show_no_scale(desk_log):
+    """A covered lens; OpenCV refuses to match nothing."""
+    source = desk(desk_log, 5000)
+
+    def covered(index):
+        if index < len(source) // 2:
+            return source.entry_at(index)
+        frame = source.entry_at(index).load()
+        black = replace(frame, image=np.zeros_like(frame.image), depth_m=np.zeros_like(frame.depth_m))
+        return MemoryEntry(int(source.stamps_ns[index]), black)
+
+    assert depth_warnings(replace(source, entry_at=covered)) == []
+
+
 def millimetres_for_redwood(desk_log, folder):
     """The desk as a Redwood log, whose depth is taken to be in millimetres, but is in units of 0.2 mm."""
     calibration = copy_numbered(desk_log, folder) / "calibration.toml"
