@@ -58,7 +58,7 @@ def between(
     noise: gtsam.noiseModel.Base = _noise(weight * factor.information)
     if kernel is not None:
         noise = gtsam.noiseModel.Robust.Create(kernel.estimator(), noise)
-    return gtsam.BetweenFactorPose3(factor.i, factor.j, _pose3(factor.T_i_j), noise)
+    return gtsam.BetweenFactorPose3(factor.i, factor.j, pose3(factor.T_i_j), noise)
 
 
 def anchor(
@@ -67,7 +67,7 @@ def anchor(
     """Return the prior that holds a component's first node; its information is (6, 6)."""
     import gtsam
 
-    return gtsam.PriorFactorPose3(node, _pose3(T_world_node), _noise(information))
+    return gtsam.PriorFactorPose3(node, pose3(T_world_node), _noise(information))
 
 
 def values_of(T_world_node: Mapping[int, Transform], nodes: Iterable[int]) -> gtsam.Values:
@@ -76,7 +76,7 @@ def values_of(T_world_node: Mapping[int, Transform], nodes: Iterable[int]) -> gt
 
     values = gtsam.Values()
     for node in nodes:
-        values.insert(node, _pose3(T_world_node[node]))
+        values.insert(node, pose3(T_world_node[node]))
     return values
 
 
@@ -97,7 +97,7 @@ def _noise(information: Array) -> gtsam.noiseModel.Gaussian:
     return gtsam.noiseModel.Gaussian.Information(0.5 * (information + information.T))
 
 
-def _pose3(T_a_b: Transform) -> gtsam.Pose3:
+def pose3(T_a_b: Transform) -> gtsam.Pose3:
     """GTSAM ends the whole process when a rotation is off SO(3) by rounding, so it is projected first."""
     import gtsam
 

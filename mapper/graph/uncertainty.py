@@ -45,6 +45,12 @@ class Comparison:
         )
 
 
+def information_of(covariance: Array) -> Array:
+    """Return the symmetric inverse of a (6, 6) covariance."""
+    information = np.linalg.inv(covariance)
+    return np.asarray(0.5 * (information + information.T), np.float64)
+
+
 def compare(
     T_i_j: Transform, T_i_j_predicted: Transform, covariance: Array, *, slack_m: float, slack_rad: float
 ) -> Comparison:

@@ -8,7 +8,9 @@ from numpy.typing import NDArray
 
 from mapper.core.geometry import Array, rotation_exp
 from mapper.core.timebase import NS_PER_S, Stamps
+from mapper.core.units import unit_of_gravity
 from mapper.sensing.gyroscope import Gyroscope
+from mapper.sensing.inertial import InertialReadings
 from mapper.sources.base import Log
 
 _STATED_RAD, _UNSTATED_RAD = 0.1, 2.0  # a mounting in tf is right to some degrees, or wrong altogether
@@ -21,6 +23,7 @@ _LEAST_SIGMA_RAD = 1e-4
 DEGREES = pi / 180.0
 _SAME_UNIT = 1.25  # ratio of the turns of two units that are one
 _LEFT_HANDED_COST = 0.5  # of that of right-handed axes, below which they are left-handed
+CERTAIN_RAD = 0.05  # standard deviation of a mounting that is known
 _CLEAR_RAD = 0.02  # smaller turns do not show the unit
 
 
@@ -86,6 +89,31 @@ def with_body_rates(log: Log, calibration: GyroscopeCalibration | None) -> Log:
     if calibration is None or log.gyroscope is None or log.gyroscope.is_of_body:
         return log
     return replace(log, gyroscope=calibration.applied_to(log.gyroscope))
+
+
+def body_readings(log: Log, calibration: GyroscopeCalibration) -> InertialReadings | None:
+    """Return a log's angular velocities and accelerations of the body; None where they cannot be told.
+
+    Accelerations have to be as long as gravity in m/s² or g, and a mounting is one of both readings only if
+    it is certain and right-handed. They are interpolated at the times of the angular velocities.
+    """
+    gyroscope, felt = log.gyroscope, log.accelerations
+    mounting_rad = float(np.sqrt(np.diag(calibration.covariance)[:3].max()))
+    if gyroscope is None or felt is None or calibration.scale < 0.0 or mounting_rad > CERTAIN_RAD:
+        return None
+    unit = unit_of_gravity(float(np.median(np.linalg.norm(felt.acceleration_mps2, axis=1))))
+    turned = calibration.applied_to(gyroscope)
+    R_body_felt = calibration.R_body_imu
+    if felt.are_axes_stated and gyroscope.R_body_imu is not None:
+        R_body_felt = R_body_felt @ gyroscope.R_body_imu.T
+    stamps_ns = felt.stamps_ns - round(calibration.offset_s * NS_PER_S)
+    inside = (turned.stamps_ns >= stamps_ns[0]) & (turned.stamps_ns <= stamps_ns[-1])
+    if unit is None or inside.sum() < 2:
+        return None
+    at_ns = turned.stamps_ns[inside]
+    felt_body = unit * felt.acceleration_mps2 @ R_body_felt.T
+    accelerations = np.column_stack([np.interp(at_ns, stamps_ns, column) for column in felt_body.T])
+    return InertialReadings(at_ns, turned.rates_radps[inside], accelerations, turned.gap_ns)
 
 
 def uncalibrated(gyroscope: Gyroscope) -> GyroscopeCalibration:

@@ -10,6 +10,7 @@ from mapper.core.deskew import SampledMotion, Twist
 from mapper.core.geometry import Array, Transform, rotation_log
 from mapper.core.timebase import NS_PER_S
 from mapper.odometry.gyroscope_calibration import (
+    CERTAIN_RAD,
     DEGREES,
     GyroscopeCalibration,
     calibrate,
@@ -23,7 +24,7 @@ _KEPT = 400  # intervals that a fit uses: bias drifts over minutes
 _ERRORS, _FEWEST_ERRORS = 30, 5
 _MEDIAN_LENGTH = 1.538  # of a vector of three independent normal errors, in standard deviations
 _LONGEST_TURN_RAD = 2.8
-_ANOTHER_RAD, _CERTAIN_RAD = 0.2, 0.05  # of a mounting that contradicts tf's; of one that is known
+_ANOTHER_RAD = 0.2  # of a mounting that contradicts tf's
 _ANOTHER_UNIT = 1.25
 _CONTRADICTION_RAD, _CONTRADICTION_SIGMAS = 0.2, 6.0  # far beyond any error but that of a wrong pose
 
@@ -174,7 +175,7 @@ class MotionPrior:
         if stated is not None:
             off = float(np.linalg.norm(rotation_log(stated @ found.R_body_imu.T)))
             origin = "from tf"
-            if off > _ANOTHER_RAD and sigmas[:3].max() < _CERTAIN_RAD:
+            if off > _ANOTHER_RAD and sigmas[:3].max() < CERTAIN_RAD:
                 notes.append(
                     f"{name}: tf has it {np.degrees(off):.0f}° from where the turns of the frames have it; "
                     "the latter is used"

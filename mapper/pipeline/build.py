@@ -27,6 +27,7 @@ from mapper.pipeline.checkpoints import (
     remove_checkpoints,
 )
 from mapper.pipeline.components import largest_component
+from mapper.pipeline.inertial_bridging import bridge
 from mapper.pipeline.joined_components import joined
 from mapper.pipeline.solve import solve
 from mapper.pipeline.track import first_session, noted_log_warnings, track_log
@@ -137,6 +138,7 @@ class _Steps:
                 observer=self.observer,
                 checkpoints=None if self.checkpoints is None else TrackingCheckpoints(self.checkpoints),
             )
+            tracking = bridge(self.source, tracking, progress=self.progress)
             tracking = joined(self.source, tracking, self.config, progress=self.progress)
             tracking = largest_component(tracking, progress=self.progress)
         if self.checkpoints is not None:

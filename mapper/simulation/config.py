@@ -69,6 +69,8 @@ class SynthImuConfig(Config):
     """Standard deviation, over logs, of the gyroscope's bias at the start."""
     bias_walk_radps_per_sqrt_s: NonNegativeFloat = 2e-4
     accelerometer_noise_mps2: NonNegativeFloat = 0.05
+    accelerometer_bias_mps2: NonNegativeFloat = 0.05
+    """Standard deviation, over logs, of the accelerometer's bias."""
     mounting_rad: tuple[float, float, float] = (0.1, -0.2, 1.5)
     """Rotation vector of the unit in the body."""
     offset_s: NonNegativeFloat = 0.007

@@ -80,7 +80,8 @@ def measure_imu(
 ) -> tuple[Gyroscope, Accelerations]:
     """Return the angular velocities and accelerations that a unit at the body's origin measures.
 
-    White noise is added to both, and a bias that walks to the angular velocities. The unit is mounted in a
+    White noise is added to both, a bias to the accelerations, and one that walks to the angular velocities.
+    The unit is mounted in a
     rotation that the log does not state, and its clock is ahead.
 
     Args:
@@ -104,6 +105,7 @@ def measure_imu(
     noise = config.gyroscope_noise_radps * rng.standard_normal((count, 3))
     rates_imu = rates_body @ R_body_imu + bias + np.cumsum(walk, axis=0) + noise
     felt_imu = felt_body @ R_body_imu + config.accelerometer_noise_mps2 * rng.standard_normal((count, 3))
+    felt_imu = felt_imu + rng.normal(0.0, config.accelerometer_bias_mps2, 3)
     stamps_ns = START_NS + np.round((times_s + config.offset_s) * NS_PER_S).astype(np.int64)
     unit_mps2 = GRAVITY_MPS2 if config.in_g else 1.0
     return Gyroscope(_IMU_NAME, stamps_ns, rates_imu), Accelerations(stamps_ns, felt_imu / unit_mps2)

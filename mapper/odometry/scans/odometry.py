@@ -12,6 +12,7 @@ from mapper.core.frames import Frame
 from mapper.core.geometry import Array, Transform, adjoint, inverse
 from mapper.features.frame_view import ScanView
 from mapper.graph.model import BetweenFactor
+from mapper.graph.uncertainty import information_of
 from mapper.odometry.base import Diagnostics, FrameOdometry, FrameResult, lost_frame
 from mapper.odometry.gyroscope_calibration import GyroscopeCalibration
 from mapper.odometry.keyframe_distance import is_far
@@ -165,9 +166,7 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
             node = self._next_node
             self._next_node += 1
             self._noise.restart()
-            information = np.linalg.inv(covariance)
-            information = 0.5 * (information + information.T)
-            factors = (BetweenFactor(found.keyframe.node, node, T_key_body, information),)
+            factors = (BetweenFactor(found.keyframe.node, node, T_key_body, information_of(covariance)),)
             if is_doubtful:
                 self._doubtful = scan
             else:

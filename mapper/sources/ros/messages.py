@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.geometry import Array, Transform
-from mapper.core.units import GRAVITY_MPS2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -167,16 +166,6 @@ class FixMessage:
     status: int
     geodetic: Array
     covariance_enu: Array
-
-
-def unit_mps2(acceleration: Array) -> float | None:
-    """Return the unit in which a (3,) acceleration is as long as gravity: 1 m/s² or g; None where neither is.
-
-    ROS says m/s²; drivers of Livox and Hesai write g.
-    """
-    length = float(np.linalg.norm(acceleration))
-    units = (unit for unit in (1.0, GRAVITY_MPS2) if 0.5 < length * unit / GRAVITY_MPS2 < 2.0)
-    return next(units, None)
 
 
 ImageMessage = PixelsMessage | FileMessage

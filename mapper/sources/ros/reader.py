@@ -14,7 +14,7 @@ from mapper.core.geometry import FARTHEST_M, Transform
 from mapper.core.rotations import pose_of_row
 from mapper.core.timebase import NS_PER_S
 from mapper.core.trajectory import Trajectory
-from mapper.core.units import GRAVITY_MPS2
+from mapper.core.units import GRAVITY_MPS2, unit_of_gravity
 from mapper.sensing.gnss import GnssFixes
 from mapper.sensing.gyroscope import Gyroscope
 from mapper.sources.base import Accelerations
@@ -30,7 +30,6 @@ from mapper.sources.ros.messages import (
     Message,
     PoseMessage,
     frame_of,
-    unit_mps2,
 )
 from mapper.sources.ros.recording import Recording
 from mapper.sources.text import ROUNDING
@@ -125,7 +124,7 @@ class RecordingReader:
         if not len(order):
             return None, [*notes, f"{series.topic.name}: no readings"]
         stamps_ns, acceleration_imu = series.stamps_ns[order], series.imu[order, 3:]
-        unit = unit_mps2(np.median(np.linalg.norm(acceleration_imu, axis=1)) * np.eye(3)[0])
+        unit = unit_of_gravity(float(np.median(np.linalg.norm(acceleration_imu, axis=1))))
         if unit == GRAVITY_MPS2:
             acceleration_imu *= unit
             notes.append(f"{series.topic.name}: accelerations are as long as 1 at rest: taken as g")

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from mapper.core.errors import SourceError, listed
+from mapper.core.units import unit_of_gravity
 from mapper.sources.config import TopicsConfig
 from mapper.sources.ros.image_messages import is_depth
 from mapper.sources.ros.index import Series
@@ -23,7 +24,6 @@ from mapper.sources.ros.messages import (
     ImageMessage,
     Message,
     frame_of,
-    unit_mps2,
 )
 
 TRUTH, WHEELS = "/ground_truth", "/wheel_odometry"
@@ -327,7 +327,7 @@ def _unused_notes(
 
 def _feels_gravity(series: Series) -> bool:
     """Return whether an accelerometer feels gravity: a gyroscope's empty accelerations do not."""
-    return unit_mps2(series.imu[0, 3:]) is not None
+    return unit_of_gravity(float(np.linalg.norm(series.imu[0, 3:]))) is not None
 
 
 def _turns(series: Series) -> bool:

@@ -1,0 +1,272 @@
+"""Stretches of a log whose frames show no motion, or not all of it, bridged by inertial readings."""
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapper.core.doubts import Doubt
+from mapper.core.errors import GraphError
+from mapper.core.geometry import Array, Transform, adjoint, inverse
+from mapper.graph.components import component_numbers
+from mapper.graph.inertial import SmoothedPath, smooth_path
+from mapper.graph.model import BetweenFactor, PoseGraph
+from mapper.graph.uncertainty import information_of
+from mapper.odometry.base import FrameResult
+from mapper.odometry.gyroscope_calibration import body_readings
+from mapper.pipeline.tracking_result import TrackingResult
+from mapper.run.manifest import RunWarning
+from mapper.runtime.progress import Progress
+from mapper.sensing.inertial import InertialReadings
+from mapper.sources.base import Log
+
+_TRUSTED_MPS = 0.1
+"""Standard deviation of the velocity up to which a frame is placed, as of motions that scans do not show."""
+_CONTRADICTION = 25.0
+"""Variance factor from which on residuals are not noise but wrong readings: 5 standard deviations."""
+METHOD = "inertial"
+
+
+def bridge(source: Log, tracking: TrackingResult, *, progress: Progress) -> TrackingResult:
+    """Return the result with what the log's inertial readings say where its frames say too little.
+
+    Frames that were lost are placed, doubtful as nothing of them is seen, and the parts of the path on both
+    sides of them are connected. Where surfaces leave a motion open, or the readings contradict the odometry,
+    keyframes' factors and frames' poses become the smoothed ones; these are no longer doubtful where the
+    velocity is known. All else stays as it is.
+
+    Args:
+        source: The log.
+        tracking: Result of its first pass, whose graph is not solved yet.
+        progress: Receives notes.
+    """
+    before = len(tracking.warnings)
+    tracks = tracking.tracks
+    readings = None if tracking.gyroscope is None else body_readings(source, tracking.gyroscope)
+    if readings is None:
+        return tracking
+    # A frame that no reading reaches from the one before begins another window, at the first known pose.
+    unreached = [
+        k + 1 for k, (a, b) in enumerate(pairwise(tracks)) if not readings.covers(a.stamp_ns, b.stamp_ns)
+    ]
+    for begin, end in pairwise([0, *unreached, len(tracks)]):
+        known = [k for k in range(begin, end) if tracks[k].node is not None]
+        if len(known) > 1:
+            tracking = _bridge_window(tracking, readings, known[0], end - 1)
+    for warning in tracking.warnings[before:]:
+        progress.note(warning.sentence)
+    return tracking
+
+
+def _is_weak(track: FrameResult) -> bool:
+    return track.node is None or bool(track.diagnostics.unobservable) or _is_open(track)
+
+
+def _is_open(track: FrameResult) -> bool:
+    return any(doubt.kind == "unobservable" for doubt in track.doubts)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Window:
+    """Frames that inertial readings reach, as the problem of ``smooth_path``.
+
+    Attributes:
+        tracks: The frames, of which the first is placed.
+        index_of: Index of each node: that of its frame, or, before the window, one after all frames.
+        poses: Pose of each frame that is placed, and of each node, by its index.
+        part_of: Number of the part of the path, by index.
+        factors: The odometry's measurements between them.
+    """
+
+    tracks: Sequence[FrameResult]
+    index_of: Mapping[int, int]
+    poses: Mapping[int, Transform]
+    part_of: Mapping[int, int]
+    factors: Sequence[BetweenFactor]
+
+
+def _window_of(tracks: Sequence[FrameResult], graph: PoseGraph, part_of_node: Mapping[int, int]) -> _Window:
+    frame_at = {track.stamp_ns: k for k, track in enumerate(tracks)}
+    nodes = sorted({track.node for track in tracks if track.node is not None})
+    later = itertools.count(len(tracks))
+    at = [frame_at.get(graph.stamps_ns[node]) for node in nodes]
+    index_of = {node: next(later) if index is None else index for node, index in zip(nodes, at, strict=True)}
+    poses = {index: graph.T_world_node[node] for node, index in index_of.items()}
+    part_of = {index: part_of_node[node] for node, index in index_of.items()}
+    factors = [
+        replace(factor, i=index_of[factor.i], j=index_of[factor.j])
+        for factor in graph.factors
+        if factor.origin != "loop" and factor.i in index_of and factor.j in index_of
+    ]
+    for k, track in enumerate(tracks):
+        if track.node is None or k in poses:
+            continue
+        poses[k] = graph.T_world_node[track.node] @ track.T_node_body
+        part_of[k] = part_of_node[track.node]
+        if track.covariance is not None and (not track.doubts or _is_open(track)):
+            information = information_of(track.covariance)
+            factors.append(BetweenFactor(index_of[track.node], k, track.T_node_body, information))
+    held = {index for factor in factors for index in (factor.i, factor.j)}
+    poses = {index: T for index, T in poses.items() if index < len(tracks) or index in held}
+    return _Window(tracks, index_of, poses, part_of, factors)
+
+
+def _bridge_window(
+    tracking: TrackingResult, readings: InertialReadings, first: int, last: int
+) -> TrackingResult:
+    """Return the result with the smoothed poses of the weak frames first … last."""
+    graph, part_of_node = tracking.graph, component_numbers(tracking.graph.without_loops())
+    window = _window_of(tracking.tracks[first : last + 1], graph, part_of_node)
+    tracks, factors = window.tracks, window.factors
+    stamps_ns = np.array([track.stamp_ns for track in tracks], np.int64)
+    try:
+        path = smooth_path(stamps_ns, window.poses, window.part_of, factors, readings)
+    except GraphError as error:
+        return _with_note(tracking, f"accelerations are not used: {error}")
+    if path.variance_factor > _CONTRADICTION:
+        return _with_note(
+            tracking,
+            "accelerations are not used: with the angular velocities they contradict the path of the frames "
+            f"by {np.sqrt(path.variance_factor):.0f} standard deviations; are their axes and clock right?",
+        )
+    inside = {node: index for node, index in window.index_of.items() if index < len(tracks)}
+    weak = np.array([_is_weak(track) for track in tracks])
+    wrong = [factors[k].j for k in np.flatnonzero(path.contradicted).tolist()]
+    weak[[k for k in wrong if k < len(tracks)]] = True
+    changed = _place_frames(tracks, weak, path, inside)
+    replaced = _replace_factors(graph, weak, path, inside)
+    connected = _connect_parts(replaced, part_of_node, path, inside)
+    if weak.any():
+        lost = sum(track.node is None for track in tracks)
+        placed = lost - sum(track.node is None for track in changed)
+        tracking = _with_note(
+            tracking,
+            f"by the IMU {placed} of {lost} lost frames are placed, the motion of {weak.sum() - lost} that "
+            "surfaces leave open or it contradicts is smoothed, and "
+            f"{len(connected.factors) - len(graph.factors)} parts of the path are connected; it knows the "
+            f"velocity to ±{path.velocity_sigmas_mps[weak].max():.2g} m/s",
+        )
+    return replace(
+        tracking,
+        tracks=(*tracking.tracks[:first], *changed, *tracking.tracks[last + 1 :]),
+        graph=connected,
+    )
+
+
+def _with_note(tracking: TrackingResult, sentence: str) -> TrackingResult:
+    return replace(tracking, warnings=(*tracking.warnings, RunWarning(kind="imu", sentence=sentence)))
+
+
+def _place_frames(
+    tracks: Sequence[FrameResult], weak: NDArray[np.bool_], path: SmoothedPath, index_of: Mapping[int, int]
+) -> list[FrameResult]:
+    """Return the results of a window's frames, weak ones at their smoothed poses relative to a node."""
+    node_of = {index: node for node, index in index_of.items()}
+    changed, before = [], -1
+    for k, track in enumerate(tracks):
+        before = k if k in node_of else before
+        if not weak[k] or before < 0:
+            changed.append(track)
+            continue
+        is_known = path.velocity_sigmas_mps[k] <= _TRUSTED_MPS
+        doubts = tuple(doubt for doubt in track.doubts if doubt.kind != "unobservable" or not is_known)
+        if track.is_keyframe:
+            changed.append(replace(track, doubts=doubts))
+            continue
+        if track.node is None and not is_known:
+            changed.append(track)
+            continue
+        covariance = path.covariance(before, k)
+        if track.node is None:
+            off_m = float(np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1]))
+            doubts = (Doubt("unobservable", f"nothing is seen, placed by the IMU to ±{off_m:.2g} m"),)
+            track = replace(track, diagnostics=replace(track.diagnostics, method=METHOD))
+        changed.append(
+            replace(
+                track,
+                node=node_of[before],
+                T_node_body=inverse(path.T_world_body[before]) @ path.T_world_body[k],
+                covariance=covariance,
+                doubts=doubts,
+            )
+        )
+    return changed
+
+
+def _replace_factors(
+    graph: PoseGraph, weak: NDArray[np.bool_], path: SmoothedPath, index_of: Mapping[int, int]
+) -> PoseGraph:
+    """Return the graph with smoothed factors where weak frames lie between its nodes.
+
+    The errors of such a stretch are those of one velocity, not independent: factors' covariances grow until
+    their sum is that of the whole stretch.
+    """
+    weak_before = np.concatenate([[0], np.cumsum(weak)])
+    replaced: dict[int, tuple[int, int]] = {}
+    for number, factor in enumerate(graph.factors):
+        if factor.origin == "odometry" and factor.i in index_of and factor.j in index_of:
+            i, j = index_of[factor.i], index_of[factor.j]
+            if weak_before[max(i, j) + 1] > weak_before[min(i, j) + 1]:
+                replaced[number] = i, j
+    factors = list(graph.factors)
+    for run in _chains(replaced):
+        for number, covariance in zip(run, _covariances(path, [replaced[k] for k in run]), strict=True):
+            factors[number] = _factor(
+                path, factors[number].i, factors[number].j, *replaced[number], covariance
+            )
+    return graph.with_factors(factors)
+
+
+def _connect_parts(
+    graph: PoseGraph, part_of: Mapping[int, int], path: SmoothedPath, index_of: Mapping[int, int]
+) -> PoseGraph:
+    """Return the graph with a factor between parts that follow each other, the later moved to its place."""
+    by_time = sorted(index_of.items(), key=lambda one: one[1])
+    joined = dict(part_of)
+    for (a, i), (b, j) in pairwise(by_time):
+        if joined[a] == joined[b] or path.velocity_sigmas_mps[i : j + 1].max() > _TRUSTED_MPS:
+            continue
+        factor = _factor(path, a, b, i, j, path.covariance(i, j))
+        T_new_old = graph.T_world_node[a] @ factor.T_i_j @ inverse(graph.T_world_node[b])
+        moved = {node for node, part in joined.items() if part == joined[b]}
+        joined |= dict.fromkeys(moved, joined[a])
+        graph = graph.with_poses(
+            {node: T_new_old @ T if node in moved else T for node, T in graph.T_world_node.items()}
+        )
+        others, loops = graph.without_loops().factors, graph.loops
+        graph = graph.with_factors([*others, factor, *loops])
+    return graph
+
+
+def _factor(path: SmoothedPath, a: int, b: int, i: int, j: int, covariance: Array) -> BetweenFactor:
+    """Return the factor between nodes a and b, whose poses are those of times i and j."""
+    T_i_j = inverse(path.T_world_body[i]) @ path.T_world_body[j]
+    return BetweenFactor(a, b, T_i_j, information_of(covariance))
+
+
+def _chains(ends: Mapping[int, tuple[int, int]]) -> list[list[int]]:
+    """Return the factors, given by their ends, in chains in which each begins where the one before ends."""
+    chains: list[list[int]] = []
+    for number in sorted(ends, key=lambda k: ends[k][1]):
+        if chains and ends[chains[-1][-1]][1] == ends[number][0]:
+            chains[-1].append(number)
+        else:
+            chains.append([number])
+    return chains
+
+
+def _covariances(path: SmoothedPath, ends: Sequence[tuple[int, int]]) -> list[Array]:
+    """Return the covariances of a chain of motions, grown until their sum is at least that of the whole."""
+    from scipy.linalg import eigh
+
+    whole = path.covariance(ends[0][0], ends[-1][1])
+    T_world_end = path.T_world_body[ends[-1][1]]
+    to_end = [adjoint(inverse(T_world_end) @ path.T_world_body[j]) for _, j in ends]
+    single = [path.covariance(i, j) for i, j in ends]
+    ratios, axes = eigh(whole, sum(Ad @ C @ Ad.T for Ad, C in zip(to_end, single, strict=True)))
+    growth = np.linalg.inv(axes).T @ np.diag(np.sqrt(np.maximum(ratios, 1.0))) @ axes.T
+    grown = [np.linalg.solve(Ad, growth @ Ad) for Ad in to_end]
+    return [G @ C @ G.T for G, C in zip(grown, single, strict=True)]

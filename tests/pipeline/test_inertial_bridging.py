@@ -1,0 +1,214 @@
+"""Bridging by inertial readings: lost frames, parts of a path, motions that surfaces leave open."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from mapper.core.doubts import Doubt
+from mapper.core.geometry import exp, inverse, length_and_angle, log
+from mapper.core.timebase import NS_PER_S
+from mapper.graph.components import components
+from mapper.graph.model import BetweenFactor, PoseGraph
+from mapper.odometry.base import Diagnostics, FrameResult, lost_frame
+from mapper.odometry.gyroscope_calibration import GyroscopeCalibration
+from mapper.pipeline.inertial_bridging import bridge
+from mapper.pipeline.tracking_result import TrackingResult
+from mapper.runtime.progress import SILENT
+from mapper.simulation.config import SynthImuConfig
+from mapper.simulation.path import START_NS
+from mapper.simulation.readings import measure_imu
+from tests.support.logs import log_in_memory
+
+SIGMAS = np.array([1e-3] * 3 + [3e-3] * 3)
+TILTED = exp(np.array([0.3, -0.2, 0.5]), np.zeros(3))  # the world of an odometry is not level
+IMU = SynthImuConfig(bias_radps=0.0, mounting_rad=(0.1, -0.2, 1.5))
+CALIBRATION = GyroscopeCalibration(
+    Rotation.from_rotvec(IMU.mounting_rad).as_matrix(), np.zeros(3), IMU.offset_s, 1.0, np.eye(7) * 1e-8
+)
+
+
+@cache
+def walk(seed):
+    """T_world_body at times in seconds: a smooth walk that turns and sways."""
+    rng = np.random.default_rng(seed)
+    hz, phase = rng.uniform(0.05, 0.4, (6, 4)), rng.uniform(0.0, 2.0 * np.pi, (6, 4))
+    size = np.array([0.15, 0.15, 0.4, 0.6, 0.6, 0.1])[:, None] * rng.uniform(0.5, 1.0, (6, 4))
+
+    def poses(times_s):
+        waves = (size[:, :, None] * np.sin(2.0 * np.pi * hz[:, :, None] * times_s + phase[:, :, None])).sum(1)
+        T = np.tile(np.eye(4), (len(times_s), 1, 1))
+        T[:, :3, :3] = Rotation.from_euler("zyx", waves[[2, 1, 0]].T).as_matrix()
+        T[:, :3, 3] = waves[3:].T + np.array([0.8, 0.0, 0.0]) * times_s[:, None]
+        return T
+
+    return poses
+
+
+@cache
+def made(seed, *, lost=(), seconds=16.0):
+    """A log with readings, what its frames say at 10 Hz, each fifth a keyframe, and their true poses.
+
+    Frames of ``lost`` are lost; after them the odometry begins a part in a world of its own.
+    """
+    rng = np.random.default_rng(100 + seed)
+    times_s = np.arange(0.5, seconds, 0.1)
+    truth = walk(seed)(times_s)
+    gyroscope, accelerations = measure_imu(IMU, walk(seed), duration_s=seconds + 1.0, rng=rng)
+    log_ = log_in_memory([], gyroscope=gyroscope, accelerations=accelerations)
+    graph, tracks, node, at, T_world_true = PoseGraph(), [], None, 0, TILTED
+    for k, T_true in enumerate(truth):
+        stamp_ns = START_NS + round(times_s[k] * NS_PER_S)
+        if k in lost:
+            tracks.append(lost_frame(stamp_ns, np.eye(4)))
+            node, T_world_true = None, np.eye(4)
+            continue
+        noise = SIGMAS * rng.standard_normal(6)
+        is_keyframe = node is None or k % 5 == 0
+        before, number = node, len(graph.T_world_node)
+        T_node_body = np.eye(4)
+        if before is not None:
+            T_node_body = inverse(truth[at]) @ T_true @ exp(noise[:3], noise[3:])
+        if is_keyframe:
+            graph.add_node(number, stamp_ns, T_world_true @ T_true)
+            if before is not None:
+                graph.add_factors([BetweenFactor(before, number, T_node_body, np.diag(SIGMAS**-2.0))])
+            node, at, T_node_body = number, k, np.eye(4)
+        tracks.append(
+            FrameResult(
+                stamp_ns,
+                node,
+                T_node_body,
+                np.eye(4),
+                is_keyframe,
+                Diagnostics(),
+                covariance=np.diag(SIGMAS**2),
+            )
+        )
+    return log_, TrackingResult(tuple(tracks), (), graph, (), {}, gyroscope=CALIBRATION), truth
+
+
+def relative(result, truth, a, b):
+    """Error (rotation, translation) of frame b's pose relative to frame a's."""
+    poses = [result.graph.T_world_node[result.tracks[k].node] @ result.tracks[k].T_node_body for k in (a, b)]
+    return np.concatenate(log(inverse(inverse(truth[a]) @ truth[b]) @ inverse(poses[0]) @ poses[1]))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_two_seconds_without_a_view_are_bridged(seed):
+    lost = range(70, 90)
+    log_, tracking, truth = made(seed, lost=lost)
+    assert len(components(tracking.graph)) == 2
+    found = bridge(log_, tracking, progress=SILENT)
+    assert len(components(found.graph)) == 1
+    for k in (*lost, 95, 110):
+        error = relative(found, truth, 69, k)
+        assert np.linalg.norm(error[:3]) < 0.01
+        assert np.linalg.norm(error[3:]) < 0.03
+    assert all(found.tracks[k].doubts[0].kind == "unobservable" for k in lost)
+    assert not any(found.tracks[k].doubts for k in range(len(truth)) if k not in lost)
+
+
+def test_the_covariance_of_a_bridge_is_that_of_its_errors():
+    chi2 = []
+    for seed in range(12):
+        log_, tracking, truth = made(seed, lost=range(70, 100))
+        found = bridge(log_, tracking, progress=SILENT)
+        factor = found.graph.factors[-1]
+        ends = [k for k, t in enumerate(found.tracks) if t.is_keyframe and t.node in (factor.i, factor.j)]
+        error = np.concatenate(log(inverse(inverse(truth[ends[0]]) @ truth[ends[1]]) @ factor.T_i_j))
+        chi2.append(error @ factor.information @ error)
+    assert 0.3 < np.mean(chi2) / 6.0 < 2.0
+
+
+def test_a_motion_that_surfaces_leave_open_is_the_readings():
+    """As in a tunnel: for six seconds the motion along x is a guess that is off by a tenth."""
+    log_, tracking, truth = made(3)
+    open_ = range(51, 111)
+    wide = SIGMAS.copy()
+    wide[3] = 0.5
+    doubt = (Doubt("unobservable", "translation along x is not seen but predicted"),)
+    stretch = np.eye(4)
+    tracks, factors = list(tracking.tracks), list(tracking.graph.factors)
+    for k in open_:
+        T = tracks[k].T_node_body.copy()
+        T[0, 3] *= 1.1
+        tracks[k] = replace(
+            tracks[k], T_node_body=T, covariance=np.diag(wide**2), doubts=doubt,
+            diagnostics=Diagnostics(unobservable="translation along x"),
+        )  # fmt: skip
+    nodes = {tracks[k].node for k in open_ if tracks[k].is_keyframe}
+    for n, factor in enumerate(factors):
+        if factor.j in nodes:
+            stretch = factor.T_i_j.copy()
+            stretch[0, 3] *= 1.1
+            factors[n] = replace(factor, T_i_j=stretch, information=np.diag(wide**-2.0))
+    graph = tracking.graph.with_factors(factors)
+    found = bridge(log_, replace(tracking, tracks=tuple(tracks), graph=graph), progress=SILENT)
+    assert not any(track.doubts for track in found.tracks)
+    T_first_last, whole = np.eye(4), np.zeros((6, 6))
+    for factor in found.graph.factors:
+        if factor.j in nodes:
+            T_first_last = T_first_last @ factor.T_i_j
+            whole += np.linalg.inv(factor.information)
+    off_m = length_and_angle(inverse(inverse(truth[50]) @ truth[110]) @ T_first_last)[0]
+    assert off_m < min(0.12, 3.0 * np.trace(whole[3:, 3:]) ** 0.5)
+    assert whole[3, 3] ** 0.5 < 0.1
+
+
+def test_a_pose_that_the_readings_contradict_is_replaced():
+    """A keyframe a metre off, of which its scan is certain."""
+    log_, tracking, _ = made(4)
+    wrong = next(k for k, factor in enumerate(tracking.graph.factors) if factor.j == 12)
+    factors = list(tracking.graph.factors)
+    factors[wrong] = replace(factors[wrong], T_i_j=factors[wrong].T_i_j @ exp(np.zeros(3), np.eye(3)[0]))
+    graph = tracking.graph.with_factors(factors)
+    found = bridge(log_, replace(tracking, graph=graph), progress=SILENT)
+    factor = found.graph.factors[wrong]
+    assert length_and_angle(inverse(tracking.graph.factors[wrong].T_i_j) @ factor.T_i_j)[0] < 0.01
+    assert [k for k, one in enumerate(found.graph.factors) if one is not factors[k]] == [wrong]
+
+
+def flipped(log_):
+    return replace(log_.accelerations, acceleration_mps2=log_.accelerations.acceleration_mps2 * [1, -1, 1])
+
+
+def late(log_):
+    return replace(log_.accelerations, stamps_ns=log_.accelerations.stamps_ns + NS_PER_S // 2)
+
+
+@pytest.mark.parametrize("fault", [flipped, late])
+def test_accelerations_that_contradict_the_path_are_not_used_and_named(fault):
+    log_, tracking, _ = made(5, lost=range(70, 90))
+    found = bridge(replace(log_, accelerations=fault(log_)), tracking, progress=SILENT)
+    assert len(components(found.graph)) == 2
+    assert found.tracks == tracking.tracks
+    assert [warning.kind for warning in found.warnings] == ["imu"]
+
+
+def test_accelerations_in_g_are_the_same():
+    log_, tracking, truth = made(6, lost=range(70, 90))
+    in_g = replace(log_.accelerations, acceleration_mps2=log_.accelerations.acceleration_mps2 / 9.80665)
+    found = bridge(replace(log_, accelerations=in_g), tracking, progress=SILENT)
+    assert np.linalg.norm(relative(found, truth, 69, 95)[3:]) < 0.04
+
+
+def test_a_gap_of_the_readings_is_not_bridged():
+    log_, tracking, _ = made(7, lost=range(70, 90))
+    begin_ns = tracking.tracks[75].stamp_ns
+    kept = abs(log_.gyroscope.stamps_ns - begin_ns) > NS_PER_S // 4
+    gyroscope = replace(
+        log_.gyroscope, stamps_ns=log_.gyroscope.stamps_ns[kept], rates_radps=log_.gyroscope.rates_radps[kept]
+    )
+    found = bridge(replace(log_, gyroscope=gyroscope), tracking, progress=SILENT)
+    assert len(components(found.graph)) == 2
+
+
+def test_a_log_that_shows_everything_stays_as_it_is():
+    log_, tracking, _ = made(8)
+    found = bridge(log_, tracking, progress=SILENT)
+    assert found.tracks == tracking.tracks
+    assert found.graph.factors == tracking.graph.factors
+    assert bridge(replace(log_, accelerations=None), tracking, progress=SILENT) is tracking
