@@ -163,26 +163,24 @@ class KeyframeDecision:
     def is_due(self, tracked_pose: TrackedPose, assessed: Assessment) -> bool:
         """Return whether the next tracked frame becomes a keyframe.
 
-        A doubtful frame with enough inliers does not: tracking goes on without it. A motion that was not
-        observed is uncertain in the factor too, so it is no hindrance.
+        A doubtful frame with enough inliers does not: tracking goes on without it. With fewer, its landmarks
+        may be all that the next one sees; its factor is as uncertain as the doubts say.
         """
         config, inliers = self._config, tracked_pose.inliers
         self._frames += 1
         self._most_inliers = max(self._most_inliers, inliers)
         if assessed.doubts and inliers >= config.weak_inliers:
             return False
-        is_blind = tracked_pose.depth is not None and bool(tracked_pose.depth.unobservable)
-        if len(tracked_pose.doubts) > is_blind:
-            return False
-        if is_blind and tracked_pose.depth is not None and tracked_pose.depth.observes_next:
+        depth = tracked_pose.depth
+        if depth is not None and depth.unobservable and depth.observes_next:
             return True
         if self._frames >= config.max_keyframe_gap:
             return True
-        if tracked_pose.depth is not None and inliers < config.min_inliers:
+        if depth is not None and inliers < config.min_inliers:
             is_textured = (
                 tracked_pose.observation.has_depth.sum() >= config.weak_inliers and self._frames >= _MIN_GAP
             )
-            return is_textured or tracked_pose.depth.overlap < _DEPTH_OVERLAP
+            return is_textured or depth.overlap < _DEPTH_OVERLAP
         kept_ratio = inliers / self._most_inliers
         is_young = self._frames < _MIN_GAP and inliers >= config.weak_inliers
         share = _YOUNG_SHARE if is_young else 1.0

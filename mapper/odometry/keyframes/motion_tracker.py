@@ -99,7 +99,9 @@ class MotionPoseTracker:
                 break
         else:
             return None
-        moved = self._earlier_depth.moved(observation, T_camera_world, last.reference)
+        moved = np.zeros(len(observation), np.bool_)
+        if T_predicted is not None:  # seen from a pose that is merely the last one, all seems to have moved
+            moved = self._earlier_depth.moved(observation, T_camera_world, last.reference)
         still = ~moved[feature[hits]]
         if still.sum() >= max(self._config.min_matches, _LEAST_STILL_RATIO * len(hits)):
             hits = hits[still]
