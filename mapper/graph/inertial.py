@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.core.geometry import Array, Transform, adjoint, inverse, transform
+from mapper.core.geometry import Array, Transform, adjoint, inverse, length_and_angle, transform
 from mapper.core.timebase import NS_PER_S, Stamps
 from mapper.core.units import GRAVITY_MPS2
 from mapper.graph.batch import Effort, problem_of, solve
@@ -29,8 +29,8 @@ _GYROSCOPE_WALK, _ACCELEROMETER_WALK = 3e-4, 1e-3
 _INTEGRATION_M2 = 1e-6
 _KERNEL = Kernel("huber", 3.0)
 """Of odometry's factors: where surfaces show a motion that is not, the readings contradict it."""
-_CONTRADICTION_SIGMAS = 6.0
-"""Far beyond any error but that of a wrong pose, as for rotations that a gyroscope rules out."""
+_CONTRADICTION_SIGMAS, _CONTRADICTION_M, _CONTRADICTION_RAD = 6.0, 0.1, 0.1
+"""Far beyond any error but that of a wrong pose: covariances of odometries may be several times too small."""
 _VELOCITY_S = 0.5
 """Before and after a pose, in which its velocity to begin with is measured."""
 
@@ -120,14 +120,21 @@ def smooth_path(
     with solver_errors("the inertial readings do not determine the path"):
         marginals = gtsam.Marginals(problem, values)
         variances = [np.linalg.eigvalsh(marginals.marginalCovariance(velocity[k]))[-1] for k in times]
-    chi2 = np.array([2.0 * between(factor).error(values) for factor in factors])
     return SmoothedPath(
         T_world_body=np.array([values.atPose3(k).matrix() for k in times]),
         velocity_sigmas_mps=np.sqrt(variance_factor * np.array(variances)),
-        contradicted=chi2 > _CONTRADICTION_SIGMAS**2 * variance_factor,
+        contradicted=np.array([_contradicts(factor, values, variance_factor) for factor in factors], bool),
         variance_factor=variance_factor,
         _marginals=marginals,
     )
+
+
+def _contradicts(factor: BetweenFactor, values: gtsam.Values, variance_factor: float) -> bool:
+    T_i_j = (values.atPose3(factor.i).inverse() * values.atPose3(factor.j)).matrix()
+    distance_m, angle_rad = length_and_angle(inverse(factor.T_i_j) @ T_i_j)
+    chi2 = 2.0 * between(factor).error(values)
+    is_large = distance_m > _CONTRADICTION_M or angle_rad > _CONTRADICTION_RAD
+    return is_large and chi2 > _CONTRADICTION_SIGMAS**2 * variance_factor
 
 
 def _parameters(readings: InertialReadings) -> gtsam.PreintegrationCombinedParams:

@@ -8,6 +8,7 @@ from mapper.core.deskew import Motion
 from mapper.features.frame_view import FrameView
 from mapper.graph.model import BetweenFactor
 from mapper.odometry.base import FeatureMatches, FrameResult, GyroscopeUser, Observation, Odometry
+from mapper.odometry.gyroscope_calibration import GyroscopeCalibration
 from mapper.sources.base import FrameRef
 
 
@@ -37,6 +38,10 @@ class NodeOffset(Generic[Observation]):
     def gyroscope_notes(self) -> Sequence[str]:
         """Return how the gyroscope was used."""
         return self._odometry.gyroscope_notes() if isinstance(self._odometry, GyroscopeUser) else ()
+
+    def gyroscope_calibration(self) -> GyroscopeCalibration | None:
+        """Return the gyroscope's calibration."""
+        return self._odometry.gyroscope_calibration() if isinstance(self._odometry, GyroscopeUser) else None
 
     def finish(self) -> Sequence[BetweenFactor]:
         """Return the measurements that were still being refined when the log ended."""

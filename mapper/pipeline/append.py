@@ -11,9 +11,11 @@ from mapper.loops.closure import LoopClosure, accepted_loops, why_none_accepted
 from mapper.loops.config import KeyframeLoopsConfig
 from mapper.loops.factory import build_keyframe_loop_detector
 from mapper.odometry.base import FrameResult
+from mapper.odometry.gyroscope_calibration import with_body_rates
 from mapper.odometry.node_offset import NodeOffset
 from mapper.pipeline.components import component_of
 from mapper.pipeline.fuse import carry_times, fuse_into
+from mapper.pipeline.inertial_bridging import bridge
 from mapper.pipeline.joined_components import joined
 from mapper.pipeline.reobserve import reobserve
 from mapper.pipeline.solve import solve
@@ -82,7 +84,11 @@ def append(
             session = source.sessions[-1].log
             start = _after(before, first, session, config, progress)
             tracking = track_log(session, config, progress=progress, start=start, observer=observer)
+            tracking = bridge(session, tracking, progress=progress)
             tracking = _joined(source, before, tracking, config, progress)
+        if tracking.gyroscope is not None:
+            writer.record_gyroscope(tracking.gyroscope)
+            source = chained(first, with_body_rates(second, tracking.gyroscope))
         writer.warn([*warnings, *tracking.warnings])
         refuse_a_fragment(tracking, config, sensor=source.sensor)
         _refuse_unconnected(second, run, tracking.loops, known)
@@ -120,6 +126,7 @@ def _manifest(run: Run, source: Log, config: SourceConfig) -> Manifest:
         libraries=library_versions(),
         input=known.model_copy(update={"appended": appended}),
         levelling=run.manifest.levelling,
+        gyroscope=run.manifest.gyroscope,
         warnings=tuple(warning for warning in run.manifest.warnings if warning.kind in INPUT_KINDS),
         timing=Timing(started=now_text()),
     )

@@ -35,7 +35,7 @@ from mapper.pipeline.tracking_checkpoints import TrackingCheckpoints
 from mapper.pipeline.tracking_result import TrackingResult, from_tracking, refuse_a_fragment, save_places
 from mapper.run import files
 from mapper.run.folder import Run, open_run
-from mapper.run.manifest import GyroscopeFit, Levelling, RunWarning, Solve, Weight
+from mapper.run.manifest import Levelling, RunWarning, Solve, Weight
 from mapper.run.observers import NULL_OBSERVER, Observer
 from mapper.run.stored_tracking import save_solved, save_tracking
 from mapper.run.writer import RunWriter, first_manifest, write_run
@@ -150,7 +150,7 @@ class _Steps:
         self.writer.warn(tracking.warnings)
         save_tracking(self.writer, from_tracking(tracking, self.source.truth))
         if tracking.gyroscope is not None:
-            self.writer.update(gyroscope=GyroscopeFit.of(tracking.gyroscope))
+            self.writer.record_gyroscope(tracking.gyroscope)
         refuse_a_fragment(tracking, self.config, sensor=self.source.sensor)
         return tracking
 

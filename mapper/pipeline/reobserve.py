@@ -7,8 +7,10 @@ from mapper.core.deskew import twist_at
 from mapper.core.trajectory import Trajectory
 from mapper.features.frame_view import FrameView
 from mapper.odometry.factory import odometry_for
+from mapper.odometry.scans.scan_observation import ScanObservation
 from mapper.runtime.ordered_map import ordered_map
 from mapper.runtime.progress import SILENT, Progress
+from mapper.sensing.sweep_motion import motion_during
 from mapper.sources.base import FrameRef, Log
 
 
@@ -36,8 +38,12 @@ def reobserve(
     index_of = {int(stamp_ns): index for index, stamp_ns in enumerate(trajectory.stamps_ns)}
 
     def view(entry: FrameRef) -> tuple[int, FrameView]:
-        twist = twist_at(trajectory, index_of[entry.stamp_ns])
-        return entry.stamp_ns, odometry.view(odometry.read(entry), twist)
+        observation, index = odometry.read(entry), index_of[entry.stamp_ns]
+        if isinstance(observation, ScanObservation):
+            motion = motion_during(observation.scan, trajectory, index, source.gyroscope)
+        else:
+            motion = twist_at(trajectory, index)
+        return entry.stamp_ns, odometry.view(observation, motion)
 
     entries = list(source.entries_of(stamps_ns))
     views = {}

@@ -298,14 +298,13 @@ class Run:
     def open_log(self) -> Log:
         """Return the log that it was built from, with the same frames selected and all that was appended.
 
-        Its gyroscope is calibrated as by the build.
+        Gyroscopes are calibrated as by the build.
 
         Raises:
             RunError: It is no longer there, or is not what it was.
             SourceError: It cannot be opened.
         """
-        log = open_inputs(self.manifest.input, self.config.source, run=self.path)
-        return self.manifest.with_body_rates(log)
+        return open_inputs(self.manifest, self.config.source, run=self.path)
 
     def files(self) -> list[Path]:
         """Return the folder's files, by name."""

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from mapper.core.errors import RunError
 from mapper.core.units import MIB
-from mapper.run.manifest import Input, InputLog
+from mapper.run.manifest import Input, InputLog, Manifest
 from mapper.sources import open_source
 from mapper.sources.base import Log
 from mapper.sources.chained import chained, sessions_of
@@ -53,11 +53,13 @@ def _files(folder: Path) -> Iterator[tuple[str, Path]]:
                 yield str(file.relative_to(folder)), file
 
 
-def open_inputs(known: Input, config: SourceConfig, *, run: Path) -> Log:
+def open_inputs(manifest: Manifest, config: SourceConfig, *, run: Path) -> Log:
     """Return the log that a run was made from, with the same frames selected and all that was appended.
 
+    Their gyroscopes are calibrated as by the build.
+
     Args:
-        known: The logs, from the run's manifest.
+        manifest: Names the logs.
         config: Settings of the first log.
         run: The run's folder, for errors.
 
@@ -65,9 +67,12 @@ def open_inputs(known: Input, config: SourceConfig, *, run: Path) -> Log:
         RunError: A log is no longer there, or is not what it was.
         SourceError: It cannot be opened.
     """
-    source = _open(known, config, run)
+    known = manifest.input
+    source = manifest.with_body_rates(_open(known, config, run))
     for log in known.appended:
-        source = chained(source, _open(log, log.source, run), shift_ns=log.shift_ns)
+        later = _open(log, log.source, run)
+        later = later if log.gyroscope is None else log.gyroscope.applied_to(later)
+        source = chained(source, later, shift_ns=log.shift_ns)
     refuse_another_log(known, source, run=run)
     return source
 

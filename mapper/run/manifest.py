@@ -40,6 +40,38 @@ _LIBRARIES = (
 )
 
 
+class GyroscopeFit(Config):
+    """Calibration of the log's gyroscope, by which scans are deskewed."""
+
+    R_body_imu: tuple[tuple[float, float, float], ...]
+    bias_radps: tuple[float, float, float]
+    offset_s: float
+    """Added to the frames' stamps it gives the readings'."""
+    scale: float
+    """Factor from the readings to rad/s; negative where their axes are left-handed."""
+
+    @classmethod
+    def of(cls, calibration: GyroscopeCalibration) -> Self:
+        """Return the record of a calibration."""
+        return cls(
+            R_body_imu=calibration.R_body_imu.tolist(),
+            bias_radps=calibration.bias.tolist(),
+            offset_s=calibration.offset_s,
+            scale=calibration.scale,
+        )
+
+    @property
+    def calibration(self) -> GyroscopeCalibration:
+        """The calibration, without its uncertainty."""
+        return GyroscopeCalibration(
+            np.array(self.R_body_imu), np.array(self.bias_radps), self.offset_s, self.scale, np.zeros((7, 7))
+        )
+
+    def applied_to(self, log: Log) -> Log:
+        """Return a log with the readings of its gyroscope calibrated."""
+        return with_body_rates(log, self.calibration)
+
+
 class InputLog(Config):
     """A log that was read."""
 
@@ -60,6 +92,8 @@ class AppendedLog(InputLog):
     """Nanoseconds added to its stamps."""
     begins_ns: int
     """Stamp of its first frame, on the run's clock."""
+    gyroscope: GyroscopeFit | None = None
+    """None where it has no gyroscope that was of use."""
 
 
 class Input(InputLog):
@@ -171,34 +205,6 @@ class Solve(Config):
     """Share of the loops that reached the solver and were rejected by it."""
 
 
-class GyroscopeFit(Config):
-    """Calibration of the log's gyroscope, by which scans are deskewed."""
-
-    R_body_imu: tuple[tuple[float, float, float], ...]
-    bias_radps: tuple[float, float, float]
-    offset_s: float
-    """Added to the frames' stamps it gives the readings'."""
-    scale: float
-    """Factor from the readings to rad/s; negative where their axes are left-handed."""
-
-    @classmethod
-    def of(cls, calibration: GyroscopeCalibration) -> Self:
-        """Return the record of a calibration."""
-        return cls(
-            R_body_imu=calibration.R_body_imu.tolist(),
-            bias_radps=calibration.bias.tolist(),
-            offset_s=calibration.offset_s,
-            scale=calibration.scale,
-        )
-
-    @property
-    def calibration(self) -> GyroscopeCalibration:
-        """The calibration, without its uncertainty."""
-        return GyroscopeCalibration(
-            np.array(self.R_body_imu), np.array(self.bias_radps), self.offset_s, self.scale, np.zeros((7, 7))
-        )
-
-
 class Levelling(Config):
     """Record of how the world's z axis and floor were found."""
 
@@ -299,8 +305,8 @@ class Manifest(Config):
     """Every file of the run but this; empty while it is being built."""
 
     def with_body_rates(self, log: Log) -> Log:
-        """Return the run's log with the readings of its gyroscope calibrated as by the run."""
-        return with_body_rates(log, None if self.gyroscope is None else self.gyroscope.calibration)
+        """Return the run's first log with the readings of its gyroscope calibrated as by the run."""
+        return log if self.gyroscope is None else self.gyroscope.applied_to(log)
 
     def save(self, path: Path) -> None:
         """Write the manifest atomically."""

@@ -7,11 +7,13 @@ from typing import Any
 
 from mapper.config.build import BuildConfig
 from mapper.core.errors import MapperError, WriteError
+from mapper.odometry.gyroscope_calibration import GyroscopeCalibration
 from mapper.run import files
 from mapper.run.digests import digests_of
 from mapper.run.input_logs import fingerprint
 from mapper.run.manifest import (
     AppendedLog,
+    GyroscopeFit,
     Input,
     Manifest,
     RunWarning,
@@ -50,11 +52,23 @@ class RunWriter:
         notes = [warning.sentence for warning in warnings]
         known = self.manifest.input
         if known.appended:
-            *others, last = known.appended
-            last = last.model_copy(update={"notes": (*last.notes, *notes)})
-            self.update(input=known.model_copy(update={"appended": (*others, last)}))
+            self._update_last(notes=(*known.appended[-1].notes, *notes))
         else:
             self.update(input=known.model_copy(update={"notes": (*known.notes, *notes)}))
+
+    def record_gyroscope(self, calibration: GyroscopeCalibration) -> None:
+        """Keep the calibration of the gyroscope of the log that was read last."""
+        fit = GyroscopeFit.of(calibration)
+        if self.manifest.input.appended:
+            self._update_last(gyroscope=fit)
+        else:
+            self.update(gyroscope=fit)
+
+    def _update_last(self, **parts: Any) -> None:
+        known = self.manifest.input
+        *others, last = known.appended
+        appended = (*others, last.model_copy(update=parts))
+        self.update(input=known.model_copy(update={"appended": appended}))
 
     def record_timing(self, *, log_s: float, frames: int) -> None:
         """Put the seconds of the stages so far into the manifest, and what follows from them.

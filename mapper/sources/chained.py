@@ -46,8 +46,9 @@ class _ShiftedEntry(WrappedEntry):
 def chained(first: Log, second: Log, *, shift_ns: int | None = None) -> Log:
     """Return a log followed by another.
 
-    The chain has no accelerations and no gyroscope, for two logs' readings may be in different axes, and no
-    wheel odometry, for each log's is in a frame of its own. Its ``sessions`` keep both.
+    The chain has the angular velocities of gyroscopes that are calibrated, which are the body's. It has no
+    accelerations, for two logs' may be in different axes, and no wheel odometry, for each log's is in a frame
+    of its own. Its ``sessions`` keep all of it.
 
     Args:
         first: A log, or several chained ones.
@@ -81,6 +82,7 @@ def chained(first: Log, second: Log, *, shift_ns: int | None = None) -> Log:
         stamps_ns=np.concatenate([log.stamps_ns for log in logs]),
         entry_at=entry_at,
         truth=truth,
+        gyroscope=_joined_gyroscope(logs),
         T_base_body=logs[0].T_base_body,
         notes=notes,
         sessions=sessions,
@@ -113,15 +115,35 @@ def _later(stamped: _Stamped | None, shift_ns: int) -> _Stamped | None:
     return stamped and replace(stamped, stamps_ns=stamped.stamps_ns + shift_ns)
 
 
-def _joined_truth(logs: Sequence[Log]) -> tuple[Trajectory | None, list[str]]:
-    """Return the truths one after the other, each until half way to the next log's first frame."""
+def _joined_gyroscope(logs: Sequence[Log]) -> Gyroscope | None:
+    """Return the body's angular velocities of all logs that have them, each log's until the next begins."""
+    parts = []
+    for log, (begin_ns, end_ns) in zip(logs, _spans_ns(logs), strict=True):
+        gyroscope = log.gyroscope
+        if gyroscope is not None and gyroscope.is_of_body:
+            inside = (gyroscope.stamps_ns > begin_ns) & (gyroscope.stamps_ns <= end_ns)
+            parts.append((gyroscope.name, gyroscope.stamps_ns[inside], gyroscope.rates_radps[inside]))
+    if not parts:
+        return None
+    names, stamps_ns, rates = zip(*parts, strict=True)
+    name = " + ".join(dict.fromkeys(names))
+    return Gyroscope(name, np.concatenate(stamps_ns), np.concatenate(rates), np.eye(3), is_of_body=True)
+
+
+def _spans_ns(logs: Sequence[Log]) -> list[tuple[int, int]]:
+    """Return the time of each log: from half way to the frames before it to half way to those after it."""
     bounds_ns = [
         np.iinfo(np.int64).min,
         *((int(a.stamps_ns[-1]) + int(b.stamps_ns[0])) // 2 for a, b in pairwise(logs)),
         np.iinfo(np.int64).max,
     ]
+    return list(pairwise(bounds_ns))
+
+
+def _joined_truth(logs: Sequence[Log]) -> tuple[Trajectory | None, list[str]]:
+    """Return the truths one after the other, each until half way to the next log's first frame."""
     named, parts = [], []
-    for log, (begin_ns, end_ns) in zip(logs, pairwise(bounds_ns), strict=True):
+    for log, (begin_ns, end_ns) in zip(logs, _spans_ns(logs), strict=True):
         if log.truth is None:
             continue
         stamps_ns = log.truth.stamps_ns

@@ -13,7 +13,7 @@ from mapper.pipeline.append import append
 from mapper.pipeline.build import build
 from mapper.pipeline.edit import edit_loops
 from mapper.run.folder import open_run
-from mapper.simulation.config import STREET, LidarSensorConfig
+from mapper.simulation.config import STREET, LidarSensorConfig, LidarSynthConfig, SynthImuConfig
 from mapper.simulation.lidar import write_lidar_log
 from mapper.sources import open_source
 
@@ -97,3 +97,24 @@ def test_loops_between_images_are_refused_for_scans(logs, tmp_path):
     config = load_config(None, ["loops.kind=places"], sensor="lidar")
     with pytest.raises(ConfigError, match="compare images, and these are scans; want scans"):
         build(open_source(logs / "drive", config.source), config, tmp_path / "run")
+
+
+def test_both_sessions_keep_their_gyroscopes(tmp_path):
+    hand = LidarSynthConfig(
+        scene="courtyard", seed=2, loop_m=60.0, rate_hz=2.0, duration_s=12.0, speed_mps=1.2, tilt_rad=0.3,
+        yaw_swing_rad=1.5, imu=SynthImuConfig(),
+        sensor=LidarSensorConfig(rings=16, lowest_ring_rad=-0.26, highest_ring_rad=0.26, azimuth_steps=450),
+    )  # fmt: skip
+    for name in ("one", "two"):
+        write_lidar_log(tmp_path / name, hand)
+    config = load_config(None, SETTINGS, sensor="lidar")
+    one = build(open_source(tmp_path / "one", config.source), config, tmp_path / "run")
+    both = appended(one, tmp_path / "two", tmp_path / "both")
+    (later,) = both.manifest.input.appended
+    for fit in (both.manifest.gyroscope, later.gyroscope):
+        assert fit.offset_s == pytest.approx(0.007, abs=0.004)
+    log = both.open_log()
+    assert log.gyroscope.is_of_body
+    assert log.gyroscope.stamps_ns[0] < log.stamps_ns[0] + 10_000_000
+    assert log.gyroscope.stamps_ns[-1] >= log.stamps_ns[-1]
+    assert np.abs(log.gyroscope.rates_radps).max() < 4.0

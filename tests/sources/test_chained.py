@@ -1,9 +1,12 @@
 """Several logs as one: clocks, truths, and what every frame keeps."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from mapper.core.timebase import NS_PER_S
+from mapper.sensing.gyroscope import Gyroscope
 from mapper.sources import open_source
 from mapper.sources.chained import chained, sessions_of
 from mapper.sources.config import SourceConfig
@@ -110,3 +113,23 @@ def test_a_single_log_is_one_session(two):
     (session,) = sessions_of(two[0])
     assert session.log is two[0]
     assert [entry.stamp_ns for entry in session.log.entries()] == stamps_of(two[0])
+
+
+def test_calibrated_gyroscopes_follow_one_another(two):
+    """Readings go on after the last frame, and begin before the first one."""
+
+    def with_rates(log, *, is_of_body):
+        begin_ns, end_ns = log.stamps_ns[[0, -1]]
+        stamps_ns = np.arange(begin_ns - NS_PER_S, end_ns + NS_PER_S, 10_000_000)
+        rates = np.full((len(stamps_ns), 3), float(len(log)))
+        return replace(log, gyroscope=Gyroscope("imu", stamps_ns, rates, is_of_body=is_of_body))
+
+    source = chained(*(with_rates(log, is_of_body=True) for log in two))
+    gyroscope = source.gyroscope
+    assert gyroscope.is_of_body
+    assert (np.diff(gyroscope.stamps_ns) > 0).all()
+    for session in source.sessions:
+        begin_ns, end_ns = session.log.stamps_ns[[0, -1]]
+        inside = (gyroscope.stamps_ns >= begin_ns) & (gyroscope.stamps_ns <= end_ns)
+        assert set(gyroscope.rates_radps[inside, 0]) == {float(len(session.log))}
+    assert chained(*(with_rates(log, is_of_body=False) for log in two)).gyroscope is None
