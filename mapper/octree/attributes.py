@@ -111,13 +111,14 @@ class AttributeLayer:
         """
         capacity = len(self._arrays.rows)
         if len(self._blocks) > capacity:
-            self._arrays = _grow(self._arrays, slots=len(self._blocks), rows=len(self._arrays.hits))
+            spare = np.full(len(self._blocks) - capacity, -1, np.int32)
+            self._arrays = self._arrays._replace(rows=np.append(self._arrays.rows, spare))
         missing = slots[self._arrays.rows[slots] < 0]
         count = self._count + len(missing)
         if count > len(self._arrays.hits):
             check_memory(count * BLOCK_VOXELS * _VOXEL_BYTES, f"attributes of {count} blocks of 8³ voxels")
             rows = max(count, int(len(self._arrays.hits) * GROWTH))
-            self._arrays = _grow(self._arrays, slots=len(self._blocks), rows=rows)
+            self._arrays = _grow(self._arrays, slots=len(self._arrays.rows), rows=rows)
         self._arrays.rows[missing] = np.arange(self._count, count)
         self._count = count
         return self._arrays.rows[slots]

@@ -58,7 +58,7 @@ class OctreeMap(MapView):
 
     @property
     def memory_bytes(self) -> int:
-        """Bytes of the map itself, spare capacity included, without the scan window."""
+        """Bytes of the map itself, without the scan window."""
         return self.blocks.memory_bytes + (self.attributes.memory_bytes if self.attributes else 0)
 
     def write(self, path: AnyPath) -> None:
