@@ -1,5 +1,6 @@
 """Plausibility of the frame of a LiDAR's scans: around the sensor, or of a map in which the sensor moves."""
 
+from collections.abc import Iterable, Iterator
 from itertools import pairwise
 
 import numpy as np
@@ -7,10 +8,10 @@ import numpy as np
 from mapper.core.errors import FrameError
 from mapper.core.frames import Scan
 from mapper.core.geometry import Array
-from mapper.sources.base import Log
+from mapper.sources.base import FrameRef, Log
 
-_LOOKED_AT = 6
-"""Scans, spread over the log."""
+_LOOKED_AT, _LOOKED_AT_AT_FIRST = 6, 3
+"""Scans, spread over the log; where the first of them show the sensor at their origin, no others are read."""
 _DIRECTION_RAD = np.radians(1.0)
 _BEHIND_RATIO, _BEHIND_M = 1.3, 0.3
 """A point is behind another in its direction if it is so much farther; neighbours on a wall are not."""
@@ -31,17 +32,11 @@ def scan_frame_warnings(log: Log) -> list[str]:
     """
     if log.sensor != "lidar":
         return []
-    scans = []
-    for entry in log.spread_entries(_LOOKED_AT):
-        try:
-            scan = entry.scan()
-        except FrameError:
-            continue
-        if len(scan.points_body):
-            scans.append(scan)
-    behind = [_share_behind(scan) for scan in scans]
-    if len(scans) < 3 or np.median(behind) <= _MOST_BEHIND:
-        return []
+    for most in (_LOOKED_AT_AT_FIRST, _LOOKED_AT):
+        scans = list(_readable(log.spread_entries(most)))
+        behind = [_share_behind(scan) for scan in scans]
+        if len(scans) < 3 or np.median(behind) <= _MOST_BEHIND:
+            return []
     ways_m = [_middle_way_m(one, other) for one, other in pairwise(scans)]
     moved = [k for k, way_m in enumerate(ways_m) if way_m > _MOVED_M]
     stayed = [k for k in moved if _surfaces_way_m(scans[k], scans[k + 1]) < _STAYED_SHARE * ways_m[k]]
@@ -53,6 +48,17 @@ def scan_frame_warnings(log: Log) -> list[str]:
         "others as seen from their origin; are they in the frame of a map and not around the sensor? map the "
         "driver's own clouds"
     ]
+
+
+def _readable(entries: Iterable[FrameRef]) -> Iterator[Scan]:
+    """Yield the scans that can be read and have points."""
+    for entry in entries:
+        try:
+            scan = entry.scan()
+        except FrameError:
+            continue
+        if len(scan.points_body):
+            yield scan
 
 
 def _share_behind(scan: Scan) -> float:
