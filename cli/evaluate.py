@@ -1,5 +1,7 @@
 """``mapper eval``: errors of a trajectory, and the quality of a map."""
 
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -8,7 +10,7 @@ import typer
 from mapper.cli.answer import Answer, Output
 from mapper.cli.completion import run_folders
 from mapper.cli.options import refuse_with, refuse_without
-from mapper.core.errors import DataError
+from mapper.core.errors import DataError, MapperError, UntrustedError
 
 if TYPE_CHECKING:
     from mapper.core.timebase import Stamps
@@ -17,8 +19,6 @@ if TYPE_CHECKING:
     from mapper.evaluators.metrics.map_quality import MapQuality
     from mapper.evaluators.metrics.metric import Metric
     from mapper.run.folder import Run
-    from mapper.runtime.progress import Progress
-    from mapper.sources.base import Log
 
 _TOLERANCE = 1
 
@@ -85,6 +85,28 @@ def evaluate(
     sharpness: Annotated[
         bool, typer.Option("--sharpness", help="Measure how thick walls are where the log's scans overlap.")
     ] = False,
+    agreement: Annotated[
+        bool,
+        typer.Option(
+            "--agreement",
+            help="Measure how far poses are from what views of one place show; done anyway without a truth.",
+        ),
+    ] = False,
+    against: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="RUN",
+            autocompletion=run_folders,
+            help="Tell, without a truth, whether the run or this one of the same log is better.",
+        ),
+    ] = None,
+    gate: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="METRIC=LIMIT",
+            help="Exit with status 1 if a metric exceeds a limit, as in 'ATE RMSE=0.05'; may be repeated.",
+        ),
+    ] = None,
     plot: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for plots of the errors.")] = None,
     format_: Annotated[
         Format,
@@ -118,6 +140,8 @@ def evaluate(
             "--map-world": map_world,
             "--register": register,
             "--sharpness": sharpness,
+            "--agreement": agreement,
+            "--against": against,
             "--plot": plot,
         }
         refuse_with(f"{estimate}, a merged map", only_of_runs, remedy="evaluate its runs one by one")
@@ -125,33 +149,39 @@ def evaluate(
         of_map = {"--map-world": map_world, "--register": register, "--tolerance": tolerance}
         refuse_without("--map", of_map)
     voxels = _TOLERANCE if tolerance is None else tolerance
+    limits = _limits(gate or [])
     if is_merged:
-        return _of_merged_map(estimate, align, map_, voxels, format_)
+        return _gated(_of_merged_map(estimate, align, map_, voxels, format_), limits)
     run, trajectory, known = estimate_and_truth(estimate, truth, times)
     found = _path_errors(
         trajectory,
         known,
         align,
         lengths,
-        frames_ns=_frames_ns(run, log, used=sharpness),
+        frames_ns=_frames_ns(run, log, used=sharpness or agreement or against is not None),
         names=(str(estimate), str(truth) if truth else "its truth"),
     )
     metrics = list(found.metrics)
     if run is not None and known is not None:
         metrics += loop_metrics_of_run(run, known)
-    moved_log = _log_of(_needed(run, estimate, "--sharpness"), log) if sharpness else None
+    if run is None:
+        of_log = {"--sharpness": sharpness, "--agreement": agreement, "--against": against}
+        refuse_with(f"{estimate}, a trajectory alone", of_log, remedy="give the folder of its run")
     if map_ is None:
         quality = None
     else:
         built = _needed(run, estimate, "--map")
         quality = _map_quality(built, map_, world=map_world, register=register, voxels=voxels)
         metrics += quality.metrics
-    if moved_log is not None:
-        path = run.tracked_trajectory if run else trajectory
-        metrics += _sharpness_of(moved_log, path, progress=output.progress())
+    notes: list[str] = []
+    if run is not None and (sharpness or agreement or against is not None or known is None):
+        seen, notes = _of_log(
+            run, log, sharpness=sharpness, agreement=agreement, against=against, output=output
+        )
+        metrics += seen
     if plot is not None:
         _plot(plot, found, quality, align=align, name=estimate.resolve().name, map_=map_)
-    return _answer(run, metrics, found, format_)
+    return _gated(_answer(run, metrics, found, format_, notes), limits)
 
 
 def _path_errors(
@@ -176,12 +206,16 @@ def _path_errors(
     return found
 
 
-def _answer(run: "Run | None", metrics: "list[Metric]", found: "Assessment", format_: Format) -> Answer:
+def _answer(
+    run: "Run | None", metrics: "list[Metric]", found: "Assessment", format_: Format, notes: "list[str]"
+) -> Answer:
     from mapper.evaluators.metrics.metric import records_of
 
     text = _text(metrics, found, format_)
     if found.matched is None and format_ in ("text", "markdown"):
         text += "\n\nno ground truth, so no errors: --truth FILE compares with one"
+    if format_ in ("text", "markdown"):
+        text = "\n\n".join([text, *notes])
     document: dict[str, Any] = {"metrics": records_of(_every_metric(metrics, found))}
     if run is not None:
         from mapper.cli.summary import verdict_text
@@ -246,17 +280,57 @@ def _map_quality(run: "Run", path: Path, *, world: World | None, register: bool,
     return map_quality(run, reference, world=world, voxels=voxels, register=register)
 
 
-def _log_of(run: "Run", log: Path | None) -> "Log":
-    from mapper.run.folder import moved_log
-
-    return (run if log is None else moved_log(run, log)).open_log()
-
-
-def _sharpness_of(source: "Log", trajectory: "Trajectory", *, progress: "Progress") -> "list[Metric]":
+def _of_log(
+    run: "Run", log: Path | None, *, sharpness: bool, agreement: bool, against: Path | None, output: Output
+) -> "tuple[list[Metric], list[str]]":
+    """Return what the views of the run's log show without a truth, and sentences on it."""
+    from mapper.evaluators.metrics.agreement import (
+        agreement_metrics,
+        comparison_metrics,
+        disagreements_of,
+        which_is_better,
+    )
     from mapper.evaluators.metrics.sharpness import RADIUS_M, sharpness_metrics, views_of
+    from mapper.run.folder import moved_log, open_run
 
-    views = views_of(source, trajectory, progress=progress)
-    return sharpness_metrics(views, radius_m=RADIUS_M[source.sensor])
+    progress, asked = output.progress(), sharpness or agreement or against is not None
+    try:
+        source = (run if log is None else moved_log(run, log)).open_log()
+        metrics: list[Metric] = []
+        if sharpness:
+            views = views_of(source, run.tracked_trajectory, progress=progress)
+            metrics += sharpness_metrics(views, radius_m=RADIUS_M[source.sensor])
+        if agreement or against is not None or not sharpness:
+            own = disagreements_of(source, run.tracked_trajectory, progress=progress)
+            metrics += agreement_metrics(own)
+    except MapperError as error:
+        if asked:
+            raise
+        return [], [f"agreement of views not measured: {error}"]
+    if against is None:
+        return metrics, []
+    other = disagreements_of(source, open_run(against).tracked_trajectory, progress=progress)
+    compared = comparison_metrics(own, other)
+    return [*metrics, *compared], [which_is_better(compared, f"{run.path}", f"{against}")]
+
+
+def _limits(gates: Sequence[str]) -> dict[str, float]:
+    limits = {}
+    for gate in gates:
+        name, _, limit = gate.rpartition("=")
+        try:
+            limits[name] = float(limit)
+        except ValueError:
+            raise DataError(f"--gate {gate}: want METRIC=LIMIT, as in 'ATE RMSE=0.05'") from None
+    return limits
+
+
+def _gated(answer: Answer, limits: Mapping[str, float]) -> Answer:
+    """Return the answer with the error that its metrics exceed the limits, if one does."""
+    from mapper.evaluators.metrics.metric import exceeded
+
+    too_large = exceeded(answer.document["metrics"], limits)
+    return replace(answer, error=UntrustedError("; ".join(too_large))) if too_large else answer
 
 
 def _frames_ns(run: "Run | None", log: Path | None, *, used: bool) -> "Stamps | None":

@@ -2,8 +2,9 @@
 
 import json
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from mapper.core.errors import DataError
 
@@ -43,6 +44,32 @@ class Metric:
 def records_of(metrics: Iterable[Metric]) -> list[dict[str, str | float]]:
     """Return each metric's name, value and unit for other programs: every digit, angles in radians."""
     return [{"name": metric.name, "value": metric.value, "unit": metric.unit} for metric in metrics]
+
+
+def exceeded(records: Iterable[Mapping[str, Any]], limits: Mapping[str, float]) -> list[str]:
+    """Return a sentence for each metric that exceeds a limit.
+
+    Args:
+        records: Metrics as of :func:`records_of`.
+        limits: Largest values by the beginnings of the metrics' names; of angles in degrees.
+
+    Raises:
+        DataError: No metric begins like that.
+    """
+    known = list(records)
+    sentences = []
+    for beginning, limit in limits.items():
+        named = [record for record in known if record["name"].startswith(beginning)]
+        if not named:
+            names = ", ".join(record["name"] for record in known)
+            raise DataError(f"{beginning}={limit:g}: no metric begins like that; there are {names}")
+        for record in named:
+            angle = record["unit"] in _DEGREES
+            value = math.degrees(record["value"]) if angle else record["value"]
+            unit = _DEGREES[record["unit"]] if angle else record["unit"]
+            if value > limit:
+                sentences.append(f"{record['name']} is {value:.6g} {unit}, more than {limit:g}")
+    return sentences
 
 
 def text_table(metrics: Sequence[Metric]) -> str:

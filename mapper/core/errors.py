@@ -54,7 +54,7 @@ class TrackingError(MapperError):
 
 
 class UntrustedError(MapperError):
-    """A run that is written whole, but whose verdict is not "trusted"."""
+    """A result that is whole, but not as good as was asked for: not trusted, or beyond a limit."""
 
 
 class GraphError(MapperError):

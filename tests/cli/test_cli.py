@@ -246,6 +246,24 @@ def test_eval_holds_the_map_against_the_world_of_a_synthetic_log(run_folder, des
     assert scores["occupied F-score, within 1 voxel"] < 0.7
 
 
+def test_eval_judges_a_run_without_a_truth(run_folder, desk_log, tmp_path):
+    bare, other = tmp_path / "bare", tmp_path / "other"
+    shutil.copytree(desk_log, bare)
+    (bare / "groundtruth.txt").unlink()
+    mapper("build", bare, "--out", other, "--set", "odometry.kind=isvd", "--quiet")
+    told = json.loads(mapper("eval", other, "--json").stdout)["metrics"]
+    values = {metric["name"]: metric["value"] for metric in told}
+    assert "ATE RMSE, SE(3)-aligned" not in values
+    assert 0.0 < values["disagreement of views RMS"] < 0.05
+    shutil.rmtree(bare)
+    assert "not measured" in mapper("eval", other).stdout
+
+    compared = json.loads(mapper("eval", run_folder, "--against", other, "--json").stdout)["metrics"]
+    assert {metric["name"]: metric["value"] for metric in compared}["views compared in both runs"] > 50
+    mapper("eval", run_folder, "--gate", "ATE RMSE=1", "--quiet")
+    assert "more than 0.0001" in mapper("eval", run_folder, "--gate", "ATE RMSE=0.0001", status=1).stderr
+
+
 def test_eval_reads_kitti_text_with_and_without_times(run_folder, tmp_path):
     poses, times = tmp_path / "poses.txt", tmp_path / "times.txt"
     mapper("export", run_folder, "--as", "kitti", "--out", poses)

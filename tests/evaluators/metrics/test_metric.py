@@ -3,7 +3,14 @@ import json
 import pytest
 
 from mapper.core.errors import DataError
-from mapper.evaluators.metrics.metric import Metric, json_text, markdown_table, records_of, text_table
+from mapper.evaluators.metrics.metric import (
+    Metric,
+    exceeded,
+    json_text,
+    markdown_table,
+    records_of,
+    text_table,
+)
 
 METRICS = [
     Metric("matched poses", 786, "pairs"),
@@ -52,3 +59,13 @@ def test_a_name_has_the_condition():
     metric = Metric("ATE RMSE", 0.01, "m", "SE(3)-aligned")
     assert metric.name == "ATE RMSE, SE(3)-aligned"
     assert records_of([metric]) == [{"name": metric.name, "value": 0.01, "unit": "m"}]
+
+
+def test_limits_are_compared_in_the_units_that_people_see():
+    records = records_of(METRICS)
+    assert exceeded(records, {"ATE": 0.02, "matched": 786.0, "turn": 28.7}) == []
+    (sentence,) = exceeded(records, {"turn": 28.6})
+    assert "28.6479 °" in sentence
+    assert len(exceeded(records, {"ATE RMSE": 0.01, "matched poses": 1.0})) == 2
+    with pytest.raises(DataError, match="no metric begins"):
+        exceeded(records, {"RPE": 1.0})
