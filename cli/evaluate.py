@@ -285,9 +285,9 @@ def _of_log(
 ) -> "tuple[list[Metric], list[str]]":
     """Return what the views of the run's log show without a truth, and sentences on it."""
     from mapper.evaluators.metrics.agreement import (
+        CommonViews,
         agreement_metrics,
         comparison_metrics,
-        disagreements_of,
         which_is_better,
     )
     from mapper.evaluators.metrics.sharpness import RADIUS_M, sharpness_metrics, views_of
@@ -301,7 +301,8 @@ def _of_log(
             views = views_of(source, run.tracked_trajectory, progress=progress)
             metrics += sharpness_metrics(views, radius_m=RADIUS_M[source.sensor])
         if agreement or against is not None or not sharpness:
-            own = disagreements_of(source, run.tracked_trajectory, progress=progress)
+            common = CommonViews(source)
+            own = common.disagreements(run.tracked_trajectory, progress=progress)
             metrics += agreement_metrics(own)
     except MapperError as error:
         if asked:
@@ -309,7 +310,7 @@ def _of_log(
         return [], [f"agreement of views not measured: {error}"]
     if against is None:
         return metrics, []
-    other = disagreements_of(source, open_run(against).tracked_trajectory, progress=progress)
+    other = common.disagreements(open_run(against).tracked_trajectory, progress=progress)
     compared = comparison_metrics(own, other)
     return [*metrics, *compared], [which_is_better(compared, f"{run.path}", f"{against}")]
 

@@ -1,9 +1,9 @@
 """Comparison of methods on one log: a job for each, as odometry over all frames and on pairs of them."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ from mapper.evaluators.compare.catalogue import methods_for
 from mapper.evaluators.compare.config import CompareConfig, TrialsConfig
 from mapper.evaluators.compare.methods import FrameReader, Method, PreparedFrame, Tracker, reason_of
 from mapper.evaluators.compare.pairwise import guesses_for, pairs_of, trials_of
+from mapper.evaluators.metrics.agreement import CommonViews
 from mapper.evaluators.metrics.odometry import OdometryRun, Step, assess_run, step_for
 from mapper.evaluators.study.engine import digest, run_study, versions
 from mapper.run.input_logs import fingerprint
@@ -104,7 +105,9 @@ def compare(source: Log, config: CompareConfig, folder: Path, *, progress: Progr
         progress.note(f"skipped: {skip.reason}")
     frames_ns = np.array(one["frames_ns"], np.int64)
     truth, step = _truth_during(source, frames_ns), step_for(frames_ns)
+    runs = [assess_run(_run_of(name, record), truth, step) for name, record in found.items()]
     if truth is None:
+        runs = list(_judged_by_views(source, runs, progress))
         notes = [*notes, "the log has no truth for these frames: no errors, and no registration of pairs"]
     frames = len(found) * len(frames_ns)
     return Comparison(
@@ -113,7 +116,7 @@ def compare(source: Log, config: CompareConfig, folder: Path, *, progress: Progr
         sensor=source.sensor,
         config=config,
         truth=truth,
-        runs=tuple(assess_run(_run_of(name, record), truth, step) for name, record in found.items()),
+        runs=tuple(runs),
         step=step,
         trials=_by_pair([trial for record in found.values() for trial in record["trials"]]),
         read_ms=1e3 * sum(record["read_s"] for record in found.values()) / frames,
@@ -121,6 +124,16 @@ def compare(source: Log, config: CompareConfig, folder: Path, *, progress: Progr
         skipped=skipped,
         notes=tuple(notes),
     )
+
+
+def _judged_by_views(source: Log, runs: Iterable[OdometryRun], progress: Progress) -> Iterator[OdometryRun]:
+    """Yield the runs with how far they are from what views of one place show, where that is known."""
+    common = CommonViews(source)
+    for run in runs:
+        disagreement_m = None
+        with suppress(DataError, FrameError):
+            disagreement_m = common.disagreements(run.trajectory, progress=progress).rms_m
+        yield replace(run, disagreement_m=disagreement_m)
 
 
 def _run_of(method: str, record: Any) -> OdometryRun:

@@ -222,10 +222,14 @@ def _odometry(comparison: Comparison) -> Table:
     broken = [f"{run.method} {run.broke}" for run in comparison.runs if run.broke]
     frames = max(run.frames for run in comparison.runs)
     unread = f" ({len(comparison.skipped)} more cannot be read)" if comparison.skipped else ""
+    without_truth = [Column("disagreement_m", "views disagree m", decimals(4))]
+    if comparison.truth is not None:
+        without_truth = []
     return Table(
         columns=[
             Column("method", "method"),
             Column("ate_rmse_m", "ATE RMSE m", decimals(4)),
+            *without_truth,
             Column("rpe_rmse_m", f"RPE {step} m", decimals(4)),
             Column("rpe_rmse_rad", f"RPE {step} °", _DEGREES),
             Column("drift_ratio", "drift %", percent(1)),
@@ -240,6 +244,7 @@ def _odometry(comparison: Comparison) -> Table:
                 "failures": run.failures,
                 "coverage_ratio": run.coverage,
                 "ate_rmse_m": run.errors.ate_m,
+                "disagreement_m": run.disagreement_m,
                 "rpe_rmse_m": run.errors.rpe_m,
                 "rpe_rmse_rad": run.errors.rpe_rad,
                 "drift_ratio": run.errors.drift_ratio,

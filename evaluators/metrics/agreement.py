@@ -4,10 +4,10 @@ It needs no truth. Frames are compared in pairs, also far apart in the log, whil
 and loop closure some keyframes, so that drift and bent maps show. Frames that err alike agree.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from typing import Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,50 +56,57 @@ class Disagreements:
     moments: NDArray[np.intp]
     distances_m: Array
 
-
-def disagreements_of(source: Log, trajectory: Trajectory, *, progress: Progress = SILENT) -> Disagreements:
-    """Return how far pairs of views of one place are from where a trajectory puts them.
-
-    Two images: the distance between the camera's position relative to the other's and that which paired
-    features show, as a loop is measured. Two scans: the root mean square of the part of their distances
-    from point to plane (Chen & Medioni 1992) that one rigid motion, to first order, would take away.
-
-    Args:
-        source: The log.
-        trajectory: T_world_body of its frames.
-        progress: Receives stages, counts and notes.
-
-    Raises:
-        DataError: No two of the frames that are compared show one place.
-        FrameError: A frame cannot be read.
-    """
-    moment_of = _moments(source.stamps_ns)
-    chosen = [frame for frame in placed_frames(source, trajectory) if frame.entry.stamp_ns in moment_of]
-    images = source.sensor == "rgbd"
-    with progress.stage("agree") as report:
-        pairs = list(
-            _compared(_ImageViews(), chosen, report) if images else _compared(_ScanViews(), chosen, report)
-        )
-    if not pairs:
-        raise DataError(f"agreement: of {len(chosen)} frames spread over the log no two show one place")
-    first_ns, second_ns, distances_m = zip(*pairs, strict=True)
-    stamps_ns = np.array([first_ns, second_ns]).T
-    moments = np.array([[moment_of[stamp_ns] for stamp_ns in pair] for pair in stamps_ns.tolist()])
-    return Disagreements(stamps_ns, moments, np.array(distances_m))
+    @property
+    def rms_m(self) -> float:
+        """Their root mean square, metres."""
+        return float(np.sqrt((self.distances_m**2).mean()))
 
 
-def _compared(
-    views: "_Views[View]", frames: Sequence[PlacedFrame], report: Callable[[int, int], None]
-) -> Iterator[tuple[int, int, float]]:
-    """Yield the stamps and the distance of each pair of frames that show one place."""
-    described = list(ordered_map(views.describe, frames))
-    pairs = list(combinations(range(len(frames)), 2))
-    for done, (i, j) in enumerate(pairs, start=1):
-        report(done, len(pairs))
-        T_i_j = inverse(frames[i].T_world_body) @ frames[j].T_world_body
-        distance_m = views.distance_m(described[i], described[j], T_i_j)
-        if distance_m is not None:
-            yield frames[i].entry.stamp_ns, frames[j].entry.stamp_ns, distance_m
+class CommonViews:
+    """Frames of a log, in pairs of which many show one place, by which trajectories are judged."""
+
+    def __init__(self, source: Log) -> None:
+        """Choose the frames; they are read when they are needed.
+
+        Args:
+            source: The log.
+        """
+        self._source = source
+        self._moment_of = _moments(source.stamps_ns)
+        self._views: _Views[Any] = _ImageViews() if source.sensor == "rgbd" else _ScanViews()
+
+    def disagreements(self, trajectory: Trajectory, *, progress: Progress = SILENT) -> Disagreements:
+        """Return how far pairs of views of one place are from where a trajectory puts them.
+
+        Two images: the distance between the camera's position relative to the other's and that which paired
+        features show, as a loop is measured. Two scans: the root mean square of the part of their distances
+        from point to plane (Chen & Medioni 1992) that one rigid motion, to first order, would take away.
+
+        Args:
+            trajectory: T_world_body of the log's frames.
+            progress: Receives stages, counts and notes.
+
+        Raises:
+            DataError: No two of the frames that are compared show one place.
+            FrameError: A frame cannot be read.
+        """
+        placed = placed_frames(self._source, trajectory)
+        frames = [frame for frame in placed if frame.entry.stamp_ns in self._moment_of]
+        pairs = list(combinations(range(len(frames)), 2))
+        stamps_ns, distances_m = [], []
+        with progress.stage("agree") as report:
+            seen = list(ordered_map(self._views.describe, frames))
+            for done, (i, j) in enumerate(pairs, start=1):
+                report(done, len(pairs))
+                T_i_j = inverse(frames[i].T_world_body) @ frames[j].T_world_body
+                distance_m = self._views.distance_m(seen[i], seen[j], T_i_j)
+                if distance_m is not None:
+                    stamps_ns.append((frames[i].entry.stamp_ns, frames[j].entry.stamp_ns))
+                    distances_m.append(distance_m)
+        if not distances_m:
+            raise DataError(f"agreement: of {len(frames)} frames spread over the log no two show one place")
+        moments = [[self._moment_of[stamp_ns] for stamp_ns in pair] for pair in stamps_ns]
+        return Disagreements(np.array(stamps_ns), np.array(moments), np.array(distances_m))
 
 
 def agreement_metrics(disagreements: Disagreements) -> list[Metric]:
@@ -111,7 +118,7 @@ def agreement_metrics(disagreements: Disagreements) -> list[Metric]:
     low_m, high_m = np.sqrt(_interval(squares_m2, disagreements.moments)).tolist()
     return [
         Metric("views that show one place", len(squares_m2), "pairs"),
-        Metric("disagreement of views RMS", float(np.sqrt(squares_m2.mean())), "m"),
+        Metric("disagreement of views RMS", disagreements.rms_m, "m"),
         Metric("disagreement of views, interval from", low_m, "m", "95 %"),
         Metric("disagreement of views, interval to", high_m, "m", "95 %"),
     ]
@@ -184,17 +191,26 @@ class _Views(Protocol[View]):
 
 
 class _ImageViews:
-    """Images, compared by their features."""
+    """Images, compared by their features; what they show does not depend on the poses and is kept."""
 
     def __init__(self) -> None:
         self._odometry = build_frame_odometry(LocalMapConfig())
         self._verifier = ImageVerifier(ImageVerificationConfig())
+        self._views: dict[int, ImageView] = {}
+        self._motions: dict[tuple[int, int], Transform | None] = {}
 
     def describe(self, frame: PlacedFrame, /) -> ImageView:
-        return self._verifier.describe(self._odometry.view(self._odometry.read(frame.entry)))
+        stamp_ns = frame.entry.stamp_ns
+        if stamp_ns not in self._views:
+            view = self._odometry.view(self._odometry.read(frame.entry))
+            self._views[stamp_ns] = self._verifier.describe(view)
+        return self._views[stamp_ns]
 
     def distance_m(self, i: ImageView, j: ImageView, T_i_j: Transform, /) -> float | None:
-        measured = self._verifier.verify(i, j).T_i_j
+        pair = i.stamp_ns, j.stamp_ns
+        if pair not in self._motions:
+            self._motions[pair] = self._verifier.verify(i, j).T_i_j
+        measured = self._motions[pair]
         return None if measured is None else float(np.linalg.norm((T_i_j - measured)[:3, 3]))
 
 

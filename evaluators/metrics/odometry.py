@@ -68,6 +68,8 @@ class OdometryRun:
         errors: Errors of these poses; unknown without truth or with too few of them.
         steps_m: (S,) errors of the translation over one step; empty where no two poses are one apart.
         broke: Why the method did not come to the end of the log; empty when it did.
+        disagreement_m: How far its poses are from what views of one place show, root mean square; None where
+            there is a truth or it is not known.
     """
 
     method: str
@@ -79,6 +81,7 @@ class OdometryRun:
     errors: PathErrors = PathErrors()
     steps_m: Array = field(default_factory=lambda: np.empty(0))
     broke: str = ""
+    disagreement_m: float | None = None
 
     @property
     def coverage(self) -> float:

@@ -184,10 +184,14 @@ def test_frames_that_cannot_be_read_are_skipped_for_all(desk, tmp_path):
         compare(damaged(desk, set(range(8))), RGBD, tmp_path / "all")
 
 
-def test_without_truth_there_is_speed_and_a_path_only(desk, tmp_path):
-    config = RGBD.model_copy(update={"methods": ("gicp",)})
+def test_without_truth_there_is_speed_and_how_far_views_disagree(desk, tmp_path):
+    config = RGBD.model_copy(update={"methods": ("gicp", "icp")})
     comparison = compare(replace(desk, truth=None), config, tmp_path / "cells")
-    row = odometry_records(comparison)[0]
+    row, other = odometry_records(comparison)
+    first, second = odometry_records(compare(desk, config, tmp_path / "with truth"))
+    assert first["ate_rmse_m"] > 2.0 * second["ate_rmse_m"]
+    assert row["disagreement_m"] > 2.0 * other["disagreement_m"]
+    assert first["disagreement_m"] is None
     assert (row["ate_rmse_m"], row["rpe_rmse_m"], row["drift_ratio"]) == (None, None, None)
     assert row["frames_per_s"] > 0.0
     assert not comparison.trials

@@ -11,9 +11,9 @@ from mapper.core.geometry import exp
 from mapper.core.timebase import NS_PER_S
 from mapper.core.trajectory import Trajectory
 from mapper.evaluators.metrics.agreement import (
+    CommonViews,
     agreement_metrics,
     comparison_metrics,
-    disagreements_of,
     which_is_better,
 )
 from mapper.sources import open_source
@@ -40,6 +40,10 @@ def drifting(truth, metres_per_frame, *, jitter_m=0.0):
     errors_m = metres_per_frame * np.arange(len(truth)) + rng.normal(0.0, jitter_m, len(truth))
     errors = [exp(np.zeros(3), np.array([0.0, error_m, 0.0])) for error_m in errors_m]
     return replace(truth, T_world_body=truth.T_world_body @ np.array(errors))
+
+
+def disagreements_of(log, trajectory):
+    return CommonViews(log).disagreements(trajectory)
 
 
 def values_of(metrics):
