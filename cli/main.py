@@ -42,6 +42,7 @@ _COLLECT_AFTER = 50_000
 """New objects after which Python searches for cycles: at its own 700 this takes 6 to 12 % of a build: the
 libraries leave a million objects to search, and our data have no cycles."""
 _USER_CAN_HELP = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EACCES, errno.EPERM, errno.EROFS}
+_USER_CAN_HELP |= {errno.ENAMETOOLONG, errno.ELOOP}
 
 
 class Guarded(VerbGroup):

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mapper.config.loading import Settings, load_source_config
+from mapper.config.loading import Settings, load_config, load_source_config
 from mapper.core.errors import SourceError
 from mapper.core.frames import Frame, Sensor
 from mapper.runtime.regular_files import AnyPath
@@ -55,7 +55,7 @@ def inspect(
 
     Args:
         path: As of :func:`open_log`.
-        overrides: ``source.key=value`` as text; other settings are left out.
+        overrides: ``key.path=value`` as text.
         settings: The same as values by dotted name.
 
     Returns:
@@ -66,7 +66,21 @@ def inspect(
     """
     from mapper.sources.inspection import inspect_log  # loads foxglove, which opening a log may not need
 
-    return inspect_log(Path(path), load_source_config(None, overrides, settings=settings))
+    def why_untrackable(log: Log) -> str | None:
+        if log.sensor != "lidar":
+            return None
+        from mapper.odometry.scans import scan_observation
+        from mapper.odometry.scans.config import AnyScanOdometryConfig
+        from mapper.odometry.scans.surroundings import adapted_to
+
+        odometry = load_config(None, overrides, settings=settings, sensor=log.sensor).odometry
+        odometry = adapted_to(odometry, log)
+        if not isinstance(odometry, AnyScanOdometryConfig):
+            return None
+        return scan_observation.why_untrackable(log, odometry)
+
+    config = load_source_config(None, overrides, settings=settings)
+    return inspect_log(Path(path), config, check=why_untrackable)
 
 
 def read_frame(name: AnyPath, config: SourceConfig) -> tuple[Frame, Sensor]:

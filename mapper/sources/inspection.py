@@ -1,6 +1,6 @@
 """Facts of a log, without building anything from it."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -124,21 +124,29 @@ class Inspection:
     problem: str | None
 
 
-def inspect_log(path: Path, config: SourceConfig) -> Inspection:
+def inspect_log(
+    path: Path, config: SourceConfig, *, check: Callable[[Log], str | None] = lambda _: None
+) -> Inspection:
     """Return what is in a log of any kind.
+
+    Args:
+        path: The log.
+        config: Settings by which it is opened.
+        check: Returns why nothing of it can be mapped, as only the settings of the odometry tell; None if
+            something can.
 
     Raises:
         SourceError: It is no log of a known format, or is damaged beyond reading.
     """
     if not (path.exists() and format_of(path) == RECORDING):
-        return _inspected(path, [], open_source(path, config))
+        return _inspected(path, [], open_source(path, config), check)
     reader = RecordingReader(recordings.open_recording(path))
     topics = [_topic(series) for series in reader.series.values()]
     try:
         log = selected(recording_log(reader, config), config)
     except (DependencyError, SourceError) as error:
         return Inspection(path, topics, None, str(error))
-    return _inspected(path, topics, log)
+    return _inspected(path, topics, log, check)
 
 
 def timing_of(stamps_ns: Stamps) -> Timing:
@@ -161,7 +169,9 @@ def _topic(series: Series) -> TopicFacts:
     return TopicFacts(topic.name, topic.type, topic.encoding, timing_of(series.stamps_ns))
 
 
-def _inspected(path: Path, topics: Sequence[TopicFacts], source: Log) -> Inspection:
+def _inspected(
+    path: Path, topics: Sequence[TopicFacts], source: Log, check: Callable[[Log], str | None]
+) -> Inspection:
     checks = ReadingChecks(source)
     damage = list(_damage(checks))  # loads grey images, before the first is loaded in colour
     first, problem = _first_frame(checks.log)
@@ -187,7 +197,8 @@ def _inspected(path: Path, topics: Sequence[TopicFacts], source: Log) -> Inspect
         warnings=[*time_warnings(source), *depth_warnings(source), *scan_frame_warnings(source)],
         vehicle=vehicle_box(source),
     )
-    return Inspection(path, topics, log, problem or _without_depth(source) or _unwritable(source))
+    why = problem or _without_depth(source) or _unwritable(source) or check(source)
+    return Inspection(path, topics, log, why)
 
 
 def _without_depth(source: Log) -> str | None:

@@ -87,6 +87,24 @@ def test_a_verb_answers_to_each_kind_of_input(verb, kind, inputs, options):
         assert result.stderr.count("\n") == 1
 
 
+@pytest.mark.parametrize("verb", ANSWERS)
+def test_a_name_longer_than_any_is_a_line(verb, options):
+    result = invoke(verb, "a" * 300, *options.get(verb, ()))
+    assert (result.exit_code, result.stderr.count("\n")) == (1, 1)
+
+
+@pytest.mark.parametrize(("metres", "status"), [(1.0, 0), (0.001, 1), (0.05, 1)])
+def test_inspect_and_build_refuse_scans_without_returns_in_range(metres, status, tmp_path):
+    rng = np.random.default_rng(3)
+    for k in range(12):
+        points = rng.uniform(-9.0, 9.0, (3000, 3)) * [1.0, 1.0, 0.2]
+        np.save(tmp_path / f"{k:04}.npy", metres * points)
+    assert invoke("inspect", tmp_path).exit_code == status
+    if status:
+        built = invoke("build", tmp_path, "--out", tmp_path / "run", "--quiet")
+        assert (built.exit_code, "source.cloud_scale" in built.stderr) == (1, True)
+
+
 def test_data_that_are_no_logs_are_named(tmp_path):
     images = tmp_path / "images"
     images.mkdir()

@@ -123,7 +123,7 @@ def map_sizes(chapter: Chapter) -> dict[str, str]:
         coarse = octree.coarser(level, parent="max")
         octree_bytes = bt_bytes(coarse)
         sizes[f"octree, {coarse.resolution_m:g} m"] = (
-            f"{_size(octree_bytes)}, {100.0 * octree_bytes / cloud_bytes:.3g} % of the cloud"
+            f"{_size(octree_bytes)}, {100.0 * octree_bytes / max(cloud_bytes, 1):.3g} % of the cloud"
         )
     return sizes
 

@@ -13,9 +13,11 @@ from mapper.features.frame_view import ScanView
 from mapper.odometry.scans.config import ScanOdometryConfig
 from mapper.odometry.scans.scan_matcher import DeskewedScan
 from mapper.registration.surfaces import prepared
+from mapper.sources.base import Log
 
 _MIN_POINTS = 100
 """Fewer points left after thinning do not constrain a pose."""
+_LOOKED_AT = 6
 _FINER = 0.5  # voxel size of the first thinning, of whose points each prepared point is the mean
 
 
@@ -83,7 +85,8 @@ def observe_scan(frame: Frame, config: ScanOdometryConfig) -> ScanObservation:
         raise FrameError(
             f"scan {scan.stamp_ns}: {len(scan.points_body)} points, of which {len(kept)} are left between "
             f"{config.min_range_m:g} m and {config.max_range_m:g} m and {_FINER * config.voxel_m:g} m apart; "
-            f"want {_MIN_POINTS} (odometry.min_range_m, max_range_m, voxel_m)"
+            f"want {_MIN_POINTS} (odometry.min_range_m, max_range_m, voxel_m; source.cloud_scale where these "
+            "are no metres)"
         )
     thinned = replace(scan, points_body=points_body[kept], colors=None, times_s=None)
     median_m = float(np.median(range_m[in_range][kept]))
@@ -95,6 +98,19 @@ def observe_scan(frame: Frame, config: ScanOdometryConfig) -> ScanObservation:
     middle_s, half_s = 0.5 * (first_s + last_s), 0.5 * (last_s - first_s)
     swept = replace(thinned, times_s=times_s)
     return ScanObservation(swept, middle_s, half_s, median_m, None, config.voxel_m)
+
+
+def why_untrackable(log: Log, config: ScanOdometryConfig) -> str | None:
+    """Return why none of some scans, spread over a log, can be tracked; None if one can."""
+    first = None
+    for entry in log.spread_entries(_LOOKED_AT):
+        try:
+            observe_scan(entry.load(), config)
+        except FrameError as error:
+            first = first or str(error)
+        else:
+            return None
+    return first
 
 
 def _prepared(scan: Scan, voxel_m: float) -> DeskewedScan:

@@ -105,7 +105,8 @@ def read_array_m(path: ImageFile, units_per_m: float, float_units_per_m: float) 
     if array.dtype == np.uint16:
         return depth_m_from(array, units_per_m)
     unit = float_units_per_m if array.dtype.kind == "f" else units_per_m
-    depth_m: DepthImage = array.astype(np.float32) / np.float32(unit)
+    with np.errstate(all="ignore"):  # a damaged file's numbers may be too large, or signalling NaN
+        depth_m: DepthImage = array.astype(np.float32) / np.float32(unit)
     return np.where(np.isfinite(depth_m) & (depth_m > 0.0), depth_m, np.float32(0.0))
 
 
