@@ -10,12 +10,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mapper.core.errors import GraphError
 from mapper.core.geometry import Array, Transform, adjoint, inverse, length_and_angle, transform
 from mapper.core.timebase import NS_PER_S, Stamps
 from mapper.core.units import GRAVITY_MPS2
 from mapper.graph.batch import Effort, problem_of, solve
 from mapper.graph.model import BetweenFactor
-from mapper.graph.terms import Kernel, anchor, between, pose3, solver_errors
+from mapper.graph.terms import Kernel, anchor, between, pose3
 from mapper.sensing.inertial import InertialReadings
 
 if TYPE_CHECKING:
@@ -117,9 +118,11 @@ def smooth_path(
     problem = problem_of(terms)
     freedom = sum(term.dim() for term in terms) - values.dim()
     variance_factor = max(1.0, 2.0 * problem.error(values) / max(freedom, 1))
-    with solver_errors("the inertial readings do not determine the path"):
+    try:
         marginals = gtsam.Marginals(problem, values)
         variances = [np.linalg.eigvalsh(marginals.marginalCovariance(velocity[k]))[-1] for k in times]
+    except RuntimeError:  # GTSAM's text is long, and of its own variables
+        raise GraphError(f"the inertial readings do not determine the path of {len(times)} frames") from None
     return SmoothedPath(
         T_world_body=np.array([values.atPose3(k).matrix() for k in times]),
         velocity_sigmas_mps=np.sqrt(variance_factor * np.array(variances)),

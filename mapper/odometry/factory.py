@@ -100,7 +100,7 @@ def build_frame_odometry(
         case IsvdOdometryConfig():
             from mapper.odometry.isvd.odometry import IsvdOdometry
 
-            return IsvdOdometry(config, motion_check=motion_check)
+            return IsvdOdometry(config, motion_check=motion_check, gyroscope=gyroscope)
         case LocalMapConfig():
             from mapper.odometry.keyframes.motion_tracker import MotionPoseTracker
             from mapper.odometry.keyframes.odometry import KeyframeOdometry

@@ -45,9 +45,13 @@ def bridge(source: Log, tracking: TrackingResult, *, progress: Progress) -> Trac
     """
     before = len(tracking.warnings)
     tracks = tracking.tracks
-    readings = None if tracking.gyroscope is None else body_readings(source, tracking.gyroscope)
-    if readings is None:
+    if tracking.gyroscope is None or source.accelerations is None:
         return tracking
+    readings = body_readings(source, tracking.gyroscope)
+    if readings is None:
+        sentence = "accelerations are not used: their unit, or their mounting on the body, is not known"
+        progress.note(sentence)
+        return _with_note(tracking, sentence)
     # A frame that no reading reaches from the one before begins another window, at the first known pose.
     unreached = [
         k + 1 for k, (a, b) in enumerate(pairwise(tracks)) if not readings.covers(a.stamp_ns, b.stamp_ns)
@@ -121,11 +125,12 @@ def _bridge_window(
     graph, part_of_node = tracking.graph, component_numbers(tracking.graph.without_loops())
     window = _window_of(tracking.tracks[first : last + 1], graph, part_of_node)
     tracks, factors = window.tracks, window.factors
+    weak = np.array([_is_weak(track) for track in tracks])
     stamps_ns = np.array([track.stamp_ns for track in tracks], np.int64)
     try:
         path = smooth_path(stamps_ns, window.poses, window.part_of, factors, readings)
     except GraphError as error:
-        return _with_note(tracking, f"accelerations are not used: {error}")
+        return _with_note(tracking, f"accelerations are not used: {error}") if weak.any() else tracking
     if path.variance_factor > _CONTRADICTION:
         return _with_note(
             tracking,
@@ -133,9 +138,9 @@ def _bridge_window(
             f"by {np.sqrt(path.variance_factor):.0f} standard deviations; are their axes and clock right?",
         )
     inside = {node: index for node, index in window.index_of.items() if index < len(tracks)}
-    weak = np.array([_is_weak(track) for track in tracks])
-    wrong = [factors[k].j for k in np.flatnonzero(path.contradicted).tolist()]
-    weak[[k for k in wrong if k < len(tracks)]] = True
+    for factor, is_contradicted in zip(factors, path.contradicted.tolist(), strict=True):
+        if is_contradicted:
+            weak[max(k for k in (factor.i, factor.j) if k < len(tracks))] = True
     changed = _place_frames(tracks, weak, path, inside)
     replaced = _replace_factors(graph, weak, path, inside)
     connected = _connect_parts(replaced, part_of_node, path, inside)
@@ -199,25 +204,25 @@ def _place_frames(
 def _replace_factors(
     graph: PoseGraph, weak: NDArray[np.bool_], path: SmoothedPath, index_of: Mapping[int, int]
 ) -> PoseGraph:
-    """Return the graph with smoothed factors where weak frames lie between its nodes.
+    """Return the graph with one smoothed factor to each weak node, in place of the odometry's.
 
-    The errors of such a stretch are those of one velocity, not independent: factors' covariances grow until
+    The errors of consecutive ones are those of one velocity, not independent: their covariances grow until
     their sum is that of the whole stretch.
     """
-    weak_before = np.concatenate([[0], np.cumsum(weak)])
-    replaced: dict[int, tuple[int, int]] = {}
+    ends: dict[int, tuple[int, int]] = {}
     for number, factor in enumerate(graph.factors):
         if factor.origin == "odometry" and factor.i in index_of and factor.j in index_of:
             i, j = index_of[factor.i], index_of[factor.j]
-            if weak_before[max(i, j) + 1] > weak_before[min(i, j) + 1]:
-                replaced[number] = i, j
-    factors = list(graph.factors)
-    for run in _chains(replaced):
-        for number, covariance in zip(run, _covariances(path, [replaced[k] for k in run]), strict=True):
-            factors[number] = _factor(
-                path, factors[number].i, factors[number].j, *replaced[number], covariance
-            )
-    return graph.with_factors(factors)
+            if weak[max(i, j)]:
+                ends[number] = i, j
+    nearest = {max(ends[number]): number for number in sorted(ends, key=lambda number: min(ends[number]))}
+    smoothed: dict[int, BetweenFactor] = {}
+    for chain in _chains({number: ends[number] for number in nearest.values()}):
+        for number, covariance in zip(chain, _covariances(path, [ends[k] for k in chain]), strict=True):
+            factor = graph.factors[number]
+            smoothed[number] = _factor(path, factor.i, factor.j, *ends[number], covariance)
+    kept = enumerate(graph.factors)
+    return graph.with_factors(smoothed.get(k, f) for k, f in kept if k in smoothed or k not in ends)
 
 
 def _connect_parts(

@@ -12,7 +12,17 @@ from numpy.typing import NDArray
 from mapper.core.deskew import Motion
 from mapper.core.errors import ConfigError, FrameError
 from mapper.core.frames import Frame, PinholeCamera, RgbdFrame
-from mapper.core.geometry import Array, Transform, apply, inverse, mean_pose, mean_rotation, transform
+from mapper.core.geometry import (
+    Array,
+    Transform,
+    apply,
+    inverse,
+    mean_pose,
+    mean_rotation,
+    rotation_exp,
+    rotation_log,
+    transform,
+)
 from mapper.features.base import Detector
 from mapper.features.factory import build_detector
 from mapper.features.frame_view import ImageView
@@ -28,7 +38,9 @@ from mapper.odometry.base import (
     lost_frame,
 )
 from mapper.odometry.config import IsvdOdometryConfig, MatchConfig
+from mapper.odometry.gyroscope_calibration import GyroscopeCalibration
 from mapper.odometry.isvd.registration import IsvdObservation, PairRegistration, RegisterPair, matched_pairs
+from mapper.odometry.motion_prior import MotionPrior
 from mapper.odometry.sharpest_keyframe import SharpestKeyframes
 from mapper.registration.base import Alignment
 from mapper.registration.reprojection import (
@@ -39,6 +51,7 @@ from mapper.registration.reprojection import (
 from mapper.runtime.archived import Archived, archived
 from mapper.sensing.config import KINECT_NOISE
 from mapper.sensing.depth import depth_sigma_m, dif, feature_depth_m
+from mapper.sensing.gyroscope import Gyroscope
 
 _DEPTH_SHARE = 0.01
 """Error of depths beside the sensor's noise, as a share: its scale, and the slope where a feature lies."""
@@ -109,6 +122,7 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
         detector: Detector | None = None,
         register: RegisterPair | None = None,
         motion_check: MotionCheck | None = None,
+        gyroscope: Gyroscope | None = None,
     ) -> None:
         """Start before the first frame.
 
@@ -118,8 +132,10 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
                 the detection.
             register: Replaces the registration, so that they can share registrations as well.
             motion_check: Rules out poses after a gap; None if nothing but the images tells of the motion.
+            gyroscope: Angular velocities of the log; None if it has none.
         """
         self._config = config
+        self._prior = MotionPrior(gyroscope)
         self._motion_check = motion_check
         self._detector = detector or build_detector(config.detector)
         self._registration = PairRegistration(config.registration, by_pixels=config.residual == "pixels")
@@ -213,6 +229,14 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
         before_px[now] = earlier.measured[:, :2][then]
         return FeatureMatches(np.isfinite(before_px[:, 0]), before_px)
 
+    def gyroscope_notes(self) -> Sequence[str]:
+        """Return how the gyroscope was used, if the log has one."""
+        return self._prior.notes()
+
+    def gyroscope_calibration(self) -> GyroscopeCalibration | None:
+        """Return the gyroscope's calibration, if the log has one that was of use."""
+        return self._prior.calibration
+
     def _undistorted(self, pixels: NDArray[np.float32], camera: PinholeCamera) -> Array:
         exact: Array = pixels.astype(np.float64)
         return camera.undistort(exact) if self._config.undistort else exact
@@ -247,7 +271,7 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
         candidates = []
         for frame in earlier:
             alignment, weight, matches = self._register_pair(frame.observation, observation, match)
-            if alignment.converged and self._is_possible(alignment, frame.observation, observation):
+            if alignment.converged and self._is_possible(alignment, frame, observation):
                 T = alignment.T_target_source
                 assert alignment.information is not None  # it converged
                 information = with_model_error(alignment.information, T)
@@ -256,9 +280,12 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
                 )
         return candidates
 
-    def _is_possible(self, found: Alignment, earlier: IsvdObservation, now: IsvdObservation) -> bool:
-        """Return whether a motion across a gap is possible, where something else tells it."""
-        check, begin_ns, end_ns = self._motion_check, earlier.stamp_ns, now.stamp_ns
+    def _is_possible(self, found: Alignment, earlier: TrackedFrame, now: IsvdObservation) -> bool:
+        """Return whether the gyroscope, or across a gap something else, does not rule out a motion."""
+        check, begin_ns, end_ns = self._motion_check, earlier.observation.stamp_ns, now.stamp_ns
+        last, R_world_now = self._recent[-1], (earlier.T_world_body @ found.T_target_source)[:3, :3]
+        if self._prior.reject(last.observation.stamp_ns, end_ns, last.T_world_body[:3, :3].T @ R_world_now):
+            return False
         if check is None or not is_gap(begin_ns, end_ns):
             return True
         return not check.contradiction(found.T_target_source, begin_ns, end_ns)
@@ -311,6 +338,7 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
         node = self._next_node
         self._next_node += 1
         tracked = TrackedFrame(node, observation, T_world_body)
+        self._learn_turn(tracked)
         self._recent.append(tracked)
         if self._config.earlier == "frames":
             keyframe = self._sharpest.add(node, len(observation.features))
@@ -347,6 +375,18 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
             factors=factors,
             links=factors,
         )
+
+    def _learn_turn(self, tracked: TrackedFrame) -> None:
+        """Let the prior compare the turn since the last frame with the gyroscope's."""
+        if len(self._recent) < 2:
+            return
+        (R_before, before_ns), (R_last, last_ns), (R_now, now_ns) = (
+            (frame.T_world_body[:3, :3], frame.observation.stamp_ns)
+            for frame in (self._recent[-2], self._recent[-1], tracked)
+        )
+        share = (now_ns - last_ns) / (last_ns - before_ns)
+        constant = rotation_exp(share * rotation_log(R_before.T @ R_last))
+        self._prior.learn(last_ns, now_ns, R_last.T @ R_now, constant)
 
 
 def align_images(

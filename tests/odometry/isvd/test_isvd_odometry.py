@@ -5,12 +5,13 @@ import pytest
 
 from mapper.core.errors import FrameError
 from mapper.core.frames import PinholeCamera, RgbdFrame, Scan
-from mapper.core.geometry import apply, exp, inverse, log, mean_rotation
+from mapper.core.geometry import apply, exp, inverse, log, mean_rotation, rotation_log
 from mapper.features.base import Features
 from mapper.features.config import OrbConfig
 from mapper.odometry.config import IsvdOdometryConfig
 from mapper.odometry.isvd.odometry import IsvdOdometry
 from mapper.odometry.isvd.registration import IsvdObservation
+from mapper.sensing.gyroscope import Gyroscope
 
 CAMERA = PinholeCamera(640, 480, 500.0, 500.0, 320.0, 240.0)
 BF_PX_M = 40.0
@@ -226,6 +227,26 @@ def test_keyframes_far_from_the_loss_are_tried_in_turn():
     assert methods[0] == "lost"
     assert "relocalised" in methods
     assert methods[-1] == "isvd"
+
+
+def swaying(time_s: float) -> np.ndarray:
+    return exp(0.2 * np.array([0.6 * np.sin(1.7 * time_s), np.sin(1.3 * time_s), 0.0]), np.zeros(3))
+
+
+@pytest.mark.parametrize("has_gyroscope", [True, False])
+def test_a_gyroscope_rules_out_a_view_of_another_direction(has_gyroscope):
+    times_s = np.arange(0.0, 5.0, 0.005)
+    steps = [rotation_log((inverse(swaying(t - 1e-4)) @ swaying(t + 1e-4))[:3, :3]) / 2e-4 for t in times_s]
+    gyroscope = Gyroscope("imu", np.round(1e9 * times_s).astype(np.int64), np.array(steps))
+    odometry = IsvdOdometry(IsvdOdometryConfig(), gyroscope=gyroscope if has_gyroscope else None)
+    wall = Wall(3)
+    for k in range(40):
+        result = odometry.track(wall.seen_from(swaying(0.1 * k), k * 100_000_000))
+        assert result.node is not None
+    if has_gyroscope:
+        np.testing.assert_allclose(odometry.gyroscope_calibration().R_body_imu, np.eye(3), atol=0.05)
+    turned = swaying(3.9) @ exp(np.array([0.0, 0.3, 0.0]), np.zeros(3))
+    assert (odometry.track(wall.seen_from(turned, 3_910_000_000)).node is None) == has_gyroscope
 
 
 def test_bridges_a_view_without_a_common_plane_by_matching_without_homography():
