@@ -16,7 +16,6 @@ from mapper.sources.base import Log
 _STATED_RAD, _UNSTATED_RAD = 0.1, 2.0  # a mounting in tf is right to some degrees, or wrong altogether
 _BIAS_RADPS, _OFFSET_S = 0.02, 0.05  # of units without calibration, and of unsynchronised clocks
 _TRIED_OFFSETS_S = 0.025 * np.arange(-10, 11)
-_DIFFERENCE_NS = 5_000_000
 _ITERATIONS = 8
 _KERNEL = 2.4  # Cauchy's, in standard deviations
 _LEAST_SIGMA_RAD = 1e-4
@@ -59,19 +58,20 @@ class GyroscopeCalibration:
             ends_ns: (M,) later ones.
         """
         shift_ns = round(self.offset_s * NS_PER_S)
-        G, early, late = (
-            gyroscope.rotations(begins_ns + shift, ends_ns + shift, self.bias, self.scale)
-            for shift in (shift_ns, shift_ns - _DIFFERENCE_NS, shift_ns + _DIFFERENCE_NS)
-        )
+        begins_imu_ns, ends_imu_ns = begins_ns + shift_ns, ends_ns + shift_ns
+        G, known = gyroscope.rotations(begins_imu_ns, ends_imu_ns, self.bias, self.scale)
         R = self.R_body_imu
-        R_begin_end = R @ G[0] @ R.T
+        R_begin_end = R @ G @ R.T
         seconds = (ends_ns - begins_ns) / NS_PER_S
-        by_time = _logs(early[0].transpose(0, 2, 1) @ late[0]) / (2 * _DIFFERENCE_NS / NS_PER_S)
+        first, last = (
+            self.scale * gyroscope.rates_at(at_ns) - self.bias for at_ns in (begins_imu_ns, ends_imu_ns)
+        )
+        by_time = last - np.einsum("mji,mj->mi", G, first)
         J = np.empty((len(seconds), 3, 7))
         J[:, :, :3] = R_begin_end.transpose(0, 2, 1) - np.eye(3)
-        J[:, :, 3:6] = -0.5 * seconds[:, None, None] * (R @ (np.eye(3) + G[0].transpose(0, 2, 1)))
+        J[:, :, 3:6] = -0.5 * seconds[:, None, None] * (R @ (np.eye(3) + G.transpose(0, 2, 1)))
         J[:, :, 6] = by_time @ R.T
-        return R_begin_end, J, G[1] & early[1] & late[1]
+        return R_begin_end, J, known
 
     def applied_to(self, gyroscope: Gyroscope) -> Gyroscope:
         """Return the readings of the body: in its axes and the frames' clock, without the bias."""
@@ -232,7 +232,7 @@ def _prior_sigmas(gyroscope: Gyroscope) -> Array:
 
 def _logs(R: Array) -> Array:
     """Return the (M, 3) rotation vectors of (M, 3, 3) rotations."""
-    from scipy.spatial.transform import Rotation  # takes long to import, and few logs have a gyroscope
+    from mapper.sensing.gyroscope_kernels import rotation_vectors  # numba takes long to import
 
-    vectors: Array = Rotation.from_matrix(R).as_rotvec()
+    vectors: Array = rotation_vectors(np.ascontiguousarray(R))
     return vectors

@@ -43,6 +43,7 @@ class MotionPrior:
         self._gyroscope = gyroscope
         self._calibration = None if gyroscope is None else uncalibrated(gyroscope)
         self._of_body: Gyroscope | None = None  # made when it is needed
+        self._turns: dict[tuple[int, int], tuple[Array, float] | None] = {}  # of the frame that is tracked
         self._intervals: deque[tuple[int, int, Array]] = deque(maxlen=_KEPT)
         self._errors: deque[float] = deque(maxlen=_ERRORS)
         self._errors_without: deque[float] = deque(maxlen=_ERRORS)
@@ -52,8 +53,8 @@ class MotionPrior:
         self._rejected_ns = -1
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the state without the calibrated readings, which are made again when they are needed."""
-        return {**self.__dict__, "_of_body": None}
+        """Return the state without what is made again when it is needed."""
+        return {**self.__dict__, "_of_body": None, "_turns": {}}
 
     def turn(self, begin_ns: int, end_ns: int) -> Array | None:
         """Return the rotation (3, 3) of the body between two times; None if constant velocity is better."""
@@ -114,6 +115,7 @@ class MotionPrior:
         if gyroscope is None or np.linalg.norm(rotation_log(R_begin_end)) > _LONGEST_TURN_RAD:
             return
         found = self._turn(begin_ns, end_ns)
+        self._turns.clear()
         if found is None:
             self._uncovered += 1
             return
@@ -217,13 +219,13 @@ class MotionPrior:
         """Return the gyroscope's rotation and its standard deviation by the calibration alone."""
         if self._gyroscope is None or self._calibration is None:
             return None
-        R, J, known = self._calibration.turns(
-            self._gyroscope, np.array([begin_ns], np.int64), np.array([end_ns], np.int64)
-        )
-        if not known[0]:
-            return None
-        variance = float(np.trace(J[0] @ self._calibration.covariance @ J[0].T)) / 3.0
-        return R[0], float(np.sqrt(variance))
+        if (begin_ns, end_ns) not in self._turns:
+            R, J, known = self._calibration.turns(
+                self._gyroscope, np.array([begin_ns], np.int64), np.array([end_ns], np.int64)
+            )
+            variance = float(np.trace(J[0] @ self._calibration.covariance @ J[0].T)) / 3.0
+            self._turns[begin_ns, end_ns] = (R[0], math.sqrt(variance)) if known[0] else None
+        return self._turns[begin_ns, end_ns]
 
     def _is_better(self, R: Array, sigma_rad: float) -> bool:
         """Return whether a rotation of the gyroscope is more certain than constant velocity."""

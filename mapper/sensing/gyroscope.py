@@ -97,5 +97,10 @@ class Gyroscope:
         )
         return R_begin_end, known
 
+    def rates_at(self, stamps_ns: Stamps) -> Array:
+        """Return the (M, 3) readings at (M,) times, on the lines between them."""
+        columns = [np.interp(stamps_ns, self.stamps_ns, column) for column in self.rates_radps.T]
+        return np.stack(columns, axis=1)
+
     def _of(self, kept: NDArray[np.bool_]) -> "Gyroscope":
         return replace(self, stamps_ns=self.stamps_ns[kept], rates_radps=self.rates_radps[kept])

@@ -1,4 +1,4 @@
-"""Kernels of the gyroscope: integration of angular velocities."""
+"""Kernels of the gyroscope: integration of angular velocities, and vectors of rotations."""
 
 import numpy as np
 from numba import njit
@@ -38,3 +38,34 @@ def integrate(stamps_ns, rates, begins_ns, ends_ns, bias, scale, gap_ns):  # typ
                 k += 1
         R_begin_end[m] = R
     return R_begin_end, known
+
+
+@njit(cache=True, nogil=True)
+def rotation_vectors(R):  # type: ignore[no-untyped-def]
+    """Return the (M, 3) rotation vectors, at most π long, of (M, 3, 3) rotations, by their quaternions."""
+    vectors = np.empty((len(R), 3))
+    for m in range(len(R)):
+        w = np.array([R[m, 2, 1] - R[m, 1, 2], R[m, 0, 2] - R[m, 2, 0], R[m, 1, 0] - R[m, 0, 1]])
+        trace = R[m, 0, 0] + R[m, 1, 1] + R[m, 2, 2]
+        largest = 0
+        for a in range(1, 3):
+            if R[m, a, a] > R[m, largest, largest]:
+                largest = a
+        if trace > R[m, largest, largest]:  # four times the quaternion, by the largest of its numbers
+            part = 2.0 * np.sqrt(1.0 + trace)
+            scalar = part
+            axis = 4.0 * w / part
+        else:
+            part = 2.0 * np.sqrt(max(1.0 + 2.0 * R[m, largest, largest] - trace, 0.0))
+            scalar = 4.0 * w[largest] / part
+            axis = np.empty(3)
+            for a in range(3):
+                axis[a] = 4.0 * (R[m, a, largest] + R[m, largest, a]) / part
+            axis[largest] = part
+        sine = np.sqrt(axis[0] ** 2 + axis[1] ** 2 + axis[2] ** 2)
+        if scalar < 0.0:
+            axis, scalar = -axis, -scalar
+        factor = 2.0 * np.arctan2(sine, scalar) / sine if sine > 0.0 else 0.0
+        for a in range(3):
+            vectors[m, a] = factor * axis[a]
+    return vectors

@@ -5,6 +5,7 @@ from scipy.spatial.transform import Rotation
 
 from mapper.core.timebase import NS_PER_S
 from mapper.sensing.gyroscope import Gyroscope
+from mapper.sensing.gyroscope_kernels import rotation_vectors
 
 
 def turning(*, seconds=2.0, rate_hz=200.0):
@@ -61,3 +62,21 @@ def test_readings_at_the_end_of_the_range_are_left_out():
     sound, notes = Gyroscope("/imu", gyroscope.stamps_ns, rates).without_saturation()
     assert len(sound) == len(gyroscope) - 20
     assert len(notes) == 2
+
+
+def test_vectors_of_rotations_are_scipys():
+    rng = np.random.default_rng(1)
+    axes = rng.normal(size=(3000, 3))
+    angles = np.concatenate(
+        [rng.uniform(0.0, np.pi - 1e-6, 2000), 10.0 ** rng.uniform(-12.0, 0.0, 998), [0.0, np.pi - 1e-9]]
+    )
+    vectors = angles[:, None] * axes / np.linalg.norm(axes, axis=1)[:, None]
+    np.testing.assert_allclose(
+        rotation_vectors(Rotation.from_rotvec(vectors).as_matrix()), vectors, atol=1e-7
+    )
+
+
+def test_readings_between_two_times_lie_on_a_line():
+    gyroscope, _ = turning()
+    middle_ns = (gyroscope.stamps_ns[10:12].sum() // 2)[None]
+    np.testing.assert_allclose(gyroscope.rates_at(middle_ns)[0], gyroscope.rates_radps[10:12].mean(axis=0))
