@@ -1,14 +1,19 @@
-"""``python -m tests.fuzz --cases N [--seed S]``: read damaged inputs, and print those that end in a fault."""
+"""``python -m tests.fuzz --cases N [--seed S] [--lines]``: damaged inputs or command lines; prints faults."""
 
 import argparse
 import sys
 import time
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
+from hypothesis import strategies as st
+
+from tests.fuzz.command_lines import Sandbox, lines
 from tests.fuzz.corpus import FORMATS
-from tests.fuzz.runner import Case, Runner, cases, for_each_case
+from tests.fuzz.runner import Reading, Runner, cases, for_each_case
 
 _REPORT_S = 10.0
 
@@ -31,13 +36,13 @@ class Progress:
             print(f"{done}/{self._total} {dict(self.outcomes)}, ends at {end}", file=sys.stderr)
 
 
-def fuzz(runner: Runner, count: int, seed: int) -> int:
-    """Read so many cases and print the faults; return how many there are."""
+def fuzz(strategy: st.SearchStrategy[Any], run_case: Callable[[Any], Reading], count: int, seed: int) -> int:
+    """Run so many cases and print the faults; return how many there are."""
     progress, faults = Progress(count), 0
 
-    def run(case: Case) -> None:
+    def run(case: Any) -> None:
         nonlocal faults
-        reading = runner.run_case(case)
+        reading = run_case(case)
         progress.add(reading.outcome)
         if reading.is_fault:
             faults += 1
@@ -46,7 +51,7 @@ def fuzz(runner: Runner, count: int, seed: int) -> int:
                 flush=True,
             )
 
-    for_each_case(cases(), count, seed, run)
+    for_each_case(strategy, count, seed, run)
     print(f"{progress.outcomes.total()} cases: {dict(progress.outcomes)}, {faults} faults")
     return faults
 
@@ -56,10 +61,15 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description=__doc__)
     parser.add_argument("--cases", type=int, default=1000, help="how many inputs to damage")
     parser.add_argument("--seed", type=int, default=0, help="of the cases; another seed is other damage")
+    parser.add_argument("--lines", action="store_true", help="command lines with hostile paths and files")
     options = parser.parse_args()
     with TemporaryDirectory(prefix="mapper-fuzz-") as scratch, Runner(Path(scratch)) as runner:
         print(f"{len(FORMATS)} formats, {options.cases} cases", file=sys.stderr)
-        return 1 if fuzz(runner, options.cases, options.seed) else 0
+        if options.lines:
+            found = fuzz(lines(), Sandbox(Path(scratch), runner).run, options.cases, options.seed)
+        else:
+            found = fuzz(cases(), runner.run_case, options.cases, options.seed)
+        return 1 if found else 0
 
 
 if __name__ == "__main__":

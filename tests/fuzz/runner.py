@@ -6,10 +6,11 @@ import select
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
+from typing import Any
 
 import hypothesis
 import numpy as np
@@ -48,9 +49,7 @@ def cases(formats: Iterable[str] = tuple(FORMATS), damages: Iterable[str] = KIND
     return st.builds(Case, st.sampled_from(list(formats)), one_or_two, st.integers(0, (1 << 32) - 1))
 
 
-def for_each_case(
-    strategy: st.SearchStrategy[Case], count: int, seed: int, do: Callable[[Case], None]
-) -> None:
+def for_each_case(strategy: st.SearchStrategy[Any], count: int, seed: int, do: Callable[[Any], None]) -> None:
     """Do something with so many cases of a strategy, the same for the same seed."""
 
     @hypothesis.seed(seed)
@@ -62,7 +61,7 @@ def for_each_case(
         suppress_health_check=list(hypothesis.HealthCheck),
     )
     @hypothesis.given(strategy)
-    def run(case: Case) -> None:
+    def run(case: Any) -> None:
         do(case)
 
     run()
@@ -105,7 +104,10 @@ class Child:
 
     def run(self, command: str, path: Path, *, limit_s: float = TIME_LIMIT_S) -> Reading:
         """Run a command of ``tests.fuzz.child``, with a path for each ``{}`` in it."""
-        words = [word.replace("{}", str(path)) for word in command.split()]
+        return self.ask([word.replace("{}", str(path)) for word in command.split()], limit_s=limit_s)
+
+    def ask(self, words: Sequence[str], *, limit_s: float = TIME_LIMIT_S) -> Reading:
+        """Run a command of ``tests.fuzz.child`` by its words."""
         process = self._process or self._begin()
         assert process.stdin is not None
         assert process.stdout is not None

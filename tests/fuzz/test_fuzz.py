@@ -1,12 +1,13 @@
-"""Damaged inputs of every format are read or refused with one line: no traceback, no death, no hang."""
+"""Damaged inputs and hostile command lines are taken or refused with a line: no traceback, death or hang."""
 
 import hypothesis
 import pytest
 
+from tests.fuzz.command_lines import Sandbox, every_verb, lines
 from tests.fuzz.corpus import FORMATS, commands_of
 from tests.fuzz.runner import Runner, cases
 
-CASES = 300
+CASES, LINES = 300, 60
 
 
 @pytest.fixture(scope="module")
@@ -28,3 +29,19 @@ def test_undamaged_inputs_are_read(runner, tmp_path):
 def test_damaged_inputs_are_read_or_refused(runner, case):
     reading = runner.run_case(case)
     assert not reading.is_fault, f"{reading.file}\n{reading.command}\n{reading.outcome}: {reading.detail}"
+
+
+@pytest.fixture(scope="module")
+def sandbox(runner, tmp_path_factory):
+    return Sandbox(tmp_path_factory.mktemp("lines"), runner)
+
+
+@hypothesis.given(line=lines(brief=True))
+@hypothesis.settings(max_examples=LINES, derandomize=True)
+def test_command_lines_are_run_or_refused_and_nothing_is_lost(sandbox, line):
+    reading = sandbox.run(line)
+    assert not reading.is_fault, f"{reading.file}\n{reading.command}\n{reading.outcome}: {reading.detail}"
+
+
+def test_lines_are_of_every_verb():
+    assert {("build",), ("sensor", "depth"), ("vocabulary", "show")} <= {verb.words for verb in every_verb()}
