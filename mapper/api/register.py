@@ -11,13 +11,12 @@ from mapper.api.logs import read_frame
 from mapper.config.loading import Settings, load_source_config, overridden
 from mapper.config.register import check_method, register_config
 from mapper.core.errors import ConfigError
-from mapper.core.frames import Frame, RgbdFrame, Scan, Sensor
+from mapper.core.frames import Cloud, Frame, RgbdFrame, Scan, Sensor
 from mapper.core.geometry import Transform, is_rigid, point_rows, transform
 from mapper.core.rotations import pose_of_row, rotation_from_euler
 from mapper.odometry.config import IsvdOdometryConfig
 from mapper.registration.base import Alignment
 from mapper.registration.factory import build_registration
-from mapper.run.cloud import Cloud
 from mapper.runtime.regular_files import AnyPath
 from mapper.sources.config import SourceConfig
 

@@ -1,8 +1,8 @@
 """RGB-D frames, scans, and the pinhole camera model."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from isal import isal_zlib
@@ -153,6 +153,7 @@ class Scan:
         times_s: (N,) float32 seconds after ``stamp_ns`` of each point, where the file has them.
         far_returns: Number of returns that were left out as farther than any sensor reaches.
         untimed_returns: Number of returns that were left out because their time cannot be right.
+        intensities: (N,) float32 of each point, in the sensor's own unit, where the file has them.
     """
 
     stamp_ns: int
@@ -162,6 +163,7 @@ class Scan:
     times_s: NDArray[np.float32] | None = None
     far_returns: int = 0
     untimed_returns: int = 0
+    intensities: NDArray[np.float32] | None = None
 
     def __post_init__(self) -> None:
         shape = self.points_body.shape
@@ -178,6 +180,22 @@ class Scan:
             raise DataError(f"scan {self.stamp_ns}: colors {self.colors.shape}, want {shape}")
         if self.times_s is not None and self.times_s.shape != shape[:1]:
             raise DataError(f"scan {self.stamp_ns}: times {self.times_s.shape}, want {shape[:1]}")
+        if self.intensities is not None and self.intensities.shape != shape[:1]:
+            raise DataError(f"scan {self.stamp_ns}: intensities {self.intensities.shape}, want {shape[:1]}")
+
+    def select(self, kept: NDArray[np.bool_]) -> "Scan":
+        """Return the scan with the returns of an (N,) mask alone."""
+
+        def some(rows: Any) -> Any:
+            return None if rows is None else np.compress(kept, rows, axis=0)
+
+        return replace(
+            self,
+            points_body=some(self.points_body),
+            colors=some(self.colors),
+            times_s=some(self.times_s),
+            intensities=some(self.intensities),
+        )
 
     @property
     def stamp(self) -> float:
@@ -199,6 +217,35 @@ class Scan:
     def scan(self) -> "Scan":
         """Return the scan itself: frames of every kind can be converted to a scan."""
         return self
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Cloud:
+    """Points with a colour each; ``numpy.asarray(cloud)`` gives the points.
+
+    Attributes:
+        points: (N, 3) float32, metres, levelled world: z up, floor at 0.
+        colors: (N, 3) uint8 RGB.
+        intensities: (N,) float32 in the sensor's own unit; None where the log has none.
+    """
+
+    points: Points32
+    colors: NDArray[np.uint8]
+    intensities: NDArray[np.float32] | None = None
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
+        return np.array(self.points, dtype=dtype, copy=copy)
+
+    def select(self, kept: NDArray[np.bool_]) -> "Cloud":
+        """Return the cloud with the points of an (N,) mask alone."""
+        return Cloud(
+            np.compress(kept, self.points, axis=0),
+            np.compress(kept, self.colors, axis=0),
+            None if self.intensities is None else self.intensities[kept],
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

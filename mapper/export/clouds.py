@@ -25,10 +25,12 @@ def pcd(run: Run, path: Path, _progress: Progress) -> None:
 
 
 def _columns(run: Run) -> dict[str, NDArray[Any]]:
-    """Return coordinates and colours; of a map with attributes also hits and the time of the last of them."""
+    """Return coordinates, colours and intensities; of a map with attributes hits and the time of the last."""
     cloud, octree = run.cloud, run.octree
     columns = dict(zip("xyz", cloud.points.T, strict=True))
     columns |= dict(zip(("red", "green", "blue"), cloud.colors.T, strict=True))
+    if cloud.intensities is not None:
+        columns["intensity"] = cloud.intensities
     if octree.attributes is not None:
         found = octree.attributes.at(cloud.points.astype(np.float64))
         seen_s = (found.last_seen_ns - run.trajectory.stamps_ns[0]) / NS_PER_S

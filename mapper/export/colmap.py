@@ -6,14 +6,13 @@ from pathlib import Path
 from typing import Any
 
 from mapper.core.errors import FrameError, RunError
-from mapper.core.frames import NO_DISTORTION, PinholeCamera, RgbdFrame
+from mapper.core.frames import NO_DISTORTION, Cloud, PinholeCamera, RgbdFrame
 from mapper.core.geometry import Transform, inverse
 from mapper.core.rotations import quaternion_from_rotation
 from mapper.core.timebase import seconds_text_from_ns
 from mapper.export.export_folders import export_folder
 from mapper.export.mesh_files import write_ply
 from mapper.mapping.cloud import thinned_to_view
-from mapper.run.cloud import Cloud
 from mapper.run.folder import Run
 from mapper.runtime.atomic import write_bytes, write_json, write_text
 from mapper.runtime.progress import Progress

@@ -14,6 +14,7 @@ from mapper.mapping.cloud import Colors
 from mapper.runtime.atomic import atomic_file, write_bytes, write_text
 
 _PLY_VERTEX = np.dtype([("position", "<f4", 3), ("color", "u1", 3)])
+_PLY_VERTEX_OF_LIDAR = np.dtype([*_PLY_VERTEX.descr, ("intensity", "<f4")])
 _CHUNK = 1_000_000  # vertices written at once
 _PLY_TRIANGLE = np.dtype([("corners", "u1"), ("vertices", "<i4", 3)])
 
@@ -24,6 +25,7 @@ def write_ply(
     colors: NDArray[np.uint8],
     *,
     triangles: NDArray[np.int32] | None = None,
+    intensities: NDArray[np.float32] | None = None,
 ) -> None:
     """Write a little-endian binary PLY, atomically.
 
@@ -32,6 +34,7 @@ def write_ply(
         points: (N, 3) float32 metres.
         colors: (N, 3) uint8 RGB.
         triangles: (T, 3) int32 indices of points, counterclockwise seen from outside; None for a cloud.
+        intensities: (N,) of the points; None leaves them out.
 
     Raises:
         DataError: Shapes that differ.
@@ -45,16 +48,20 @@ def write_ply(
         f"element vertex {len(points)}",
         *(f"property float {axis}" for axis in ("x", "y", "z")),
         *(f"property uchar {channel}" for channel in ("red", "green", "blue")),
+        *([] if intensities is None else ["property float intensity"]),
     ]
+    vertex = _PLY_VERTEX if intensities is None else _PLY_VERTEX_OF_LIDAR
     if triangles is not None:
         header += [f"element face {len(triangles)}", "property list uchar int vertex_indices"]
     with atomic_file(path) as part, part.open("wb") as file:
         file.write("\n".join([*header, "end_header\n"]).encode("ascii"))
         for first in range(0, len(points), _CHUNK):
             some = slice(first, first + _CHUNK)
-            vertices = np.empty(len(points[some]), _PLY_VERTEX)
+            vertices = np.empty(len(points[some]), vertex)
             vertices["position"] = points[some]
             vertices["color"] = colors[some]
+            if intensities is not None:
+                vertices["intensity"] = intensities[some]
             vertices.tofile(file)
         if triangles is not None:
             faces = np.full(len(triangles), 3, _PLY_TRIANGLE)

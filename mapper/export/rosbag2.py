@@ -5,12 +5,14 @@ from collections.abc import Iterator
 from itertools import chain
 from pathlib import Path
 
-from mapper.core.frames import Points32, Scan
+import numpy as np
+
+from mapper.core.frames import Cloud, Scan
 from mapper.export.export_folders import export_folder
 from mapper.export.mcap_messages import OCCUPANCY_GRID, encode_occupancy_grid
 from mapper.export.run_maps import maps_of, snapshots_of
 from mapper.export.run_mcap import BODY, CAMERA
-from mapper.mapping.cloud import Colors, thinned_to_view
+from mapper.mapping.cloud import MOST_TO_VIEW
 from mapper.mapping.fusion import Snapshot
 from mapper.octree.grid import OccupancyGrid
 from mapper.octree.octomap_file import bt_words
@@ -66,8 +68,8 @@ def _latched_messages(run: Run, image: Snapshot | None) -> Iterator[SerializedMe
     yield _grid_message(begin_ns, "/traversable", maps.traversable)
     if maps.keepout is not None:
         yield _grid_message(begin_ns, "/keepout", maps.keepout)
-    yield _cloud_message(begin_ns, "/cloud", maps.cloud_points_world, maps.cloud_colors)
-    yield _cloud_message(begin_ns, "/dynamic", maps.dynamic_points_world, maps.dynamic_colors)
+    yield _cloud_message(begin_ns, "/cloud", maps.cloud)
+    yield _cloud_message(begin_ns, "/dynamic", maps.dynamic)
     words, _ = bt_words(maps.octree)
     yield octomap_message(
         begin_ns, "/octomap_binary", words, resolution_m=maps.octree.resolution_m, frame=MAP
@@ -79,9 +81,10 @@ def _grid_message(stamp_ns: int, topic: str, grid: OccupancyGrid) -> SerializedM
     return SerializedMessage(stamp_ns, topic, OCCUPANCY_GRID, data)
 
 
-def _cloud_message(stamp_ns: int, topic: str, points_world: Points32, colors: Colors) -> SerializedMessage:
-    shown_world, colors_shown = thinned_to_view(points_world, colors)
-    return cloud_message(topic, Scan(stamp_ns, shown_world, colors=colors_shown), frame=MAP)
+def _cloud_message(stamp_ns: int, topic: str, cloud: Cloud) -> SerializedMessage:
+    shown = Scan(stamp_ns, cloud.points, colors=cloud.colors, intensities=cloud.intensities)
+    every_nth = np.arange(len(cloud)) % (-(-len(cloud) // MOST_TO_VIEW) or 1) == 0
+    return cloud_message(topic, shown.select(every_nth), frame=MAP)
 
 
 def _pose_messages(run: Run) -> Iterator[SerializedMessage]:

@@ -32,13 +32,10 @@ def maps_of(run: Run) -> Maps:
         FrameError: The cloud cannot be read.
         DataError: A grid cannot be read.
     """
-    moved = read_cloud(run.file(files.DYNAMIC))
     return Maps(
         octree=run.octree,
-        cloud_points_world=run.cloud.points,
-        cloud_colors=run.cloud.colors,
-        dynamic_points_world=moved.points,
-        dynamic_colors=moved.colors,
+        cloud=run.cloud,
+        dynamic=read_cloud(run.file(files.DYNAMIC)),
         grid=run.slice,
         traversable=run.traversable,
         storeys=tuple(_storeys(run)),

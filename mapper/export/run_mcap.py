@@ -58,8 +58,8 @@ def log_maps(log: McapLog, maps: Maps, *, stamp_ns: int) -> None:
     occupied_world = maps.octree.occupied()
     for name, points_world, colors in (
         ("octree", occupied_world, height_colors(occupied_world[:, 2])),
-        ("cloud", maps.cloud_points_world, maps.cloud_colors),
-        ("dynamic", maps.dynamic_points_world, maps.dynamic_colors),
+        ("cloud", maps.cloud.points, maps.cloud.colors),
+        ("dynamic", maps.dynamic.points, maps.dynamic.colors),
     ):
         shown_world, colors_shown = thinned_to_view(points_world, colors)
         log.cloud(stamp_ns, shown_world, colors=colors_shown, name=name)

@@ -8,7 +8,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from mapper.core.errors import DataError
-from mapper.core.frames import Points32
+from mapper.core.frames import Cloud
 from mapper.core.voxel_index import HALF_SPAN, cell_key, cell_of, claim_row, voxel_index
 from mapper.octree.blocks import GROWTH
 
@@ -20,12 +20,13 @@ Colors = NDArray[np.uint8]
 MOST_TO_VIEW = 5_000_000
 """Largest number of points of a cloud that is made to be looked at."""
 
+_NO_INTENSITIES, _NO_SUMS = np.empty(0, np.float32), np.empty((0, 1), np.float32)
 _BATCH = 65_536  # points added at once: bounds the memory reserved ahead of need
 _LOWEST_LEVEL = 30.0  # of 255: where the palette of heights begins
 
 
 class CloudBuilder:
-    """Builder of a cloud whose points are the mean position and mean colour of the points in each voxel.
+    """Builder of a cloud whose points are the mean position, colour and intensity of those in each voxel.
 
     Memory is about 60 bytes a voxel and does not depend on the number of points added: positions are summed
     as offsets from the voxel's centre, for which single precision does.
@@ -46,22 +47,20 @@ class CloudBuilder:
         self._size = 0
         self._offsets = np.zeros((_BATCH, 3), np.float32)  # sums, in voxels
         self._counts = np.zeros((_BATCH, 4), np.uint32)  # sums of red, green and blue, and number of points
+        self._intensities: NDArray[np.float32] | None = None  # sums, where every point has one
         self._index = voxel_index(_BATCH)
 
     def __len__(self) -> int:
         """Return the number of voxels with a point."""
         return self._size
 
-    def add(self, points_world: Points32, colors: Colors) -> None:
-        """Add a cloud.
-
-        Args:
-            points_world: (N, 3) float32 metres, world frame.
-            colors: (N, 3) uint8 RGB.
+    def add(self, cloud: Cloud) -> None:
+        """Add a cloud; intensities are kept where all clouds have them.
 
         Raises:
             DataError: Shapes that differ, a coordinate that is not finite, or one beyond the key range.
         """
+        points_world, colors, intensities = cloud.points, cloud.colors, cloud.intensities
         if points_world.ndim != 2 or points_world.shape[1] != 3 or colors.shape != points_world.shape:
             raise DataError(
                 f"cloud: points {points_world.shape} and colors {colors.shape}, want two of (N, 3)"
@@ -75,36 +74,48 @@ class CloudBuilder:
                 f"cloud: a coordinate of {reach_m} m; {self.voxel_m} m voxels reach {limit_m:.0f} m, "
                 "drop the point or enlarge the voxel"
             )
+        if self._size == 0 and intensities is not None:
+            self._intensities = np.zeros((len(self._offsets), 1), np.float32)
+        if intensities is None:
+            self._intensities = None
         for first in range(0, len(points_world), _BATCH):
             batch = slice(first, first + _BATCH)
             self._reserve(_BATCH)
             self._size = _fold(
                 points_world[batch],
                 colors[batch],
+                _NO_INTENSITIES if intensities is None else intensities[batch],
                 1.0 / self.voxel_m,
                 self._index,
                 self._offsets,
                 self._counts,
+                _NO_SUMS if self._intensities is None else self._intensities,
                 self._size,
             )
 
-    def points_and_colors(self) -> tuple[Points32, Colors]:
-        """Return (M, 3) float32 mean positions and (M, 3) uint8 mean colours, in order of first points."""
+    def cloud(self) -> Cloud:
+        """Return the mean points, in the order of the first points in the voxels."""
         points, colors = np.empty((self._size, 3), np.float32), np.empty((self._size, 3), np.uint8)
         _fill_means(self._index.keys, self._offsets, self._counts, self.voxel_m, points, colors)
-        return points, colors
+        if self._intensities is None:
+            return Cloud(points, colors)
+        counts = self._counts[: self._size, 3].astype(np.float32)
+        return Cloud(points, colors, self._intensities[: self._size, 0] / counts)
 
     def _reserve(self, more: int) -> None:
         need = self._size + more
         if need > len(self._offsets):
             rows = max(need, int(GROWTH * len(self._offsets)))
-            for sums in (self._offsets, self._counts):
-                sums.resize((rows, sums.shape[1]), refcheck=False)  # a copy would need both at once
+            for sums in (self._offsets, self._counts, self._intensities):
+                if sums is not None:
+                    sums.resize((rows, sums.shape[1]), refcheck=False)  # a copy would need both at once
             self._index = voxel_index(rows, self._index.keys[: self._size])
 
 
 @njit(cache=True, nogil=True)
-def _fold(points, colors, voxels_per_m, index, offsets, counts, size):  # type: ignore[no-untyped-def]
+def _fold(  # type: ignore[no-untyped-def]
+    points, colors, intensities, voxels_per_m, index, offsets, counts, intensity_sums, size
+):
     """Add each point to its voxel's sums; return the number of voxels."""
     last_key, voxel = np.int64(-1), np.int64(-1)
     for i in range(len(points)):
@@ -121,6 +132,8 @@ def _fold(points, colors, voxels_per_m, index, offsets, counts, size):  # type: 
         for channel in range(3):
             counts[voxel, channel] += colors[i, channel]
         counts[voxel, 3] += 1
+        if len(intensity_sums):
+            intensity_sums[voxel, 0] += intensities[i]
     return size
 
 

@@ -1,14 +1,12 @@
 """Fusing of the clouds: that of what stands still, and that of what moved."""
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.errors import FrameError
-from mapper.core.frames import Points32
+from mapper.core.frames import Cloud
 from mapper.core.trajectory import Trajectory
-from mapper.mapping.cloud import CloudBuilder, Colors, height_colors
+from mapper.mapping.cloud import CloudBuilder, height_colors
 from mapper.mapping.config import FuseSettings
 from mapper.mapping.placed_frames import PlacedFrame, placed_frames, within_reach
 from mapper.octree.casting import depth_limit_of
@@ -20,21 +18,6 @@ from mapper.sources.base import Log
 _COLOURED_HEIGHTS_M = -1.0, 8.0  # the same in every scan
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Returns:
-    """Returns of a frame.
-
-    Attributes:
-        points_world: (N, 3) float32 metres.
-        colors: (N, 3) uint8 RGB.
-        moving: (N,) whether each belongs to something that moves.
-    """
-
-    points_world: Points32
-    colors: Colors
-    moving: NDArray[np.bool_]
-
-
 def fuse_clouds(
     source: Log,
     trajectory: Trajectory,
@@ -42,8 +25,8 @@ def fuse_clouds(
     objects: MovingObjects | None,
     *,
     progress: Progress,
-) -> tuple[tuple[Points32, Colors], tuple[Points32, Colors]]:
-    """Return the points and colours of what stands still and of what moved.
+) -> tuple[Cloud, Cloud]:
+    """Return the clouds of what stands still and of what moved.
 
     Every ``cloud.frame_stride``-th frame adds its points; frames that cannot be read are left out.
 
@@ -59,7 +42,8 @@ def fuse_clouds(
     frames = [frame for frame in placed_frames(source, trajectory) if frame.index % stride == 0]
     depth_limit = depth_limit_of(config.octree)
 
-    def read(frame: PlacedFrame) -> _Returns | None:
+    def read(frame: PlacedFrame) -> tuple[Cloud, NDArray[np.bool_]] | None:
+        """Return a frame's returns and which of them moved; None if it cannot be read."""
         try:
             scan = frame.scan_of(frame.entry.load())
         except FrameError:
@@ -71,15 +55,15 @@ def fuse_clouds(
         points_world, colors = scan.points_body @ R.T + t, scan.colors
         if colors is None:  # the sensor has no colour: heights are shown by it
             colors = height_colors(points_world[:, 2], between_m=_COLOURED_HEIGHTS_M)
-        if objects is None:
-            return _Returns(points_world, colors, np.zeros(len(points_world), np.bool_))
-        return _Returns(points_world, colors, objects.returns_of(points_world))
+        cloud = Cloud(points_world, colors, scan.intensities)
+        moved = np.zeros(len(cloud), np.bool_) if objects is None else objects.returns_of(points_world)
+        return cloud, moved
 
     with progress.stage("cloud") as report:
         for done, returns in enumerate(ordered_map(read, frames, workers=config.workers), start=1):
             report(done, len(frames))
             if returns is not None:
-                for builder, chosen in ((still, ~returns.moving), (moving, returns.moving)):
-                    points_world = np.compress(chosen, returns.points_world, axis=0)
-                    builder.add(points_world, np.compress(chosen, returns.colors, axis=0))
-    return still.points_and_colors(), moving.points_and_colors()
+                cloud, moved = returns
+                still.add(cloud.select(~moved))
+                moving.add(cloud.select(moved))
+    return still.cloud(), moving.cloud()

@@ -7,11 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from mapper.core.errors import DataError, FrameError
-from mapper.core.frames import Frame, PinholeCamera, Points32, RgbdFrame, Scan
+from mapper.core.frames import Cloud, Frame, PinholeCamera, Points32, RgbdFrame, Scan
 from mapper.core.geometry import Transform
 from mapper.core.trajectory import Trajectory
 from mapper.core.voxel_grid import thin
-from mapper.mapping.cloud import Colors
 from mapper.mapping.cloud_fusion import fuse_clouds
 from mapper.mapping.config import AppliedEdit, Edits, FuseSettings, McapConfig
 from mapper.mapping.edits import MapEditor
@@ -75,10 +74,8 @@ class Maps:
 
     Attributes:
         octree: Occupied, free and unknown space.
-        cloud_points_world: (N, 3) float32 metres, levelled world, all in occupied voxels of the octree.
-        cloud_colors: (N, 3) uint8 RGB.
-        dynamic_points_world: (M, 3) float32 metres, the points of what moved, which is in no map.
-        dynamic_colors: (M, 3) uint8 RGB.
+        cloud: Points in the levelled world, all in occupied voxels of the octree.
+        dynamic: Points of what moved, which is in no map.
         grid: The slice through the octree above the floor.
         traversable: The floor that a robot can drive on, of the storey on which the path begins.
         storeys: The same of every storey, the lowest first, where floors lie over each other.
@@ -88,10 +85,8 @@ class Maps:
     """
 
     octree: OctreeMap
-    cloud_points_world: Points32
-    cloud_colors: Colors
-    dynamic_points_world: Points32
-    dynamic_colors: Colors
+    cloud: Cloud
+    dynamic: Cloud
     grid: OccupancyGrid
     traversable: OccupancyGrid
     storeys: tuple[OccupancyGrid, ...]
@@ -168,14 +163,11 @@ def fuse_log(
     octree, objects = _fuse_scans(
         source, trajectory, config, progress, on_snapshot=on_snapshot, cached=cached, updates=updates
     )
-    (points_world, colors), (dynamic_points_world, dynamic_colors) = fuse_clouds(
-        source, trajectory, config, objects, progress=progress
-    )
+    cloud, dynamic = fuse_clouds(source, trajectory, config, objects, progress=progress)
     if objects is not None:
-        moved, points = len(dynamic_points_world), len(points_world) + len(dynamic_points_world)
-        progress.note(f"moving objects: {moved} of {points} points of the clouds")
+        progress.note(f"moving objects: {len(dynamic)} of {len(cloud) + len(dynamic)} points of the clouds")
     editor = MapEditor(edits, trajectory.positions_world, config.traversable.head_room_m)
-    known, occupied = len(octree), np.count_nonzero(octree.are_occupied(points_world))
+    known, occupied = len(octree), np.count_nonzero(octree.are_occupied(cloud.points))
     erased = editor.erase(octree)
     floor = reachable_floor(octree, config.traversable, positions_world=trajectory.positions_world)
     driven = editor.crop_ground(driven_ground(floor), floor.columns)
@@ -184,7 +176,7 @@ def fuse_log(
     floor_below = Band(config.slice, octree.resolution_m).floor_below(grid, driven)
     octree.drop_unknown()  # the slice has the columns of all blocks, as the floor
     passable, blocked = editor.edit_floor(traversable(floor, config.traversable))
-    kept = octree.are_occupied(points_world)
+    kept = octree.are_occupied(cloud.points)
     made = (*erased, *cropped, *blocked)
     if made:
         progress.note(
@@ -195,10 +187,8 @@ def fuse_log(
         progress.note(f"edits by hand without effect: {'; '.join(idle)}; are they in the frame of this map?")
     return Maps(
         octree=octree,
-        cloud_points_world=points_world[kept],
-        cloud_colors=colors[kept],
-        dynamic_points_world=dynamic_points_world,
-        dynamic_colors=dynamic_colors,
+        cloud=cloud.select(kept),
+        dynamic=dynamic,
         grid=grid,
         traversable=passable.home.grid,
         storeys=passable.over_each_other,

@@ -60,6 +60,4 @@ def within_reach(scan: Scan, T_world_body: Transform, config: OctreeConfig) -> t
         return scan, 0
     points_world = scan.points_body @ T_world_body[:3, :3].T + T_world_body[:3, 3]
     kept = np.abs(points_world).max(axis=1) < limit_m
-    colors = None if scan.colors is None else scan.colors[kept]
-    reached = Scan(scan.stamp_ns, scan.points_body[kept], scan.origin_body, colors)
-    return reached, len(kept) - int(kept.sum())
+    return scan.select(kept), len(kept) - int(kept.sum())

@@ -235,8 +235,8 @@ def _write_counts(writer: RunWriter, maps: Maps, trajectory: Trajectory) -> None
         update={
             "leaves": len(maps.octree),
             "occupied": maps.octree.count_occupied(),
-            "cloud_points": len(maps.cloud_points_world),
-            "dynamic_points": len(maps.dynamic_points_world),
+            "cloud_points": len(maps.cloud),
+            "dynamic_points": len(maps.dynamic),
         }
     )
     writer.update(counts=counts)
@@ -269,8 +269,8 @@ def _write_maps(folder: Path, maps: Maps) -> None:
     write_bt(folder / files.OCTREE_BT, maps.octree)
     write_ot(folder / files.OCTREE_OT, maps.octree)
     write_map(folder / files.OCTREE_MAP, maps.octree)
-    write_ply(folder / files.CLOUD, maps.cloud_points_world, maps.cloud_colors)
-    write_ply(folder / files.DYNAMIC, maps.dynamic_points_world, maps.dynamic_colors)
+    for name, cloud in ((files.CLOUD, maps.cloud), (files.DYNAMIC, maps.dynamic)):
+        write_ply(folder / name, cloud.points, cloud.colors, intensities=cloud.intensities)
     write_grid(folder, files.SLICE, maps.grid)
     write_grid(folder, files.TRAVERSABLE, maps.traversable)
     if maps.keepout is not None:
@@ -295,11 +295,11 @@ def _write_pictures(writer: RunWriter, maps: Maps, results: RunResults, *, has_c
         lines=lines,
         poses=results.poses,
     )
-    if len(maps.cloud_points_world):
+    if len(maps.cloud):
         write_cloud_views(
             writer.folder / files.CLOUD_VIEWS,
-            maps.cloud_points_world,
-            maps.cloud_colors,
+            maps.cloud.points,
+            maps.cloud.colors,
             trajectory,
             has_colors=has_colors,
         )

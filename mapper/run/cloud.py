@@ -1,6 +1,5 @@
 """Coloured cloud of a run, read back from its PLY file."""
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -8,29 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.errors import FrameError
-from mapper.core.frames import Points32
+from mapper.core.frames import Cloud
 from mapper.core.geometry import FARTHEST_M
 from mapper.sources.cloud_files.parsing import Columns
 from mapper.sources.cloud_files.ply import read_ply
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Cloud:
-    """Points with a colour each; ``numpy.asarray(cloud)`` gives the points.
-
-    Attributes:
-        points: (N, 3) float32, metres, levelled world: z up, floor at 0.
-        colors: (N, 3) uint8 RGB.
-    """
-
-    points: Points32
-    colors: NDArray[np.uint8]
-
-    def __len__(self) -> int:
-        return len(self.points)
-
-    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
-        return np.array(self.points, dtype=dtype, copy=copy)
 
 
 def read_cloud(path: Path) -> Cloud:
@@ -47,7 +27,10 @@ def read_cloud(path: Path) -> Cloud:
     if not -FARTHEST_M <= points.min(initial=0.0) <= points.max(initial=0.0) <= FARTHEST_M:
         first = np.flatnonzero(~(np.abs(points) <= FARTHEST_M).all(axis=1))[0]
         raise FrameError(f"{path}: point {first} is at {points[first]}, want finite metres")
-    return Cloud(points, _columns(columns, ("red", "green", "blue"), np.uint8, path))
+    colors = _columns(columns, ("red", "green", "blue"), np.uint8, path)
+    if "intensity" not in columns:
+        return Cloud(points, colors)
+    return Cloud(points, colors, _columns(columns, ("intensity",), np.float32, path).ravel())
 
 
 def _columns(

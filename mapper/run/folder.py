@@ -41,9 +41,9 @@ from mapper.sources.trajectory_files import read_tum
 if TYPE_CHECKING:  # compiled code, which takes longer to load than most files of a run
     from matplotlib.axes import Axes
 
+    from mapper.core.frames import Cloud
     from mapper.octree.grid import OccupancyGrid
     from mapper.octree.map import OctreeMap
-    from mapper.run.cloud import Cloud
     from mapper.runtime.progress import Progress
 
 

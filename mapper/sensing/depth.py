@@ -152,9 +152,7 @@ class DepthLimit:
         near = z <= limit_m
         noise = self.noise.constant_m, self.noise.linear, self.noise.quadratic_per_m
         free_ends = _free_ends(scan.points_body, scan.origin_body, noise, limit_m)
-        colors = None if scan.colors is None else np.compress(near, scan.colors, axis=0)
-        points_body = np.compress(near, scan.points_body, axis=0)
-        return Scan(scan.stamp_ns, points_body, scan.origin_body, colors), free_ends
+        return scan.select(near), free_ends
 
 
 @njit(cache=True, nogil=True)

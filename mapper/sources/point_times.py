@@ -83,13 +83,7 @@ def without_untimed(scan: Scan) -> Scan:
     if scan.times_s is None or not np.isnan(scan.times_s.sum()):
         return scan
     timed = ~np.isnan(scan.times_s)
-    return replace(
-        scan,
-        points_body=scan.points_body[timed],
-        colors=None if scan.colors is None else scan.colors[timed],
-        times_s=scan.times_s[timed],
-        untimed_returns=int((~timed).sum()),
-    )
+    return replace(scan.select(timed), untimed_returns=int((~timed).sum()))
 
 
 def _counted_on(values: NDArray[np.number]) -> NDArray[np.number]:

@@ -48,12 +48,7 @@ class _ClearedEntry(WrappedEntry):
                 f"frame {scan.stamp_ns}: all {len(kept)} returns are of the vehicle or out of range "
                 "(source.body.box, min_range_m, max_range_m)"
             )
-        return replace(
-            scan,
-            points_body=scan.points_body[kept],
-            colors=None if scan.colors is None else scan.colors[kept],
-            times_s=None if scan.times_s is None else scan.times_s[kept],
-        )
+        return scan.select(kept)
 
 
 def are_of_the_world(scan: Scan, config: BodyConfig) -> NDArray[np.bool_]:

@@ -9,6 +9,7 @@ from mapper.config.loading import load_config
 from mapper.export.exporters import export
 from mapper.pipeline.build import build
 from mapper.sources import open_source
+from tests.support.street_scans import SENSOR, on_street, still_scan, street
 
 
 @pytest.fixture(scope="module")
@@ -53,3 +54,27 @@ def test_pcd(run, tmp_path):
         np.column_stack([packed >> 16, packed >> 8 & 255, packed & 255]), run.cloud.colors
     )
     assert_attributes(run, cloud.pc_data["hits"], cloud.pc_data["time_s"])
+
+
+@pytest.fixture(scope="module")
+def lidar_run(tmp_path_factory):
+    """A run of scans in KITTI's records, of which each point's intensity is its range over 100 m."""
+    folder = tmp_path_factory.mktemp("intensities")
+    (folder / "velodyne").mkdir()
+    for k in range(10):
+        points = still_scan(street(7), SENSOR, on_street(street(7), 20.0 + 0.5 * k), seed=k)
+        records = np.column_stack([points, np.linalg.norm(points, axis=1) / 100.0]).astype("<f4")
+        records.tofile(folder / "velodyne" / f"{k:06d}.bin")
+    config = load_config(None, [], sensor="lidar")
+    return build(open_source(folder, config.source), config, folder / "run")
+
+
+def test_intensities_come_along(lidar_run, tmp_path):
+    cloud = lidar_run.cloud
+    ranges_m = np.linalg.norm(cloud.points - lidar_run.trajectory.positions_world[5], axis=1)
+    assert cloud.intensities is not None
+    assert np.abs(100.0 * cloud.intensities - ranges_m).max() < 4.0
+    las = laspy.read(export(lidar_run, "las", tmp_path / "cloud.laz"))
+    np.testing.assert_allclose(las.intensity / 65535.0, cloud.intensities, atol=1e-5)
+    pcd = PointCloud.from_path(export(lidar_run, "pcd", tmp_path / "cloud.pcd"))
+    np.testing.assert_array_equal(pcd.pc_data["intensity"], cloud.intensities)

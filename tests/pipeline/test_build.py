@@ -131,9 +131,9 @@ def test_depth_counts_as_far_as_its_noise_is_below_a_voxel(run, desk_log, tmp_pa
 def test_a_desk_where_nothing_moves_loses_nothing(run):
     maps = maps_of(run)
 
-    assert len(maps.dynamic_points_world) == run.manifest.counts.dynamic_points
-    assert len(maps.dynamic_points_world) < 0.005 * len(maps.cloud_points_world)
-    assert not maps.octree.are_occupied(maps.dynamic_points_world).any()
+    assert len(maps.dynamic) == run.manifest.counts.dynamic_points
+    assert len(maps.dynamic) < 0.005 * len(maps.cloud)
+    assert not maps.octree.are_occupied(maps.dynamic.points).any()
 
 
 def test_the_log_holds_the_whole_story(run):

@@ -47,7 +47,7 @@ def log_run(log: RerunLog, results: RunResults, maps: Maps) -> None:
     log.loops(results.loops, results.graph.T_world_node)
     log.times(results.frame_ms)
     log.voxels(maps.octree)
-    log.cloud(*thinned_to_view(maps.cloud_points_world, maps.cloud_colors))
+    log.cloud(*thinned_to_view(maps.cloud.points, maps.cloud.colors))
     log.grid("slice", maps.grid)
     log.grid("traversable", maps.traversable)
     for number, storey in enumerate(maps.storeys):
@@ -58,8 +58,8 @@ def log_run(log: RerunLog, results: RunResults, maps: Maps) -> None:
 def extent(results: RunResults, maps: Maps) -> Array:
     """Return the (2, 3) lower and upper corner around the path and all but a few stray points, metres."""
     seen = [results.trajectory.positions_world]
-    if len(maps.cloud_points_world):
-        seen.append(np.percentile(maps.cloud_points_world, [2.0, 98.0], axis=0))
+    if len(maps.cloud.points):
+        seen.append(np.percentile(maps.cloud.points, [2.0, 98.0], axis=0))
     points_world = np.concatenate(seen)
     return np.array([points_world.min(axis=0), points_world.max(axis=0)])
 

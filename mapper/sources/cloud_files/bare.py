@@ -20,6 +20,8 @@ from mapper.sources.cloud_files.records import KITTIS, other_width
 
 _FLOAT32 = np.dtype("<f4")
 _MAX_CLASS = 1000
+_WITH_INTENSITY = (KITTIS, 5)
+"""Widths of records whose fourth number is an intensity: KITTI's, and nuScenes' with a ring after it."""
 EMPTY = "the file is empty"
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*([eE][-+]?\d+)?|\.\d+([eE][-+]?\d+)?|nan|inf)", re.IGNORECASE)
 
@@ -55,7 +57,9 @@ def read_bin(path: Path, columns: int | None = None) -> Columns:
             f"{path}: {size} bytes, want a multiple of {record_bytes}, {what}; copy it again if it was cut, "
             "else --set source.bin_columns to the numbers of a record"
         )
-    return _xyz(numbers.reshape(-1, columns or KITTIS))
+    records = numbers.reshape(-1, columns or KITTIS)
+    names = ("x", "y", "z", "intensity") if records.shape[1] in _WITH_INTENSITY else ("x", "y", "z")
+    return {name: records[:, column] for column, name in enumerate(names)}
 
 
 def read_npy(path: Path) -> Columns:

@@ -7,16 +7,17 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mapper.core.errors import FrameError
 from mapper.core.units import MIB
 from mapper.runtime.atomic import write_bytes
 from mapper.runtime.regular_files import MOST_UNPACKED_RATIO
 from mapper.runtime.worker_process import call_isolated
-from mapper.sources.cloud_files.parsing import MOST_BYTES, Columns, refusing_damage
+from mapper.sources.cloud_files.parsing import MOST_BYTES, Column, Columns, refusing_damage
 
 _COLOURS = ("red", "green", "blue")
-_EXTRAS = ("gps_time", *_COLOURS)
+_EXTRAS = ("gps_time", "intensity", *_COLOURS)
 _DATE_AT, _DATE_BYTES = 90, 4  # day and year
 _RECORDS = struct.Struct("<100xI")  # how many records of variable length follow the header (LAS 1.0 to 1.4)
 _RECORD_BYTES = 54  # of each one's own header
@@ -77,13 +78,21 @@ def _columns(reader: Any) -> Columns:
     return {name: np.asarray(values) for name, values in columns.items()}
 
 
+def _sixteen_bits(intensities: Column) -> NDArray[np.uint16]:
+    most = np.iinfo(np.uint16).max
+    largest = float(intensities.max(initial=0.0))
+    scale = most / max(largest, 1.0) if largest <= 1.0 or largest > most else 1.0
+    scaled: NDArray[np.uint16] = np.rint(np.clip(intensities, 0.0, None) * scale).astype(np.uint16)
+    return scaled
+
+
 def write_las(path: Path, columns: Columns) -> None:
     """Write points with colours as LAS 1.2, atomically; compressed if the name ends in ".laz".
 
     Args:
         path: File to write.
-        columns: x, y, z in metres, which are rounded to 0.1 mm; red, green, blue, uint8; others become extra
-            dimensions.
+        columns: x, y, z in metres, which are rounded to 0.1 mm; red, green, blue, uint8; intensity, scaled to
+            the 16 bits of LAS where it exceeds them or is a share of 1; others become extra dimensions.
     """
     import laspy
 
@@ -93,12 +102,14 @@ def write_las(path: Path, columns: Columns) -> None:
     header.generating_software = "mapper"
     header.offsets = np.floor(low)
     header.scales = np.maximum(_SCALE_M, (high - low + 1.0) / 2**31)
-    extra = [name for name in columns if name not in ("x", "y", "z", *_COLOURS)]
+    extra = [name for name in columns if name not in ("x", "y", "z", "intensity", *_COLOURS)]
     header.add_extra_dims([laspy.ExtraBytesParams(name, columns[name].dtype) for name in extra])
     cloud = laspy.LasData(header)
     cloud.xyz = points
     for name in extra:
         cloud[name] = columns[name]
+    if "intensity" in columns:
+        cloud["intensity"] = _sixteen_bits(columns["intensity"])
     for name in _COLOURS:
         cloud[name] = columns[name].astype(np.uint16) * _FULL_RANGE
     data = BytesIO()

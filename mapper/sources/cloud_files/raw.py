@@ -1,5 +1,6 @@
 """Measured points, in metres around the sensor, from the columns of a cloud file."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,8 @@ from mapper.core.frames import Points32
 from mapper.sources.cloud_files.parsing import MAX_RANGE_M, MIN_POINTS, SAMPLES, Column, Columns
 from mapper.sources.point_times import time_field
 
+_INTENSITY_FIELDS = ("intensity", "reflectivity", "reflectance", "scalar_intensity")
+"""Names of drivers, of CloudCompare, and of LAS."""
 _AWAY_RATIO = 10.0  # times the cloud's own size, and it cannot be a sweep around its origin
 
 
@@ -23,11 +26,13 @@ class RawCloud:
         points: (N, 3) float32, metres, sensor frame.
         times: (N,) each point's time as the file has it; ``relative_times_s`` finds unit and clock.
         colors: (N, 3) uint8 RGB.
+        intensities: (N,) float32.
     """
 
     points: Points32
     times: Column | None
     colors: NDArray[np.uint8] | None
+    intensities: NDArray[np.float32] | None
 
 
 def cloud_from(columns: Columns, *, path: Path, scale: float | None) -> RawCloud:
@@ -55,12 +60,28 @@ def cloud_from(columns: Columns, *, path: Path, scale: float | None) -> RawCloud
     field = time_field(columns)
     times = None if field is None else columns[field]
     colors = _colors(columns)
+    field = intensity_field(columns)
+    intensities = None if field is None else intensities_of(columns[field])
     if measured < total:
         points = points.compress(is_measured, axis=0)  # three times as fast as an index
         times = None if times is None else times[is_measured]
         colors = None if colors is None else colors.compress(is_measured, axis=0)
+        intensities = None if intensities is None else intensities.compress(is_measured)
     check_range(points, where=f"{path}", is_scaled=scale is not None)
-    return RawCloud(points, times, colors)
+    return RawCloud(points, times, colors, intensities)
+
+
+def intensity_field(names: Iterable[str]) -> str | None:
+    """Return the first name, in the case it is written in, that drivers give a point's intensity."""
+    return next((name for name in names if name.lower() in _INTENSITY_FIELDS), None)
+
+
+def intensities_of(values: Column) -> NDArray[np.float32] | None:
+    """Return (N,) intensities, 0 where not finite; None where all are 0, as in files without any."""
+    if values.dtype.kind not in "fiu":
+        return None
+    intensities = np.nan_to_num(values.astype(np.float32), nan=0.0, posinf=0.0, neginf=0.0)
+    return intensities if intensities.any() else None
 
 
 def _measured(points: Points32) -> NDArray[np.bool_]:

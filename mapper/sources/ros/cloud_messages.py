@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from mapper.core.errors import DataError, FrameError
 from mapper.core.frames import Scan
 from mapper.core.geometry import Transform, apply
-from mapper.sources.cloud_files.raw import check_range
+from mapper.sources.cloud_files.raw import check_range, intensities_of, intensity_field
 from mapper.sources.point_times import relative_times_s, time_field, without_untimed
 from mapper.sources.ros.messages import CloudMessage
 from mapper.sources.valid_returns import valid_returns
@@ -105,7 +105,7 @@ def scan_from(
     Args:
         message: The cloud.
         T_body_frame: Pose of the cloud's frame in the body's.
-        with_colours: Take the points' colours too, if there are any.
+        with_colours: Take the points' colours and intensities too, if there are any.
         where: Name of the message in an error.
         scale: Metres per unit; None is 1, and refuses what looks like millimetres.
 
@@ -123,7 +123,7 @@ def scan_from(
     T_body_points = T_body_frame @ message.T_frame_points
     if not np.array_equal(T_body_points, np.eye(4)):
         points_body = apply(T_body_points, points_body.astype(np.float64)).astype(np.float32)
-    times = time_field(names)
+    times, intensity = time_field(names), intensity_field(names)
     scan = Scan(
         message.stamp_ns,
         points_body,
@@ -131,6 +131,7 @@ def scan_from(
         colors=_colours(points, names, kept) if with_colours else None,
         times_s=None if times is None else relative_times_s(points[times][kept], message.stamp_ns),
         far_returns=far,
+        intensities=intensities_of(points[intensity][kept]) if with_colours and intensity else None,
     )
     return without_untimed(scan)
 

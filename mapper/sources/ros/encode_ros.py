@@ -90,13 +90,16 @@ def camera_info_message(stamp_ns: int, topic: str, camera: PinholeCamera, *, fra
 
 
 def cloud_message(topic: str, scan: Scan, *, frame: str) -> SerializedMessage:
-    """Return a sensor_msgs/msg/PointCloud2 of a scan's points, times and colours."""
+    """Return a sensor_msgs/msg/PointCloud2 of a scan's points, intensities, times and colours."""
     columns = [(name, "f4") for name in "xyz"]
+    columns += [("intensity", "f4")] if scan.intensities is not None else []
     columns += [("time", "f4")] if scan.times_s is not None else []
     columns += [("rgb", "u4")] if scan.colors is not None else []
     points = np.empty(len(scan.points_body), np.dtype([(name, f"<{kind}") for name, kind in columns]))
     for axis, name in enumerate("xyz"):
         points[name] = scan.points_body[:, axis]
+    if scan.intensities is not None:
+        points["intensity"] = scan.intensities
     if scan.times_s is not None:
         points["time"] = scan.times_s
     if scan.colors is not None:

@@ -25,7 +25,7 @@ def write_kitti_log(
     """Write a LiDAR log as a KITTI folder and return the scans that could not be.
 
     There is no ``calib.txt``: poses are the LiDAR's own. They are written if every scan has a true one
-    within 20 ms, for KITTI's lines bear no stamps. Colours, and intensities, are not kept.
+    within 20 ms, for KITTI's lines bear no stamps. Colours are not kept.
 
     Args:
         source: Log that is written.
@@ -40,7 +40,7 @@ def write_kitti_log(
     clouds = out / "velodyne"
     for done, entry in enumerate(source.entries(), start=1):
         try:
-            scan = entry.load(colour=False)
+            scan = entry.load()
             if not isinstance(scan, Scan):
                 raise SourceError(f"{source.path}: images, not scans; KITTI folders hold scans: --as tum")
             clouds.mkdir(parents=True, exist_ok=True)
@@ -67,15 +67,23 @@ def write_kitti_log(
 
 
 def save_scan(stem: Path, scan: Scan) -> None:
-    """Write a scan as KITTI's records with intensity 0, or x, y, z and t as an array where it has times."""
+    """Write a scan as KITTI's records, or x, y, z and t as an array where it has times.
+
+    Where a scan has no intensities, those of the records are 0.
+    """
     if scan.times_s is None:
         records = np.zeros((len(scan.points_body), 4), dtype="<f4")
         records[:, :3] = scan.points_body
+        if scan.intensities is not None:
+            records[:, 3] = scan.intensities
         records.tofile(stem.with_suffix(".bin"))
         return
-    timed = np.empty(len(scan.points_body), dtype=_TIMED)
+    kind = _TIMED if scan.intensities is None else np.dtype([*_TIMED.descr, ("intensity", "<f4")])
+    timed = np.empty(len(scan.points_body), dtype=kind)
     timed["x"], timed["y"], timed["z"] = scan.points_body.T
     timed["t"] = scan.times_s
+    if scan.intensities is not None:
+        timed["intensity"] = scan.intensities
     np.save(stem.with_suffix(".npy"), timed)
 
 

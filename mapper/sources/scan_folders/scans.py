@@ -44,13 +44,14 @@ class ScanEntry:
             colors=cloud.colors[kept] if colour and cloud.colors is not None else None,
             times_s=None if cloud.times is None else relative_times_s(cloud.times[kept], self.stamp_ns),
             far_returns=far,
+            intensities=cloud.intensities[kept] if colour and cloud.intensities is not None else None,
         )
         return without_untimed(scan)
 
     def scan(self) -> Scan:
-        """Read the cloud.
+        """Read the cloud without colours and intensities.
 
         Raises:
             FrameError: As ``load``.
         """
-        return self.load()
+        return self.load(colour=False)

@@ -372,3 +372,35 @@ def test_a_single_cloud_is_a_scan_at_time_zero(tmp_path):
     assert scan.stamp_ns == 0
     np.testing.assert_array_equal(scan.points_body, POINTS)
     np.testing.assert_allclose(scan.times_s, TIMES / 1e9, rtol=1e-6)
+
+
+@pytest.mark.parametrize("ending", [".bin", ".pcd", ".las", ".ply"])
+def test_intensities_are_read(tmp_path, ending):
+    intensities = RNG.integers(1, 200, N).astype(np.float32)
+    path = tmp_path / f"cloud{ending}"
+    if ending == ".bin":
+        np.column_stack([POINTS, intensities]).astype(np.float32).tofile(path)
+    elif ending == ".pcd":
+        names, kinds = ("x", "y", "z", "reflectivity"), (np.float32,) * 3 + (np.uint16,)
+        PointCloud.from_points([*POINTS.T, intensities.astype(np.uint16)], names, kinds).save(path)
+    elif ending == ".ply":
+        fields = [("x", "f4"), ("y", "f4"), ("z", "f4"), ("scalar_Intensity", "f4")]
+        rows = np.array([(*point, value) for point, value in zip(POINTS, intensities, strict=True)], fields)
+        PlyData([PlyElement.describe(rows, "vertex")]).write(path)
+    else:
+        written = laspy.LasData(laspy.LasHeader(point_format=3, version="1.2"))
+        written.header.scales = [1e-4] * 3
+        written.x, written.y, written.z = POINTS.T
+        written.intensity = intensities.astype(np.uint16)
+        written.write(path)
+    np.testing.assert_array_equal(read_cloud(path).intensities, intensities)
+
+
+def test_intensities_that_say_nothing_are_none(tmp_path):
+    path = tmp_path / "cloud.bin"
+    np.column_stack([POINTS, np.zeros(N)]).astype(np.float32).tofile(path)
+    assert read_cloud(path).intensities is None
+    values = np.ones(N, np.float32)
+    values[3] = np.nan
+    np.column_stack([POINTS, values]).astype(np.float32).tofile(path)
+    assert read_cloud(path).intensities.tolist() == [1.0] * 3 + [0.0] + [1.0] * (N - 4)
