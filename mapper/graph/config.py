@@ -34,6 +34,13 @@ class WheelFactorsConfig(WheelNoiseConfig):
     """Connect keyframes by wheel odometry, if the log has it."""
 
 
+class GnssFactorsConfig(Config):
+    """Settings of GNSS factors."""
+
+    use: bool = True
+    """Put the map in a local east-north-up frame, and let fixes correct the path where it has drifted."""
+
+
 class GraphConfig(Config):
     """Settings of the pose graph's solver."""
 
@@ -52,6 +59,7 @@ class GraphConfig(Config):
     """Initial poses of the batch solve: the "given" estimates, a "chordal" relaxation that needs none, or
     "auto": the relaxation if the estimates fit badly, no loops are outliers, and its cost is lower."""
     wheels: WheelFactorsConfig = WheelFactorsConfig()
+    gnss: GnssFactorsConfig = GnssFactorsConfig()
     max_iterations: PositiveInt = 100
     """Limit for each connected component's last solve."""
     relative_error: PositiveFloat = 1e-8

@@ -13,7 +13,7 @@ from mapper.core.geometry import Array, adjoint, inverse
 from mapper.graph.batch import problem_of
 from mapper.graph.components import components_with_factors
 from mapper.graph.model import PoseGraph, PoseSigmas
-from mapper.graph.terms import anchor, between, solver_errors, values_of
+from mapper.graph.terms import anchor, between, position, solver_errors, values_of
 
 if TYPE_CHECKING:
     import gtsam
@@ -53,7 +53,9 @@ def marginals_of(graph: PoseGraph) -> Marginals:
     relative: dict[tuple[int, int], Array] = {}
     for nodes, indices in components_with_factors(graph):
         known = [graph.factors[k] for k in indices]
-        problem = problem_of([*map(between, known), anchor(nodes[0], graph.T_world_node[nodes[0]], _HELD)])
+        measured = [position(factor) for factor in graph.fixes if factor.node in set(nodes)]
+        held = anchor(nodes[0], graph.T_world_node[nodes[0]], _HELD)
+        problem = problem_of([*map(between, known), *measured, held])
         linear = problem.linearize(values_of(graph.T_world_node, nodes))
         with solver_errors(f"covariances of {len(nodes)} nodes from node {nodes[0]}"):
             net = linear.eliminateSequential(gtsam.Ordering.ColamdGaussianFactorGraph(linear))

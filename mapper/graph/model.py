@@ -1,7 +1,7 @@
 """Pose graph: nodes, relative-pose factors, and the solution."""
 
 from collections.abc import Container, Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from operator import mul
 from typing import TYPE_CHECKING, Literal
 
@@ -67,6 +67,33 @@ class BetweenFactor:
             raise GraphError(f"factor {self.i} → {self.j}: information is not positive definite") from None
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class PositionFactor:
+    """A measured position of a point that moves with a node, such as a GNSS antenna's.
+
+    Attributes:
+        node: Node that carries the point.
+        point_node: (3,) the point in the node, metres.
+        position_world: (3,) its measured position, metres.
+        information: (3, 3) of the measurement along the world's axes, m⁻².
+        weight: Share of the information that counts: consecutive measurements have errors in common.
+        stamp_ns: Time of the measurement, nanoseconds.
+    """
+
+    node: int
+    point_node: Array
+    position_world: Array
+    information: Array = field(repr=False)
+    weight: float = 1.0
+    stamp_ns: int = 0
+
+    def moved(self, T_new_world: Transform) -> "PositionFactor":
+        """Return the same measurement in another world frame."""
+        R = T_new_world[:3, :3]
+        position = R @ self.position_world + T_new_world[:3, 3]
+        return replace(self, position_world=position, information=R @ self.information @ R.T)
+
+
 @dataclass(slots=True)
 class PoseGraph:
     """Nodes with their estimates, and the factors between them. Grows while a log is tracked.
@@ -76,12 +103,14 @@ class PoseGraph:
         stamps_ns: Time of every node.
         factors: Measurements between nodes.
         fixed: Nodes that a solve leaves where they are, in place of each component's first.
+        fixes: Measured positions; a component with any has no fixed node, and the world's z is up.
     """
 
     T_world_node: dict[int, Transform] = field(default_factory=dict)
     stamps_ns: dict[int, int] = field(default_factory=dict)
     factors: list[BetweenFactor] = field(default_factory=list)
     fixed: tuple[int, ...] = ()
+    fixes: tuple[PositionFactor, ...] = ()
 
     def __repr__(self) -> str:
         nodes, factors = len(self.T_world_node), len(self.factors)
@@ -138,12 +167,13 @@ class PoseGraph:
         self.stamps_ns[node] = stamp_ns
 
     def moved(self, T_new_world: Transform) -> "PoseGraph":
-        """Return the graph in another world frame; its measurements are the same."""
-        return self.with_poses({node: T_new_world @ T for node, T in self.T_world_node.items()})
+        """Return the graph in another world frame; its relative measurements are the same."""
+        moved = self.with_poses({node: T_new_world @ T for node, T in self.T_world_node.items()})
+        return replace(moved, fixes=tuple(factor.moved(T_new_world) for factor in self.fixes))
 
     def with_poses(self, T_world_node: dict[int, Transform]) -> "PoseGraph":
         """Return the graph with other poses of the same nodes."""
-        return PoseGraph(T_world_node, self.stamps_ns, self.factors, self.fixed)
+        return replace(self, T_world_node=T_world_node)
 
     @property
     def has_wheels(self) -> bool:
@@ -152,7 +182,7 @@ class PoseGraph:
 
     def with_factors(self, factors: Iterable[BetweenFactor]) -> "PoseGraph":
         """Return the graph with these factors in place of its own."""
-        return PoseGraph(self.T_world_node, self.stamps_ns, list(factors), self.fixed)
+        return replace(self, factors=list(factors))
 
     def without_loops(self) -> "PoseGraph":
         """Return the graph with the factors of odometry and wheels alone."""
@@ -169,6 +199,7 @@ class PoseGraph:
             {node: stamp_ns for node, stamp_ns in self.stamps_ns.items() if node in nodes},
             [factor for factor in self.factors if factor.i in nodes and factor.j in nodes],
             tuple(node for node in self.fixed if node in nodes),
+            tuple(factor for factor in self.fixes if factor.node in nodes),
         )
 
     def add_factors(self, factors: Iterable[BetweenFactor]) -> None:

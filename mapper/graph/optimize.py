@@ -15,7 +15,7 @@ from mapper.graph.config import GraphConfig
 from mapper.graph.model import PoseGraph, Solution
 from mapper.graph.proportional_correction import distribute
 from mapper.graph.robust import solve_part
-from mapper.graph.terms import anchor, between, poses_of, values_of
+from mapper.graph.terms import between, gauge, poses_of, values_of
 from mapper.runtime.progress import SILENT, Progress
 
 if TYPE_CHECKING:
@@ -27,8 +27,8 @@ def optimize(graph: PoseGraph, config: GraphConfig, *, progress: Progress = SILE
 
     Least squares on ½ Σ w ‖log(T_i_j⁻¹ · T_i⁻¹ · T_j)‖², each in its factor's metric; w is 1 but for loops,
     which ``config.robust`` weighs. Every connected component is solved on its own and
-    keeps its first node where it was, or of ``graph.fixed`` the first that is in it; a node without
-    factors keeps its estimate.
+    keeps its first node where it was, or of ``graph.fixed`` the first that is in it, unless positions of its
+    nodes were measured; a node without factors keeps its estimate.
 
     With ``config.solve == "proportional"`` the loops are spread along the path instead, and with "none"
     all estimates are returned as they are; the errors show how well they fit.
@@ -63,7 +63,7 @@ def optimize(graph: PoseGraph, config: GraphConfig, *, progress: Progress = SILE
                 part = Part(
                     known=[graph.factors[k] for k in known],
                     loops=[graph.factors[k] for k in loops],
-                    held=[*(terms[k] for k in known), anchor(fixed, graph.T_world_node[fixed])],
+                    held=[*(terms[k] for k in known), *gauge(graph, set(nodes), fixed)],
                     start=given if len(nodes) == given.size() else values_of(graph.T_world_node, nodes),
                     fixed=fixed,
                 )

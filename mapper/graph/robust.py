@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
 _GROWTH = 1.4
 """Factor by which μ grows in each round (Yang et al. 2020, remark 5)."""
 _MAX_ROUNDS = 100
-_ROUND = Effort(max_iterations=3, relative_error=1e-4)
+ROUND = Effort(max_iterations=3, relative_error=1e-4)
 """Solver effort of a round: its result is only the start of the next."""
 _DECIDED = 1e-3
 """A weight this close to 0 or 1 has converged."""
@@ -73,14 +74,7 @@ def graduate(part: Part, width: float) -> tuple[Array, Graduated]:
     weights = (apart <= _DRIFT_SLACK**2 * limit).astype(np.float64)
     now = _round(part, terms, weights, Graduated(part.start, apart, 0))
     worst = now.chi2[weights > 0.0].max(initial=0.0)
-    if worst > limit:
-        mu = limit / (2.0 * worst - limit)
-        for _ in range(_MAX_ROUNDS):
-            weights = _truncated(now.chi2, limit, mu)
-            now = _round(part, terms, weights, now)
-            if (np.minimum(weights, 1.0 - weights) < _DECIDED).all():
-                break
-            mu *= _GROWTH
+    now = truncate(partial(_round, part, terms), now, worst=worst, limit=limit)
     now = _refine_inliers(part, terms, now, apart=apart, limit=limit)
     return (now.chi2 <= limit).astype(np.float64), now
 
@@ -99,8 +93,30 @@ def chi2_of(terms: Sequence[gtsam.NonlinearFactor], poses: gtsam.Values) -> Arra
 def _round(
     part: Part, terms: Sequence[gtsam.NonlinearFactor], weights: Array, before: Graduated
 ) -> Graduated:
-    poses, more = solve(part.held, weighted(part.loops, weights), before.poses, effort=_ROUND)
+    poses, more = solve(part.held, weighted(part.loops, weights), before.poses, effort=ROUND)
     return Graduated(poses, chi2_of(terms, poses), before.iterations + more)
+
+
+def truncate(
+    step: Callable[[Array, Graduated], Graduated], now: Graduated, *, worst: float, limit: float
+) -> Graduated:
+    """Return the state in which truncated least squares has decided on every measurement.
+
+    Args:
+        step: Returns the state after a round with some weights, from the state before.
+        now: State with all measurements that take part at first.
+        worst: Largest χ² of these.
+        limit: χ² beyond which a measurement is an outlier.
+    """
+    if worst > limit:
+        mu = limit / (2.0 * worst - limit)
+        for _ in range(_MAX_ROUNDS):
+            weights = _truncated(now.chi2, limit, mu)
+            now = step(weights, now)
+            if (np.minimum(weights, 1.0 - weights) < _DECIDED).all():
+                break
+            mu *= _GROWTH
+    return now
 
 
 def _truncated(chi2: Array, limit: float, mu: float) -> Array:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -16,11 +16,13 @@ from mapper.graph.config import KernelKind
 if TYPE_CHECKING:
     import gtsam
 
-    from mapper.graph.model import BetweenFactor
+    from mapper.graph.model import BetweenFactor, PoseGraph, PositionFactor
 
 # The anchor only removes the freedom to move the whole component, so at the solution it costs nothing
 # whatever its width; a far tighter one would spoil the conditioning for no gain.
 _ANCHOR_INFORMATION = np.eye(6) * 1e6  # 1 mrad, 1 mm
+LEVEL_SIGMA_RAD = 0.02
+"""Error of a levelled world's up: where walls are few it is the normal of the ground, and streets slope."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +72,42 @@ def anchor(
     return gtsam.PriorFactorPose3(node, pose3(T_world_node), _noise(information))
 
 
+def position(
+    factor: PositionFactor, *, weight: float = 1.0, kernel: Kernel | None = None
+) -> gtsam.GPSFactorArm:
+    """Return weight · ½ ‖T_world_node · p_node − p_world‖² in the factor's metric and of its own weight.
+
+    A kernel's width is in sigmas of the measurement, whatever its weight.
+    """
+    import gtsam
+
+    noise: gtsam.noiseModel.Base = _noise(weight * factor.weight * factor.information)
+    if kernel is not None:
+        scaled = Kernel(kernel.kind, kernel.width * factor.weight**0.5)
+        noise = gtsam.noiseModel.Robust.Create(scaled.estimator(), noise)
+    return gtsam.GPSFactorArm(factor.node, factor.position_world, factor.point_node, noise)
+
+
+def upright(node: int, T_world_node: Transform, sigma_rad: float) -> gtsam.AttitudeFactorPose3:
+    """Return the prior that a node keeps its tilt, the world's z being up; its heading is free."""
+    import gtsam
+
+    up_node = gtsam.Unit3(T_world_node[2, :3])
+    noise = gtsam.noiseModel.Isotropic.Sigma(2, sigma_rad)
+    return gtsam.AttitudeFactorPose3(node, gtsam.Unit3(np.array([0.0, 0.0, 1.0])), noise, up_node)
+
+
+def gauge(
+    graph: PoseGraph, nodes: Collection[int], fixed: int, information: Array = _ANCHOR_INFORMATION
+) -> list[gtsam.NonlinearFactor]:
+    """Return what determines where a component is: its measured positions and its tilt, else one node."""
+    T_world_fixed = graph.T_world_node[fixed]
+    measured = [position(factor) for factor in graph.fixes if factor.node in nodes]
+    if measured:
+        return [*measured, upright(fixed, T_world_fixed, LEVEL_SIGMA_RAD)]
+    return [anchor(fixed, T_world_fixed, information)]
+
+
 def values_of(T_world_node: Mapping[int, Transform], nodes: Iterable[int]) -> gtsam.Values:
     """Return some nodes' poses as GTSAM's values."""
     import gtsam
@@ -91,7 +129,7 @@ def poses_of(values: gtsam.Values) -> dict[int, Transform]:
 
 
 def _noise(information: Array) -> gtsam.noiseModel.Gaussian:
-    """Return the noise model of a (6, 6) information matrix; only the symmetric part counts."""
+    """Return the noise model of an information matrix; only the symmetric part counts."""
     import gtsam
 
     return gtsam.noiseModel.Gaussian.Information(0.5 * (information + information.T))

@@ -27,6 +27,7 @@ from mapper.pipeline.checkpoints import (
     remove_checkpoints,
 )
 from mapper.pipeline.components import largest_component
+from mapper.pipeline.georeference import Georeferenced, georeference
 from mapper.pipeline.inertial_bridging import bridge
 from mapper.pipeline.joined_components import joined
 from mapper.pipeline.solve import solve
@@ -112,6 +113,7 @@ class _Solved:
     tracking: TrackingResult
     report: Solve
     level: Level
+    georeferenced: Georeferenced
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -162,8 +164,10 @@ class _Steps:
         tracking = largest_component(tracking, progress=self.progress)
         with self.writer.clock.stage("level"):
             level = level_of(with_body_rates(self.source, tracking.gyroscope), tracking, self.config)
-        tracking = replace(tracking, graph=tracking.graph.moved(level.T_level_world))
-        solved = _Solved(tracking, graph.report, level)
+            tracking = replace(tracking, graph=tracking.graph.moved(level.T_level_world))
+            placed = georeference(tracking, self.source.gnss, self.config.graph)
+        level = replace(level, T_level_world=placed.T_map_world @ level.T_level_world)
+        solved = _Solved(placed.tracking, graph.report, level, placed)
         if self.checkpoints is not None:
             self.checkpoints.store("solved", solved)
         return solved
@@ -178,14 +182,20 @@ class _Steps:
         if implausible := _height_warning(self.source, tracking.tracked_trajectory()):
             self.progress.note(implausible)
             self.writer.warn([RunWarning(kind="depth", sentence=implausible, weight="doubt")])
+        for warning in solved.georeferenced.warnings:
+            self.progress.note(warning.text)
+        self.writer.warn(solved.georeferenced.warnings)
         with self.writer.clock.stage("solve"):
             save_solved(self.writer, from_tracking(tracking, self.source.truth))
             save_places(self.writer, tracking)
+        report = solved.georeferenced.report
+        detail = level.detail if report is None else f"{level.detail}; then x was turned to east by GNSS"
         if poses is not None:
             write_tum(self.writer.folder / files.ODOMETRY, poses)
         self.writer.update(
             solve=solved.report,
-            levelling=Levelling(method=level.method, detail=level.detail, has_floor=level.has_floor),
+            levelling=Levelling(method=level.method, detail=detail, has_floor=level.has_floor),
+            georeference=report,
         )
 
     def fuse(self) -> None:

@@ -214,7 +214,9 @@ class _FirstPass:
         """Return the result of all frames; nothing is added afterwards."""
         tracks = _in_hindsight(self.tracks, odometry, checks)
         before = self._start.graph
-        graph = PoseGraph(dict(before.T_world_node), dict(before.stamps_ns), list(before.factors))
+        graph = PoseGraph(
+            dict(before.T_world_node), dict(before.stamps_ns), list(before.factors), fixes=before.fixes
+        )
         for track in tracks:
             if track.is_keyframe and track.node is not None:
                 graph.add_node(track.node, track.stamp_ns, track.T_world_body)

@@ -14,6 +14,7 @@ TRUTH = "truth.tum"
 ODOMETRY = "odometry.tum"
 KITTI = "trajectory.kitti"
 GRAPH = "graph.g2o"
+FIXES = "gnss.csv"
 LOOPS = "loops.jsonl"
 PLACES = "places.bin"
 FRAMES = "frames.csv"
@@ -79,6 +80,12 @@ RUN_FILES = (
     RunFiles((TRUTH,), "the log's own truth, in its own frame, if there is any", "tracking"),
     RunFiles((ODOMETRY,), "the poses of a caller's own odometry, if the build was given one", "tracking"),
     RunFiles((GRAPH,), "the pose graph at its solution", "tracking"),
+    RunFiles(
+        (FIXES,),
+        "the GNSS fixes that correct the path: position, antenna in its node, and information along the "
+        "map's axes, of which the weight counts",
+        "tracking",
+    ),
     RunFiles(
         (LOOPS,),
         "every loop candidate: who proposed it, what was measured, its verdict and why, its weight",

@@ -22,6 +22,7 @@ from mapper.run import files
 from mapper.run.digests import changing, checked, regular
 from mapper.run.doubtful_frames import without_doubtful
 from mapper.run.frame_outcomes import FrameRecord, read_frame_ms, read_records, stamps_of
+from mapper.run.gnss_file import read_fixes
 from mapper.run.input_logs import open_inputs
 from mapper.run.manifest import (
     Manifest,
@@ -104,7 +105,8 @@ class Run:
     @cached_property
     def graph(self) -> PoseGraph:
         """Pose graph with its nodes at the solution, in the levelled world."""
-        return read_g2o(self.file(files.GRAPH))
+        graph, fixes = read_g2o(self.file(files.GRAPH)), self.file(files.FIXES)
+        return replace(graph, fixes=read_fixes(fixes)) if fixes.exists() else graph
 
     @cached_property
     def loops(self) -> list[LoopClosure]:

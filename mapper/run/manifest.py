@@ -16,6 +16,7 @@ from mapper.core.config import Config, drop_unknown
 from mapper.core.errors import DataError, RunError
 from mapper.mapping.config import AppliedEdit
 from mapper.odometry.gyroscope_calibration import GyroscopeCalibration, with_body_rates
+from mapper.run.georeference import Georeference
 from mapper.runtime.atomic import MANIFEST_NAME, write_text
 from mapper.runtime.regular_files import MOST_BYTES, read_regular, read_text
 from mapper.sensing.config import DepthNoiseConfig
@@ -294,6 +295,8 @@ class Manifest(Config):
     """None until the maps are made."""
     solve: Solve | None = None
     levelling: Levelling | None = None
+    georeference: Georeference | None = None
+    """None where the map is in a frame of its own."""
     gyroscope: GyroscopeFit | None = None
     """None where the log has no gyroscope that was of use."""
     depth: DepthReach | None = None

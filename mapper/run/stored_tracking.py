@@ -14,6 +14,7 @@ from mapper.run import files
 from mapper.run.doubtful_frames import placed_by_neighbours
 from mapper.run.folder import Run
 from mapper.run.frame_outcomes import FrameRecord, write_frame_ms, write_records
+from mapper.run.gnss_file import write_fixes
 from mapper.run.manifest import SkippedFrame
 from mapper.run.pose_covariances import uncertain_poses, write_poses
 from mapper.run.writer import RunWriter
@@ -104,6 +105,8 @@ def save_tracking(writer: RunWriter, tracked: StoredTracking) -> None:
     save_frames(writer, tracked, nodes=len(graph.T_world_node))
     if graph.T_world_node:
         write_g2o(folder / files.GRAPH, graph)
+        if graph.fixes:
+            write_fixes(folder / files.FIXES, graph.fixes)
         keyframes = trajectory_from((graph.stamps_ns[node], T) for node, T in graph.T_world_node.items())
         write_tum(folder / files.KEYFRAMES, keyframes)
 

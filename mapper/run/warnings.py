@@ -35,6 +35,7 @@ INPUT_KINDS = frozenset(
         "camera",
         "shutter",
         "imu",
+        "gnss",
         "sweep",
         "frozen",
         "far returns",
