@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.timebase import NS_PER_S
+from mapper.export.crs import place_of, wkt_of
 from mapper.octree.attributes import NEVER_SEEN
 from mapper.run.folder import Run
 from mapper.runtime.progress import Progress
@@ -15,8 +16,9 @@ from mapper.sources.cloud_files.pcd import write_pcd
 
 
 def las(run: Run, path: Path, _progress: Progress) -> None:
-    """Write LAS, or LAZ if the name ends so."""
-    write_las(path, _columns(run))
+    """Write LAS, or LAZ if the name ends so, with the reference system of a map whose place is known."""
+    place = place_of(run)
+    write_las(path, _columns(run), wkt=None if place is None else wkt_of(place))
 
 
 def pcd(run: Run, path: Path, _progress: Progress) -> None:

@@ -7,12 +7,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.errors import DataError
+from mapper.export.crs import place_of
 from mapper.export.export_folders import export_folder
 from mapper.export.figures import CELL_PX, FREE_CELL, OCCUPIED_CELL, UNKNOWN_CELL
 from mapper.export.grid import write_grid, write_values
 from mapper.navigation.config import CostmapConfig
 from mapper.navigation.distance import plane_distances
 from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, overlap_of, with_obstacles
+from mapper.run.georeference import Georeference
 from mapper.run.map_folder import MapFolder
 from mapper.runtime.atomic import write_bytes, write_text
 from mapper.runtime.progress import Progress
@@ -120,7 +122,8 @@ def nav2(run: MapFolder, path: Path, _progress: Progress) -> None:
         write_grid(folder, MAP, grid)
         write_grid(folder, KEEPOUT, keepout)
         write_values(folder, SPEED, slowed, grid)
-        write_text(folder / PARAMETERS, _parameters(run.config.costmap, grid.resolution_m))
+        parameters = _parameters(run.config.costmap, grid.resolution_m)
+        write_text(folder / PARAMETERS, parameters + _datum(place_of(run)))
         write_text(folder / LAUNCH, _LAUNCH)
 
 
@@ -223,6 +226,18 @@ global_costmap:
       rolling_window: true
       plugins: ["inflation_layer"] # and the layer of your own sensor
 {layers}"""
+
+
+def _datum(place: Georeference | None) -> str:
+    """Return robot_localization's parameters for GNSS in the map's frame; empty if its place is unknown."""
+    if place is None:
+        return ""
+    return f"""\
+navsat_transform:
+  ros__parameters:
+    wait_for_datum: true
+    datum: [{place.latitude_deg!r}, {place.longitude_deg!r}, 0.0] # the map's origin; its x points east
+"""
 
 
 def _server(package_node: str, name: str, mask: str = "") -> str:

@@ -19,7 +19,9 @@ from mapper.run.manifest import RunWarning, Weight
 from mapper.sensing.gnss import GnssFixes
 from mapper.sensing.wheel_kinematics import pose_at
 
-_MAX_GAP_NS, _MIN_FIXES = NS_PER_S, 10
+_MAX_GAP_NS = NS_PER_S
+_MIN_FIXES = 6
+"""Heading and position take two, and their residuals are to say something."""
 _UNKNOWN_SIGMAS_M = np.array([3.3, 3.3, 6.6])
 """Of a fix that states none: 8 m horizontally, 13 m vertically at 95 % (GPS performance standard, 2020)."""
 _LEAST_SIGMA_M = 0.02

@@ -24,6 +24,7 @@ _RECORD_BYTES = 54  # of each one's own header
 _COORDINATES = struct.Struct("<3d")  # a point's x, y and z once they are scaled
 _LAZ_COPIES = 3  # the packed points' layers, all points as records, and their coordinates
 _LAZ_BUFFERS_BYTES = 256 * MIB
+_WKT_RECORD = "LASF_Projection", 2112, "OGC WKT"
 _SCALE_M = 1e-4  # of coordinates; wider where 32 bits do not hold them
 _FULL_RANGE = 257  # 255 becomes 65535: LAS has colours of 16 bits
 
@@ -86,19 +87,24 @@ def _sixteen_bits(intensities: Column) -> NDArray[np.uint16]:
     return scaled
 
 
-def write_las(path: Path, columns: Columns) -> None:
-    """Write points with colours as LAS 1.2, atomically; compressed if the name ends in ".laz".
+def write_las(path: Path, columns: Columns, *, wkt: str | None = None) -> None:
+    """Write points with colours as LAS, atomically; compressed if the name ends in ".laz".
 
     Args:
         path: File to write.
         columns: x, y, z in metres, which are rounded to 0.1 mm; red, green, blue, uint8; intensity, scaled to
             the 16 bits of LAS where it exceeds them or is a share of 1; others become extra dimensions.
+        wkt: Coordinate reference system as WKT 1, which takes LAS 1.4; None writes LAS 1.2 without one.
     """
     import laspy
 
     points = np.column_stack([columns[axis] for axis in "xyz"]).astype(np.float64)
     low, high = points.min(axis=0, initial=0.0), points.max(axis=0, initial=0.0)
     header = laspy.LasHeader(point_format=2, version="1.2")
+    if wkt is not None:
+        header = laspy.LasHeader(point_format=7, version="1.4")
+        header.global_encoding.wkt = True
+        header.vlrs.append(laspy.VLR(*_WKT_RECORD, record_data=wkt.encode() + b"\0"))
     header.generating_software = "mapper"
     header.offsets = np.floor(low)
     header.scales = np.maximum(_SCALE_M, (high - low + 1.0) / 2**31)
