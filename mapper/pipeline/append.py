@@ -126,6 +126,7 @@ def _manifest(run: Run, source: Log, config: SourceConfig) -> Manifest:
         libraries=library_versions(),
         input=known.model_copy(update={"appended": appended}),
         levelling=run.manifest.levelling,
+        georeference=run.manifest.georeference,
         gyroscope=run.manifest.gyroscope,
         warnings=tuple(warning for warning in run.manifest.warnings if warning.kind in INPUT_KINDS),
         timing=Timing(started=now_text()),

@@ -47,8 +47,8 @@ def chained(first: Log, second: Log, *, shift_ns: int | None = None) -> Log:
     """Return a log followed by another.
 
     The chain has the angular velocities of gyroscopes that are calibrated, which are the body's. It has no
-    accelerations, for two logs' may be in different axes, and no wheel odometry, for each log's is in a frame
-    of its own. Its ``sessions`` keep all of it.
+    accelerations, for two logs' may be in different axes, no wheel odometry, for each log's is in a frame
+    of its own, and no GNSS fixes. Its ``sessions`` keep all of it.
 
     Args:
         first: A log, or several chained ones.
@@ -67,6 +67,11 @@ def chained(first: Log, second: Log, *, shift_ns: int | None = None) -> Log:
         f"{session.log.name}: stamps raised by {session.shift_ns / NS_PER_S:.3f} s, to follow the log before"
         for session in sessions
         if session.shift_ns
+    ]
+    notes += [
+        f"{log.name}: GNSS fixes that are not used; those of the first session place the map"
+        for log in logs[1:]
+        if log.gnss is not None
     ]
     starts = [0, *accumulate(map(len, logs))]
 

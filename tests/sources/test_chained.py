@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from mapper.core.timebase import NS_PER_S
+from mapper.sensing.gnss import GnssFixes
 from mapper.sensing.gyroscope import Gyroscope
 from mapper.sources import open_source
 from mapper.sources.chained import chained, sessions_of
@@ -133,3 +134,15 @@ def test_calibrated_gyroscopes_follow_one_another(two):
         inside = (gyroscope.stamps_ns >= begin_ns) & (gyroscope.stamps_ns <= end_ns)
         assert set(gyroscope.rates_radps[inside, 0]) == {float(len(session.log))}
     assert chained(*(with_rates(log, is_of_body=False) for log in two)).gyroscope is None
+
+
+def test_fixes_of_a_later_session_are_named_and_kept_on_its_clock(two):
+    first, second = two
+    place = np.array([[47.5, 19.0, 120.0]])
+    fixes = GnssFixes("/fix", second.stamps_ns[:1], place, np.eye(3)[None], np.zeros(1, np.int8))
+    source = chained(first, replace(second, gnss=fixes))
+    assert source.gnss is None
+    (session,) = source.sessions[1:]
+    assert session.log.gnss.stamps_ns[0] == fixes.stamps_ns[0] + session.shift_ns
+    assert sum("GNSS" in note for note in source.notes) == 1
+    assert not any("GNSS" in note for note in chained(first, second).notes)
