@@ -8,10 +8,9 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mapper.core.errors import GraphError
-from mapper.core.geometry import Array, Transform, adjoint, inverse, length_and_angle, transform
+from mapper.core.geometry import Array, Transform, adjoint, inverse, length_and_angle, log, transform
 from mapper.core.timebase import NS_PER_S, Stamps
 from mapper.core.units import GRAVITY_MPS2
 from mapper.graph.batch import Effort, problem_of, solve
@@ -31,7 +30,7 @@ _INTEGRATION_M2 = 1e-6
 _KERNEL = Kernel("huber", 3.0)
 """Of odometry's factors: where surfaces show a motion that is not, the readings contradict it."""
 _CONTRADICTION_SIGMAS, _CONTRADICTION_M, _CONTRADICTION_RAD = 6.0, 0.1, 0.1
-"""Far beyond any error but that of a wrong pose: covariances of odometries may be several times too small."""
+"""Far beyond any error but that of a wrong pose."""
 _VELOCITY_S = 0.5
 """Before and after a pose, in which its velocity to begin with is measured."""
 
@@ -43,13 +42,11 @@ class SmoothedPath:
     Attributes:
         T_world_body: (N, 4, 4).
         velocity_sigmas_mps: (N,) standard deviation of the velocity in its worst direction.
-        contradicted: (M,) which of the odometry's factors the path contradicts by many standard deviations.
         variance_factor: Mean square of the residuals, in their variances: 1 where noise explains them.
     """
 
     T_world_body: Array
     velocity_sigmas_mps: Array
-    contradicted: NDArray[np.bool_]
     variance_factor: float
     _marginals: Any = field(repr=False)
 
@@ -60,6 +57,19 @@ class SmoothedPath:
         J = np.hstack([-to_j, np.eye(6)])
         blocks = np.block([[joint.at(a, b) for b in (i, j)] for a in (i, j)])
         return np.asarray(self.variance_factor * J @ blocks @ J.T, np.float64)
+
+    def contradicts(self, factor: BetweenFactor) -> bool:
+        """Return whether a factor between two of the times is far off the path, and the path is that sure.
+
+        Its own covariance has no say: those of odometries may be several times too small.
+        """
+        i, j = factor.i, factor.j
+        miss = inverse(factor.T_i_j) @ inverse(self.T_world_body[i]) @ self.T_world_body[j]
+        distance_m, angle_rad = length_and_angle(miss)
+        if distance_m <= _CONTRADICTION_M and angle_rad <= _CONTRADICTION_RAD:
+            return False
+        off = np.concatenate(log(miss))
+        return float(off @ np.linalg.solve(self.covariance(i, j), off)) > _CONTRADICTION_SIGMAS**2
 
 
 def smooth_path(
@@ -126,18 +136,9 @@ def smooth_path(
     return SmoothedPath(
         T_world_body=np.array([values.atPose3(k).matrix() for k in times]),
         velocity_sigmas_mps=np.sqrt(variance_factor * np.array(variances)),
-        contradicted=np.array([_contradicts(factor, values, variance_factor) for factor in factors], bool),
         variance_factor=variance_factor,
         _marginals=marginals,
     )
-
-
-def _contradicts(factor: BetweenFactor, values: gtsam.Values, variance_factor: float) -> bool:
-    T_i_j = (values.atPose3(factor.i).inverse() * values.atPose3(factor.j)).matrix()
-    distance_m, angle_rad = length_and_angle(inverse(factor.T_i_j) @ T_i_j)
-    chi2 = 2.0 * between(factor).error(values)
-    is_large = distance_m > _CONTRADICTION_M or angle_rad > _CONTRADICTION_RAD
-    return is_large and chi2 > _CONTRADICTION_SIGMAS**2 * variance_factor
 
 
 def _parameters(readings: InertialReadings) -> gtsam.PreintegrationCombinedParams:

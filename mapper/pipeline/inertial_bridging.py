@@ -138,9 +138,10 @@ def _bridge_window(
             f"by {np.sqrt(path.variance_factor):.0f} standard deviations; are their axes and clock right?",
         )
     inside = {node: index for node, index in window.index_of.items() if index < len(tracks)}
-    for factor, is_contradicted in zip(factors, path.contradicted.tolist(), strict=True):
-        if is_contradicted:
-            weak[max(k for k in (factor.i, factor.j) if k < len(tracks))] = True
+    for factor in factors:
+        later = max(factor.i, factor.j)
+        if later < len(tracks) and path.contradicts(factor):
+            weak[later] = True
     changed = _place_frames(tracks, weak, path, inside)
     replaced = _replace_factors(graph, weak, path, inside)
     connected = _connect_parts(replaced, part_of_node, path, inside)

@@ -158,12 +158,15 @@ def test_a_motion_that_surfaces_leave_open_is_the_readings():
     assert whole[3, 3] ** 0.5 < 0.1
 
 
-def test_a_pose_that_the_readings_contradict_is_replaced():
-    """A keyframe a metre off, of which its scan is certain."""
+@pytest.mark.parametrize("sigma_m", [0.003, 0.1])
+def test_a_pose_that_the_readings_contradict_is_replaced(sigma_m):
+    """A keyframe 0.3 m off, which its factor excludes or allows for."""
     log_, tracking, _ = made(4)
     wrong = next(k for k, factor in enumerate(tracking.graph.factors) if factor.j == 12)
     factors = list(tracking.graph.factors)
-    factors[wrong] = replace(factors[wrong], T_i_j=factors[wrong].T_i_j @ exp(np.zeros(3), np.eye(3)[0]))
+    aside = exp(np.zeros(3), 0.3 * np.eye(3)[0])
+    information = np.diag([*SIGMAS[:3] ** -2.0, *[sigma_m**-2.0] * 3])
+    factors[wrong] = replace(factors[wrong], T_i_j=factors[wrong].T_i_j @ aside, information=information)
     graph = tracking.graph.with_factors(factors)
     found = bridge(log_, replace(tracking, graph=graph), progress=SILENT)
     factor = found.graph.factors[wrong]
