@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -59,17 +60,15 @@ class SmoothedPath:
         return np.asarray(self.variance_factor * J @ blocks @ J.T, np.float64)
 
     def contradicts(self, factor: BetweenFactor) -> bool:
-        """Return whether a factor between two of the times is far off the path, and the path is that sure.
-
-        Its own covariance has no say: those of odometries may be several times too small.
-        """
+        """Return whether a factor between two of the times is far off the path, and both are that sure."""
         i, j = factor.i, factor.j
         miss = inverse(factor.T_i_j) @ inverse(self.T_world_body[i]) @ self.T_world_body[j]
         distance_m, angle_rad = length_and_angle(miss)
         if distance_m <= _CONTRADICTION_M and angle_rad <= _CONTRADICTION_RAD:
             return False
         off = np.concatenate(log(miss))
-        return float(off @ np.linalg.solve(self.covariance(i, j), off)) > _CONTRADICTION_SIGMAS**2
+        chi2 = min(off @ factor.information @ off, off @ np.linalg.solve(self.covariance(i, j), off))
+        return bool(chi2 > _CONTRADICTION_SIGMAS**2)
 
 
 def smooth_path(
@@ -97,6 +96,9 @@ def smooth_path(
     """
     import gtsam
 
+    largest = Counter(part_of[k] for k in poses if k < len(stamps_ns)).most_common(1)[0][0]
+    placed = [k for k in sorted(poses) if k < len(stamps_ns) and part_of[k] == largest]
+    readings = readings.at_body(stamps_ns[placed], np.array([poses[k] for k in placed]))
     parameters = _parameters(readings)
     segments = [
         _preintegrated(readings, begin_ns, end_ns, parameters)
