@@ -28,8 +28,8 @@ _DESK_M = 1.5
 """Depth of most of a desk or an object; nearer than that a whole room is not."""
 _USUAL_UNITS_PER_M = (MM_PER_M, TUM_UNITS_PER_M)
 _CHANGE = 3.0
-"""Ratio of the median depths of two consecutive frames, and of all before to all after them, by which units
-change: usual ones differ by 4 or 5, or by 1000."""
+"""Ratio of the median depths of two consecutive frames by which units change, if all frames before are more
+like the one and all after more like the other: usual units differ by 4 or 5, or by 1000."""
 
 _PAIR_WITHIN_NS = NS_PER_S // 2
 _MIN_MOTION_M = 0.03
@@ -125,11 +125,11 @@ def _change_warning(log: Log, frames: Mapping[int, RgbdFrame]) -> list[str]:
     found = {index: _median_m(frame) for index, frame in frames.items() if frame.depth_m.any()}
     indices, medians_m = list(found), np.array(list(found.values()))
     for k in range(2, len(indices) - 1):
-        before_m, after_m = medians_m[:k], medians_m[k:]
-        is_apart = after_m.min() > _CHANGE * before_m.max() or before_m.min() > _CHANGE * after_m.max()
-        if not is_apart:
+        last, first = indices[k - 1], indices[k]
+        last_m, first_m = float(medians_m[k - 1]), float(medians_m[k])
+        is_after = abs(np.log(medians_m / first_m)) < abs(np.log(medians_m / last_m))
+        if max(first_m / last_m, last_m / first_m) <= _CHANGE or is_after[:k].any() or not is_after[k:].all():
             continue
-        last, first, last_m, first_m = indices[k - 1], indices[k], float(before_m[-1]), float(after_m[0])
         while first - last > 1:
             middle = (first + last) // 2
             frame = read_depth(log.entry_at(middle))

@@ -13,7 +13,8 @@ from mapper.sources.base import Log
 
 _MAX_RATE_HZ = 1000.0
 _PLACES, _ALL_PLACES = 6, 100
-"""Places of the log at which two consecutive images are compared; more where these are unlike."""
+"""Places of half a log at which two consecutive images are compared; more where these are unlike."""
+_LEAST_FRAMES = 4 * _PLACES
 _SIZE_PX = (32, 24)
 _UNLIKE = 0.9
 """Difference of consecutive images in that of any two: 0.2 to 0.6 down to 1.5 Hz, 0.84 of every 15th of 30 Hz
@@ -38,9 +39,28 @@ def _rate_warnings(log: Log) -> list[str]:
 
 
 def _order_warnings(log: Log) -> list[str]:
-    """Return that consecutive images are no more alike than any two, while others are."""
-    if log.sensor != "rgbd" or len(log) < 4 * _PLACES:
+    """Return that the consecutive images of a half are no more alike than any two, while others are."""
+    if log.sensor != "rgbd":
         return []
+    indices = np.arange(len(log))
+    parts = {" of the first half": indices[: len(log) // 2], " of the second half": indices[len(log) // 2 :]}
+    if len(log) < 2 * _LEAST_FRAMES:
+        parts = {"": indices}
+    ratios = {where: ratio for where, part in parts.items() if (ratio := _unlikeness(log.subset(part)))}
+    if not ratios:
+        return []
+    where = next(iter(ratios)) if len(ratios) < len(parts) else ""
+    return [
+        f"stamps: consecutive images{where} are no more alike than any two, though each has another that is "
+        f"{max(ratios.values()):.1f} times as like it; are the stamps those of other images (sorted by text, "
+        "or shuffled)?"
+    ]
+
+
+def _unlikeness(log: Log) -> float | None:
+    """Return how much less alike consecutive images are than the most alike ones; None if they follow."""
+    if len(log) < _LEAST_FRAMES:
+        return None
 
     @cache
     def view(index: int) -> Array | None:
@@ -50,7 +70,7 @@ def _order_warnings(log: Log) -> list[str]:
         first = np.unique(np.linspace(0, len(log) - 2, places).astype(int)).tolist()
         pairs = [(k, k + 1) for k in first if view(k) is not None and view(k + 1) is not None]
         if len(pairs) < _PLACES - 1:
-            return []
+            return None
         indices = np.unique(pairs)
         views = np.array([view(k) for k in indices.tolist()])
         between = np.array([np.sqrt(((views - one) ** 2).mean(axis=1)) for one in views])
@@ -58,15 +78,10 @@ def _order_warnings(log: Log) -> list[str]:
         begins, ends = np.searchsorted(indices, pairs).T
         consecutive = between[begins, ends]
         if np.median(consecutive) < _UNLIKE * np.median(between[apart > 1]):
-            return []
+            return None
     nearest = np.where(apart > 1, between, np.inf).min(axis=1)
     ratio = float(np.median(consecutive) / max(np.median(nearest), 1e-9))
-    if ratio < _LESS_ALIKE:
-        return []
-    return [
-        "stamps: consecutive images are no more alike than any two, though each has another that is "
-        f"{ratio:.1f} times as like it; are the stamps those of other images (sorted by text, or shuffled)?"
-    ]
+    return ratio if ratio >= _LESS_ALIKE else None
 
 
 def _view(log: Log, index: int) -> Array | None:

@@ -115,6 +115,12 @@ def test_a_change_of_units_in_the_middle_is_found(after, is_change):
     assert not is_change or "from frame 23 on" in found[0]
 
 
+def test_a_change_of_units_in_the_last_quarter_of_varied_depth_is_found():
+    depths_m = np.linspace(1.9, 3.8, 40)
+    depths_m[30:] *= 0.2
+    assert "from frame 30 on" in depth_warnings(plain(depths_m))[0]
+
+
 def test_a_walk_from_near_to_far_is_no_change_of_units():
     assert depth_warnings(plain(np.linspace(0.6, 5.0, 60))) == []
 

@@ -35,6 +35,8 @@ def test_shuffled_images_are_told_and_those_in_order_are_not():
     shuffled = np.random.default_rng(6).permutation(140)
 
     assert len(time_warnings(passing(shuffled))) == 1
+    half_shuffled = np.concatenate([np.arange(70), 70 + np.argsort(shuffled[:70])])
+    assert "second half" in time_warnings(passing(half_shuffled))[0]
     assert time_warnings(passing(np.arange(140))) == []
 
 
