@@ -91,6 +91,9 @@ class OccupancyGrid:
             raise DataError(f"grid: origin {self.origin_world_m}, want two finite numbers")
         if not 0.0 < self.resolution_m < np.inf:
             raise DataError(f"grid: resolution {self.resolution_m} m, want > 0")
+        with np.errstate(over="ignore"):
+            if not np.isfinite(self.origin_world_m / self.resolution_m).all():
+                raise DataError(f"grid: origin {self.origin_world_m} m in cells of {self.resolution_m} m")
 
 
 def overlap_of(

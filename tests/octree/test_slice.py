@@ -115,6 +115,7 @@ def test_a_band_thinner_than_a_voxel_is_refused():
         (np.zeros(4, np.int8), np.zeros(2), 0.05, r"\(4,\)"),
         (np.zeros((2, 2), np.int8), np.zeros(3), 0.05, "two finite numbers"),
         (np.zeros((2, 2), np.int8), np.array([0.0, np.nan]), 0.05, "two finite numbers"),
+        (np.zeros((2, 2), np.int8), np.array([0.0, 1.0]), 1e-320, "in cells of"),
         (np.zeros((2, 2), np.int8), np.zeros(2), 0.0, "resolution 0"),
     ],
 )

@@ -90,6 +90,8 @@ def image_of(message: ImageMessage, *, colour: bool, where: str) -> Image:
     if encoding is None:
         raise FrameError(f"{where}: colour encoded as {message.encoding}; known are {', '.join(_COLOUR)}")
     pixels = _pixels(message, "u1", encoding.channels, where=where)
+    if not pixels.size:
+        raise FrameError(f"{where}: an image of {message.width_px}×{message.height_px} px")
     code = encoding.to_rgb if colour else encoding.to_grey
     if code is None:
         return np.ascontiguousarray(pixels)
