@@ -52,7 +52,7 @@ from mapper.run.manifest import Levelling, Verdict
 from mapper.run.pose_covariances import uncertain_poses
 from mapper.run.results import RunResults
 from mapper.run.stored_tracking import StoredTracking
-from mapper.run.warnings import find_warnings, verdict_of
+from mapper.run.verdict import find_warnings, verdict_of
 from mapper.run.writer import first_manifest
 from mapper.runtime.progress import SILENT
 from mapper.sources import open_source

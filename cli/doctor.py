@@ -69,7 +69,7 @@ def doctor(
 
         findings = examine(progress=progress)
     else:
-        from mapper.run.checks import check_run
+        from mapper.run.file_checks import check_run
 
         findings = check_run(run, progress=progress)
     failed = [finding.name for finding in findings if finding.verdict == "failed"]

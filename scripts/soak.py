@@ -22,7 +22,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from mapper.core.errors import MapperError
-from mapper.run.checks import check_run
+from mapper.run.file_checks import check_run
 from mapper.run.folder import open_run
 from mapper.runtime.atomic import partial_of
 

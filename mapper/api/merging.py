@@ -140,7 +140,7 @@ def _placing(
         case "truth":
             return Placing(by_truth(runs))
         case "auto":
-            from mapper.pipeline.place_runs import place_by_shared_places, place_jointly  # loads GTSAM
+            from mapper.pipeline.join_runs import place_by_shared_places, place_jointly  # loads GTSAM
 
             if not jointly:
                 return place_by_shared_places(runs, workers=workers, progress=progress)

@@ -52,7 +52,7 @@ from mapper.merging.slicing import Sliced, slice_map
 from mapper.octree.config import OctreeConfig
 from mapper.octree.grid import OccupancyGrid
 from mapper.run import files
-from mapper.run.warnings import merge_warnings
+from mapper.run.verdict import merge_warnings
 from mapper.runtime.atomic import MANIFEST_NAME, atomic_folder
 from mapper.runtime.executor import IN_PROCESS, Workers, make_executor
 from mapper.runtime.progress import SILENT, Progress

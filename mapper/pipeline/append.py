@@ -26,7 +26,7 @@ from mapper.run.folder import Run, open_run
 from mapper.run.manifest import Manifest, Timing, library_versions, now_text
 from mapper.run.observers import NULL_OBSERVER, Observer
 from mapper.run.stored_tracking import StoredTracking, load_tracking, save_solved
-from mapper.run.warnings import INPUT_KINDS
+from mapper.run.verdict import INPUT_KINDS
 from mapper.run.writer import appended_log, write_run
 from mapper.runtime.progress import SILENT, Progress
 from mapper.sources.base import Log

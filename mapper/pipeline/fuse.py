@@ -36,7 +36,7 @@ from mapper.run.manifest import DepthReach, Solve, Status, Timing
 from mapper.run.observers import NULL_OBSERVER, Observer
 from mapper.run.results import RunResults
 from mapper.run.stored_tracking import StoredTracking, load_tracking, save_solved
-from mapper.run.warnings import FLOOR, find_warnings, floor_warnings, verdict_of
+from mapper.run.verdict import FLOOR, find_warnings, floor_warnings, verdict_of
 from mapper.run.writer import RunWriter, write_run
 from mapper.runtime.atomic import is_temporary
 from mapper.runtime.progress import SILENT, Progress

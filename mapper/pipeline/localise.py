@@ -43,7 +43,7 @@ from mapper.run.manifest import LocalisedManifest, Solve, Stretch, StretchState
 from mapper.run.pose_covariances import UncertainPoses, uncertain_poses, write_poses
 from mapper.run.results import RunResults
 from mapper.run.stored_tracking import save_frames
-from mapper.run.warnings import localisation_warnings, verdict_of
+from mapper.run.verdict import localisation_warnings, verdict_of
 from mapper.run.writer import RunWriter, first_manifest, write_run
 from mapper.runtime.progress import SILENT, Progress
 from mapper.sources.base import Log

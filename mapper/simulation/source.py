@@ -21,12 +21,12 @@ from mapper.simulation.boxes import write_scene
 from mapper.simulation.builder import FACES
 from mapper.simulation.config import LidarSynthConfig, SynthConfig, set_or_first
 from mapper.simulation.disturbances import between, disturbed, shown_frames
+from mapper.simulation.kinect import observe, warp_of
 from mapper.simulation.movers import Movers, make_movers
 from mapper.simulation.path import Motion, frame_stamps, make_motion, seconds_of
 from mapper.simulation.raycast import Rendering
 from mapper.simulation.readings import measure_gnss, measure_imu, measure_wheels
 from mapper.simulation.scene import Scene, make_scene
-from mapper.simulation.sensor import observe, warp_of
 from mapper.simulation.shutter import Shutter
 from mapper.simulation.streams import Stream, noise_index, rng_of
 from mapper.sources.base import ImageFiles, Log

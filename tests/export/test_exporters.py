@@ -18,7 +18,7 @@ from mapper.graph.g2o import read_g2o
 from mapper.octree.grid import OCCUPIED, UNKNOWN, read_grid
 from mapper.octree.map import read_octree
 from mapper.pipeline.build import build
-from mapper.run.checks import check_run
+from mapper.run.file_checks import check_run
 from mapper.run.folder import moved_log, open_run
 from mapper.sources import open_source
 from mapper.sources.trajectory_files import read_kitti, read_tum

@@ -14,7 +14,7 @@ from mapper.core.timebase import nearest
 from mapper.pipeline.build import build
 from mapper.pipeline.known_map import load_known_map
 from mapper.pipeline.localise import localise
-from mapper.run.checks import check_run
+from mapper.run.file_checks import check_run
 from mapper.run.folder import Run, open_run
 from mapper.run.frame_outcomes import read_records
 from mapper.run.pose_covariances import read_poses

@@ -11,8 +11,8 @@ from mapper.core.errors import RunError
 from mapper.export.exporters import EXPORTERS, export
 from mapper.pipeline.fuse import fuse
 from mapper.run import digests, files
-from mapper.run.checks import check_run
 from mapper.run.digests import changing
+from mapper.run.file_checks import check_run
 from mapper.run.folder import open_run
 from mapper.run.manifest import read_manifest
 from tests.support.command_line import mapper

@@ -3,7 +3,7 @@
 import pytest
 
 from mapper.run.manifest import RunWarning
-from mapper.run.warnings import find_warnings, verdict_of
+from mapper.run.verdict import find_warnings, verdict_of
 from tests.support.run_results import MANIFEST, doubted, lost, results_of
 
 NOTE = RunWarning(kind="gap", sentence="a gap")

@@ -14,7 +14,7 @@ from mapper.run.frame_outcomes import DISCONNECTED
 from mapper.run.manifest import AppendedLog, Levelling, RunWarning, SkippedFrame
 from mapper.run.pose_covariances import uncertain_poses
 from mapper.run.results import aligned_truth
-from mapper.run.warnings import find_warnings, merge_warnings
+from mapper.run.verdict import find_warnings, merge_warnings
 from mapper.sources.config import SourceConfig
 from tests.support.run_results import MANIFEST, STEP_NS, doubted, lost, results_of
 

@@ -9,8 +9,8 @@ import pytest
 from mapper.core.errors import SourceError
 from mapper.simulation import CameraSimulator, Rendering, observe, read_scene, write_tum_log
 from mapper.simulation.config import SensorConfig, SynthConfig
+from mapper.simulation.kinect import BASELINE_M, DISPARITY_FOCAL_PX, axial_sigma_m
 from mapper.simulation.path import seconds_of
-from mapper.simulation.sensor import BASELINE_M, DISPARITY_FOCAL_PX, axial_sigma_m
 from mapper.sources import open_source
 from mapper.sources.trajectory_files import read_tum
 from tests.support.ideal_sensors import IDEAL_SENSOR

@@ -6,7 +6,7 @@ import pytest
 
 from mapper.config.loading import load_config
 from mapper.pipeline.build import build
-from mapper.run.checks import check_run
+from mapper.run.file_checks import check_run
 from mapper.run.observers import Observers
 from mapper.runtime.atomic import partial_of
 from mapper.runtime.journal import StateFile

@@ -27,8 +27,9 @@ from mapper.odometry.config import KeyframeOdometryConfig
 from mapper.odometry.gyroscope_calibration import GyroscopeCalibration
 from mapper.odometry.keyframes.earlier_depth import EarlierDepth
 from mapper.odometry.keyframes.frame_doubts import UNDOUBTED, Assessment, FrameDoubts
+from mapper.odometry.keyframes.keyframe_decision import KeyframeDecision
 from mapper.odometry.keyframes.landmarks import LandmarkMap
-from mapper.odometry.keyframes.local_mapping import KeyframeDecision, LocalMapping
+from mapper.odometry.keyframes.local_mapping import LocalMapping
 from mapper.odometry.keyframes.pose_tracker import (
     PoseTracker,
     TrackedPose,

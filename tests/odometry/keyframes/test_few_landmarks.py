@@ -10,7 +10,7 @@ from mapper.core.doubts import Doubt
 from mapper.odometry.config import LocalMapConfig
 from mapper.odometry.factory import build_frame_odometry
 from mapper.odometry.keyframes.frame_doubts import Assessment
-from mapper.odometry.keyframes.local_mapping import KeyframeDecision
+from mapper.odometry.keyframes.keyframe_decision import KeyframeDecision
 from mapper.pipeline.track import track_log
 from mapper.runtime.progress import SILENT
 from mapper.sources import open_source

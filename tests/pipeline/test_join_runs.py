@@ -22,11 +22,11 @@ from mapper.merging.merge import merge
 from mapper.merging.merged_map import open_map
 from mapper.merging.placing import Placed, Placing, by_truth
 from mapper.octree.map import read_octree
-from mapper.pipeline import place_runs
+from mapper.pipeline import join_runs
 from mapper.pipeline.build import build
 from mapper.pipeline.fuse import fuse
+from mapper.pipeline.join_runs import place_by_shared_places, place_jointly
 from mapper.pipeline.known_map import run_places
-from mapper.pipeline.place_runs import place_by_shared_places, place_jointly
 from mapper.run.folder import moved_log, open_run
 from mapper.sources import open_source
 from tests.support.command_line import mapper
@@ -200,7 +200,7 @@ def test_a_run_whose_places_do_not_compare_is_left_out(halves, monkeypatch):
     def places_of(run, *, progress):
         return known[run.path].pop() if run.path in known else run_places(run, progress=progress)
 
-    monkeypatch.setattr(place_runs, "run_places", places_of)
+    monkeypatch.setattr(join_runs, "run_places", places_of)
     with pytest.raises(RunError, match="is of sensor lidar, and the first run of rgbd"):
         place_by_shared_places([halves[1], halves[0]])
     with pytest.raises(RunError, match="no keyframe of it can be recognised"):

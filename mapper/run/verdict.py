@@ -1,4 +1,4 @@
-"""Warnings about a run, all of them, from its results."""
+"""Warnings about a run, all of them, from its results, and the verdict that follows from them."""
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
