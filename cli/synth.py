@@ -45,6 +45,9 @@ _NOT_OF: Mapping[SensorKind, tuple[str, ...]] = {
 }
 """Options that have no meaning for a sensor."""
 
+_LEAST_NOISE = 1e-6
+"""Factors on noise below it are 0: single precision holds no smaller steps of disparity."""
+
 
 def synth(
     out: Annotated[
@@ -61,7 +64,11 @@ def synth(
     rooms: Annotated[int | None, typer.Option(help="rgbd: rooms of the flat, an even number from 4.")] = None,
     plane_at: Annotated[
         float | None,
-        typer.Option(metavar="METRES", help="rgbd: stand still at this distance from a bare wall."),
+        typer.Option(
+            metavar="METRES",
+            max=50.0,
+            help="rgbd: stand still at this distance from a bare wall, 50 at most.",
+        ),
     ] = None,
     scene: Annotated[
         SceneName | None,
@@ -243,6 +250,7 @@ def _camera_noise(noise: float | None) -> dict[str, object]:
     if noise is None:
         return {}
     usual = SensorConfig()
+    noise = 0.0 if noise < _LEAST_NOISE else noise
     return {
         "sensor.axial_noise_ratio": noise,
         "sensor.lateral_noise_px": noise * usual.lateral_noise_px,

@@ -119,7 +119,7 @@ class SynthConfig(Config):
     """Distance from the walls of a hall to the path, the camera's smallest distance from them."""
     rooms: Annotated[int, Field(ge=4, multiple_of=2)] = 4
     """Rooms of the flat, in two rows; doors join them to one ring."""
-    room_size_m: Annotated[float, Field(ge=3.6)] = 4.4
+    room_size_m: Annotated[float, Field(ge=3.6, le=60.0)] = 4.4
     """Mean side of a room, wall to wall."""
     room_height_m: Annotated[float, Field(ge=2.3)] = 2.6
     furniture_per_room: NonNegativeInt = 9
@@ -139,7 +139,7 @@ class SynthConfig(Config):
     path: Literal["loop", "desk", "spin", "wall"] = "loop"
     """"loop": walk through every room; "desk": small motions before a desk; "spin": turn fast on the spot;
     "wall": stand before a wall, looking straight at it."""
-    wall_distance_m: PositiveFloat = 1.5
+    wall_distance_m: Annotated[float, Field(gt=0.0, le=50.0)] = 1.5
     """Distance from the camera to that wall."""
     laps: PositiveFloat = 1.0
     """Rounds of the loop."""

@@ -88,7 +88,7 @@ def observe_scan(frame: Frame, config: ScanOdometryConfig) -> ScanObservation:
             f"want {_MIN_POINTS} (odometry.min_range_m, max_range_m, voxel_m; source.cloud_scale where these "
             "are no metres)"
         )
-    thinned = replace(scan, points_body=points_body[kept], colors=None, times_s=None)
+    thinned = replace(scan, points_body=points_body[kept], colors=None, times_s=None, intensities=None)
     median_m = float(np.median(range_m[in_range][kept]))
     if scan.times_s is None:
         whole = _prepared(thinned, config.voxel_m)

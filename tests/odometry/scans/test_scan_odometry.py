@@ -1,5 +1,6 @@
 """Every LiDAR odometry, on synthetic streets."""
 
+from dataclasses import replace
 from functools import cache
 from itertools import pairwise
 
@@ -40,6 +41,16 @@ def scans(seed=0, *, motion_distortion=False):
 def tracked(config, log):
     odometry = build_frame_odometry(config)
     return [odometry.track(odometry.observe(scan)) for scan in log]
+
+
+def test_colours_times_and_intensities_do_not_hinder_tracking():
+    scan = scans(motion_distortion=True)[0]
+    n = len(scan.points_body)
+    full = replace(scan, colors=np.zeros((n, 3), np.uint8), intensities=np.ones(n, np.float32))
+    odometry = build_frame_odometry(GicpOdometryConfig())
+    ours, bare = odometry.observe(full).scan, odometry.observe(scan).scan
+    assert ours.points_body.tobytes() == bare.points_body.tobytes()
+    assert (ours.colors, ours.intensities) == (None, None)
 
 
 def misses(tracks, source, *, since=0):
