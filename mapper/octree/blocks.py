@@ -207,7 +207,9 @@ class BlockStore:
             values = self._file.grown(in_file)
         else:
             check_memory(count * BLOCK_BYTES, f"a map of {count} blocks of 8³ voxels")
-            values = np.empty((max(count, int(_MEMORY_GROWTH * len(self._codes))), BLOCK_VOXELS), np.float32)
+            most = np.inf if self._folder is None else self._max_memory_bytes / BLOCK_BYTES
+            rows = max(count, int(min(_MEMORY_GROWTH * len(self._codes), most)))
+            values = np.empty((rows, BLOCK_VOXELS), np.float32)
         values[: self._count] = self.table.values[: self._count]
         return values
 
