@@ -130,6 +130,8 @@ def evaluate(
     from mapper.evaluators.metrics.loops import loop_metrics_of_run
     from mapper.run.manifest import is_merged_map
 
+    of_log = {"--sharpness": sharpness, "--agreement": agreement, "--against": against}
+    reads_log = any(of_log.values())
     is_merged = is_merged_map(estimate)
     if is_merged:
         only_of_runs = {
@@ -139,9 +141,7 @@ def evaluate(
             "--lengths": lengths,
             "--map-world": map_world,
             "--register": register,
-            "--sharpness": sharpness,
-            "--agreement": agreement,
-            "--against": against,
+            **of_log,
             "--plot": plot,
         }
         refuse_with(f"{estimate}, a merged map", only_of_runs, remedy="evaluate its runs one by one")
@@ -158,14 +158,13 @@ def evaluate(
         known,
         align,
         lengths,
-        frames_ns=_frames_ns(run, log, used=sharpness or agreement or against is not None),
+        frames_ns=_frames_ns(run, log, used=reads_log),
         names=(str(estimate), str(truth) if truth else "its truth"),
     )
     metrics = list(found.metrics)
     if run is not None and known is not None:
         metrics += loop_metrics_of_run(run, known)
     if run is None:
-        of_log = {"--sharpness": sharpness, "--agreement": agreement, "--against": against}
         refuse_with(f"{estimate}, a trajectory alone", of_log, remedy="give the folder of its run")
     if map_ is None:
         quality = None
@@ -174,7 +173,7 @@ def evaluate(
         quality = _map_quality(built, map_, world=map_world, register=register, voxels=voxels)
         metrics += quality.metrics
     notes: list[str] = []
-    if run is not None and (sharpness or agreement or against is not None or known is None):
+    if run is not None and (reads_log or known is None):
         seen, notes = _of_log(
             run, log, sharpness=sharpness, agreement=agreement, against=against, output=output
         )
@@ -310,9 +309,15 @@ def _of_log(
         return [], [f"agreement of views not measured: {error}"]
     if against is None:
         return metrics, []
-    other = common.disagreements(open_run(against).tracked_trajectory, progress=progress)
-    compared = comparison_metrics(own, other)
-    return [*metrics, *compared], [which_is_better(compared, f"{run.path}", f"{against}")]
+    other = open_run(against)
+    compared = comparison_metrics(own, common.disagreements(other.tracked_trajectory, progress=progress))
+    notes = [which_is_better(compared, f"{run.path}", f"{against}")]
+    if other.manifest.input.fingerprint != run.manifest.input.fingerprint:
+        notes.append(
+            f"{against} was built from {other.manifest.input.path}, whose files are not those of "
+            f"{run.manifest.input.path}: this holds only if the frames are the same"
+        )
+    return [*metrics, *compared], notes
 
 
 def _limits(gates: Sequence[str]) -> dict[str, float]:

@@ -4,7 +4,7 @@ It needs no truth. Frames are compared in pairs, also far apart in the log, whil
 and loop closure some keyframes, so that drift and bent maps show. Frames that err alike agree.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations, pairwise
 from typing import Any, Protocol, TypeVar
@@ -12,9 +12,10 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.core.deskew import twist_at
+from mapper.core.deskew import Twist, twist_at
 from mapper.core.errors import DataError
 from mapper.core.geometry import Array, Transform, apply, inverse, stride_for
+from mapper.core.running_median import SIGMAS_PER_MAD
 from mapper.core.timebase import NS_PER_S, Stamps
 from mapper.core.trajectory import Trajectory
 from mapper.evaluators.metrics.metric import Metric
@@ -199,15 +200,22 @@ class _ImageViews:
 
     def __init__(self) -> None:
         self._verifier = ImageVerifier(ImageVerificationConfig())
+        self._by_readout = {s: build_frame_odometry(LocalMapConfig(readout_s=s)) for s in _READOUTS_S}
         self._readout_s: float | None = None
         self._views: dict[int, ImageView] = {}
         self._motions: dict[tuple[int, int], Transform | None] = {}
 
     def describe(self, frames: Sequence[PlacedFrame], /) -> list[ImageView]:
-        if self._readout_s is None:
-            self._readout_s = self._best_readout_s(frames)
         new = [frame for frame in frames if frame.entry.stamp_ns not in self._views]
-        self._views |= {view.stamp_ns: view for view in _seen(new, self._readout_s)}
+        observed = list(ordered_map(lambda frame: self._by_readout[0.0].read(frame.entry), new))
+        twists = [twist_at(frame.trajectory, frame.index) for frame in new]
+        if self._readout_s is None:
+            views = {s: self._seen(observed, twists, s) for s in _READOUTS_S}
+            self._readout_s = self._best_readout_s(views)
+            found = views[self._readout_s]
+        else:
+            found = self._seen(observed, twists, self._readout_s)
+        self._views |= {view.stamp_ns: view for view in found}
         return [self._views[frame.entry.stamp_ns] for frame in frames]
 
     def distance_m(self, i: ImageView, j: ImageView, T_i_j: Transform, /) -> float | None:
@@ -217,27 +225,21 @@ class _ImageViews:
         measured = self._motions[pair]
         return None if measured is None else float(np.linalg.norm((T_i_j - measured)[:3, 3]))
 
-    def _best_readout_s(self, frames: Sequence[PlacedFrame]) -> float:
+    def _seen(self, observed: Sequence[Any], twists: Sequence[Twist], readout_s: float) -> list[ImageView]:
+        """Return the views of images whose rows are read in some time."""
+        odometry = self._by_readout[readout_s]
+        views = (odometry.view(one, twist) for one, twist in zip(observed, twists, strict=True))
+        return [self._verifier.describe(view) for view in views]
+
+    def _best_readout_s(self, views: Mapping[float, Sequence[ImageView]]) -> float:
         """Return the readout time by which consecutive images fit each other best."""
         residuals_px = []
-        for readout_s in _READOUTS_S:
-            verified = (self._verifier.verify(i, j) for i, j in pairwise(_seen(frames, readout_s)))
+        for seen in views.values():
+            verified = (self._verifier.verify(i, j) for i, j in pairwise(seen))
             residuals_px.append([np.nan if one.reason else one.residual_px for one in verified])
         by_readout = np.array(residuals_px, np.float64)
         known = ~np.isnan(by_readout).any(axis=0)
-        return _READOUTS_S[int(by_readout[:, known].sum(axis=1).argmin())]
-
-
-def _seen(frames: Sequence[PlacedFrame], readout_s: float) -> list[ImageView]:
-    """Return the views of frames, of which a shutter reads the rows in some time."""
-    odometry = build_frame_odometry(LocalMapConfig(readout_s=readout_s))
-
-    def view(frame: PlacedFrame) -> ImageView:
-        seen = odometry.view(odometry.read(frame.entry), twist_at(frame.trajectory, frame.index))
-        assert isinstance(seen, ImageView)
-        return seen
-
-    return list(ordered_map(view, frames))
+        return list(views)[int(by_readout[:, known].sum(axis=1).argmin())]
 
 
 class _ScanViews:
@@ -260,7 +262,7 @@ class _ScanViews:
         rows, residuals_m = rows[has_normal], residuals_m[has_normal]
         if len(rows) < _MIN_PAIRS:
             return None
-        spread_m = max(2.0 * 1.4826 * float(np.median(np.abs(residuals_m))), _LEAST_SPREAD_M)
+        spread_m = max(2.0 * SIGMAS_PER_MAD * float(np.median(np.abs(residuals_m))), _LEAST_SPREAD_M)
         weights = 1.0 / (1.0 + (residuals_m / spread_m) ** 2)  # Cauchy's
         weighted = rows * weights[:, np.newaxis]
         values, motions = np.linalg.eigh(np.einsum("ni,nj->ij", weighted, rows))

@@ -64,9 +64,7 @@ def exceeded(records: Iterable[Mapping[str, Any]], limits: Mapping[str, float]) 
             names = ", ".join(record["name"] for record in known)
             raise DataError(f"{beginning}={limit:g}: no metric begins like that; there are {names}")
         for record in named:
-            angle = record["unit"] in _DEGREES
-            value = math.degrees(record["value"]) if angle else record["value"]
-            unit = _DEGREES[record["unit"]] if angle else record["unit"]
+            value, unit = _as_shown(record["value"], record["unit"])
             if value > limit:
                 sentences.append(f"{record['name']} is {value:.6g} {unit}, more than {limit:g}")
     return sentences
@@ -93,9 +91,11 @@ def json_text(metrics: Sequence[Metric]) -> str:
 
 
 def shown(metric: Metric, *, digits: int = 6) -> tuple[str, str, str]:
-    """Return a metric's name, value and unit as they are shown; angles in degrees, here alone."""
-    if metric.unit in _DEGREES:
-        return metric.name, f"{math.degrees(metric.value):.{digits}g}", _DEGREES[metric.unit]
-    if isinstance(metric.value, int):
-        return metric.name, str(metric.value), metric.unit
-    return metric.name, f"{metric.value:.{digits}g}", metric.unit
+    """Return a metric's name, value and unit as they are shown."""
+    value, unit = _as_shown(metric.value, metric.unit)
+    return metric.name, str(value) if isinstance(value, int) else f"{value:.{digits}g}", unit
+
+
+def _as_shown(value: float, unit: str) -> tuple[float, str]:
+    """Return a value with its unit for people: angles in degrees, here alone."""
+    return (math.degrees(value), _DEGREES[unit]) if unit in _DEGREES else (value, unit)

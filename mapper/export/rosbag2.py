@@ -5,9 +5,8 @@ from collections.abc import Iterator
 from itertools import chain
 from pathlib import Path
 
-import numpy as np
-
 from mapper.core.frames import Cloud, Scan
+from mapper.core.geometry import stride_for
 from mapper.export.export_folders import export_folder
 from mapper.export.mcap_messages import OCCUPANCY_GRID, encode_occupancy_grid
 from mapper.export.run_maps import maps_of, snapshots_of
@@ -82,9 +81,10 @@ def _grid_message(stamp_ns: int, topic: str, grid: OccupancyGrid) -> SerializedM
 
 
 def _cloud_message(stamp_ns: int, topic: str, cloud: Cloud) -> SerializedMessage:
-    shown = Scan(stamp_ns, cloud.points, colors=cloud.colors, intensities=cloud.intensities)
-    every_nth = np.arange(len(cloud)) % (-(-len(cloud) // MOST_TO_VIEW) or 1) == 0
-    return cloud_message(topic, shown.select(every_nth), frame=MAP)
+    shown = slice(None, None, stride_for(len(cloud), MOST_TO_VIEW))
+    intensities = None if cloud.intensities is None else cloud.intensities[shown]
+    scan = Scan(stamp_ns, cloud.points[shown], colors=cloud.colors[shown], intensities=intensities)
+    return cloud_message(topic, scan, frame=MAP)
 
 
 def _pose_messages(run: Run) -> Iterator[SerializedMessage]:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from mapper.core.errors import DataError
 from mapper.core.frames import Cloud
+from mapper.core.geometry import stride_for
 from mapper.core.voxel_index import HALF_SPAN, cell_key, cell_of, claim_row, voxel_index
 from mapper.octree.blocks import GROWTH
 
@@ -150,7 +151,7 @@ def _fill_means(keys, offsets, counts, voxel_m, points, colors):  # type: ignore
 
 def thinned_to_view(points: NDArray[Real], colors: Colors) -> tuple[NDArray[Real], Colors]:
     """Return every n-th of (N, 3) points and their colours, so few that a viewer or a picture shows them."""
-    step = -(-len(points) // MOST_TO_VIEW) or 1
+    step = stride_for(len(points), MOST_TO_VIEW)
     return points[::step], colors[::step]
 
 

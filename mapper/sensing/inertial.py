@@ -6,12 +6,11 @@ import numpy as np
 
 from mapper.core.geometry import Array
 from mapper.core.rotations import rotation_from_quaternion
+from mapper.core.running_median import SIGMAS_PER_MAD
 from mapper.core.timebase import NS_PER_S, Stamps
 
 _LEAST_RATE_DENSITY, _LEAST_ACCELERATION_DENSITY = 5e-4, 1e-3
 """rad/s/√Hz and m/s²/√Hz: better ones are those of larger units than robots carry."""
-_NORMAL_MAD = 1.4826
-"""Standard deviation of a normal error, in medians of its absolute value."""
 
 _HALF_S, _MOST_TRIPLES, _FEWEST_TRIPLES = 0.4, 2000, 20
 """Time between the poses of a triple: the error of poses by its square is that of an acceleration."""
@@ -136,7 +135,7 @@ class InertialReadings:
             information = A.T @ (A * (weight / sigma**2)[:, None]) + prior
             found = np.linalg.solve(information, A.T @ (b * weight) / sigma**2)
             off = np.abs(b - A @ found)
-            sigma = max(_NORMAL_MAD * float(np.median(off)), 1e-4)
+            sigma = max(SIGMAS_PER_MAD * float(np.median(off)), 1e-4)
             weight = np.minimum(1.0, 2.0 * sigma / np.maximum(off, 1e-12))
         place_m = np.asarray(found[6:], np.float64)
         covariance = np.linalg.inv(information)[6:, 6:]
@@ -153,7 +152,7 @@ class InertialReadings:
     def _density(self, values: Array) -> float:
         """Return the noise of readings by their second differences, which motion hardly changes."""
         seconds = float(np.median(np.diff(self.stamps_ns))) / NS_PER_S
-        sigma = _NORMAL_MAD * float(np.median(np.abs(np.diff(values, n=2, axis=0)))) / np.sqrt(6.0)
+        sigma = SIGMAS_PER_MAD * float(np.median(np.abs(np.diff(values, n=2, axis=0)))) / np.sqrt(6.0)
         return float(sigma * np.sqrt(seconds))
 
 

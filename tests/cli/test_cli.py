@@ -260,6 +260,8 @@ def test_eval_judges_a_run_without_a_truth(run_folder, desk_log, tmp_path):
 
     compared = json.loads(mapper("eval", run_folder, "--against", other, "--json").stdout)["metrics"]
     assert {metric["name"]: metric["value"] for metric in compared}["views compared in both runs"] > 50
+    assert "whose files are not those of" in mapper("eval", run_folder, "--against", other).stdout
+    assert "whose files" not in mapper("eval", run_folder, "--against", run_folder).stdout
     mapper("eval", run_folder, "--gate", "ATE RMSE=1", "--quiet")
     assert "more than 0.0001" in mapper("eval", run_folder, "--gate", "ATE RMSE=0.0001", status=1).stderr
 

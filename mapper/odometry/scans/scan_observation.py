@@ -105,7 +105,7 @@ def why_untrackable(log: Log, config: ScanOdometryConfig) -> str | None:
     first = None
     for entry in log.spread_entries(_LOOKED_AT):
         try:
-            observe_scan(entry.load(), config)
+            observe_scan(entry.load(colour=False), config)
         except FrameError as error:
             first = first or str(error)
         else:

@@ -8,6 +8,7 @@ import numpy as np
 from mapper.core.deskew import SampledMotion, Twist, deskewed
 from mapper.core.frames import Scan
 from mapper.core.geometry import Array, Transform, apply, exp, inverse
+from mapper.core.running_median import SIGMAS_PER_MAD
 from mapper.odometry.scans.config import ScanOdometryConfig
 from mapper.odometry.scans.pose_candidate import PoseCandidate
 from mapper.odometry.scans.pose_search import KnownPath, PoseSearch
@@ -217,7 +218,7 @@ def fit_sweep_motion(
         rows, residuals_m = np.concatenate(parts), np.concatenate(distances)
         if len(rows) < _FEWEST_PAIRS:
             return None
-        scale_m = max(1.4826 * float(np.median(np.abs(residuals_m))), 0.02 * voxel_m)
+        scale_m = max(SIGMAS_PER_MAD * float(np.median(np.abs(residuals_m))), 0.02 * voxel_m)
         weights = 1.0 / (1.0 + (residuals_m / (_KERNEL * scale_m)) ** 2)
         weights /= _ALIKE * len(keyframes) * scale_m**2
         information = np.einsum("ni,n,nj->ij", rows, weights, rows)

@@ -45,9 +45,10 @@ def write_recording(
 
     Image files are copied byte for byte where ROS has a message for them: colour as CompressedImage, 16-bit
     PNGs of millimetres as compressedDepth. Depth in other units is written as float32 metres, which loses
-    nothing. Of scans, points, times and colours are written. Truth is on /ground_truth, wheel odometry, as
-    poses of the sensor's own frame, on /wheel_odometry, accelerations and angular velocities on /imu, or the
-    latter on /gyroscope where their times differ, GNSS fixes on /fix, the antenna, if known, in /tf_static.
+    nothing. Of scans, points, intensities, times and colours are written. Truth is on /ground_truth, wheel
+    odometry, as poses of the sensor's own frame, on /wheel_odometry, accelerations and angular velocities on
+    /imu, or the latter on /gyroscope where their times differ, GNSS fixes on /fix, the antenna, if known, in
+    /tf_static.
 
     Args:
         source: Log that is written.
