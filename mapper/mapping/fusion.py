@@ -275,7 +275,7 @@ def _fuse_scans(
     with updates.reopen() as written:
         return octree, remove_moving_objects(
             octree,
-            lambda: ordered_map(CachedUpdate.update, written.entries(), workers=config.workers),
+            written.replay(workers=config.workers),
             T_world_camera=written.poses_world if source.sensor == "rgbd" else None,
         )
 

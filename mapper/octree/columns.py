@@ -100,8 +100,8 @@ def occupied_columns(octree: "MapView", *, margin: int) -> Columns:
 def occupied_voxels(octree: "MapView") -> NDArray[np.int64]:
     """Return the (N,) occupied voxels of a map, or of a part of one, for ``columns_of``."""
     parts = [np.empty(0, np.int64)]
-    for known in octree.leaves_by_part():
-        x, y, z = known.keys[known.log_odds >= octree.occupied_log_odds].T.astype(np.int64)
+    for occupied in octree.leaves_by_part(lowest=octree.occupied_log_odds):
+        x, y, z = occupied.keys.T.astype(np.int64)
         parts.append((y << 32) | (x << 16) | z)
     return np.concatenate(parts)
 
@@ -274,8 +274,8 @@ def lowest_occupied(
     A column without one has ``NOTHING``, so that the minimum joins several maps.
     """
     lowest = np.full(shape, NOTHING, dtype=np.int32)
-    for known in octree.leaves_by_part():
-        x, y, z = known.keys[known.log_odds >= octree.occupied_log_odds].T.astype(np.int64)
+    for occupied in octree.leaves_by_part(lowest=octree.occupied_log_odds):
+        x, y, z = occupied.keys.T.astype(np.int64)
         rows, columns = y - first[1], x - first[0]
         inside = (rows >= 0) & (rows < shape[0]) & (columns >= 0) & (columns < shape[1])
         np.minimum.at(lowest, (rows[inside], columns[inside]), (z[inside] - KEY_ZERO + 1).astype(np.int32))

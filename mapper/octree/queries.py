@@ -182,11 +182,15 @@ class MapView:
 
     def occupied(self) -> Points:
         """Return the (N, 3) float64 centres of all occupied voxels, metres, in Morton order."""
-        return self._centres(occupied=True)
+        parts = [part.centres_world for part in self.leaves_by_part(lowest=self.occupied_log_odds)]
+        return np.concatenate([np.empty((0, 3)), *parts])
 
     def free(self) -> Points:
         """Return the (N, 3) float64 centres of all free voxels, metres, in Morton order."""
-        return self._centres(occupied=False)
+        parts = [
+            known.centres_world[known.log_odds < self.occupied_log_odds] for known in self.leaves_by_part()
+        ]
+        return np.concatenate([np.empty((0, 3)), *parts])
 
     def leaves(self, *, depth: int = KEY_BITS, parent: Parent = "max") -> Leaves:
         """Return every known voxel in Morton order, which does not depend on the order of the scans.
@@ -199,19 +203,22 @@ class MapView:
             DataError: No such depth or parent.
         """
         if depth == KEY_BITS:
-            return self._known_in(self.blocks.sorted_slots())
+            return self._known_in(self.blocks.sorted_slots(), lowest=-np.inf)
         codes, values = self._nodes(depth, parent)
         return Leaves(keys_of(codes).astype(np.uint16), values, self.resolution_m, depth)
 
-    def leaves_by_part(self, slots: NDArray[np.int64] | None = None) -> Iterator[Leaves]:
+    def leaves_by_part(
+        self, slots: NDArray[np.int64] | None = None, *, lowest: float | np.float32 = -np.inf
+    ) -> Iterator[Leaves]:
         """Yield the known voxels some blocks at a time, so that their list need not fit into memory.
 
         Args:
             slots: (B,) slots of the blocks; None: all, in Morton order.
+            lowest: Log-odds below which voxels are left out: ``occupied_log_odds`` yields the occupied ones.
         """
         slots = self.blocks.sorted_slots() if slots is None else slots
         for first in range(0, len(slots), BLOCKS_AT_ONCE):
-            yield self._known_in(slots[first : first + BLOCKS_AT_ONCE])
+            yield self._known_in(slots[first : first + BLOCKS_AT_ONCE], lowest=lowest)
 
     def slice(self, z_min: float, z_max: float | None = None) -> OccupancyGrid:
         """Return the 2D map of the voxels with centres between two heights; occupied beats free.
@@ -301,16 +308,11 @@ class MapView:
         centres_world: Points = (keys.astype(np.float64) - (KEY_ZERO - 0.5)) * self.resolution_m
         return centres_world
 
-    def _known_in(self, slots: NDArray[np.int64]) -> Leaves:
-        keys, values = kernels.known_voxels(self.blocks.codes[slots], slots, self.blocks.table.values)
-        return Leaves(keys, values, self.resolution_m)
-
-    def _centres(self, *, occupied: bool) -> Points:
-        parts = [np.empty((0, 3))]
-        for known in self.leaves_by_part():
-            kept = (known.log_odds >= self.occupied_log_odds) == occupied
-            parts.append(known.centres_world[kept])
-        return np.concatenate(parts)
+    def _known_in(self, slots: NDArray[np.int64], *, lowest: float | np.float32) -> Leaves:
+        keys, log_odds = kernels.known_voxels(
+            self.blocks.codes[slots], slots, self.blocks.table.values, np.float32(lowest)
+        )
+        return Leaves(keys, log_odds, self.resolution_m)
 
     def _nodes(self, depth: int, parent: Parent) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
         """Return (M,) Morton codes and (M,) log-odds of the nodes of one depth in which anything is known."""

@@ -118,25 +118,26 @@ def cast_rays(table, origins, directions, resolution_m, max_range_m, threshold, 
 
 
 @njit(cache=True, nogil=True)
-def known_voxels(codes, slots, values):
+def known_voxels(codes, slots, values, lowest):
     """Return the (K, 3) uint16 keys and (K,) float32 log-odds of blocks' known voxels, in the given order.
 
     Args:
         codes: (B,) int64 Morton codes of the blocks.
         slots: (B,) int64 their rows in ``values``.
         values: (capacity, 512) float32.
+        lowest: float32 log-odds below which voxels are left out.
     """
     count = 0
     for b in range(len(slots)):
         for voxel in range(BLOCK_VOXELS):
-            count += values[slots[b], voxel] == values[slots[b], voxel]
+            count += values[slots[b], voxel] >= lowest  # false where it is NaN
     keys = np.empty((count, 3), np.uint16)
     log_odds = np.empty(count, float32)
     k = 0
     for b in range(len(slots)):
         for voxel in range(BLOCK_VOXELS):
             value = values[slots[b], voxel]
-            if value == value:
+            if value >= lowest:
                 code = (codes[b] << (3 * BLOCK_BITS)) | voxel
                 for axis in range(3):
                     keys[k, axis] = gather(code >> axis)

@@ -8,8 +8,9 @@ hold and casting the others again gives the same bits as fusing from scratch.
 
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -21,12 +22,16 @@ from numpy.typing import NDArray
 
 from mapper.core.errors import DataError, MapFileError
 from mapper.core.geometry import Array, Transform, angle_between
+from mapper.core.units import MIB
 from mapper.octree.casting import Cast, depth_limit_of
 from mapper.octree.casting_kernels import FREE, OCCUPIED, UNTOUCHED
 from mapper.octree.config import OctreeConfig
 from mapper.octree.keys import BLOCK_VOXELS, PACKED_BYTES
 from mapper.runtime.atomic import writing
+from mapper.runtime.ordered_map import ordered_map
 
+_UPDATE_BYTES = 8 + 2 * PACKED_BYTES  # of a block
+_MOST_KEPT_BYTES = 128 * MIB
 _LEVEL = 1  # of compression: cells are mostly runs, which higher levels shrink little further
 _FORMAT = "mapper sights 1"  # the updates' former name: files with it are still read
 _RAY_SETTINGS = {"resolution_m", "max_range_m", "depth_noise", "discretize"}
@@ -87,7 +92,7 @@ def decompress(data: bytes, *, blocks: int) -> ScanUpdate:
         plain = isal_zlib.decompress(data)
     except isal_zlib.error as error:  # type: ignore[misc]  # its stub says: an instance
         raise DataError(f"scan update of {blocks} blocks: damaged: {error}") from None
-    if len(plain) != blocks * (8 + 2 * PACKED_BYTES):
+    if len(plain) != blocks * _UPDATE_BYTES:
         raise DataError(f"scan update of {blocks} blocks: damaged: {len(plain)} bytes")
     steps = np.frombuffer(plain, "<i8", count=blocks)
     free, occupied = np.frombuffer(plain, np.uint8, offset=8 * blocks).reshape(2, blocks, PACKED_BYTES)
@@ -191,10 +196,28 @@ class ScanUpdateFile:
         """(S, 4, 4) poses at which the frames were cast, in the order of the file."""
         return np.array([head["T_world_body"] for head, _ in self._heads.values()]).reshape(-1, 4, 4)
 
-    def entries(self) -> Iterator[CachedUpdate]:
-        """Yield every frame's update, in the order of the file."""
-        for stamp_ns, (head, start) in self._heads.items():
+    def entries(self, first: int = 0) -> Iterator[CachedUpdate]:
+        """Yield every frame's update, in the order of the file, from the ``first``-th on."""
+        for stamp_ns, (head, start) in islice(self._heads.items(), first, None):
             yield self._read(stamp_ns, head, start)
+
+    def replay(self, *, workers: int) -> Callable[[], Iterator[ScanUpdate]]:
+        """Return a function that yields every update, decompressed, in the order of the file.
+
+        The first ones stay in memory, so that calling it again costs less.
+        """
+        kept: list[ScanUpdate] = []
+
+        def updates() -> Iterator[ScanUpdate]:
+            yield from kept
+            kept_bytes = sum(len(update) for update in kept) * _UPDATE_BYTES
+            for update in ordered_map(CachedUpdate.update, self.entries(len(kept)), workers=workers):
+                kept_bytes += len(update) * _UPDATE_BYTES
+                if kept_bytes <= _MOST_KEPT_BYTES:
+                    kept.append(update)
+                yield update
+
+        return updates
 
     def holds_for(self, config: OctreeConfig) -> bool:
         """Return whether the updates were cast with the same settings."""

@@ -56,11 +56,12 @@ class Band:
         """
         lowest, highest = self._keys()
         slots, bases = octree.blocks.sorted_slots(), np.zeros(shape, dtype=np.int64)
-        if ground_m is None:
-            z = block_keys(octree.blocks.codes[slots])[:, 2]
-            slots = slots[(z + BLOCK_EDGE > lowest) & (z <= highest)]
-        else:
+        if ground_m is not None:
             bases += np.rint((ground_m - self.floor_z_m) / self.resolution_m).astype(np.int64)
+        z = block_keys(octree.blocks.codes[slots])[:, 2]
+        slots = slots[
+            (z + BLOCK_EDGE > lowest + bases.min(initial=0)) & (z <= highest + bases.max(initial=0))
+        ]
         seen = np.zeros(shape, dtype=np.uint8)
         for known in octree.leaves_by_part(slots):
             x, y, z = known.keys.T.astype(np.int64)
