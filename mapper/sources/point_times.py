@@ -27,6 +27,8 @@ TIME_FIELDS = (
 MAX_SWEEP_S = 2.0
 """No sensor turns slower; points farther apart in time were put together from several sweeps."""
 
+_USUAL_SWEEP_NS = NS_PER_S // 10
+"""A sweep whose returns all lie to one side is shorter, but begins no later after its stamp."""
 _MAX_WRONG_SHARE = 0.05
 """Share of the points whose times may be damaged; with more of them nothing tells which times are right."""
 _SAMPLED = 1000
@@ -51,9 +53,11 @@ def relative_times_s(values: NDArray[np.number], stamp_ns: int) -> NDArray[np.fl
     """Return the times of a sweep's points, seconds after its stamp.
 
     The unit is the coarsest of s, ms, µs and ns in which the sweep lasts at most ``MAX_SWEEP_S``: each is
-    a thousand of the next, so it is the right one of every sweep longer than 2 ms. Values within
-    ``MAX_SWEEP_S`` of zero are offsets from the stamp already; others within as much of the stamp are times
-    on its clock; all others are on a clock of the sensor's own, and the first point is taken at the stamp.
+    a thousand of the next, so it is the right one of every sweep longer than 2 ms. Values from
+    ``MAX_SWEEP_S`` before zero to the sweep's own duration after it are offsets from the stamp already;
+    others within ``MAX_SWEEP_S`` of the stamp are times on its clock; all others are on a clock of the
+    sensor's own, such as the last 32 bits of the epoch's nanoseconds, and the first point is taken at the
+    stamp.
 
     A few values that are not within ``MAX_SWEEP_S`` of the others are damaged: the driver wrote zero or NaN.
     Where a counter of 32 bits, or of the second, hour, day or week began anew, it is counted on.
@@ -107,7 +111,9 @@ def _counted_on(values: NDArray[np.number]) -> NDArray[np.number]:
 
 def _middle_and_unit(values: NDArray[np.number]) -> tuple[np.number, int | None]:
     """Return a time in the middle of the sweep and how many units a second has, by most of the values."""
-    ordered = np.sort(values[:: -(-len(values) // _SAMPLED)])
+    # At random, as damage may repeat with every ring or column of the sensor.
+    sampled = np.random.default_rng(0).integers(len(values), size=_SAMPLED)
+    ordered = np.sort(values if len(values) <= _SAMPLED else values[sampled])
     damaged = int(_MAX_WRONG_SHARE * len(ordered))
     middle = ordered[len(ordered) // 2]
     most = ordered[damaged : len(ordered) - damaged]
@@ -131,7 +137,9 @@ def _without_damage(
         return None
     first_ns = _ns(middle, units_per_s) + round(first * (NS_PER_S // units_per_s))
     after_first_s = np.where(sound, after_middle - first, np.nan) / units_per_s
-    return (after_first_s + _first_after_stamp_ns(first_ns, stamp_ns) / NS_PER_S).astype(np.float32)
+    sweep_ns = round((last - first) * (NS_PER_S // units_per_s))
+    first_after_stamp_ns = _first_after_stamp_ns(first_ns, sweep_ns, stamp_ns)
+    return (after_first_s + first_after_stamp_ns / NS_PER_S).astype(np.float32)
 
 
 def _after_stamp_s(
@@ -140,7 +148,8 @@ def _after_stamp_s(
     """Return times after the stamp of values of a known unit, the least of which is ``first``."""
     after_stamp_s = _less(values, first)
     after_stamp_s /= units_per_s
-    after_stamp_s += _first_after_stamp_ns(_ns(first, units_per_s), stamp_ns) / NS_PER_S
+    sweep_ns = round(float(after_stamp_s.max()) * NS_PER_S)
+    after_stamp_s += _first_after_stamp_ns(_ns(first, units_per_s), sweep_ns, stamp_ns) / NS_PER_S
     return after_stamp_s.astype(np.float32)
 
 
@@ -149,10 +158,10 @@ def _ns(value: np.number, units_per_s: int) -> int:
     return round(number * (NS_PER_S // units_per_s))
 
 
-def _first_after_stamp_ns(first_ns: int, stamp_ns: int) -> int:
+def _first_after_stamp_ns(first_ns: int, sweep_ns: int, stamp_ns: int) -> int:
     """Return how long after the stamp the first point was measured, by the clock that its time is on."""
     limit_ns = MAX_SWEEP_S * NS_PER_S
-    if abs(first_ns) <= limit_ns:
+    if -limit_ns <= first_ns <= max(sweep_ns, _USUAL_SWEEP_NS):
         return first_ns
     return first_ns - stamp_ns if abs(first_ns - stamp_ns) <= limit_ns else 0
 

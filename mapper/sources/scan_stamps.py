@@ -16,11 +16,11 @@ from mapper.sources.text import parse_date, parse_stamp, rows
 RATE_HZ = 10.0
 
 _DECIMAL = re.compile(r"(?<!\d)\d{1,10}\.\d+$")
-_TWO_PARTS = re.compile(r"(?<!\d)(\d{10})_(\d{1,9})$")
+_TWO_PARTS = re.compile(r"(?<!\d)(\d{10})[_-](\d{1,9})$")
 _WHOLE = re.compile(r"(?<!\d)\d+$")
 _NUMBER = re.compile(r"\d+(?=\D*$)")
 _EPOCH_DIGITS = 10  # of seconds, in the years 2001 to 2286
-_NANOSECOND_DIGITS = 9
+_UNIT_DIGITS = (3, 6, 9)  # of ms, µs and ns in a second
 
 
 def in_order(paths: Iterable[Path]) -> list[Path]:
@@ -64,7 +64,7 @@ def scan_stamps(
     named = None if chosen else _stamps_of(files)
     if named is not None:
         is_unpadded = _unpadded_stamps([path.stem for path in files]) is not None
-        note = "fractions of the stamps in the names are taken as nanoseconds without leading zeros"
+        note = "fractions of the stamps in the names are taken as whole numbers without leading zeros"
         return named, [note] if is_unpadded else []
     if listed := chosen or beside:
         return _listed(listed, files, wording), []
@@ -121,7 +121,7 @@ def _stamps_of(files: Sequence[Path]) -> Stamps | None:
 def stamps_in(stems: Sequence[str]) -> Stamps | None:
     """Return the stamps that names without their endings end with, nanoseconds; None if one has none.
 
-    pcl_ros once wrote SECONDS.NANOSECONDS without leading zeros; such fractions are whole numbers.
+    pcl_ros once wrote SECONDS.NANOSECONDS without leading zeros; such fractions are whole numbers of a unit.
     """
     unpadded_ns = _unpadded_stamps(stems)
     if unpadded_ns is not None:
@@ -133,20 +133,23 @@ def stamps_in(stems: Sequence[str]) -> Stamps | None:
 
 
 def _unpadded_stamps(stems: Sequence[str]) -> Stamps | None:
-    """Return stamps whose fractions are nanoseconds without leading zeros; None where they are decimals.
+    """Return stamps with fractions of whole ms, µs or ns without leading zeros; None where they are decimals.
 
     Such fractions differ in length and none begins with a zero. So may decimals that lost the zeros at their
-    ends, but as those the stamps are less even.
+    ends, but as those the stamps are at least twice as uneven.
     """
     parts = [found[0].split(".") for stem in stems if (found := _DECIMAL.search(stem))]
     fractions = [fraction for _, fraction in parts]
     lengths = {len(fraction) for fraction in fractions}
     starts_with_zero = any(fraction != "0" and fraction.startswith("0") for fraction in fractions)
-    if len(parts) < len(stems) or len(lengths) < 2 or max(lengths) != _NANOSECOND_DIGITS or starts_with_zero:
+    if len(parts) < len(stems) or len(lengths) < 2 or starts_with_zero:
         return None
-    whole_ns = np.array([int(seconds) * NS_PER_S + int(ns) for seconds, ns in parts], dtype=np.int64)
     decimal_ns = np.array([ns_from_seconds_text(".".join(part)) for part in parts], dtype=np.int64)
-    return whole_ns if _unevenness_ns(whole_ns) < _unevenness_ns(decimal_ns) else None
+    if (digits := max(lengths)) not in _UNIT_DIGITS:
+        return None
+    padded = [f"{seconds}.{fraction:0>{digits}}" for seconds, fraction in parts]
+    whole_ns = np.array([ns_from_seconds_text(text) for text in padded], dtype=np.int64)
+    return whole_ns if 2.0 * _unevenness_ns(whole_ns) < _unevenness_ns(decimal_ns) else None
 
 
 def _unevenness_ns(stamps_ns: Stamps) -> float:

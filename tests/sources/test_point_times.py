@@ -97,3 +97,20 @@ def test_times_of_which_many_are_damaged_are_none():
     times = np.linspace(0.0, 1e8, 1000) + 1.7e18
     times[:100] = 0.0
     assert relative_times_s(times, stamp_ns=int(1.7e18)) is None
+
+
+@pytest.mark.parametrize("share", [0.01, 0.04])
+def test_damage_that_repeats_with_a_ring_or_a_column_is_no_more_than_its_share(share):
+    times = np.linspace(0.0, 0.1, 20_000)
+    times[:: round(1.0 / share)] = np.nan
+    found = relative_times_s(times, stamp_ns=STAMP_NS)
+    assert np.isnan(found).mean() == pytest.approx(share, rel=0.02)
+
+
+def test_the_last_32_bits_of_the_epoch_are_no_offsets_from_the_stamp():
+    for k in range(40):
+        stamp_ns = STAMP_NS + k * 1_000_000_000
+        ns = (stamp_ns + np.round(SWEEP_S * 1e9).astype(np.int64)) % 2**32
+        times_s = relative_times_s(ns.astype(np.uint32), stamp_ns)
+        if ns[0] > 100_000_000:  # 1 in 43 sweeps looks like offsets from its stamp
+            np.testing.assert_allclose(times_s, SWEEP_S, atol=1e-6)

@@ -213,6 +213,19 @@ def test_the_list_that_the_user_names_goes_before_names(tmp_path):
         open_source(folder, SourceConfig(stamps_file="clock.txt"))
 
 
+@pytest.mark.parametrize("digits", [3, 6, 9])
+def test_fractions_without_leading_zeros_are_whole_numbers_of_their_unit(tmp_path, digits):
+    expected_ns = [1_700_000_000 * NS_PER_S + 7_000_000 + k * 100_000_000 for k in range(25)]
+    names = [f"{ns // NS_PER_S}.{ns % NS_PER_S // 10 ** (9 - digits)}.npy" for ns in expected_ns]
+    assert stamps_of(open_source(cloud_folder(tmp_path, names))) == expected_ns
+
+
+def test_decimals_that_lost_the_zeros_at_their_ends_stay_decimals(tmp_path):
+    expected_ns = [1_700_000_000 * NS_PER_S + 105_000_000 + k * 5_000_000 for k in range(25)]
+    names = [f"{ns / NS_PER_S:.3f}".rstrip("0") + ".npy" for ns in expected_ns]
+    assert stamps_of(open_source(cloud_folder(tmp_path, names))) == expected_ns
+
+
 def test_the_rate_is_an_option_and_missing_numbers_keep_their_time(tmp_path):
     folder = cloud_folder(tmp_path, ["scan_3.npy", "scan_4.npy", "scan_8.npy"])
     source = open_source(folder, SourceConfig(rate_hz=20.0))
