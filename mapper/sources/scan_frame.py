@@ -1,6 +1,6 @@
 """Plausibility of the frame of a LiDAR's scans: around the sensor, or of a map in which the sensor moves."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -11,13 +11,16 @@ from mapper.core.geometry import Array
 from mapper.sources.base import FrameRef, Log
 
 _LOOKED_AT, _LOOKED_AT_AT_FIRST = 6, 3
-"""Scans, spread over the log; where the first of them show the sensor at their origin, no others are read."""
+"""Scans, spread over the log; where the middle of what the first of them show stays, no others are read."""
 _DIRECTION_RAD = np.radians(1.0)
 _BEHIND_RATIO, _BEHIND_M = 1.3, 0.3
 """A point is behind another in its direction if it is so much farther; neighbours on a wall are not."""
 _MOST_BEHIND = 0.1
 """Share of the points behind others as seen from their origin: up to 0.07 among trees; where the sensor is
 metres off the origin 0.1 to 0.4 in streets and rooms, less in fields, tunnels and thin clouds."""
+_FEWER_BEHIND = 1.5
+"""Ratio of the shares as seen from the origin and from where the points' middle is: around the sensor at most
+1.3, in a map that begins at the sensor 1.4 to 30, where the sensor is metres off."""
 _MOVED_M = 0.5
 _STAYED_SHARE = 0.2
 """Scans lie in a map if surfaces move by less than so much of the way of the scans' middle."""
@@ -34,10 +37,12 @@ def scan_frame_warnings(log: Log) -> list[str]:
         return []
     for most in (_LOOKED_AT_AT_FIRST, _LOOKED_AT):
         scans = list(_readable(log.spread_entries(most)))
-        behind = [_share_behind(scan) for scan in scans]
-        if len(scans) < 3 or np.median(behind) <= _MOST_BEHIND:
+        ways_m = [float(np.linalg.norm(_middle_way(one, other))) for one, other in pairwise(scans)]
+        if not any(way_m > _MOVED_M for way_m in ways_m):
             return []
-    ways_m = [_middle_way_m(one, other) for one, other in pairwise(scans)]
+    behind = [_share_behind(scan, scan.origin_body) for scan in scans]
+    if np.median(behind) <= _MOST_BEHIND and not _is_seen_from_the_middle(scans, behind):
+        return []
     moved = [k for k, way_m in enumerate(ways_m) if way_m > _MOVED_M]
     stayed = [k for k in moved if _surfaces_way_m(scans[k], scans[k + 1]) < _STAYED_SHARE * ways_m[k]]
     if len(stayed) < 2 or 2 * len(stayed) < len(moved):
@@ -61,9 +66,18 @@ def _readable(entries: Iterable[FrameRef]) -> Iterator[Scan]:
             yield scan
 
 
-def _share_behind(scan: Scan) -> float:
-    """Return the share of the points that lie behind another one, seen from the sensor's origin."""
-    offsets = scan.points_body - scan.origin_body
+def _is_seen_from_the_middle(scans: Sequence[Scan], behind: Sequence[float]) -> bool:
+    """Return whether fewer points lie behind others as seen from where the points' middle has moved to.
+
+    A map may begin where the sensor stood; then few points of thin clouds lie behind others for long.
+    """
+    from_middle = [_share_behind(scan, scan.origin_body + _middle_way(scans[0], scan)) for scan in scans[1:]]
+    return sum(behind[1:]) > _FEWER_BEHIND * sum(from_middle)
+
+
+def _share_behind(scan: Scan, origin_body: Array) -> float:
+    """Return the share of the points that lie behind another one, seen from a place."""
+    offsets = scan.points_body - origin_body
     ranges_m = np.linalg.norm(offsets, axis=1)
     offsets, ranges_m = offsets[ranges_m > _BEHIND_M], ranges_m[ranges_m > _BEHIND_M]
     if not len(ranges_m):
@@ -77,10 +91,10 @@ def _share_behind(scan: Scan) -> float:
     return float((ranges_m > _BEHIND_RATIO * nearest_m[directions] + _BEHIND_M).mean())
 
 
-def _middle_way_m(one: Scan, other: Scan) -> float:
-    """Return how far apart the medians of two scans' points are."""
+def _middle_way(one: Scan, other: Scan) -> Array:
+    """Return the (3,) way from the median of one scan's points to that of another's, metres."""
     way: Array = np.median(other.points_body, axis=0) - np.median(one.points_body, axis=0)
-    return float(np.linalg.norm(way))
+    return way
 
 
 def _surfaces_way_m(one: Scan, other: Scan) -> float:

@@ -26,7 +26,7 @@ def crossings(origin, rays, box):
     return ends.min(axis=0).max(axis=1), ends.max(axis=0).min(axis=1)
 
 
-def room_seen_from(origin, *, seed):
+def room_seen_from(origin, *, seed, pillars=PILLARS):
     azimuth, elevation = np.meshgrid(
         np.radians(np.arange(0, 360, 0.5)), np.radians(np.arange(-15.0, 16.0, 2.0))
     )
@@ -35,7 +35,7 @@ def room_seen_from(origin, *, seed):
     ).reshape(-1, 3)
     rays += 1e-9
     ranges_m = crossings(origin, rays, ROOM)[1]
-    for pillar in PILLARS:
+    for pillar in pillars:
         begin, end = crossings(origin, rays, pillar)
         ranges_m = np.where((begin < end) & (begin > 0.0), np.minimum(ranges_m, begin), ranges_m)
     return rays * (ranges_m + np.random.default_rng(seed).normal(0.0, 0.01, len(rays)))[:, None]
@@ -52,6 +52,17 @@ def test_scans_in_a_map_are_told_by_surfaces_that_stay_while_the_view_moves(move
         entries.append(ScanEntry(Scan(k * 10**8, points.astype(np.float32))))
 
     assert len(scan_frame_warnings(log_in_memory(entries, sensor="lidar"))) == is_found
+
+
+@pytest.mark.parametrize("in_map", [True, False])
+def test_a_map_that_begins_at_the_sensor_is_told_where_little_stands_before_other_things(in_map):
+    entries = []
+    for k in range(12):
+        origin = np.array([1.0 * k, 0.4, 1.2])
+        points = room_seen_from(origin, seed=k, pillars=PILLARS[::6]) + np.array([1.0 * k, 0.0, 0.0]) * in_map
+        entries.append(ScanEntry(Scan(k * 10**8, points.astype(np.float32))))
+
+    assert len(scan_frame_warnings(log_in_memory(entries, sensor="lidar"))) == in_map
 
 
 def test_images_and_single_scans_have_no_frame_to_doubt():

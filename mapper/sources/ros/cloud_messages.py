@@ -1,6 +1,6 @@
 """Point cloud messages as scans: structured views of the payload, without missing returns."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -24,6 +24,36 @@ _LIVOX_NOISE = 0b1111
 """Bits of a Livox point's tag that are not zero for noise: by its position (stray points between near and far
 surfaces), and by its intensity (rain, fog, dust). The next two count returns (Livox SDK protocol, tag
 information; of a Mid-360 they are a third kind of confidence)."""
+
+
+def usable_fields(
+    stated: Iterable[tuple[str, int, int, int]], types: Mapping[int, str], *, order: str, point_bytes: int
+) -> tuple[list[Field], list[str]]:
+    """Return the fields that hold a number of each point, every name once, and notes on the others.
+
+    Args:
+        stated: Name, offset in a point in bytes, number of the type, and number of values of each field.
+        types: Numpy's names of the types, by their numbers.
+        order: Byte order, ``<`` or ``>``.
+        point_bytes: Distance from one point to the next.
+    """
+    fields: dict[str, Field] = {}
+    notes: list[str] = []
+    for name, offset, number, count in stated:
+        kind = types.get(number)
+        if kind is None:
+            why = f"its type {number} is not known"
+        elif count > 1:
+            why = f"it has {count} values a point"
+        elif name in fields:
+            why = "an earlier one has the same name"
+        elif (end := offset + np.dtype(kind).itemsize) > point_bytes:
+            why = f"it ends at byte {end} of points of {point_bytes} bytes"
+        else:
+            fields[name] = (name, offset, order + kind, 1)
+            continue
+        notes.append(f"field {name} is left out: {why}")
+    return list(fields.values()), notes
 
 
 def structured(

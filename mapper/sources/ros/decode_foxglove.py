@@ -20,7 +20,7 @@ from google.protobuf.timestamp_pb2 import Timestamp
 
 from mapper.core.errors import DataError
 from mapper.core.timebase import NS_PER_S
-from mapper.sources.ros.cloud_messages import structured
+from mapper.sources.ros.cloud_messages import structured, usable_fields
 from mapper.sources.ros.messages import (
     CameraMessage,
     CloudMessage,
@@ -95,14 +95,9 @@ def _camera(m: Any) -> CameraMessage:
 
 
 def _cloud(m: Any) -> CloudMessage:
-    known = [f for f in m.fields if f.type in _NUMERIC_TYPES]
-    fields = [(f.name, f.offset, "<" + _NUMERIC_TYPES[f.type], 1) for f in known]
-    notes = [
-        f"field {f.name} is left out: its type {f.type} is none of PackedElementField's"
-        for f in m.fields
-        if f.type not in _NUMERIC_TYPES
-    ]
     data, stride = _payload(m.data), m.point_stride
+    stated = [(f.name, f.offset, f.type, 1) for f in m.fields]
+    fields, notes = usable_fields(stated, _NUMERIC_TYPES, order="<", point_bytes=stride)
     points = structured(data, fields, point_bytes=stride, shape=(1, len(data) // max(stride, 1)))
     T_frame_points = pose_from_numbers(np.array(_numbers(m.pose.position, m.pose.orientation)))
     if T_frame_points is None:  # protobuf leaves zeros out: an empty pose is none

@@ -10,7 +10,7 @@ from mapper.core.errors import DataError
 from mapper.core.geometry import is_rigid, transform
 from mapper.core.rotations import row_of_pose
 from mapper.core.timebase import NS_PER_S
-from mapper.sources.ros.cloud_messages import Field, structured, without_noise
+from mapper.sources.ros.cloud_messages import structured, usable_fields, without_noise
 from mapper.sources.ros.driver_messages import decode_driver_message
 from mapper.sources.ros.messages import (
     DRIVER_CLOUDS,
@@ -86,16 +86,8 @@ def _camera(m: Any) -> CameraMessage:
 
 def _cloud(m: Any) -> CloudMessage:
     order = ">" if m.is_bigendian else "<"
-    fields: list[Field] = [
-        (f.name, f.offset, order + POINT_FIELD_TYPES[f.datatype], max(f.count, 1))
-        for f in m.fields
-        if f.datatype in POINT_FIELD_TYPES
-    ]
-    notes = [
-        f"field {f.name} is left out: its datatype {f.datatype} is none of PointField's"
-        for f in m.fields
-        if f.datatype not in POINT_FIELD_TYPES
-    ]
+    stated = [(f.name, f.offset, f.datatype, f.count) for f in m.fields]
+    fields, notes = usable_fields(stated, POINT_FIELD_TYPES, order=order, point_bytes=m.point_step)
     packed_bytes = m.width * m.point_step
     if m.height > 1 and m.row_step not in (0, packed_bytes) and len(m.data) == m.height * packed_bytes:
         notes.append(f"row_step is {m.row_step}, but the rows follow each other every {packed_bytes} bytes")

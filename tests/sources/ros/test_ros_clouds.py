@@ -4,8 +4,8 @@ import pytest
 from mapper.core.errors import DataError, FrameError
 from mapper.core.frames import Scan
 from mapper.core.geometry import exp
-from mapper.sources.ros.cloud_messages import scan_from, structured
-from mapper.sources.ros.decode_ros import decode_ros
+from mapper.sources.ros.cloud_messages import scan_from, structured, usable_fields
+from mapper.sources.ros.decode_ros import POINT_FIELD_TYPES, decode_ros
 from mapper.sources.ros.encode_ros import cloud_message
 from mapper.sources.ros.messages import CloudMessage
 from mapper.sources.ros.recording import Topic
@@ -147,6 +147,26 @@ def test_rows_that_overlap_are_refused(numbers):
     """A message of 48 kB must not become a cloud of gigabytes."""
     with pytest.raises(DataError, match=r"a cloud of \d+×\d+ points of \d+ bytes"):
         structured(memoryview(bytes(48_000)), XYZ if numbers["point_bytes"] else [], **numbers)
+
+
+@pytest.mark.parametrize(
+    "field",
+    [
+        pytest.param(("intensity", 12, 0, 1), id="unknown type"),
+        pytest.param(("t", 12, 6, 2), id="two times a point"),
+        pytest.param(("x", 12, 7, 1), id="a name that is taken"),
+        pytest.param(("ring", 400, 4, 1), id="beyond the point"),
+    ],
+)
+def test_a_field_that_holds_no_number_of_each_point_is_left_out_with_a_note(field):
+    points = some_points()
+    payload = packed(points, XYZ, point_bytes=16).tobytes()
+    stated = [("x", 0, 7, 1), ("y", 4, 7, 1), ("z", 8, 7, 1), field]
+    fields, notes = usable_fields(stated, POINT_FIELD_TYPES, order="<", point_bytes=16)
+    view = structured(memoryview(payload), fields, point_bytes=16, shape=(1, len(points)))
+    np.testing.assert_array_equal(scan_of(CloudMessage(STAMP_NS, "lidar", view)).points_body, points)
+    assert len(notes) == 1
+    assert field[0] in notes[0]
 
 
 def test_the_step_of_a_single_row_does_not_matter():
