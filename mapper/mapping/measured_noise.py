@@ -46,7 +46,7 @@ class MeasuredNoise:
 
 
 def measure_noise(source: Log, *, given: DepthNoiseConfig | None = None, workers: int) -> MeasuredNoise:
-    """Measure a camera's depth noise; that of a Kinect is assumed where too few planes are seen.
+    """Measure a camera's depth noise, if the log does not state it; a Kinect's where too few planes are seen.
 
     Frames spread over the log are cut into tiles, and a plane is fitted to each. The tiles are sorted by
     distance, in steps of 10 %; the noise at a distance is the lower quartile of the standard deviations
@@ -64,6 +64,8 @@ def measure_noise(source: Log, *, given: DepthNoiseConfig | None = None, workers
     depths_m = np.concatenate([np.empty(0), *(depths for depths, _, _ in seen)])
     if given is not None:
         return MeasuredNoise(given, "as set", depths_m)
+    if source.depth_noise is not None:
+        return MeasuredNoise(source.depth_noise, "that of stereo pairs", depths_m)
     distance_m = np.concatenate([np.empty(0), *(z for _, z, _ in seen)])
     sigma_m = np.concatenate([np.empty(0), *(sigmas for _, _, sigmas in seen)])
     frame_of = np.repeat(np.arange(len(seen), dtype=np.intp), [len(z) for _, z, _ in seen])

@@ -42,6 +42,8 @@ def odometry_for(
     from mapper.odometry.given_poses import poses_for
     from mapper.odometry.scans.surroundings import adapted_to
 
+    if log.depth_noise is not None and getattr(config, "depth_noise", log.depth_noise) is None:
+        config = config.model_copy(update={"depth_noise": log.depth_noise})
     return build_odometry(adapted_to(config, log), poses_for(config, log), motion_check, log.gyroscope)
 
 

@@ -29,6 +29,7 @@ _FORMATS = (
     "image_folders.stamped_images",
     "image_folders.numbered",
     "scan_folders.kitti",
+    "image_folders.stereo_pairs",
     RECORDING,
     "scan_folders.velodyne_pcap",
     "scan_folders.clouds",

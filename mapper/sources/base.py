@@ -13,6 +13,7 @@ from mapper.core.frames import Frame, RgbdFrame, Scan, Sensor
 from mapper.core.geometry import Array, Transform
 from mapper.core.timebase import Stamps
 from mapper.core.trajectory import Trajectory
+from mapper.sensing.config import DepthNoiseConfig
 from mapper.sensing.gnss import GnssFixes
 from mapper.sensing.gyroscope import Gyroscope
 
@@ -154,6 +155,7 @@ class Log:
         T_base_body: Mounting of the body on the robot, whose base has x forward and z up (REP 103), if the
             log states it.
         wheels: T_odom_body by wheel odometry, in a frame of its own that drifts, if the log has it.
+        depth_noise: Noise of its depth, if what made it states it.
         are_units_assumed: Nothing says how many units of its depth images a metre has.
         notes: Sentences on what opening it left out or assumed.
         sessions: The logs that a chained log is made of, oldest first; empty for any other.
@@ -172,6 +174,7 @@ class Log:
     gnss: GnssFixes | None = None
     T_base_body: Transform | None = None
     wheels: Trajectory | None = None
+    depth_noise: DepthNoiseConfig | None = None
     are_units_assumed: bool = False
     notes: Sequence[str] = ()
     sessions: "Sequence[Session]" = ()

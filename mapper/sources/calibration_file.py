@@ -94,6 +94,18 @@ def read_calibration(path: Path) -> Calibration:
         raise SourceError(f"{path}: {error}") from None
 
 
+def read_yaml(text: str, where: str) -> Calibration:
+    """Return the intrinsics in the YAML text of one camera, as ROS, OpenCV, EuRoC and Kalibr write it.
+
+    Raises:
+        SourceError: It lacks a number, or the lens is unknown; the message begins with ``where``.
+    """
+    try:
+        return _interpret(*_yaml_numbers(text), where)
+    except (DataError, OverflowError) as error:
+        raise SourceError(f"{where}: {error}") from None
+
+
 def calibration_text(camera: PinholeCamera, *, depth_units_per_m: float) -> str:
     """Return the text of a ``calibration.toml``."""
     values = {

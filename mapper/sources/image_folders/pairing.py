@@ -84,12 +84,17 @@ def depth_offset_ns(config: SourceConfig) -> int:
 
 
 def pair_images(
-    colour: ImageList, depth: ImageList, config: SourceConfig, *, path: Path
+    colour: ImageList,
+    depth: ImageList,
+    config: SourceConfig,
+    *,
+    path: Path,
+    names: tuple[str, str] = ("colour", "depth"),
 ) -> tuple[list[FramePair], list[str]]:
     """Return each colour image with the nearest depth image, and a note on those that have none.
 
     Depth images are ``source.depth_offset_s`` later than their stamps, and at most ``source.max_pair_gap_s``
-    from a colour image.
+    from a colour image. ``names`` are those of the two kinds of images in messages.
 
     Raises:
         SourceError: Nothing pairs.
@@ -99,7 +104,7 @@ def pair_images(
     paired = np.flatnonzero(gap_ns <= round(max_gap_s * NS_PER_S))
     if len(paired) == 0:
         raise SourceError(
-            f"{path}: no colour image has a depth image within {max_gap_s * 1e3:g} ms; "
+            f"{path}: no {names[0]} image has a {names[1]} image within {max_gap_s * 1e3:g} ms; "
             f"the closest pair is {int(gap_ns.min()) / NS_PER_S:g} s apart (source.max_pair_gap_s)"
         )
     pairs = [
@@ -111,4 +116,4 @@ def pair_images(
         )
         for i in paired
     ]
-    return pairs, unpaired_note(len(gap_ns) - len(pairs), len(gap_ns), max_gap_s=max_gap_s)
+    return pairs, unpaired_note(len(gap_ns) - len(pairs), len(gap_ns), max_gap_s=max_gap_s, names=names)

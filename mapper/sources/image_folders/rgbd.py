@@ -228,16 +228,16 @@ def _renamed(folder: Path) -> str:
 def _camera_of(
     pairs: Sequence[FramePair], calibration: Calibration, *, depth_units_per_m: float, path: Path
 ) -> RecordedCamera:
-    colour_px, why = _first_size([pair.colour for pair in pairs], read_grey)
+    colour_px, why = first_size([pair.colour for pair in pairs], read_grey)
     if colour_px is None:
         raise SourceError(f"none of {len(pairs)} colour images can be read; the first: {why}")
-    depth_px, _ = _first_size(
+    depth_px, _ = first_size(
         [pair.depth for pair in pairs], lambda file: read_depth_m(file, depth_units_per_m)
     )
     return recorded_camera(calibration, colour_px=colour_px, depth_px=depth_px or colour_px, where=f"{path}")
 
 
-def _first_size(
+def first_size(
     files: Sequence[ImageFile], read: Callable[[ImageFile], Image | DepthImage]
 ) -> tuple[Size | None, str]:
     """Return width and height of the first image that can be read; None, and why not the first, without."""
@@ -252,14 +252,19 @@ def _first_size(
     return None, first_reason
 
 
-def unpaired_note(alone: int, total: int, *, max_gap_s: float) -> list[str]:
-    """Return a note on colour images without a depth image near in time, if there are any."""
+def unpaired_note(
+    alone: int, total: int, *, max_gap_s: float, names: tuple[str, str] = ("colour", "depth")
+) -> list[str]:
+    """Return a note on images without one of the other kind near in time, if there are any."""
     if not alone:
         return []
     left_out = "left out"
     if 2 * alone > total:
         left_out = "more than half of the log is left out (source.max_pair_gap_s)"
-    return [f"{alone} of {total} colour images have no depth image within {max_gap_s * 1e3:g} ms; {left_out}"]
+    one, other = names
+    return [
+        f"{alone} of {total} {one} images have no {other} image within {max_gap_s * 1e3:g} ms; {left_out}"
+    ]
 
 
 def read_accelerations(folder: Path) -> tuple[Accelerations | None, list[str]]:

@@ -88,7 +88,7 @@ def _colour_calibration(
             f"{reader.recording.path}: no camera info for {name}; choose one with "
             "source.topics.camera_info=… or --set source.camera.fx_px=… and so on"
         )
-    return _calibration(_windowed(info, colour_px), is_rectified="rect" in name, name=series.topic.name)
+    return calibration_of(info, colour_px, is_rectified="rect" in name, name=series.topic.name)
 
 
 def _depth_camera(
@@ -241,8 +241,22 @@ def _windowed(info: CameraMessage, image_px: Size) -> CameraMessage:
     )
 
 
+def calibration_of(info: CameraMessage, image_px: Size, *, is_rectified: bool, name: str) -> Calibration:
+    """Return the intrinsics of raw images with their distortion, or of rectified ones without.
+
+    Args:
+        info: The camera's calibration.
+        image_px: Size of the images, which may be binned or a part of the sensor.
+        is_rectified: Whether the images are rectified.
+        name: Topic, for messages.
+
+    Raises:
+        SourceError: The camera is not calibrated, or its lens is unknown.
+    """
+    return _calibration(_windowed(info, image_px), is_rectified=is_rectified, name=name)
+
+
 def _calibration(info: CameraMessage, *, is_rectified: bool, name: str) -> Calibration:
-    """Return the intrinsics of raw images with their distortion, or of rectified ones without."""
     size_px = (info.width_px, info.height_px) if info.width_px and info.height_px else None
     P, K, D = info.P.tolist(), info.K.tolist(), info.D.tolist()
     if is_rectified and len(P) == 12 and P[0] > 0.0:

@@ -90,8 +90,8 @@ def _file(m: Any) -> FileMessage:
 
 
 def _camera(m: Any) -> CameraMessage:
-    D, K, P = (np.array(numbers, dtype=np.float64) for numbers in (m.D, m.K, m.P))
-    return CameraMessage(m.frame_id, m.width, m.height, m.distortion_model, D, K, P)
+    D, K, P, R = (np.array(numbers, dtype=np.float64) for numbers in (m.D, m.K, m.P, m.R))
+    return CameraMessage(m.frame_id, m.width, m.height, m.distortion_model, D, K, P, R=R)
 
 
 def _cloud(m: Any) -> CloudMessage:

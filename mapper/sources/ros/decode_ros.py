@@ -76,12 +76,12 @@ def _file(m: Any) -> FileMessage:
 
 
 def _camera(m: Any) -> CameraMessage:
-    D, K, P = (
-        np.asarray(getattr(m, name.lower(), getattr(m, name, None)), dtype=np.float64) for name in "DKP"
+    D, K, P, R = (
+        np.asarray(getattr(m, name.lower(), getattr(m, name, None)), dtype=np.float64) for name in "DKPR"
     )
     roi = m.roi
     window = Window(roi.x_offset, roi.y_offset, roi.width, roi.height, m.binning_x or 1, m.binning_y or 1)
-    return CameraMessage(m.header.frame_id, m.width, m.height, m.distortion_model, D, K, P, window)
+    return CameraMessage(m.header.frame_id, m.width, m.height, m.distortion_model, D, K, P, window, R)
 
 
 def _cloud(m: Any) -> CloudMessage:

@@ -1,6 +1,7 @@
 """Frames of a recording that have not been read yet; see :class:`mapper.sources.base.Entry`."""
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from mapper.sources.ros.frame_tree import FrameTree, is_fixed
 from mapper.sources.ros.image_messages import depth_file_of, depth_m_of, image_of
 from mapper.sources.ros.messages import CloudMessage, FileMessage, ImageMessage, Message, frame_of
 from mapper.sources.ros.recording import Place, Recording, Topic
+from mapper.sources.stereo import StereoCamera
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,6 +102,32 @@ def rgbd_entry(
         ),
         recorded,
     )
+
+
+def stereo_entry(left: Located, right: Located, camera: StereoCamera, recorded: RecordedCamera) -> RgbdEntry:
+    """Return the entry of a left and a right image, whose body is the rectified left camera.
+
+    Args:
+        left: Left image; its time is the frame's.
+        right: Right image.
+        camera: Rectifies and matches them.
+        recorded: Camera of the frame, and the size of both images.
+    """
+    read_left, read_right = (partial(_read, one) for one in (left, right))
+    depth = camera.depth_of(read_left, read_right, left)
+    images = ImageFiles(
+        camera.image_of(read_left, left),
+        depth,
+        right.stamp_ns,
+        depth.units_per_m,
+        colour_px=recorded.colour_px,
+        depth_px=recorded.depth_px,
+    )
+    return RgbdEntry(left.stamp_ns, images, recorded)
+
+
+def _read(image: Located, in_colour: bool) -> Image:
+    return image_of(image.image(), colour=in_colour, where=f"{image}")
 
 
 def _file_of(message: ImageMessage) -> bytes | None:

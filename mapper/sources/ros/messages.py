@@ -85,6 +85,7 @@ class CameraMessage:
         K: (9,) intrinsics of the raw image, row by row.
         P: (12,) intrinsics of the rectified image, row by row.
         window: Part of the sensor that the images show; size, K and P are the full sensor's.
+        R: (9,) rotation from the raw camera's axes to the rectified one's, row by row.
     """
 
     frame: str
@@ -95,6 +96,7 @@ class CameraMessage:
     K: Array
     P: Array
     window: Window = Window()
+    R: Array = field(default_factory=lambda: np.eye(3).ravel())
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -9,6 +9,7 @@ from mapper.core.errors import SourceError
 from mapper.core.frames import Sensor
 from mapper.core.timebase import NS_PER_S, Stamps
 from mapper.core.units import MM_PER_M
+from mapper.sensing.config import DepthNoiseConfig
 from mapper.sources.base import FrameRef, Log
 from mapper.sources.config import SourceConfig
 from mapper.sources.image_files.image_sizes import recorded_camera
@@ -16,7 +17,7 @@ from mapper.sources.image_files.reading import TUM_UNITS_PER_M
 from mapper.sources.image_folders.pairing import depth_offset_ns
 from mapper.sources.point_times import relative_times_s, time_field
 from mapper.sources.ros.cameras import calibrate
-from mapper.sources.ros.entries import CloudEntry, rgbd_entry
+from mapper.sources.ros.entries import CloudEntry, rgbd_entry, stereo_entry
 from mapper.sources.ros.frame_tree import is_fixed
 from mapper.sources.ros.image_messages import has_float_depth, size_of
 from mapper.sources.ros.index import Series, why_unread
@@ -30,7 +31,8 @@ from mapper.sources.ros.messages import (
     frame_of,
 )
 from mapper.sources.ros.reader import SAME_CLOCK_NS, RecordingReader
-from mapper.sources.ros.topics import CameraTopics, Choice, choose
+from mapper.sources.ros.stereo_cameras import stereo_camera
+from mapper.sources.ros.topics import CameraTopics, Choice, StereoTopics, choose
 from mapper.sources.velodyne_packets import require_decoder
 
 _JPEG_START = b"\xff\xd8"
@@ -45,6 +47,7 @@ class _Frames:
     stamps_ns: Stamps
     entry_at: Callable[[int], FrameRef]
     notes: Sequence[str]
+    depth_noise: DepthNoiseConfig | None = None
 
 
 def recording_log(reader: RecordingReader, config: SourceConfig) -> Log:
@@ -66,7 +69,7 @@ def recording_log(reader: RecordingReader, config: SourceConfig) -> Log:
         choice = choose(reader.series, reader.firsts, config.topics, path=recording.path)
     except SourceError as error:
         raise SourceError("; ".join([str(error), *problems])) from None
-    main = choice.frames.color if isinstance(choice.frames, CameraTopics) else choice.frames
+    main = _main_of(choice.frames)
     if len(main) > 1 and not np.ptp(main.stamps_ns):
         raise SourceError(
             f"{recording.path}: all {len(main)} messages of {main.topic.name} have the same stamp and the "
@@ -76,6 +79,8 @@ def recording_log(reader: RecordingReader, config: SourceConfig) -> Log:
     choice, clock_notes = _on_clock_of(main, choice)
     if isinstance(choice.frames, CameraTopics):
         frames = _rgbd(reader, choice.frames, config)
+    elif isinstance(choice.frames, StereoTopics):
+        frames = _stereo(reader, choice.frames, config)
     else:
         frames = _lidar(reader, choice.frames, config)
     truth, truth_notes = reader.truth(choice.truth, body=frames.body)
@@ -99,6 +104,7 @@ def recording_log(reader: RecordingReader, config: SourceConfig) -> Log:
         gnss=gnss,
         T_base_body=reader.mounting(frames.body),
         wheels=wheels,
+        depth_noise=frames.depth_noise,
         notes=[
             *choice.notes,
             *problems,
@@ -131,6 +137,8 @@ def _on_clock_of(main: Series, choice: Choice) -> tuple[Choice, list[str]]:
     frames = choice.frames
     if isinstance(frames, CameraTopics):
         frames = replace(frames, depth=moved(frames.depth))
+    elif isinstance(frames, StereoTopics):
+        frames = replace(frames, right=moved(frames.right))
     others = (choice.imu, choice.gyroscope, choice.gnss, choice.truth, choice.wheels)
     imu, gyroscope, gnss, truth, wheels = (one and moved(one) for one in others)
     followed = replace(
@@ -139,12 +147,45 @@ def _on_clock_of(main: Series, choice: Choice) -> tuple[Choice, list[str]]:
     return followed, list(dict.fromkeys(notes))
 
 
-def _rgbd(reader: RecordingReader, topics: CameraTopics, config: SourceConfig) -> _Frames:
+def _main_of(frames: CameraTopics | StereoTopics | Series) -> Series:
+    """Return the topic whose stamps are the frames'."""
+    match frames:
+        case CameraTopics():
+            return frames.color
+        case StereoTopics():
+            return frames.left
+        case _:
+            return frames
+
+
+def _refuse_body_frame(reader: RecordingReader, config: SourceConfig) -> None:
     if config.body_frame is not None:
         raise SourceError(
             f"{reader.recording.path}: source.body_frame={config.body_frame}: the body of RGB-D frames is "
             "the camera; leave it out, or choose clouds with source.topics.points=…"
         )
+
+
+def _stereo(reader: RecordingReader, topics: StereoTopics, config: SourceConfig) -> _Frames:
+    _refuse_body_frame(reader, config)
+    left, right, where = topics.left, topics.right, f"{reader.recording.path}"
+    i, j, notes = paired(left, right, max_gap_s=config.max_pair_gap_s, where=where)
+    first = _first_image(reader, left)
+    size_px = size_of(first, where=f"{where}: {left.topic.name}")
+    camera = stereo_camera(reader, topics, size_px=size_px)
+    recorded = recorded_camera(camera.calibration, colour_px=size_px, depth_px=size_px, where=where)
+
+    def entry_at(index: int) -> FrameRef:
+        return stereo_entry(
+            reader.located(left, int(i[index])), reader.located(right, int(j[index])), camera, recorded
+        )
+
+    notes.append(camera.note)
+    return _Frames("rgbd", frame_of(first), left.stamps_ns[i], entry_at, notes, camera.noise)
+
+
+def _rgbd(reader: RecordingReader, topics: CameraTopics, config: SourceConfig) -> _Frames:
+    _refuse_body_frame(reader, config)
     color, depth = topics.color, topics.depth
     depth = replace(depth, stamps_ns=depth.stamps_ns + depth_offset_ns(config))
     where = f"{reader.recording.path}"

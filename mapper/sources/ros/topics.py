@@ -30,6 +30,15 @@ TRUTH, WHEELS = "/ground_truth", "/wheel_odometry"
 
 _TRANSPORTS = ("/compressedDepth", "/compressed")  # what image_transport appends to an image's own topic
 _OWN_TYPES = "mapper/msg/"
+_SIDES = re.compile(r"left|infra1|Infrared_1|cam0|camera0", re.IGNORECASE)
+_OTHER_SIDE = {
+    "left": "right",
+    "infra1": "infra2",
+    "infrared_1": "Infrared_2",
+    "cam0": "cam1",
+    "camera0": "camera1",
+}
+"""Words in topics of left images, and in those of the right ones beside them."""
 _BOOKKEEPING = re.compile(
     r"(?:action|bond|builtin_interfaces|control|diagnostic|dynamic_reconfigure|lifecycle|map|nav|rcl_interfaces"
     r"|realsense2_camera|rosbag2_interfaces|rosgraph|statistics|std|tf2|visualization)(?:_msgs)?/|actionlib"
@@ -58,11 +67,28 @@ class CameraTopics:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class StereoTopics:
+    """Topics of a stereo pair.
+
+    Attributes:
+        left: Images of the left camera.
+        right: Images of the right camera.
+        left_info: Its calibration, if there is any.
+        right_info: That of the right camera.
+    """
+
+    left: Series
+    right: Series
+    left_info: Series | None
+    right_info: Series | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Choice:
     """Topics that are read.
 
     Attributes:
-        frames: Topics that are mapped: images, or clouds.
+        frames: Topics that are mapped: images with depth, stereo pairs, or clouds.
         imu: Inertial readings, if there are any.
         gyroscope: Readings with angular velocities: the same topic, if it has them.
         gnss: Fixes of a GNSS receiver, if there are any.
@@ -71,7 +97,7 @@ class Choice:
         notes: Guesses, a sentence each.
     """
 
-    frames: CameraTopics | Series
+    frames: CameraTopics | StereoTopics | Series
     imu: Series | None
     gyroscope: Series | None
     gnss: Series | None
@@ -83,7 +109,7 @@ class Choice:
 def choose(
     series: Mapping[str, Series], firsts: Mapping[str, Message], config: TopicsConfig, *, path: Path
 ) -> Choice:
-    """Return the topics to read: images where colour has depth, else clouds.
+    """Return the topics to read: images where colour has depth, else clouds, else stereo pairs.
 
     Args:
         series: Every topic.
@@ -111,7 +137,7 @@ def choose(
     truth = pick.one("truth", config.truth, POSES, _plain_rank, where=lambda name: name == TRUTH)
     wheels = pick.one("wheels", config.wheels, POSES, _plain_rank, where=lambda name: name == WHEELS)
     pick.refuse_own_runs()
-    frames: CameraTopics | Series
+    frames: CameraTopics | StereoTopics | Series
     if color is not None and depth is not None and config.points is None:
         infos = pick.all(CAMERAS)
         info = pick.one("camera_info", config.camera_info, CAMERAS, _plain_rank, where=set().__contains__)
@@ -134,6 +160,14 @@ def choose(
         both = color is not None and depth is not None
         image_reason = "point clouds are mapped" if both else "colour has no depth, or depth no colour"
         used = [points]
+    elif pairs := _stereo_pairs(colors, pick.all(IMAGES)):
+        left, right = pairs[0]
+        infos = pick.all(CAMERAS)
+        left_info, right_info = (next(iter(_beside(one, infos)), None) for one in (left, right))
+        frames = StereoTopics(left, right, left_info, right_info)
+        chosen = f"stereo pairs {left.topic.name} and {right.topic.name}"
+        notes = [_choice_note(chosen, config.color, "color")]
+        used, image_reason = [left, right], "one pair is mapped"
     else:
         raise SourceError(f"{path}: nothing to map: {_what_there_is(color, depth, series.values())}")
     if wheels is not None:
@@ -211,6 +245,21 @@ def _of_one_camera(
     if colors and depths:
         return min(product(colors, depths), key=rank)
     return _best(colors, _color_rank), min(depths, key=lambda one: one.topic.name, default=None)
+
+
+def _stereo_pairs(lefts: Sequence[Series], images: Sequence[Series]) -> list[tuple[Series, Series]]:
+    """Return the topics of left images with those of the right ones, by their names; rectified ones first."""
+    by_name = {one.topic.name: one for one in images}
+    found = [
+        (left, by_name[other])
+        for left in lefts
+        if (other := _SIDES.sub(_other_side, name := left.topic.name)) != name and other in by_name
+    ]
+    return sorted(found, key=lambda pair: ("rect" not in pair[0].topic.name, pair[0].topic.name))
+
+
+def _other_side(side: re.Match[str]) -> str:
+    return _OTHER_SIDE[side[0].lower()]
 
 
 def _best(topics: Sequence[Series], rank: Callable[[str], tuple[int, ...]]) -> Series | None:

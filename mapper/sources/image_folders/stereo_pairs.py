@@ -1,0 +1,263 @@
+"""Folders of stereo pairs: EuRoC's (Burri et al. 2016), as of TUM-VI too, and KITTI's (Geiger et al. 2012).
+
+EuRoC keeps ``cam0`` and ``cam1`` with lists of images, ``imu0`` and the truth, maybe in ``mav0``; cameras are
+described by ``sensor.yaml`` in each or by Kalibr's ``*camchain*.yaml``. KITTI's pairs are rectified, in
+``image_2`` and ``image_3`` or grey in ``image_0`` and ``image_1``, with ``calib.txt``.
+"""
+
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from mapper.core.errors import SourceError
+from mapper.core.frames import Image
+from mapper.core.geometry import Array, Transform, inverse, transform
+from mapper.core.trajectory import Trajectory
+from mapper.runtime.regular_files import read_text
+from mapper.sources.base import ImageFile, Log
+from mapper.sources.calibration import Calibration
+from mapper.sources.calibration_file import read_yaml
+from mapper.sources.config import SourceConfig
+from mapper.sources.image_files.reading import read_colour, read_grey
+from mapper.sources.image_folders.pairing import ImageList, pair_images
+from mapper.sources.image_folders.rgbd import FramePair, first_size, rgbd_log
+from mapper.sources.imu_files import read_euroc_imu
+from mapper.sources.listed_files import within
+from mapper.sources.scan_stamps import Wording, in_order, scan_stamps
+from mapper.sources.stereo import StereoCamera, rectified_pair, rectify
+from mapper.sources.text import parse_numbers, parse_stamp, pose_from_matrix, rows, time_order, truth_from
+from mapper.sources.trajectory_files import read_kitti, read_tum
+
+_TRUTH = ("state_groundtruth_estimate0", "mocap0")
+_KITTI = (("image_2", "image_3"), ("image_0", "image_1"))
+_CAMERA_SECTION = re.compile(r"^cam(\d):[ \t]*\n((?:[ \t]+.*\n?|\s*\n)+)", re.MULTILINE)
+_POSES = {"T_BS": False, "T_cam_imu": True}
+"""Keys of a camera's pose in the unit's body, and whether it is the inverse."""
+
+
+def recognise(path: Path) -> bool:
+    """Return whether a path is a folder of one of the two layouts."""
+    return _euroc(path) is not None or _kitti(path) is not None
+
+
+def read_log(path: Path, config: SourceConfig) -> Log:
+    """Return the log of a folder of stereo pairs; the body is the left camera, rectified.
+
+    Raises:
+        SourceError: No two images pair, a file is malformed, or the cameras are unknown.
+        DataError: A line of the truth is malformed.
+    """
+    folder = _euroc(path)
+    return _kitti_log(path, config) if folder is None else _euroc_log(path, folder, config)
+
+
+def stereo_log(
+    left: ImageList,
+    right: ImageList,
+    camera: StereoCamera,
+    config: SourceConfig,
+    *,
+    path: Path,
+    kind: str,
+    truth: tuple[Trajectory | None, Iterable[str]],
+    notes: Sequence[str],
+) -> Log:
+    """Return the log of left images that have a right one; arguments as of ``rgbd_log``."""
+    pairs, pair_notes = pair_images(left, right, config, path=path, names=("left", "right"))
+    return replace(
+        rgbd_log(
+            [_frame(pair, camera) for pair in pairs],
+            camera.calibration,
+            depth_units_per_m=camera.units_per_m,
+            path=path,
+            name=path.resolve().name,
+            kind=kind,
+            truth=truth,
+            notes=[*notes, *pair_notes, camera.note],
+        ),
+        depth_noise=camera.noise,
+    )
+
+
+def _frame(pair: FramePair, camera: StereoCamera) -> FramePair:
+    """Return the pair of an image and its depth that a pair of a left and a right image becomes."""
+    left, right = partial(_read, pair.colour), partial(_read, pair.depth)
+    return replace(
+        pair,
+        colour=pair.colour if camera.maps is None else camera.image_of(left, pair.colour),
+        depth=camera.depth_of(left, right, pair.depth),
+    )
+
+
+def _read(file: ImageFile, in_colour: bool) -> Image:
+    return read_colour(file) if in_colour else read_grey(file)
+
+
+def _euroc(path: Path) -> Path | None:
+    """Return the folder of EuRoC's ``cam0`` and ``cam1``; None if there is none."""
+    lists = [f"cam{k}/data.csv" for k in (0, 1)]
+    folders = (path, path / "mav0")
+    return next((folder for folder in folders if all((folder / name).is_file() for name in lists)), None)
+
+
+def _euroc_log(path: Path, folder: Path, config: SourceConfig) -> Log:
+    notes: list[str] = []
+    left, right = (_listed(folder / name, notes) for name in ("cam0", "cam1"))
+    size_px, reason = first_size(left.paths, read_grey)
+    if size_px is None:
+        raise SourceError(
+            f"{folder / 'cam0'}: none of {len(left.paths)} images can be read; the first: {reason}"
+        )
+    (left_camera, T_imu_left), (right_camera, T_imu_right) = _euroc_cameras(path, folder)
+    camera = rectify(left_camera, right_camera, inverse(T_imu_left) @ T_imu_right, size_px)
+    T_imu_body = T_imu_left @ camera.T_left_rectified
+    truth, truth_notes = _euroc_truth(folder, T_imu_body)
+    log = stereo_log(
+        left, right, camera, config, path=path, kind="euroc", truth=(truth, truth_notes), notes=notes
+    )
+    readings = folder / "imu0" / "data.csv"
+    if not readings.is_file():
+        return log
+    gyroscope, accelerations, imu_notes = read_euroc_imu(readings)
+    R_body_imu = T_imu_body[:3, :3].T
+    if gyroscope is not None:
+        gyroscope = replace(gyroscope, R_body_imu=R_body_imu)
+    if accelerations is not None:
+        turned_mps2 = accelerations.acceleration_mps2 @ R_body_imu.T
+        accelerations = replace(accelerations, acceleration_mps2=turned_mps2, are_axes_stated=True)
+    return replace(log, gyroscope=gyroscope, accelerations=accelerations, notes=[*log.notes, *imu_notes])
+
+
+def _listed(folder: Path, notes: list[str]) -> ImageList:
+    """Return the images of EuRoC's ``data.csv``: lines of nanoseconds and a name in ``data``."""
+    path, stamps_ns, paths = folder / "data.csv", [], []
+    for number, words in rows(path, separator=","):
+        where = f"{path}:{number}"
+        if len(words) != 2:
+            raise SourceError(f"{where}: {len(words)} columns, want 2: stamp in nanoseconds, filename")
+        stamps_ns.append(parse_stamp(f"{words[0]}e-9", where=where))
+        paths.append(within(folder / "data", words[1], where=where))
+    if not paths:
+        raise SourceError(f"{path}: empty list; want lines of: stamp in nanoseconds, filename")
+    stamps = np.array(stamps_ns, np.int64)
+    order, order_notes = time_order(stamps, what=f"{folder.name}/{path.name}")
+    notes += order_notes
+    return ImageList(stamps[order], [paths[i] for i in order])
+
+
+@dataclass(frozen=True, slots=True)
+class _Described:
+    """Text that describes a camera, and its place for messages."""
+
+    text: str
+    where: str
+
+
+def _euroc_cameras(path: Path, folder: Path) -> list[tuple[Calibration, Transform]]:
+    """Return both cameras and their poses in the body of the recording unit."""
+    files = [folder / f"cam{k}" / "sensor.yaml" for k in (0, 1)]
+    if all(file.is_file() for file in files):
+        described = [_Described(read_text(file, error=SourceError), f"{file}") for file in files]
+    else:
+        chains = [found for place in dict.fromkeys((path, folder, path / "dso")) for found in _chains(place)]
+        if not chains:
+            raise SourceError(f"{path}: no cam0/sensor.yaml and cam1/sensor.yaml, and no *camchain*.yaml")
+        sections = dict(_CAMERA_SECTION.findall(read_text(chains[0], error=SourceError)))
+        if not {"0", "1"} <= sections.keys():
+            raise SourceError(f"{chains[0]}: want cameras cam0 and cam1")
+        described = [_Described(sections[k], f"{chains[0]}: cam{k}") for k in ("0", "1")]
+    return [(read_yaml(one.text, one.where), _pose_in_unit(one)) for one in described]
+
+
+def _chains(folder: Path) -> list[Path]:
+    return sorted(path for path in folder.glob("*camchain*.yaml") if path.is_file())
+
+
+def _pose_in_unit(described: _Described) -> Transform:
+    for key, is_inverse in _POSES.items():
+        _, found, rest = described.text.partition(f"{key}:")
+        if not found:
+            continue
+        numbers = re.findall(r"[-+]?\d+\.?\d*(?:[eE][-+]?\d+)?", re.sub(r"(?:cols|rows):\s*\d+", "", rest))
+        T = pose_from_matrix(np.array(numbers[:16], np.float64).reshape(4, 4)) if len(numbers) >= 16 else None
+        if T is None:
+            raise SourceError(f"{described.where}: {key} is no rigid motion of 16 numbers")
+        return inverse(T) if is_inverse else T
+    raise SourceError(f"{described.where}: want the camera's pose, {' or '.join(_POSES)}")
+
+
+def _euroc_truth(folder: Path, T_imu_body: Transform) -> tuple[Trajectory | None, list[str]]:
+    path = next((file for name in _TRUTH if (file := folder / name / "data.csv").is_file()), None)
+    if path is None:
+        return None, []
+    truth = read_tum(path)
+    return replace(truth, T_world_body=truth.T_world_body @ T_imu_body), []
+
+
+def _kitti(path: Path) -> tuple[Path, Path] | None:
+    """Return the folders of a sequence's left and right images; None if there are none."""
+    if not (path / "calib.txt").is_file():
+        return None
+    pairs = ((path / left, path / right) for left, right in _KITTI)
+    return next((pair for pair in pairs if all(any(folder.glob("*.png")) for folder in pair)), None)
+
+
+def _kitti_log(path: Path, config: SourceConfig) -> Log:
+    folders = _kitti(path)
+    if folders is None:
+        raise SourceError(f"{path}: neither EuRoC's nor KITTI's stereo pairs")
+    left, right = (in_order(folder.glob("*.png")) for folder in folders)
+    if [file.name for file in left] != [file.name for file in right]:
+        raise SourceError(
+            f"{folders[0]}, {folders[1]}: not the same names; {len(left)} and {len(right)} images"
+        )
+    times, truth_file = path / "times.txt", path / "poses.txt"
+    stamps_ns, notes = scan_stamps(
+        left,
+        chosen=None,
+        beside=times if times.is_file() else None,
+        rate_hz=config.rate_hz,
+        wording=Wording("pairs", stamps_file="times.txt"),
+    )
+    size_px, reason = first_size(left, read_grey)
+    if size_px is None:
+        raise SourceError(f"{folders[0]}: none of {len(left)} images can be read; the first: {reason}")
+    P_left, P_right = (_projection(path / "calib.txt", f"P{folder.name[-1]}") for folder in folders)
+    calibration = Calibration(
+        f"{path / 'calib.txt'}", P_left[0, 0], P_left[1, 1], P_left[0, 2], P_left[1, 2], size_px=size_px
+    )
+    camera = rectified_pair(calibration, (P_left[0, 3] - P_right[0, 3]) / P_left[0, 0], size_px)
+    order, order_notes = time_order(stamps_ns, what="pairs")
+    truth, truth_notes = None, list[str]()
+    if truth_file.is_file():
+        poses = read_kitti(truth_file).T_world_body
+        if len(poses) != len(left):
+            raise SourceError(f"{truth_file}: {len(poses)} poses for {len(left)} pairs of images")
+        t_left_camera0 = np.linalg.solve(P_left[:, :3], P_left[:, 3]).astype(np.float64)
+        T_camera0_left = transform(np.eye(3), -t_left_camera0)
+        posed = zip(stamps_ns.tolist(), poses @ T_camera0_left, strict=True)
+        truth, truth_notes = truth_from(list(posed), what=truth_file.name)
+    return stereo_log(
+        ImageList(stamps_ns[order], [left[i] for i in order]),
+        ImageList(stamps_ns[order], [right[i] for i in order]),
+        camera,
+        config,
+        path=path,
+        kind="kitti-stereo",
+        truth=(truth, truth_notes),
+        notes=[*notes, *order_notes],
+    )
+
+
+def _projection(path: Path, name: str) -> Array:
+    for number, words in rows(path):
+        if words[0].rstrip(":") == name:
+            where = f"{path}:{number}"
+            if len(words) != 13:
+                raise SourceError(f"{where}: {len(words) - 1} numbers, want 12: a 3×4 projection")
+            return parse_numbers(words[1:], where=where).reshape(3, 4)
+    raise SourceError(f"{path}: no line {name}:, the projection of a camera")

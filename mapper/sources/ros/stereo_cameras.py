@@ -1,0 +1,66 @@
+"""Stereo cameras of a recording, by their calibrations and tf."""
+
+import numpy as np
+
+from mapper.core.errors import SourceError
+from mapper.core.geometry import Array, nearest_rotation, transform
+from mapper.sources.image_files.image_sizes import Size
+from mapper.sources.ros.cameras import calibration_of
+from mapper.sources.ros.index import Series
+from mapper.sources.ros.messages import CameraMessage, frame_of
+from mapper.sources.ros.reader import RecordingReader
+from mapper.sources.ros.topics import StereoTopics
+from mapper.sources.stereo import StereoCamera, rectified_pair, rectify
+
+
+def stereo_camera(reader: RecordingReader, topics: StereoTopics, *, size_px: Size) -> StereoCamera:
+    """Return the camera of a pair's frames: the rectified left one.
+
+    The right camera's place is that of its projection (CameraInfo's P), or else of tf. Images of a topic
+    without "rect" in its name are raw, and are rectified.
+
+    Raises:
+        SourceError: A camera or its place is unknown, or the cameras do not lie side by side.
+    """
+    where, name = reader.recording.path, topics.left.topic.name
+    left, right = (_info(reader, one) for one in (topics.left_info, topics.right_info))
+    if left is None or right is None or topics.left_info is None or topics.right_info is None:
+        missing = topics.left if left is None else topics.right
+        raise SourceError(
+            f"{where}: stereo images {name} and {topics.right.topic.name}: no camera info for "
+            f"{missing.topic.name}; record both, or depth images"
+        )
+    is_rectified = "rect" in name
+    left_camera, right_camera = (
+        calibration_of(info, size_px, is_rectified=is_rectified, name=series.topic.name)
+        for info, series in ((left, topics.left_info), (right, topics.right_info))
+    )
+    baseline_m = -right.P[3] / right.P[0] if right.P.size == 12 and right.P[0] > 0.0 else 0.0
+    of_tf = reader.tree.find(
+        *(frame_of(reader.firsts.get(one.topic.name)) for one in (topics.left, topics.right))
+    )
+    if baseline_m != 0.0:
+        if is_rectified:
+            return rectified_pair(left_camera, baseline_m, size_px)
+        R_left, R_right = (_rotation(info) for info in (left, right))
+        T_left_right = transform(R_left.T @ R_right, R_left.T @ np.array([baseline_m, 0.0, 0.0]))
+    elif of_tf is None or not of_tf[:3, 3].any():
+        raise SourceError(
+            f"{where}: how far {topics.right.topic.name} is from {name} is unknown: P[3] of "
+            f"{topics.right_info.topic.name} is 0, and tf does not say it; record /tf_static too"
+        )
+    elif is_rectified:
+        return rectified_pair(left_camera, float(of_tf[0, 3]), size_px)
+    else:
+        T_left_right = of_tf
+    return rectify(left_camera, right_camera, T_left_right, size_px)
+
+
+def _info(reader: RecordingReader, series: Series | None) -> CameraMessage | None:
+    info = series and reader.firsts.get(series.topic.name)
+    return info if isinstance(info, CameraMessage) else None
+
+
+def _rotation(info: CameraMessage) -> Array:
+    """Return the rotation to the rectified camera's axes; none where the calibration leaves it out."""
+    return nearest_rotation(info.R.reshape(3, 3)) if info.R.size == 9 and info.R.any() else np.eye(3)

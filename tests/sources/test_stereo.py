@@ -1,0 +1,148 @@
+"""Stereo pairs: rectified and matched as they are read, of data sets' folders and of recordings."""
+
+import cv2
+import numpy as np
+import pytest
+
+from mapper.core.errors import SourceError
+from mapper.core.geometry import angle_between, apply, inverse
+from mapper.sensing.stereo import stereo_depth_m
+from mapper.sources import open_source
+from mapper.sources.writers import write_log
+from tests.support.recordings import transforms, write
+from tests.support.stereo_rig import (
+    BARREL,
+    FISHEYE,
+    NORMAL_WORLD,
+    OFFSET_M,
+    RECTIFIED,
+    SIZE_PX,
+    T_IMU_LEFT,
+    poses_world,
+    recorded,
+    write_euroc,
+    write_imu,
+    write_kitti,
+)
+
+RECT = ("/stereo/left/image_rect", "/stereo/right/image_rect")
+RAW = ("/stereo/left/image_raw", "/stereo/right/image_raw")
+
+
+def projections(baseline_m, camera=RECTIFIED[0]):
+    K = camera.matrix
+    return [np.column_stack([K, K @ [-x, 0.0, 0.0]]) for x in (0.0, baseline_m)]
+
+
+def off_wall_m(frame, T_world_body):
+    """Return the distances of a frame's points from the wall; most pixels have one."""
+    points_world = apply(T_world_body, frame.scan().points_body.astype(np.float64))
+    assert len(points_world) > 0.6 * frame.depth_m.size
+    return points_world @ NORMAL_WORLD - OFFSET_M
+
+
+def assert_shows_wall(log, poses=None):
+    poses = log.truth.T_world_body if poses is None else poses
+    for frame, T_world_body in zip(log, poses, strict=True):
+        off_m = off_wall_m(frame, T_world_body)
+        assert abs(np.median(off_m)) < 0.01
+        sigma_m = log.depth_noise.quadratic_per_m * OFFSET_M**2
+        assert np.percentile(np.abs(off_m), 90) < 1.5 * sigma_m
+
+
+@pytest.mark.parametrize(("cameras", "kalibr"), [(BARREL, False), (FISHEYE, True)])
+def test_euroc_folder_shows_the_wall_from_the_true_poses(tmp_path, cameras, kalibr):
+    log = open_source(write_euroc(tmp_path / "log", cameras, kalibr=kalibr))
+    assert (log.kind, log.sensor, len(log)) == ("euroc", "rgbd", 2)
+    assert_shows_wall(log)
+    camera = log[0].camera
+    assert camera.fx_px == camera.fy_px
+    baseline_m = np.linalg.norm(cameras[1].T_left_camera[:3, 3])
+    assert log.depth_noise.quadratic_per_m == pytest.approx(0.3 / (camera.fx_px * baseline_m), rel=1e-3)
+
+
+def test_euroc_readings_come_with_their_mounting(tmp_path):
+    folder = write_euroc(tmp_path / "log", BARREL)
+    write_imu(folder, 50)
+    log = open_source(folder / "mav0")
+    R_body_imu, felt_mps2 = log.gyroscope.R_body_imu, log.accelerations.acceleration_mps2
+    left_turned = angle_between(R_body_imu, T_IMU_LEFT[:3, :3].T)
+    assert left_turned < 0.05  # the rectified camera is little turned against the raw one
+    up_body = log.truth.T_world_body[0, :3, :3].T @ [0.0, -1.0, 0.0]
+    np.testing.assert_allclose(felt_mps2[0] / 9.81, up_body, atol=1e-6)
+    assert log.accelerations.are_axes_stated
+
+
+def test_kitti_folder_shows_the_wall_from_the_true_poses(tmp_path):
+    log = open_source(write_kitti(tmp_path / "00"))
+    assert log.kind == "kitti-stereo"
+    assert log.stamps_ns.tolist() == [0, 100_000_000]
+    assert_shows_wall(log)
+    np.testing.assert_array_equal(log[0].gray, cv2.imread(str(tmp_path / "00/image_0/000000.png"), 0))
+
+
+def test_converted_log_has_the_same_depth(tmp_path):
+    log = open_source(write_kitti(tmp_path / "00"))
+    write_log(log, tmp_path / "tum", kind="tum")
+    for found, wanted in zip(open_source(tmp_path / "tum"), log, strict=True):
+        np.testing.assert_allclose(found.depth_m, wanted.depth_m, atol=1e-3)
+        np.testing.assert_array_equal(found.image, wanted.image)
+
+
+def test_rectified_topics_have_the_baseline_in_their_projections(tmp_path):
+    log = open_source(write(tmp_path / "bag", recorded(RECTIFIED, RECT, projections=projections(0.12))))
+    assert_shows_wall(log, poses_world(2))
+    assert RECT[1] in log.notes[0]
+
+
+def test_raw_topics_are_rectified_by_their_calibrations(tmp_path):
+    left, right = BARREL
+    T_right_left = inverse(right.T_left_camera)
+    R_left, R_right, P_left, P_right, *_ = cv2.stereoRectify(
+        *(left.matrix, np.array(left.distortion), right.matrix, np.array(right.distortion)),
+        *(SIZE_PX, T_right_left[:3, :3].copy(), T_right_left[:3, 3:].copy()),
+    )
+    messages = recorded(BARREL, RAW, projections=(P_left, P_right), rotations=(R_left, R_right))
+    log = open_source(write(tmp_path / "raw.bag", messages))
+    T_left_rectified = np.eye(4)
+    T_left_rectified[:3, :3] = R_left.T
+    assert_shows_wall(log, [T @ T_left_rectified for T in poses_world(2)])
+
+
+def test_tf_says_where_the_right_camera_is(tmp_path):
+    messages = recorded(RECTIFIED, RECT, projections=projections(0.0))
+    place = transforms(("optical0", "optical1", RECTIFIED[1].T_left_camera))
+    assert_shows_wall(open_source(write(tmp_path / "with.mcap", [place, *messages])), poses_world(2))
+    with pytest.raises(SourceError, match="tf"):
+        open_source(write(tmp_path / "without.mcap", messages))
+
+
+def test_what_is_missing_or_swapped_is_named(tmp_path):
+    messages = recorded(RECTIFIED, RECT, projections=projections(0.12))
+    with pytest.raises(SourceError, match="/stereo/right/image_rect"):
+        open_source(
+            write(tmp_path / "a", [one for one in messages if one.topic != "/stereo/right/camera_info"])
+        )
+    with pytest.raises(SourceError, match=r"-0\.12"):
+        open_source(write(tmp_path / "b", recorded(RECTIFIED, RECT, projections=projections(-0.12))))
+    folder = write_euroc(tmp_path / "c", BARREL)
+    (folder / "mav0/cam1/sensor.yaml").unlink()
+    with pytest.raises(SourceError, match="camchain"):
+        open_source(folder)
+    folder = write_euroc(tmp_path / "d", BARREL[::-1])
+    with pytest.raises(SourceError, match="right"):
+        open_source(folder)
+    folder = write_kitti(tmp_path / "e")
+    (folder / "image_1/000001.png").unlink()
+    with pytest.raises(SourceError, match="image_1"):
+        open_source(folder)
+
+
+def test_points_that_the_right_camera_does_not_see_have_no_depth():
+    left = np.random.default_rng(1).integers(0, 255, (60, 160), np.uint8)
+    left = cv2.GaussianBlur(left, (0, 0), 1.0)
+    right = np.roll(left, -8, axis=1)
+    right[:, -8:] = 0
+    depth_m = stereo_depth_m(left, right, focal_baseline_px_m=16.0)
+    assert (depth_m[:, :32] == 0.0).all()
+    assert np.median(depth_m[:, 40:]) == pytest.approx(2.0, abs=0.01)
