@@ -2,7 +2,7 @@
 
 import struct
 from array import array
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 
@@ -17,11 +17,13 @@ from mapper.sources.ros import decode_foxglove
 from mapper.sources.ros.decode import decode, decompressed
 from mapper.sources.ros.image_messages import size_of
 from mapper.sources.ros.imu_messages import readings_of
-from mapper.sources.ros.messages import IMUS, READ, SMALL, WITH_HEADER, ImageMessage, Message
+from mapper.sources.ros.messages import CLOUDS, IMUS, READ, SMALL, WITH_HEADER, ImageMessage, Message
 from mapper.sources.ros.recording import Place, Recording, Topic
 
 _TRIED = 10
 _KEPT_BYTES = 32 * MIB
+_FRAME_OFFSET = 12  # after a counter (ROS 1) or the encapsulation (CDR), seconds and nanoseconds
+_LONGEST_FRAME = 256  # bytes
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -34,7 +36,9 @@ class Series:
         log_ns: (N,) when they were recorded.
         places: (N, 3) block, offset and length of each.
         undated: Number of others without a header that can be read; they are left out.
-        are_stamps_recorded: ``stamps_ns`` is ``log_ns``, because every header has the same stamp.
+        restamped: Number of headers without a stamp of their own, whose ``stamps_ns`` are of the recording.
+        frames: Coordinate frames that a cloud's headers name, in order of appearance.
+        frame_numbers: (N,) index of each cloud's in ``frames``; (0,) of other types.
         kept: Bytes of small messages by their number: to read them again would unpack the whole file again.
         imu: (N, 6) angular velocity and acceleration of an IMU's messages, NaN of damaged ones; (0, 6) of
             other types.
@@ -45,7 +49,9 @@ class Series:
     log_ns: Stamps
     places: NDArray[np.int64]
     undated: int
-    are_stamps_recorded: bool = False
+    restamped: int = 0
+    frames: Sequence[str] = ()
+    frame_numbers: NDArray[np.intp] = field(default_factory=lambda: np.empty(0, np.intp))
     kept: Mapping[int, bytes] = field(default_factory=dict)
     imu: Array = field(default_factory=lambda: np.empty((0, 6)))
 
@@ -72,6 +78,8 @@ class _SeriesBuilder:
     undated: int = 0
     kept: dict[int, bytes] = field(default_factory=dict)
     imu: "array[float]" = field(default_factory=lambda: array("d"))
+    frames: dict[str, int] = field(default_factory=dict)
+    frame_numbers: "array[int]" = field(default_factory=lambda: array("q"))
 
 
 def index_of(recording: Recording) -> Mapping[str, Series]:
@@ -94,6 +102,9 @@ def index_of(recording: Recording) -> Mapping[str, Series]:
         elif topic.type in SMALL and len(data) <= room_bytes:
             series.kept[len(series.stamps_ns)] = bytes(data)
             room_bytes -= len(data)
+        elif topic.type in CLOUDS and topic.encoding in ("cdr", "ros1"):
+            frame = _header_frame(topic, data)
+            series.frame_numbers.append(series.frames.setdefault(frame, len(series.frames)))
         series.stamps_ns.append(stamp_ns)
         series.log_ns.append(log_ns)
         series.places.extend(place)
@@ -106,17 +117,35 @@ def index_of(recording: Recording) -> Mapping[str, Series]:
 
 def _finished(topic: Topic, series: _SeriesBuilder) -> Series:
     stamps_ns, log_ns = np.array(series.stamps_ns, np.int64), np.array(series.log_ns, np.int64)
-    are_all_the_same = len(stamps_ns) > 1 and bool((stamps_ns == stamps_ns[0]).all())
+    is_unset = _are_unset(stamps_ns, log_ns)
+    if is_unset.any():
+        clock_ns = np.int64(np.median((stamps_ns - log_ns)[~is_unset])) if not is_unset.all() else 0
+        stamps_ns = np.where(is_unset, log_ns + clock_ns, stamps_ns)
     return Series(
         topic,
-        stamps_ns=log_ns if are_all_the_same else stamps_ns,
+        stamps_ns=stamps_ns,
         log_ns=log_ns,
         places=np.array(series.places, np.int64).reshape(-1, 3),
         undated=series.undated,
-        are_stamps_recorded=are_all_the_same and not np.array_equal(stamps_ns, log_ns),
+        restamped=int(is_unset.sum()),
+        frames=tuple(series.frames),
+        frame_numbers=np.array(series.frame_numbers, np.intp),
         kept=series.kept,
         imu=np.array(series.imu, np.float64).reshape(-1, 6),
     )
+
+
+def _are_unset(stamps_ns: Stamps, log_ns: Stamps) -> NDArray[np.bool_]:
+    """Return which stamps their driver has not set: 0 unlike the others', or all where most are repeated."""
+    different, recorded = len(np.unique(stamps_ns)), len(np.unique(log_ns))
+    if different < recorded and (different == 1 or 2 * different < len(stamps_ns)):
+        return np.full(len(stamps_ns), True)
+    is_zero = stamps_ns == 0
+    if not is_zero.any() or is_zero.all():
+        return np.full(len(stamps_ns), False)
+    expected_ns = log_ns + np.int64(np.median((stamps_ns - log_ns)[~is_zero]))
+    unset: NDArray[np.bool_] = is_zero & (np.abs(expected_ns) > NS_PER_S)
+    return unset
 
 
 def first_messages(recording: Recording, series: Iterable[Series]) -> dict[str, Message]:
@@ -156,7 +185,7 @@ def _whole_message(recording: Recording, series: Series, i: int) -> Message:
 
 
 def stamp_of(topic: Topic, data: memoryview) -> int:
-    """Return the stamp with which a message with a header begins, nanoseconds.
+    """Return the stamp with which a message with a header begins, nanoseconds; 0 where it is no time.
 
     Raises:
         DataError: The message is too short to have one, or is written in an encoding that is not read.
@@ -170,4 +199,15 @@ def stamp_of(topic: Topic, data: memoryview) -> int:
         sec, nanosec = struct.unpack_from("<II", data, 4)
     else:  # CDR's own header of four bytes, whose second is the byte order
         sec, nanosec = struct.unpack_from("<iI" if data[1] & 1 else ">iI", data, 4)
-    return int(sec * NS_PER_S + nanosec)
+    return int(sec * NS_PER_S + nanosec) if nanosec < NS_PER_S else 0
+
+
+def _header_frame(topic: Topic, data: memoryview) -> str:
+    """Return the coordinate frame that a message's header names; empty if it is damaged."""
+    with suppress(DataError, struct.error):
+        data = decompressed(topic, data)
+        order = "<" if topic.encoding == "ros1" or data[1] & 1 else ">"
+        (length,) = struct.unpack_from(f"{order}I", data, _FRAME_OFFSET)
+        name = bytes(data[_FRAME_OFFSET + 4 :][: min(length, _LONGEST_FRAME)])
+        return name.rstrip(b"\0").decode(errors="replace").lstrip("/")
+    return ""

@@ -88,9 +88,10 @@ def _sound(series: Series) -> tuple[_Indices, list[str]]:
         off_ns = np.abs(stamps_ns[inner].astype(np.float64) - windows[:, _NEIGHBOURS // 2])
         is_sound[inner] = off_ns <= _MAX_STRAY_NS
     notes = []
-    if series.are_stamps_recorded:
+    if series.restamped:
         notes.append(
-            f"{series.topic.name}: every header has the same stamp; the times of recording are taken"
+            f"{series.topic.name}: {series.restamped} of {len(stamps_ns)} headers have no stamp of their "
+            "own; the times of recording are taken"
         )
     if wrong := series.undated + int((~is_sound).sum()):
         notes.append(

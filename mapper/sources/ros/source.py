@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mapper.core.errors import SourceError
+from mapper.core.errors import SourceError, listed
 from mapper.core.frames import Sensor
 from mapper.core.timebase import NS_PER_S, Stamps
 from mapper.core.units import MM_PER_M
@@ -243,6 +243,15 @@ def _lidar(reader: RecordingReader, clouds: Series, config: SourceConfig) -> _Fr
     def entry_at(index: int) -> FrameRef:
         return CloudEntry(reader.located(clouds, int(i[index])), body, tree, config.cloud_scale)
 
+    is_apart = np.array([reader.tree.find(body, one) is None for one in clouds.frames], np.bool_)
+    if is_apart.any():
+        left_out = is_apart[clouds.frame_numbers]
+        names = listed([one for one, apart in zip(clouds.frames, is_apart, strict=True) if apart])
+        notes.append(
+            f"{clouds.topic.name}: {left_out.sum()} of {len(clouds)} clouds are in frames that tf does not "
+            f"connect to {body}; left out: {names}; record /tf_static too"
+        )
+        i = i[~left_out[i]]
     tree = reader.tree_of(body, frame)
     return _Frames("lidar", body, clouds.stamps_ns[i], entry_at, notes)
 
