@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mapper.cli.answer import Answer, Output, untrusted
+from mapper.cli.answer import Answer, Output, rows_text, untrusted
 from mapper.cli.completion import run_folders
 from mapper.cli.environment import note_compilation
 from mapper.cli.options import (
@@ -29,6 +29,7 @@ from mapper.cli.options import (
     selection,
 )
 from mapper.core.errors import ConfigError, ViewerError
+from mapper.runtime.profiler import Profiler
 from mapper.runtime.result_paths import RUNS, name_of, place_of
 
 if TYPE_CHECKING:
@@ -87,6 +88,12 @@ def build(
     step: Annotated[
         bool, typer.Option("--step", help="With --rerun: wait for Enter after each frame.")
     ] = False,
+    profile: Annotated[
+        bool,
+        typer.Option(
+            "--profile", help="Print what a frame costs in each stage; write samples for speedscope.app."
+        ),
+    ] = False,
     *,
     output: Output,
 ) -> Answer:
@@ -97,27 +104,49 @@ def build(
     out = place_of(out, RUNS / name_of(log), overwrite=overwrite)
     overrides = merged(selection(first, last, stride, require_truth), set_)
     make_observer = observer_factory(rerun, step=step, overwrite=overwrite)
+    profiler = Profiler(output.progress(prompts=step)) if profile else None
     if onto is None:
-        run = built(
-            log,
-            config,
-            overrides,
-            out,
-            overwrite=overwrite,
-            fresh=fresh,
-            output=output,
-            prompts=step,
-            make_observer=make_observer,
-        )
+        with profiler or nullcontext():
+            run = built(
+                log,
+                config,
+                overrides,
+                out,
+                overwrite=overwrite,
+                fresh=fresh,
+                output=output,
+                progress=profiler or output.progress(prompts=step),
+                make_observer=make_observer,
+            )
     else:
         refuse_with("--onto", {"--config": config}, remedy="give single settings by --set")
         refuse_with("--onto", {"--rerun": rerun}, remedy="look at the new run with mapper view")
-        refuse_with("--onto", {"--fresh": fresh})
+        refuse_with("--onto", {"--fresh": fresh, "--profile": profile})
         run = appended(log, onto, overrides, out, overwrite=overwrite, output=output)
     from mapper.cli.summary import summary_of  # a build begins without what its end needs
 
     error = untrusted(run.path, run.verdict) if strict else None
-    return replace(summary_of(run), error=error)
+    answer = replace(summary_of(run), error=error)
+    return answer if profiler is None else _with_profile(answer, profiler, run.path)
+
+
+def _with_profile(answer: Answer, profiler: Profiler, run: Path) -> Answer:
+    """Write the samples beside a run, and return its answer with the time of each stage."""
+    file = run.with_name(f"{run.name}.speedscope.json")
+    profiler.write(file, name=run.name)
+    stages = profiler.stages()
+    rows = [
+        f"{name}: {one['items']} items in {one['total_s']:.1f} s, {one['median_ms']:.1f} ms each (median), "
+        f"95 % within {one['p95_ms']:.1f} ms"
+        for name, one in stages.items()
+    ]
+    lines = rows_text([("profile", rows[0]), *(("", row) for row in [*rows[1:], f"{file}"])])
+    return replace(
+        answer,
+        document={**answer.document, "profile": {"stages": stages, "file": file}},
+        text=f"{answer.text}\n{lines}",
+        details=f"{answer.details}\n{lines}",
+    )
 
 
 def built(
@@ -129,7 +158,7 @@ def built(
     overwrite: bool,
     output: Output,
     fresh: bool = False,
-    prompts: bool = False,
+    progress: "Progress | None" = None,
     make_observer: "ObserverFactory | None" = None,
 ) -> "Run":
     """Build a run of a log."""
@@ -140,7 +169,7 @@ def built(
 
     source = open_source(log, load_source_config(config_file, overrides))
     config = load_config(config_file, overrides, sensor=source.sensor)
-    progress = output.progress(prompts=prompts)
+    progress = progress or output.progress()
     note_compilation(progress)
     for note in source.notes:
         progress.note(note)

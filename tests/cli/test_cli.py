@@ -78,6 +78,15 @@ def test_build_prints_a_table(desk_log, tmp_path):
     assert (source.first_frame, source.last_frame, source.stride, source.require_truth) == (3, 24, 2, False)
 
 
+def test_a_profiled_build_tells_what_a_frame_costs(desk_log, tmp_path):
+    out = tmp_path / "run"
+    answer = json.loads(mapper("build", desk_log, "--out", out, "--last", 14, "--profile", "--json").stdout)
+    stages = answer["profile"]["stages"]
+    assert (stages["track"]["items"], stages["fuse"]["items"]) == (15, 15)
+    profiles = json.loads((tmp_path / "run.speedscope.json").read_text())["profiles"]
+    assert "MainThread" in {profile["name"] for profile in profiles}
+
+
 def test_without_rerun_a_map_is_looked_at_in_a_browser(run_folder, tmp_path):
     code = (
         "import sys; from importlib.abc import MetaPathFinder\n"
