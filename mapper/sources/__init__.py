@@ -7,7 +7,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mapper.core.errors import SourceError
+from mapper.core.errors import SourceError, listed
 from mapper.runtime.atomic import MANIFEST_NAME
 from mapper.runtime.regular_files import reads
 from mapper.sources.config import SourceConfig
@@ -133,5 +133,5 @@ def _inner_hint(path: Path) -> str:
         with suppress(SourceError):  # of a file in it that cannot be read
             if format_of(inner):
                 return f"; {inner.name} in it is one"
-    bags = sorted(bag.name for bag in path.glob("*.bag"))
-    return f"; open one of {', '.join(bags[:_MOST_TRIED])}" if bags else ""
+    recordings = sorted(one.name for one in path.glob("*") if one.suffix in (".mcap", ".bag", ".db3"))
+    return f"; open one of {listed(recordings)}" if recordings else ""

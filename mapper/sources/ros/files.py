@@ -1,9 +1,11 @@
 """Recordings recognised by their names, and opened by the reader of their format."""
 
 import re
+from contextlib import suppress
 from pathlib import Path
 
 from mapper.core.errors import SourceError
+from mapper.runtime.regular_files import read_text
 from mapper.sources.base import Log
 from mapper.sources.config import SourceConfig
 from mapper.sources.listed_files import refuse_links_out
@@ -13,6 +15,7 @@ from mapper.sources.ros.source import recording_log
 
 _ENDINGS = (".mcap", ".bag", ".db3")
 _PACKED = ".zstd"
+_NAMED = re.compile(r"^\s*-\s*([^:\n]+\.(?:mcap|db3)(?:\.zstd)?)\s*$", re.MULTILINE)
 _IN_FOLDERS = (".mcap", ".db3", _PACKED, ".bag")
 
 
@@ -42,17 +45,39 @@ def open_recording(path: Path) -> Recording:
         return _opened(path)
     from mapper.sources.ros.ros2_bag import JoinedRecording
 
-    refuse_links_out(_parts(path), log=path)
+    files = _parts(path)
+    refuse_links_out(files, log=path)
     parts: list[Recording] = []
     lost: list[str] = []
-    for part in _parts(path):
+    for part in files:
         try:
             parts.append(_opened(part))
         except SourceError as error:
             lost.append(str(error))
     if not parts:
         raise SourceError(lost[0])
-    return JoinedRecording(path, parts, lost=lost)
+    lost += [
+        f"{name}: metadata.yaml names it, but it is not there"
+        for name in _named_by_rosbag2(path)
+        if not (path / name).exists()
+    ]
+    others = [one.name for one in path.glob("*") if one.suffix in _ENDINGS and one not in files]
+    lost += [f"{name}: another recording, which is not read; open it alone" for name in sorted(others)]
+    return JoinedRecording(path, sorted(parts, key=_begin_ns), lost=lost)
+
+
+def _begin_ns(part: Recording) -> int:
+    """Return when a recording begins: parts may be numbered in another order, or anew."""
+    first = next(part.messages(), None)
+    return 0 if first is None else first.log_ns
+
+
+def _named_by_rosbag2(folder: Path) -> list[str]:
+    """Return the files that a folder's metadata.yaml names."""
+    with suppress(SourceError):
+        text = read_text(folder / "metadata.yaml", error=SourceError)
+        return [Path(name).name for name in _NAMED.findall(text)]
+    return []
 
 
 def _opened(path: Path) -> Recording:
@@ -79,14 +104,16 @@ def _opened(path: Path) -> Recording:
 def _parts(folder: Path) -> list[Path]:
     """Return a folder's recordings in sequence, of the first kind that is there.
 
-    Names of ``rosbag record --split`` differ in their dates and numbers alone; other bags lie side by side by
-    chance, and are no parts.
+    Names of parts differ in their dates and numbers alone, or stand in metadata.yaml; other recordings lie
+    side by side by chance, and are no parts.
     """
     from mapper.sources.ros.ros2_bag import in_sequence
 
     for ending in _IN_FOLDERS:
         parts = [path for path in folder.glob(f"*{ending}") if path.is_file()]
-        names = {re.sub(r"\d+", "", path.stem) for path in parts}
-        if parts and (ending != ".bag" or len(names) == 1):
+        if len({re.sub(r"[\d_.-]+", "", path.stem) for path in parts}) > 1:
+            named = _named_by_rosbag2(folder)
+            parts = [path for path in parts if path.name in named]
+        if parts:
             return in_sequence(parts)
     return []

@@ -81,6 +81,37 @@ def test_a_folder_of_mcap_files_is_one_log(tmp_path):
     ]
 
 
+@pytest.mark.parametrize("ending", [".mcap", ".bag"])
+def test_parts_are_joined_in_the_order_in_which_they_were_recorded(tmp_path, ending):
+    messages = shots(6)
+    for number, part in enumerate((messages[6:], messages[:6])):
+        write(tmp_path / f"drive/drive_{number}{ending}", part)
+    source = open_source(tmp_path / "drive")
+    assert source.stamps_ns.tolist() == [FIRST_NS + i * PERIOD_NS for i in range(6)]
+    assert not any("set back" in note for note in source.notes)
+
+
+@pytest.mark.parametrize("ending", [".mcap", ".bag"])
+def test_recordings_of_other_names_are_no_parts_unless_rosbag2_lists_them(tmp_path, ending):
+    messages = shots(6)
+    for name, part in (("morning", messages[:6]), ("evening", messages[6:])):
+        write(tmp_path / f"drives/{name}{ending}", part)
+    with pytest.raises(SourceError, match=f"open one of evening{ending}, morning{ending}"):
+        open_source(tmp_path / "drives")
+    if ending == ".mcap":
+        files = "".join(f"  - {name}.mcap\n" for name in ("morning", "evening", "night"))
+        (tmp_path / "drives/metadata.yaml").write_text(f"relative_file_paths:\n{files}")
+        source = open_source(tmp_path / "drives")
+        assert len(source) == 6
+        assert sum("night.mcap" in note for note in source.notes) == 1
+
+
+def test_a_recording_of_another_kind_beside_the_parts_is_named(tmp_path):
+    write(tmp_path / "drive/drive_0.mcap", shots(3))
+    write(tmp_path / "drive/drive.bag", shots(3))
+    assert sum("drive.bag" in note for note in open_source(tmp_path / "drive").notes) == 1
+
+
 @pytest.mark.parametrize("storage", list(StoragePlugin))
 def test_messages_that_rosbag2_compressed_are_read(tmp_path, storage):
     writer = FolderWriter(tmp_path / "log", version=8, storage_plugin=storage)
