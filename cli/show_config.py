@@ -20,7 +20,7 @@ def show_config(
     config: ConfigFile = None,
     set_: Overrides = None,
     sensor: Annotated[
-        Literal["rgbd", "lidar"], typer.Option(help="Sensor whose defaults are used.")
+        Literal["rgbd", "lidar", "lidar-2d"], typer.Option(help="Sensor whose defaults are used.")
     ] = "rgbd",
     docs: Annotated[bool, typer.Option("--docs", help="Explain every setting.")] = False,
     *,

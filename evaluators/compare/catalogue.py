@@ -121,7 +121,7 @@ def shrunk(config: AnyConfig, ratio: float) -> AnyConfig:
 
 
 def _fitted(config: Any, sensor: Sensor) -> Any:
-    if sensor == "lidar":
+    if sensor != "rgbd":
         return config
     if isinstance(config, HoughConfig):
         return _hough_indoors(config)

@@ -231,7 +231,7 @@ class MethodJob:
         stamps_ns = np.array([entry.stamp_ns for entry in entries], np.int64)
         settings, reader = self.config.trials(self.source.sensor), FrameReader(self.config.rgbd)
         pairs = pairs_of(stamps_ns, truth, count=self.config.pairs, frames_apart=settings.frames_apart)
-        level = self.source.sensor == "lidar"
+        level = self.source.sensor != "rgbd"
         trials: list[Record] = []
         with self.progress.stage(f"{self.method} on pairs") as report:
             for done, pair in enumerate(pairs, start=1):

@@ -21,7 +21,7 @@ from mapper.mapping.placed_frames import placed_frames
 from mapper.runtime.progress import SILENT, Progress
 from mapper.sources.base import Log
 
-RADIUS_M: dict[Sensor, float] = {"rgbd": 0.2, "lidar": 0.5}
+RADIUS_M: dict[Sensor, float] = {"rgbd": 0.2, "lidar": 0.5, "lidar-2d": 0.2}
 """Radius of the patches: small enough for walls to be flat, large against the errors of poses."""
 
 _FRAMES, _POINTS, _PATCHES = 100, 200_000, 5_000

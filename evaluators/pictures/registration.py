@@ -31,11 +31,13 @@ from mapper.registration.kd_tree import kd_tree
 _DRAWN = 60_000
 _MIN_ROW_IN = 0.8
 _MARGIN = 0.05
+_OF_SCANS = {
+    "from above": np.array([[1.0, 0, 0], [0, 1, 0]]),
+    "from the side": np.array([[1.0, 0, 0], [0, 0, 1]]),
+}
 _VIEWS: dict[Sensor, dict[str, Array]] = {
-    "lidar": {
-        "from above": np.array([[1.0, 0, 0], [0, 1, 0]]),
-        "from the side": np.array([[1.0, 0, 0], [0, 0, 1]]),
-    },
+    "lidar": _OF_SCANS,
+    "lidar-2d": _OF_SCANS,
     "rgbd": {
         "from above": np.array([[1.0, 0, 0], [0, 0, 1]]),
         "from the side": np.array([[0.0, 0, 1], [0, -1, 0]]),

@@ -226,14 +226,14 @@ def _resolved(
 def _misfit(config: BuildConfig, source: Log) -> str:
     """Return why a log cannot be built so; empty if it can."""
     odometry, loops = config.odometry, config.loops
-    if source.sensor == "lidar" and isinstance(odometry, IsvdOdometryConfig | KeyframeOdometryConfig):
+    if source.sensor != "rgbd" and isinstance(odometry, IsvdOdometryConfig | KeyframeOdometryConfig):
         return f"odometry.kind={odometry.kind} needs images"
     if odometry.kind == "wheels" and source.wheels is None:
         return "odometry.kind=wheels needs wheels"
     has_poses = source.truth is not None or source.device_poses is not None
     if odometry.kind == "given" and odometry.path is None and not has_poses:
         return "odometry.kind=given needs truth or device poses"
-    sees_scans = source.sensor == "lidar" or isinstance(odometry, ScanOdometryConfig)
+    sees_scans = source.sensor != "rgbd" or isinstance(odometry, ScanOdometryConfig)
     if sees_scans and isinstance(loops, _IMAGE_LOOPS):
         return f"loops.kind={loops.kind} needs images, odometry.kind={odometry.kind} takes scans"
     if not sees_scans and isinstance(loops, ScanLoopsConfig):

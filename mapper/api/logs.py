@@ -30,7 +30,8 @@ def open_log(path: AnyPath, *, config: AnyPath | None = None, settings: Settings
         settings: Values by dotted name, such as ``{"source.last_frame": 100}``.
 
     Returns:
-        The log, with ``stamps_ns``, ``sensor`` ("rgbd" or "lidar"), and ``truth`` and ``wheels`` where known.
+        The log, with ``stamps_ns``, ``sensor`` ("rgbd", "lidar" or "lidar-2d"),
+        and ``truth`` and ``wheels`` where known.
 
     Raises:
         SourceError: The path does not exist, no format fits, or the log is malformed.
@@ -67,7 +68,7 @@ def inspect(
     from mapper.sources.inspection import inspect_log  # loads foxglove, which opening a log may not need
 
     def why_untrackable(log: Log) -> str | None:
-        if log.sensor != "lidar":
+        if log.sensor == "rgbd":
             return None
         from mapper.odometry.scans import scan_observation
         from mapper.odometry.scans.config import AnyScanOdometryConfig

@@ -13,6 +13,7 @@ from pydantic import ValidationError
 from mapper.config.build import BuildConfig
 from mapper.core.config import Config, drop_unknown, flattened, kind_of, members_of
 from mapper.core.errors import ConfigError, MapperWarning
+from mapper.loops.config import PLANAR_LOOPS
 from mapper.runtime.atomic import MANIFEST_NAME
 from mapper.runtime.regular_files import AnyPath, parse_toml, read_text
 from mapper.sources.config import SourceConfig
@@ -31,6 +32,24 @@ DEFAULTS: "Mapping[Sensor, Mapping[str, Any]]" = {
         "traversable": {"max_step_m": 0.2, "slope_window_m": 2.0, "head_room_m": 2.0, "max_gap_m": 1.0},
         "costmap": {"robot_radius_m": 0.5, "inflation_radius_m": 2.0, "cost_scaling": 3.0},
         "cloud": {"voxel_m": 0.1, "frame_stride": 4},
+    },
+    "lidar-2d": {
+        "odometry": {
+            "kind": "icp",
+            "pair_distances_m": (1.0, 0.3, 0.15),
+            "scale": 1.0,
+            "min_range_m": 0.05,
+            "voxel_m": 0.1,
+            "keyframe_distance_m": 0.5,
+            "keyframe_angle_rad": 0.3,
+            "max_pair_distance_m": 0.25,
+            "rescue": None,
+        },
+        "loops": PLANAR_LOOPS.model_dump(exclude_unset=True) | {"kind": "scans"},
+        "octree": {"resolution_m": 0.05, "max_range_m": 30.0},
+        "slice": {"min_height_m": 0.0, "max_height_m": 2.0},
+        "traversable": {"floor": "layer"},
+        "cloud": {"voxel_m": 0.05, "frame_stride": 10},
     },
 }
 """Default settings per sensor, where they differ from the classes' own. A street is coarser than a room: what
@@ -177,12 +196,16 @@ def _drop_former_settings(tree: dict[str, Any], path: Path) -> None:
 
 
 def _over(defaults: Mapping[str, Any], tree: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the tree with what it leaves out taken from the defaults, part by part."""
+    """Return the tree with what it leaves out taken from the defaults, part by part.
+
+    A part of another kind than the default's has none of its settings.
+    """
     filled: dict[str, Any] = {**defaults, **tree}
     for name, value in tree.items():
         default = defaults.get(name)
         if isinstance(value, dict) and isinstance(default, dict):
-            filled[name] = {**default, **value}
+            is_other = value.get("kind", default.get("kind")) != default.get("kind")
+            filled[name] = value if is_other else _over(default, value)
     return filled
 
 

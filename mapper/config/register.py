@@ -45,7 +45,7 @@ def register_config(method: str, *sensors: Sensor) -> RegisterConfig:
     """
     member: Any = _METHODS[method]
     sensor: Sensor = "rgbd" if "rgbd" in sensors else "lidar"
-    if sensor == "lidar" or member is IsvdOdometryConfig:
+    if sensor != "rgbd" or member is IsvdOdometryConfig:
         return RegisterConfig(registration=member())
     if issubclass(member, HoughConfig):
         others = [name for name, other in _METHODS.items() if not issubclass(other, HoughConfig)]

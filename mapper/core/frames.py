@@ -154,6 +154,7 @@ class Scan:
         far_returns: Number of returns that were left out as farther than any sensor reaches.
         untimed_returns: Number of returns that were left out because their time cannot be right.
         intensities: (N,) float32 of each point, in the sensor's own unit, where the file has them.
+        is_planar: All points have one z, that of the origin: a laser swept one plane parallel to x and y.
     """
 
     stamp_ns: int
@@ -164,6 +165,7 @@ class Scan:
     far_returns: int = 0
     untimed_returns: int = 0
     intensities: NDArray[np.float32] | None = None
+    is_planar: bool = False
 
     def __post_init__(self) -> None:
         shape = self.points_body.shape
@@ -346,8 +348,9 @@ class RgbdFrame:
 Frame = RgbdFrame | Scan
 
 
-Sensor = Literal["rgbd", "lidar"]
-"""Kind of a log's sensor: RGB-D frames whose body is an optical frame, or scans with z roughly up."""
+Sensor = Literal["rgbd", "lidar", "lidar-2d"]
+"""Kind of a log's sensor: RGB-D frames whose body is an optical frame, scans with z roughly up, or planar
+scans, whose body moves in the plane of x and y."""
 
 
 def _checksum(image: Image | DepthImage) -> int | None:

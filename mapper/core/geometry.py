@@ -121,6 +121,11 @@ def rotation_log(R: Array) -> Array:
     return axis * angle
 
 
+def in_plane(T: Transform) -> Transform:
+    """Return the motion (4, 4) in the plane of x and y that is nearest: its yaw, x and y."""
+    return planar_motion(T[0, 3], T[1, 3], float(np.arctan2(T[1, 0] - T[0, 1], T[0, 0] + T[1, 1])))
+
+
 def exp(rotation_rad: Array, translation_m: Array) -> Transform:
     """Return the motion of a twist: the exponential map of SE(3) (Murray, Li & Sastry 1994, eq. 2.36)."""
     V = _left_jacobian(rotation_rad)

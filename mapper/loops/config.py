@@ -98,6 +98,10 @@ class PlaceLoopsConfig(KeyframeLoopsConfig):
 class ScanVerificationConfig(Config):
     """Verification that two scans are of one place."""
 
+    is_planar: bool = False
+    """Scans of a 2D laser: the motion is guessed by their correlation (Olson 2009), in any heading."""
+    offset_m: PositiveFloat = 4.0
+    """Largest distance along x and along y at which planar scans are compared."""
     voxel_m: PositiveFloat = 0.5
     """One point is kept per voxel."""
     reach_m: PositiveFloat = 48.0
@@ -145,6 +149,30 @@ class ScanLoopsConfig(KeyframeLoopsConfig):
     gate: GateConfig = GateConfig(slack_m=1.0, drift_rad_per_m=0.005)
     min_agreeing: NonNegativeInt = 2
     agreement_path_m: PositiveFloat = 15.0
+
+
+PLANAR_LOOPS = ScanLoopsConfig(
+    min_gap_m=10.0,
+    min_motion_m=1.0,
+    min_motion_rad=0.5,
+    max_distance_m=3.0,
+    context=ScanContextConfig(reach_m=16.0),
+    verification=ScanVerificationConfig(
+        is_planar=True,
+        voxel_m=0.1,
+        reach_m=30.0,
+        voting=VotingConfig(peaks=5),
+        pair_distances_m=(0.5, 0.2),
+        margin_m=0.15,
+        min_agreeing_ratio=0.4,
+        min_compared=60,
+        sigma_rad=0.002,
+        sigma_m=0.01,
+    ),
+    gate=GateConfig(slack_m=0.5, drift_rad_per_m=0.005),
+    agreement_path_m=5.0,
+)
+"""Loops between planar scans of rooms and corridors."""
 
 
 class ThesisLoopsConfig(Config):

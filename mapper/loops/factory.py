@@ -11,6 +11,7 @@ from mapper.core.frames import Sensor
 from mapper.features.frame_view import ImageView
 from mapper.loops.base import Proposer, Verifier
 from mapper.loops.config import (
+    PLANAR_LOOPS,
     AnyLoops,
     ImageVerificationConfig,
     NoLoopsConfig,
@@ -27,6 +28,7 @@ from mapper.loops.place_file import AnyPlace
 _LOOPS_OF: Mapping[Sensor, PlaceLoopsConfig | ScanLoopsConfig] = {
     "rgbd": PlaceLoopsConfig(),
     "lidar": ScanLoopsConfig(),
+    "lidar-2d": PLANAR_LOOPS,
 }
 
 

@@ -6,7 +6,7 @@ from functools import lru_cache, partial
 import numpy as np
 
 from mapper.core.errors import ConfigError
-from mapper.core.geometry import Array, Transform, inverse
+from mapper.core.geometry import Array, Transform, apply, inverse, transform
 from mapper.features.frame_view import FrameView, ScanView
 from mapper.graph.uncertainty import inflated
 from mapper.loops.base import Verification
@@ -14,7 +14,8 @@ from mapper.loops.closure import Discrepancy, discrepancy, exceeds
 from mapper.loops.config import ScanVerificationConfig
 from mapper.loops.scan_context_proposer import ScanPlace
 from mapper.registration.base import Alignment
-from mapper.registration.degeneracy import degeneracy_of
+from mapper.registration.correlation import correlate
+from mapper.registration.degeneracy import degeneracy_of, plane_information
 from mapper.registration.free_space import FreeSpaceCheck, FreeSpaceCounts, ScanDescription, range_image
 from mapper.registration.hough.description import centres_of
 from mapper.registration.hough.ground import find_ground, find_obstacles, level
@@ -37,6 +38,11 @@ _SAME = Discrepancy(translation_m=3.0, rotation_rad=0.3)
 """A guess nearer to the motion than both counts as the same one: GICP leads from there to the same answer."""
 
 
+_CELLS, _SPREAD_CELLS = 2.0, 4.0
+"""Voxels of a cell of the correlation of planar scans, and by which a guess is off at most."""
+_METRE_HIGH = transform(np.eye(3), np.array([0.0, 0.0, 1.0]))
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class _Description:
     """Description of one scan.
@@ -53,13 +59,15 @@ class _Description:
 class ScanVerifier:
     """Verifier of loops between scans.
 
-    A motion is guessed by Hough voting (Nagy, Gálai & Benedek 2016, §3.3), refined by GICP, and accepted when
-    the free-space check of the two scans neither contradicts it nor fits another guess as well.
+    A motion is guessed by Hough voting (Nagy, Gálai & Benedek 2016, §3.3), or between planar scans by their
+    correlation, refined by GICP, and accepted when the free-space check of the two scans neither contradicts
+    it nor fits another guess as well.
     """
 
     def __init__(self, config: ScanVerificationConfig) -> None:
         self._config = config
-        self._coarse, self._fine = FreeSpaceCheck(GUESS_MARGIN_M), FreeSpaceCheck(config.margin_m)
+        margin_m = 2.0 * _SPREAD_CELLS * config.voxel_m if config.is_planar else GUESS_MARGIN_M
+        self._coarse, self._fine = FreeSpaceCheck(margin_m), FreeSpaceCheck(config.margin_m)
         self._description = lru_cache(CACHED_PLACES)(partial(_describe, config=config))
         self._cloud = lru_cache(CACHED_PLACES)(partial(_cloud_of, config=config))
 
@@ -72,6 +80,9 @@ class ScanVerifier:
         if not isinstance(seen, ScanView):
             raise ConfigError("loops.kind=scans compares scans, and these are images; want places or thesis")
         config = self._config
+        if config.is_planar:  # all of its rays; one metre high in the plane's scan context
+            is_near = np.hypot(*seen.points_body[:, :2].T) < config.reach_m
+            return ScanPlace(seen.stamp_ns, seen.points_body[is_near], _METRE_HIGH)
         # A cloud is made of these points by a grid through the origin; in another one, voxels would merge.
         reach_m = config.voxel_m * np.ceil(config.reach_m / config.voxel_m)
         points_body = seen.points_body[thin(seen.points_body, config.voxel_m, reach_m)]
@@ -110,10 +121,23 @@ class ScanVerifier:
         return self._measured(found, alignment, self._cloud(j))
 
     def _guesses(self, i: ScanPlace, j: ScanPlace) -> list[tuple[float, Transform]]:
-        """Return the planar motions with most votes of centres and their scores, the best score first."""
-        centres = self._description(i).centres_level, self._description(j).centres_level
-        peaks = vote(*centres, self._config.voting)
-        guesses = [inverse(i.T_level_body) @ peak.motion @ j.T_level_body for peak in peaks]
+        """Return the planar motions with most support and their scores, the best score first."""
+        config = self._config
+        if config.is_planar:
+            motions = correlate(
+                self._cloud(i).points,
+                self._cloud(j).points,
+                reach_m=config.offset_m,
+                cell_m=_CELLS * config.voxel_m,
+                peaks=config.voting.peaks,
+                apart_m=_SPREAD_CELLS * config.voxel_m,
+                apart_rad=_SAME.rotation_rad,
+            )
+            guesses = [motion for _, motion in motions]
+        else:
+            centres = self._description(i).centres_level, self._description(j).centres_level
+            peaks = vote(*centres, config.voting)
+            guesses = [inverse(i.T_level_body) @ peak.motion @ j.T_level_body for peak in peaks]
         scored = [(_score(self._worse(i, j, guess, self._coarse)), guess) for guess in guesses]
         return sorted(scored, key=lambda of: -of[0])
 
@@ -146,10 +170,13 @@ class ScanVerifier:
         """Return the motion as a measurement, if the surfaces make every direction of it observable."""
         config = self._config
         assert alignment.information is not None  # GICP converged
-        degeneracy = degeneracy_of(alignment.information, points=source.points)
+        measured = alignment.information
+        if config.is_planar:
+            measured = measured + plane_information(source.points, like=measured)
+        degeneracy = degeneracy_of(measured, points=source.points)
         if degeneracy.reason:
             return replace(found, reason=degeneracy.reason)
-        information = inflated(alignment.information, sigma_rad=config.sigma_rad, sigma_m=config.sigma_m)
+        information = inflated(measured, sigma_rad=config.sigma_rad, sigma_m=config.sigma_m)
         return replace(found, T_i_j=alignment.T_target_source, information=information)
 
 
@@ -159,11 +186,18 @@ def _score(counts: FreeSpaceCounts) -> float:
 
 
 def _cloud_of(place: ScanPlace, *, config: ScanVerificationConfig) -> Prepared:
-    return prepared(place.points_body, voxel_m=config.voxel_m)
+    return prepared(place.points_body, voxel_m=config.voxel_m, is_planar=config.is_planar)
 
 
 def _describe(place: ScanPlace, *, config: ScanVerificationConfig) -> _Description:
     points_body, T_level_body, origin_body = place.points_body, place.T_level_body, np.zeros(3)
+    if config.is_planar:
+        ranges_m = range_image(points_body, origin_body, DIRECTION_RAD)
+        obstacles = apply(T_level_body, _cloud_of(place, config=config).points).astype(np.float32)
+        return _Description(
+            obstacles[:, :2].astype(np.float64),
+            ScanDescription(T_level_body, obstacles, ranges_m, DIRECTION_RAD, origin_body),
+        )
     ground = find_ground(points_body, T_level_body, config.constellation.ground)
     obstacles, _ = find_obstacles(points_body, T_level_body, ground, config.constellation.ground)
     ranges_m = range_image(points_body, origin_body, DIRECTION_RAD)

@@ -342,7 +342,8 @@ def _prepared(job: _Job, config: FuseSettings, caster: Caster) -> _Prepared | Sk
 
 def _snapshot(frame: Frame, scan: Scan, config: McapConfig) -> Snapshot | ScanSnapshot:
     if not isinstance(frame, RgbdFrame):
-        return ScanSnapshot(scan.stamp_ns, scan.points_body[thin(scan.points_body, VOXEL_M["lidar"])])
+        voxel_m = VOXEL_M["lidar-2d" if scan.is_planar else "lidar"]
+        return ScanSnapshot(scan.stamp_ns, scan.points_body[thin(scan.points_body, voxel_m)])
     return Snapshot(
         frame.stamp_ns,
         encode_jpeg(frame.image, width_px=config.image_width_px),

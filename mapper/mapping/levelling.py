@@ -23,6 +23,7 @@ from mapper.registration.planes import (
     patches_of,
     vertical_of,
 )
+from mapper.registration.surfaces import prepared
 from mapper.sources.base import Accelerations, Log
 
 
@@ -47,9 +48,11 @@ class BodyAxes:
 AXES: Mapping[Sensor, BodyAxes] = {
     "rgbd": BodyAxes(up=np.array([0.0, -1.0, 0.0]), forward=np.array([0.0, 0.0, 1.0])),
     "lidar": BodyAxes(up=np.array([0.0, 0.0, 1.0]), forward=np.array([1.0, 0.0, 0.0]), stands_on_floor=True),
+    "lidar-2d": BodyAxes(up=np.array([0.0, 0.0, 1.0]), forward=np.array([1.0, 0.0, 0.0])),
 }
 
 
+_IN_LAYER = 1.0 / 3.0  # of a voxel
 _MAX_READING_GAP_NS = 50_000_000
 _MIN_READINGS = 50
 _MAX_READINGS = 5000
@@ -64,7 +67,7 @@ class Level:
     Attributes:
         T_level_world: (4, 4). In the level frame z points up and the floor is at z = 0; the first pose is at
             x = y = 0 and heads along +x, or up to 45° from it where x and y lie along walls.
-        method: Source of the vertical: "accelerometer", "planes" or "camera".
+        method: Source of the vertical: "accelerometer", "planes", "camera" or "laser plane".
         detail: Quality of the vertical, source of the floor and of x; a sentence for the manifest.
         has_floor: The floor was seen; else its height is a guess.
         conflict: Sentence on an accelerometer or a mounting that contradicts the up taken; else empty.
@@ -134,6 +137,52 @@ def find_level(
             T_level_world = exp(np.array([0.0, 0.0, -walls.angle_rad]), np.zeros(3)) @ T_level_world
         details.append(_heading_text(walls))
     return Level(T_level_world, method, "; ".join(details), floor.is_seen, rough.conflict, rough.is_decided)
+
+
+def level_in_plane(
+    scans: Sequence[tuple[Scan, Transform]],
+    *,
+    trajectory: Trajectory,
+    config: LevelConfig,
+    axes: BodyAxes,
+    resolution_m: float,
+) -> Level:
+    """Return the level frame of planar scans: up is the normal of their plane, the floor the robot's z = 0.
+
+    A laser in or below that is taken to be on the floor. Its plane is a third of a voxel above the border of
+    a layer, so that no rounding puts a scan into the layer below, at this resolution or at half of it.
+
+    Args:
+        scans: As for ``find_level``, planar.
+        trajectory: Poses of the body.
+        config: Says what x lies along.
+        axes: Attitude of the body.
+        resolution_m: Edge of a voxel of the map.
+
+    Raises:
+        DataError: The trajectory has no poses.
+    """
+    if not len(trajectory):
+        raise DataError("levelling: the trajectory has no poses")
+    T_world_first = trajectory.T_world_body[0]
+    laser_m = float(np.median([scan.origin_body[2] for scan, _ in scans])) if scans else 0.0
+    layer_m = (np.floor(max(laser_m, 0.0) / resolution_m + 1e-6) + _IN_LAYER) * resolution_m
+    T_level_world = _frame(T_world_first, T_world_first[:3, 2], None, axes)
+    T_level_world[2, 3] += layer_m - laser_m
+    stated = "as the log states" if laser_m > 0.0 else "as the log states no height of it"
+    details = [f"up is the normal of the laser's plane, {max(laser_m, 0.0):.2f} m above the floor {stated}"]
+    if config.heading == "walls":
+        lines = [prepared(scan.points_body, voxel_m=2.0 * resolution_m, is_planar=True) for scan, _ in scans]
+        normals_world = np.concatenate(
+            [line.normals @ T[:3, :3].T for line, (_, T) in zip(lines, scans, strict=True)]
+            or [np.empty((0, 3))]
+        )
+        normals_world = normals_world[normals_world.any(axis=1)]
+        walls = wall_heading(Patches(normals_world, normals_world), T_level_world[:3, :3])
+        if walls.determined:
+            T_level_world = exp(np.array([0.0, 0.0, -walls.angle_rad]), np.zeros(3)) @ T_level_world
+        details.append(_heading_text(walls))
+    return Level(T_level_world, "laser plane", "; ".join(details), has_floor=True)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -10,6 +10,9 @@ from mapper.core.config import Config
 class TraversableConfig(Config):
     """Settings of the floor that a wheeled robot can drive on."""
 
+    floor: Literal["surfaces", "layer"] = "surfaces"
+    """Where floor is: surfaces that the sensor saw; or where it saw free space, as a 2D laser sees no floor:
+    every column with free and without occupied voxels, of which any is an obstacle."""
     max_step_m: PositiveFloat = 0.1
     """Higher steps, up or down, are obstacles; in whole voxels, of which one is within a floor's noise."""
     max_slope_rad: Annotated[float, Field(gt=0.0, lt=1.5)] = 0.35

@@ -17,7 +17,7 @@ from mapper.core.geometry import Array, Points
 from mapper.navigation import floor_kernels as kernels
 from mapper.navigation.config import TraversableConfig
 from mapper.navigation.floor_kernels import OFF_PLANE, Limits, Mask, limits_of
-from mapper.octree.columns import NOWHERE, Columns, DrivenGround, occupied_columns
+from mapper.octree.columns import NOWHERE, Columns, DrivenGround, occupied_columns, starts_of
 from mapper.octree.keys import KEY_ZERO
 from mapper.octree.map import OctreeMap
 
@@ -26,6 +26,7 @@ MAX_SENSOR_HEIGHT_M = 4.0
 _CHANGE_PER_M = 10.0
 """A change of the sensor's height by a metre costs as much as this number of samples without ground below."""
 _LONGEST_STEPS = 5.0
+_CARRIED_M = 0.3  # height of a path over a layer, where only its x and y count
 _STRETCH_M = 2.0
 """Length of a step, whatever is usual, that breaks a path, and of a stretch that was travelled along."""
 _STEADY_M = 0.3
@@ -91,7 +92,22 @@ def reachable_floor(octree: OctreeMap, config: TraversableConfig, *, positions_w
     if not len(octree):
         raise DataError("traversable floor: the map is empty; fuse scans into it first")
     columns = occupied_columns(octree, margin=margin_for(config, octree.resolution_m))
+    if config.floor == "layer":
+        columns = _as_a_layer(columns, octree, limits_of(config, columns.resolution_m).step)
+        positions_world = positions_world * [1.0, 1.0, 0.0] + [0.0, 0.0, _CARRIED_M]
     return floor_of(columns, config, paths_world=[positions_world])
+
+
+def _as_a_layer(columns: Columns, octree: OctreeMap, step: int) -> Columns:
+    """Return columns with floor at z = 0 where voxels are free, and an obstacle where any is occupied."""
+    tops = np.full(columns.shape, NOWHERE, np.int32)
+    for known in octree.leaves_by_part():
+        x, y, _ = known.keys.T.astype(np.int64)
+        height = np.where(known.log_odds >= octree.occupied_log_odds, step + 1, 0)
+        np.maximum.at(tops, (y - columns.first[1], x - columns.first[0]), height.astype(np.int32))
+    known_columns = np.flatnonzero(tops.ravel() > NOWHERE)
+    starts = starts_of(known_columns, tops.size)
+    return columns._replace(starts=starts, tops=tops.ravel()[known_columns])
 
 
 def margin_for(config: TraversableConfig, resolution_m: float) -> int:

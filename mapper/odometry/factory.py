@@ -44,7 +44,10 @@ def odometry_for(
 
     if log.depth_noise is not None and getattr(config, "depth_noise", log.depth_noise) is None:
         config = config.model_copy(update={"depth_noise": log.depth_noise})
-    return build_odometry(adapted_to(config, log), poses_for(config, log), motion_check, log.gyroscope)
+    wheels = log.wheels if log.sensor == "lidar-2d" else None
+    return build_odometry(
+        adapted_to(config, log), poses_for(config, log), motion_check, log.gyroscope, wheels
+    )
 
 
 def build_odometry(
@@ -52,6 +55,7 @@ def build_odometry(
     poses: Trajectory | None = None,
     motion_check: MotionCheck | None = None,
     gyroscope: "Gyroscope | None" = None,
+    wheels: Trajectory | None = None,
 ) -> Odometry[Any]:
     """Return the odometry that the settings choose, before its first frame; its module is imported only now.
 
@@ -60,6 +64,7 @@ def build_odometry(
         poses: T_odom_body of the log's wheel odometry, or known poses, as ``poses_for`` returns them.
         motion_check: Another measurement of the motion, which rules out poses after a gap.
         gyroscope: Angular velocities of the log, if it has any.
+        wheels: T_odom_body by which an odometry from scans predicts the motion, if it does.
 
     Raises:
         ConfigError: Wheel odometry or known poses are chosen, and the log has none; or a caller's own.
@@ -89,13 +94,14 @@ def build_odometry(
                 "choose another kind, or give it to mapper.build(…, odometry=…)"
             )
         case _:
-            return build_frame_odometry(config, motion_check, gyroscope)
+            return build_frame_odometry(config, motion_check, gyroscope, wheels)
 
 
 def build_frame_odometry(
     config: FrameOdometryConfig,
     motion_check: MotionCheck | None = None,
     gyroscope: "Gyroscope | None" = None,
+    wheels: Trajectory | None = None,
 ) -> FrameOdometry[Any]:
     """Return the odometry that the settings choose among those that use the frames' images or scans."""
     match config:
@@ -116,7 +122,7 @@ def build_frame_odometry(
         case GicpOdometryConfig() | IcpOdometryConfig() | KissOdometryConfig() | HoughOdometryConfig():
             from mapper.odometry.scans.odometry import ScanOdometry
 
-            return ScanOdometry(config, _build_matcher(config), gyroscope)
+            return ScanOdometry(config, _build_matcher(config), gyroscope, wheels)
         case _:
             assert_never(config)
 

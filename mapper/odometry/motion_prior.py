@@ -1,4 +1,4 @@
-"""Prior of the body's motion: constant velocity, and the rotation by a gyroscope where that is better."""
+"""Prior of the body's motion: wheels, the rotation by a gyroscope where that is better, constant velocity."""
 
 import math
 from collections import deque
@@ -7,8 +7,10 @@ from typing import Any
 import numpy as np
 
 from mapper.core.deskew import SampledMotion, Twist
-from mapper.core.geometry import Array, Transform, rotation_log
+from mapper.core.geometry import Array, Transform, inverse, rotation_log
+from mapper.core.running_median import RunningMedian
 from mapper.core.timebase import NS_PER_S
+from mapper.core.trajectory import Trajectory
 from mapper.odometry.gyroscope_calibration import (
     CERTAIN_RAD,
     DEGREES,
@@ -18,12 +20,17 @@ from mapper.odometry.gyroscope_calibration import (
 )
 from mapper.sensing.gyroscope import Gyroscope
 from mapper.sensing.sweep_motion import sampled_motion
+from mapper.sensing.wheel_kinematics import pose_at
 
 _FIRST_FIT, _FITS_GROW, _MOST_BETWEEN_FITS = 8, 1.5, 100
 _KEPT = 400  # intervals that a fit uses: bias drifts over minutes
 _ERRORS, _FEWEST_ERRORS = 30, 5
 _MEDIAN_LENGTH = 1.538  # of a vector of three independent normal errors, in standard deviations
 _LONGEST_TURN_RAD = 2.8
+_SLIPPED, _STANDING_M = 0.5, 0.05
+"""Median miss of the wheels, as a share of the way and 5 cm, from which on constant velocity predicts better:
+they slip, their mounting or their clock is wrong."""
+_MOST_BETWEEN_READINGS_NS = NS_PER_S
 _ANOTHER_RAD = 0.2  # of a mounting that contradicts tf's
 _ANOTHER_UNIT = 1.25
 _CONTRADICTION_RAD, _CONTRADICTION_SIGMAS = 0.2, 6.0  # far beyond any error but that of a wrong pose
@@ -38,8 +45,15 @@ class MotionPrior:
     shown yet, or whose readings contradict the odometry, is not used.
     """
 
-    def __init__(self, gyroscope: Gyroscope | None) -> None:
-        """Begin before the first frame."""
+    def __init__(self, gyroscope: Gyroscope | None, wheels: Trajectory | None = None) -> None:
+        """Begin before the first frame.
+
+        Args:
+            gyroscope: Angular velocities of the log, if it has any.
+            wheels: T_odom_body of its wheel odometry, if that predicts the motion.
+        """
+        self._wheels = wheels
+        self._wheel_misses = RunningMedian(memory=_ERRORS)
         self._gyroscope = gyroscope
         self._calibration = None if gyroscope is None else uncalibrated(gyroscope)
         self._of_body: Gyroscope | None = None  # made when it is needed
@@ -72,12 +86,39 @@ class MotionPrior:
                 at the last pose.
         """
         elapsed_s = (end_ns - begin_ns) / NS_PER_S
+        rolled = self.rolled(begin_ns, end_ns)
+        if rolled is not None:
+            return rolled
         R_begin_end = self.turn(begin_ns, end_ns)
         if R_begin_end is None:
             return twist.over(elapsed_s)
         T = np.eye(4)
         T[:3, :3], T[:3, 3] = R_begin_end, elapsed_s * velocity_mps
         return T
+
+    def rolled(self, begin_ns: int, end_ns: int) -> Transform | None:
+        """Return T_begin_end (4, 4) by the wheels; None without readings, or if they have been wrong."""
+        if len(self._wheel_misses) >= _FEWEST_ERRORS and self._wheel_misses.median > _SLIPPED:
+            return None
+        return self._rolled(begin_ns, end_ns)
+
+    def _rolled(self, begin_ns: int, end_ns: int) -> Transform | None:
+        if self._wheels is None:
+            return None
+        T_odom_begin, T_odom_end = (
+            pose_at(self._wheels, time_ns, max_gap_ns=_MOST_BETWEEN_READINGS_NS)
+            for time_ns in (begin_ns, end_ns)
+        )
+        return None if T_odom_begin is None or T_odom_end is None else inverse(T_odom_begin) @ T_odom_end
+
+    def learn_slip(self, begin_ns: int, end_ns: int, T_begin_end: Transform) -> None:
+        """Take over the motion that the odometry measured between two frames, for the trust in the wheels."""
+        rolled = self._rolled(begin_ns, end_ns)
+        if rolled is None:
+            return
+        moved_m = float(np.linalg.norm(T_begin_end[:3, 3]))
+        miss_m = float(np.linalg.norm(rolled[:3, 3] - T_begin_end[:3, 3]))
+        self._wheel_misses.add(miss_m / (moved_m + _STANDING_M))
 
     def sweep(self, middle_ns: int, half_s: float, velocity_mps: Array) -> SampledMotion | None:
         """Return the motion about the middle of a sweep; None if the gyroscope does not know it.

@@ -14,7 +14,7 @@ from mapper.core.errors import FrameError
 from mapper.core.frames import Scan
 from mapper.core.timebase import check_stamps
 from mapper.core.trajectory import Trajectory
-from mapper.mapping.levelling import Level, axes_of, find_level
+from mapper.mapping.levelling import Level, axes_of, find_level, level_in_plane
 from mapper.navigation.floor import MAX_SENSOR_HEIGHT_M
 from mapper.odometry.base import Odometry
 from mapper.odometry.gyroscope_calibration import with_body_rates
@@ -231,6 +231,14 @@ def level_of(source: Log, tracking: TrackingResult, config: BuildConfig) -> Leve
         )
         for index, scan in scans.items()
     ]
+    if source.sensor == "lidar-2d":
+        return level_in_plane(
+            placed,
+            trajectory=trajectory,
+            config=config.level,
+            axes=axes_of(source),
+            resolution_m=config.octree.resolution_m,
+        )
     return find_level(
         placed,
         trajectory=trajectory,

@@ -25,7 +25,7 @@ BY_POSES = ("wheels", "given")
 
 _HINTS: Mapping[str, str] = {
     "rgbd": "is there texture, and depth in the images?",
-    "lidar": "do the scans overlap, and are their units metres?",
+    **dict.fromkeys(("lidar", "lidar-2d"), "do the scans overlap, and are their units metres?"),
     "wheels": "do the wheels' readings cover the frames' times, without gaps beyond odometry.max_gap_s?",
     "given": "do the given poses cover the frames' times, without gaps beyond odometry.max_gap_s?",
 }

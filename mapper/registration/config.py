@@ -13,7 +13,7 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 from mapper.core.config import Config, Ratio
 from mapper.registration.hough.config import HoughGicpConfig, HoughNdtConfig
 
-VOXEL_M = {"lidar": 0.3, "rgbd": 0.05}
+VOXEL_M = {"lidar": 0.3, "lidar-2d": 0.1, "rgbd": 0.05}
 """Voxel for a scene some tens of metres wide, and for one of a few metres."""
 
 NEED_NO_GUESS = frozenset({"hough-gicp", "hough-ndt", "kiss-matcher"})

@@ -80,6 +80,20 @@ def degeneracy_of(information: Array, *, points: Points, min_share: float = _MIN
     )
 
 
+def plane_information(points: Points, *, like: Array) -> Array:
+    """Return the (6, 6) information that points lie in a plane of constant z: it has z and tilt.
+
+    Args:
+        points: (N, 3) source points, metres.
+        like: (6, 6) information of the same points' distances along normals in the plane, which are as
+            certain.
+    """
+    up = np.broadcast_to([0.0, 0.0, 1.0], points.shape)
+    rows = np.hstack([np.cross(points, up), up])
+    weight = float(np.trace(like[3:, 3:])) / max(len(points), 1)
+    return np.asarray(weight * (rows.T @ rows), np.float64)
+
+
 def projected(information: Array, degeneracy: Degeneracy) -> Array:
     """Return the information without that of the unobservable motions: unknown to within the cloud's extent.
 

@@ -15,6 +15,8 @@ from mapper.registration.kd_tree import KdTree, kd_tree, neighbours_of
 
 _NEIGHBOURS = 10
 _FEWEST_NEIGHBOURS = 5
+_NO_LINE = 0.1
+"""Product of the two variances in a plane over the square of their sum: 0 on a line, 0.25 all around."""
 _LINE = 1e-12
 """Least squared length of a normal before it is normalised, relative to the spread's; points on a line have
 none."""
@@ -50,13 +52,17 @@ class Prepared:
         return self.tree.nearest(points)
 
 
-def prepared(points: Points32 | Points, *, voxel_m: float, neighbours: int = _NEIGHBOURS) -> Prepared:
+def prepared(
+    points: Points32 | Points, *, voxel_m: float, neighbours: int = _NEIGHBOURS, is_planar: bool = False
+) -> Prepared:
     """Return a cloud with one point per voxel, its normals and search tree.
 
     Args:
         points: (N, 3) finite positions, metres.
         voxel_m: Edge of the voxels, metres.
         neighbours: Nearest points, itself included, that give each normal.
+        is_planar: All points have one z; normals then lie in their plane, and are those of the lines through
+            half as many neighbours.
 
     Raises:
         DataError: A point lies more than 2²⁰ voxels from the origin.
@@ -70,22 +76,29 @@ def prepared(points: Points32 | Points, *, voxel_m: float, neighbours: int = _NE
             f"{voxel_m} m voxels; move the cloud to the origin or enlarge voxel_m"
         )
     tree = kd_tree(voxel_means(points, voxel_m))
-    return Prepared(*_normals(tree, min(neighbours, len(tree.points))), voxel_m, neighbours, tree)
+    if is_planar:  # points of a line have two neighbours at each distance, those of a surface more
+        neighbours = max(_FEWEST_NEIGHBOURS, neighbours // 2)
+    normals = _normals(tree, min(neighbours, len(tree.points)), is_planar)
+    return Prepared(*normals, voxel_m, neighbours, tree)
 
 
-def _normals(tree: KdTree, neighbours: int) -> tuple[Array, Array]:
+def _normals(tree: KdTree, neighbours: int, is_planar: bool) -> tuple[Array, Array]:
     normals, near_normals = np.zeros_like(tree.points), np.zeros_like(tree.points)
     if neighbours >= _FEWEST_NEIGHBOURS:
         about, _ = neighbours_of(tree.points, tree.axes, tree.cuts, tree.points, neighbours)
-        _fit_normals(tree.points, about, normals)
+        _fit_normals(tree.points, about, normals, is_planar)
         nearer = max(_FEWEST_NEIGHBOURS, neighbours // 2)
-        _fit_normals(tree.points, np.ascontiguousarray(about[:, :nearer]), near_normals)
+        _fit_normals(tree.points, np.ascontiguousarray(about[:, :nearer]), near_normals, is_planar)
     return normals, near_normals
 
 
 @njit(cache=True, nogil=True)
-def _fit_normals(points, about, normals):  # type: ignore[no-untyped-def]
-    """Fill in the normals, towards the origin, of the planes that fit the points about each point best."""
+def _fit_normals(points, about, normals, is_planar):  # type: ignore[no-untyped-def]
+    """Fill in the normals, towards the origin, of the planes that fit the points about each point best.
+
+    Of points in a plane they are the lines' in it, as if these were walls as high as they are long; where the
+    points are on no line, as at corners and at the far ends of a corridor, there is none.
+    """
     count = about.shape[1]
     for i in range(len(points)):
         mx = my = mz = 0.0
@@ -97,6 +110,10 @@ def _fit_normals(points, about, normals):  # type: ignore[no-untyped-def]
             x, y, z = points[j, 0] - mx, points[j, 1] - my, points[j, 2] - mz
             xx, xy, xz = xx + x * x, xy + x * y, xz + x * z
             yy, yz, zz = yy + y * y, yz + y * z, zz + z * z
+        if is_planar:
+            zz = xx + yy
+            if xx * yy - xy * xy > _NO_LINE * zz * zz:
+                continue
         nx, ny, nz = _least_axis(xx, xy, xz, yy, yz, zz)
         sign = -1.0 if nx * points[i, 0] + ny * points[i, 1] + nz * points[i, 2] > 0.0 else 1.0
         normals[i, 0], normals[i, 1], normals[i, 2] = sign * nx, sign * ny, sign * nz

@@ -32,6 +32,7 @@ _FORMATS = (
     "image_folders.stereo_pairs",
     RECORDING,
     "scan_folders.velodyne_pcap",
+    "scan_folders.carmen",
     "scan_folders.clouds",
 )
 """Modules, imported one after the other when a log is opened, until one recognises it."""

@@ -68,7 +68,7 @@ class LogFacts:
     Attributes:
         name: Name that the log gives itself.
         kind: Format of the log.
-        sensor: "rgbd" or "lidar".
+        sensor: "rgbd", "lidar" or "lidar-2d".
         frames: Timing of its frames.
         content: The first frame that can be read, in words, or that none can.
         calibration: The camera, in words; None of a LiDAR.
@@ -261,7 +261,7 @@ def _damage(checks: ReadingChecks) -> Iterator[str]:
     Around images that repeat all frames are loaded, so that the checks find where that begins and ends. Scans
     are not loaded: as text, a single one may take seconds.
     """
-    if checks.log.sensor == "lidar":
+    if checks.log.sensor != "rgbd":
         return
     step = -(-len(checks.log) // _MOST_LOADED)
     looked_at = range(0, len(checks.log), step)

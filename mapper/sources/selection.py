@@ -21,7 +21,7 @@ def selected(log: Log, config: SourceConfig) -> Log:
     Raises:
         SourceError: Nothing is left, or truth is required of a log that has none.
     """
-    if log.sensor == "lidar" and (config.point_time_scale != 1.0 or config.sweep_s is not None):
+    if log.sensor != "rgbd" and (config.point_time_scale != 1.0 or config.sweep_s is not None):
         log = with_point_times(log, time_scale=config.point_time_scale, sweep_s=config.sweep_s)
     if config.body.clears:
         log = without_vehicle(log, config.body)

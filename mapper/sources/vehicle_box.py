@@ -48,6 +48,7 @@ class _Scale:
 _SCALES: Mapping[Sensor, _Scale] = {
     "lidar": _Scale(cell_m=0.25, vehicle_m=4.0, around_m=12.0, ground_m=0.3),
     "rgbd": _Scale(cell_m=0.05, vehicle_m=1.0, around_m=3.0, ground_m=None),
+    "lidar-2d": _Scale(cell_m=0.05, vehicle_m=1.0, around_m=3.0, ground_m=None),
 }
 
 

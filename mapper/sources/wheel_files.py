@@ -21,6 +21,7 @@ _POSE_COLUMNS = 8
 LOOKING_FORWARD: Mapping[Sensor, Transform] = {
     "rgbd": transform(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.zeros(3)),
     "lidar": np.eye(4),
+    "lidar-2d": np.eye(4),
 }
 """T_base_body of a body at the origin of a frame with x forward, y left and z up."""
 

@@ -142,7 +142,7 @@ def _write_images_log(
 
 def _camera_of(source: Log) -> PinholeCamera:
     """Return the camera of the first readable frame's colour image: a log without any is no RGB-D log."""
-    if source.sensor == "lidar":
+    if source.sensor != "rgbd":
         raise SourceError(f"{source.path}: scans without images; TUM and mbag hold RGB-D frames: --as kitti")
     reason = "it has no frames"
     for entry in source.entries():

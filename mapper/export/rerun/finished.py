@@ -84,7 +84,9 @@ def about_text(run: Run, *, name: str) -> str:
 
 
 _TIMELINE = "stage"
-_UP = {"lidar": rr.ViewCoordinates.RIGHT_HAND_Z_UP, "rgbd": rr.ViewCoordinates.RDF}
+_UP = {"rgbd": rr.ViewCoordinates.RDF} | dict.fromkeys(
+    ("lidar", "lidar-2d"), rr.ViewCoordinates.RIGHT_HAND_Z_UP
+)
 
 
 def record_registration(

@@ -35,6 +35,7 @@ _UPRIGHT: dict[Sensor, Transform] = {
     # x right, y down, z forward, held level, becomes x right, y forward, z up.
     "rgbd": np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]]),
     "lidar": np.eye(4),
+    "lidar-2d": np.eye(4),
 }
 
 

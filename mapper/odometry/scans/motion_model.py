@@ -14,14 +14,16 @@ _MIN_ELAPSED_S = 0.005  # over less, an error of millimetres becomes a large vel
 _ERRORS, _FEWEST_ERRORS = 50, 5  # of recent predictions: of so many the median is taken, of fewer none
 _MEDIAN_LENGTH = 1.538  # of a vector of three independent normal errors, in standard deviations
 _LEAST_M, _LEAST_RAD, _LEAST_SHARE = 2e-3, 1e-3, 0.02
+_WHEELS_SHARE = 0.05  # of the way and of the turn, as graph.wheels has it
 
 
 @dataclass(frozen=True, slots=True)
 class Spread:
-    """Standard deviations of a predicted pose, of each axis: rad and m."""
+    """Standard deviations of a predicted pose, of each axis: rad and m; and whether wheels predicted it."""
 
     rotation_rad: float
     translation_m: float
+    is_by_wheels: bool = False
 
 
 class MotionModel:
@@ -43,6 +45,7 @@ class MotionModel:
         self._placed = 0
         self._covariance = np.zeros((6, 6))
         self._turn_errors, self._shift_errors = RunningMedian(memory=_ERRORS), RunningMedian(memory=_ERRORS)
+        self._wheel_turns, self._wheel_shifts = RunningMedian(memory=_ERRORS), RunningMedian(memory=_ERRORS)
 
     def elapsed_s(self, time_ns: int) -> float:
         """Return the seconds since the last scan that was placed."""
@@ -52,6 +55,10 @@ class MotionModel:
         """Return T_world_body (4, 4) at a time, by the gyroscope, or if the velocity stays."""
         velocity_mps = self.T_world_last[:3, :3].T @ self._velocity_world
         return self.T_world_last @ self.prior.predict(self._time_ns, time_ns, self.twist, velocity_mps)
+
+    def is_by_wheels(self, time_ns: int) -> bool:
+        """Return whether the wheels predict the pose at a time."""
+        return self.prior.rolled(self._time_ns, time_ns) is not None
 
     def sweep(
         self, middle_ns: int, half_s: float, T_world_middle: Transform | None = None
@@ -75,12 +82,21 @@ class MotionModel:
                 velocity_world = (T_world_middle[:3, 3] - self.T_world_last[:3, 3]) / elapsed_s
         return self.prior.sweep(middle_ns, half_s, R_world_middle.T @ velocity_world)
 
+    def during(self, middle_ns: int, half_s: float) -> Twist:
+        """Return the velocity during a sweep by the wheels, else the one until the last scan."""
+        half_ns = round(half_s * NS_PER_S)
+        rolled = self.prior.rolled(middle_ns - half_ns, middle_ns + half_ns) if half_ns else None
+        return self.twist if rolled is None else twist_between(np.eye(4), rolled, duration_s=2.0 * half_s)
+
     def spread(self, time_ns: int) -> Spread | None:
         """Return the spread of a predicted pose; None before enough predictions could be compared.
 
         Errors are accelerations: they grow with the time since the last scan and since the one before it. A
         steady log is given two hundredths of the motion, so that its first acceleration is no surprise.
         """
+        rolled = self.prior.rolled(self._time_ns, time_ns)
+        if rolled is not None:
+            return self._spread_of_wheels(rolled)
         if len(self._turn_errors) < _FEWEST_ERRORS:
             return None
         elapsed_s = self.elapsed_s(time_ns)
@@ -91,6 +107,18 @@ class MotionModel:
         return Spread(
             float(np.hypot(rotation * time_s2, _LEAST_RAD + _LEAST_SHARE * turned)),
             float(np.hypot(translation * time_s2, _LEAST_M + _LEAST_SHARE * moved)),
+        )
+
+    def _spread_of_wheels(self, rolled: Transform) -> Spread:
+        """Return the spread of a motion by the wheels: the errors that they had, and those of most wheels."""
+        moved, turned = float(np.linalg.norm(rolled[:3, 3])), angle_between(np.eye(3), rolled[:3, :3])
+        rotation, translation = (
+            errors.median / _MEDIAN_LENGTH for errors in (self._wheel_turns, self._wheel_shifts)
+        )
+        return Spread(
+            float(np.hypot(rotation, _LEAST_RAD + _WHEELS_SHARE * turned)),
+            float(np.hypot(translation, _LEAST_M + _WHEELS_SHARE * moved)),
+            is_by_wheels=True,
         )
 
     def acceleration(self, time_ns: int, T_world_body: Transform, twist: Twist) -> float:
@@ -159,9 +187,13 @@ class MotionModel:
                 T_last_body = inverse(self.T_world_last) @ T_world_body
                 error = inverse(self.predicted(time_ns)) @ T_world_body
                 lengths = angle_between(np.eye(3), error[:3, :3]), float(np.linalg.norm(error[:3, 3]))
+                if self.is_by_wheels(time_ns):
+                    self._wheel_turns.add(lengths[0])
+                    self._wheel_shifts.add(lengths[1])
                 time_s2 = _time_s2(elapsed_s, self._elapsed_s)
                 self._turn_errors.add(lengths[0] / time_s2)
                 self._shift_errors.add(lengths[1] / time_s2)
+                self.prior.learn_slip(self._time_ns, time_ns, T_last_body)
                 self.prior.learn(self._time_ns, time_ns, T_last_body[:3, :3], constant[:3, :3])
             if measured is None:
                 covariance = np.diag(self.velocity_sigmas(time_ns) ** 2)

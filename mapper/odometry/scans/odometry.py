@@ -10,6 +10,7 @@ from mapper.core.deskew import STILL, Motion
 from mapper.core.doubts import Doubt
 from mapper.core.frames import Frame
 from mapper.core.geometry import Array, Transform, adjoint, inverse
+from mapper.core.trajectory import Trajectory
 from mapper.features.frame_view import ScanView
 from mapper.graph.model import BetweenFactor
 from mapper.graph.uncertainty import information_of
@@ -46,7 +47,11 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
     """
 
     def __init__(
-        self, config: ScanOdometryConfig, matcher: ScanMatcher, gyroscope: Gyroscope | None = None
+        self,
+        config: ScanOdometryConfig,
+        matcher: ScanMatcher,
+        gyroscope: Gyroscope | None = None,
+        wheels: Trajectory | None = None,
     ) -> None:
         """Begin before the first scan.
 
@@ -54,13 +59,14 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
             config: Settings.
             matcher: Finds poses in the local map.
             gyroscope: Angular velocities of the log; None if it has none.
+            wheels: T_odom_body by which the motion is predicted; None if it is not.
         """
         self._config = config
         self._matcher = matcher
         self._assessment = PoseAssessment(config)
         self._registration = SweepRegistration(config, matcher, PoseSearch(config, matcher, self._assessment))
         self._noise = ScanNoise()
-        self._prior = MotionPrior(gyroscope)
+        self._prior = MotionPrior(gyroscope, wheels)
         self._motion = MotionModel(0, np.eye(4), self._prior)
         self._keyframes: deque[ScanKeyframe] = deque(maxlen=_KEYFRAMES)  # the newest first
         self._doubtful: ScanKeyframe | None = None
@@ -127,6 +133,7 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
             T_key_scan,
             self._motion.elapsed_s(observation.middle_ns),
             at_stamp + Ad @ found.keyframe.covariance_at_stamp @ Ad.T,
+            errors_add_up=not self._motion.is_by_wheels(observation.middle_ns),
         )
 
     def _go_on_from(self, keyframe: ScanKeyframe) -> None:

@@ -15,6 +15,8 @@ _CONTRADICTION_WEIGHT = 15.0
 _UNSHOWN_VOXELS = 0.5  # error of a measured motion that next to no surface shows
 _MOST_SIGMAS = 3.0
 _SURE = 0.98  # probability that surfaces show a motion
+_WHEEL_SIGMAS = 2.0  # for the tails of their errors: wheels slip now and then
+_SLIDING_VOXELS = 2.5
 _UNKNOWN_PARTS = 0.1  # share of the extent by which a prediction is off before any could be compared
 
 
@@ -154,6 +156,8 @@ def fuse_with_prediction(
         each = np.array([spread.rotation_rad] * 3 + [spread.translation_m] * 3)
         predicted_m = np.linalg.norm(to_motions * each, axis=1)
     corrections_m = to_motions @ np.concatenate(log(inverse(T_world_predicted) @ T_world_found))
+    if spread is not None and spread.is_by_wheels:
+        shown = _shown_given(shown, np.asarray(corrections_m, np.float64), predicted_m, voxel_m)
     gains = predicted_m**2 / (predicted_m**2 + found_m**2)
     gains[np.abs(corrections_m) > _MOST_SIGMAS * np.hypot(predicted_m, found_m)] = 0.0
     weights = shown + (1.0 - shown) * gains
@@ -161,3 +165,15 @@ def fuse_with_prediction(
     left = (1.0 - shown) * (1.0 - gains)
     open_m = np.sqrt(left * (predicted_m**2 + shown * (1.0 - gains) * corrections_m**2))
     return T_world_predicted @ exp(kept[:3], kept[3:]), open_m
+
+
+def _shown_given(shown: Array, corrections_m: Array, predicted_m: Array, voxel_m: float) -> Array:
+    """Return (6,) probabilities that surfaces show motions, given how much these correct the wheels'.
+
+    By Bayes' rule: a motion that is shown corrects as much as wheels err, one that is not by as much as a
+    match may slide, any correction within some voxels alike.
+    """
+    sigmas_m = _WHEEL_SIGMAS * predicted_m
+    if_shown = np.exp(-0.5 * (corrections_m / sigmas_m) ** 2) / (np.sqrt(2.0 * np.pi) * sigmas_m)
+    if_not = 1.0 / (2.0 * _SLIDING_VOXELS * voxel_m)
+    return np.where(shown >= 1.0, shown, shown * if_shown / (shown * if_shown + (1.0 - shown) * if_not))

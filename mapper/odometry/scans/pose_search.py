@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mapper.core.geometry import Transform, angle_between, exp, inverse
+from mapper.core.geometry import Transform, angle_between, exp, in_plane, inverse
 from mapper.odometry.scans.config import ScanOdometryConfig
 from mapper.odometry.scans.motion_model import MotionModel, Spread
 from mapper.odometry.scans.pose_assessment import PoseAssessment
@@ -155,6 +155,8 @@ class PoseSearch:
                 scan.spread,
                 voxel_m=scan.deskewed.prepared.voxel_m,
             )
+        if scan.deskewed.scan.is_planar:
+            T_world_middle = in_plane(T_world_middle)
         jump = jump_between(scan.T_world_predicted, T_world_middle, scan.spread)
         shares = Shares(fit.overlap, fit.agreement, fit.contradicting)
         return PoseCandidate(keyframe, T_world_middle, fit, shares, jump, open_m, hypothesis.method)
@@ -196,7 +198,7 @@ class PoseSearch:
                         target.deskewed.prepared,
                         deskewed.prepared,
                         inverse(target.T_world_middle) @ T_world_guess,
-                        kind="plane-icp",
+                        kind="gicp" if deskewed.scan.is_planar else "plane-icp",  # planes leave tilt open
                         pair_distances_m=distances_m,
                     )
                     if not isinstance(T_target_scan, str):

@@ -20,6 +20,8 @@ _MARGIN_M = 0.2
 _CHECKED_POINTS = 2000
 _GRAZING = 0.01  # least sine of the angle between a ray and a surface
 _PIXELS = 1.5  # a ray that is compared with a point is off by up to so many
+_LEAST_IN_SIGHT = 0.2  # of the points: fewer in sight tell nothing of the others
+_ON_A_LINE = 3  # a point and its neighbours on both sides
 _FACING = 0.3
 """Share of one point's displacement along its normals, from which on its pair shows the motion: more than
 the errors of normals make."""
@@ -57,15 +59,28 @@ class ScanKeyframe:
         """Its points and rays for the free-space check."""
         return described(self.deskewed)
 
+    @cached_property
+    def spacing_m(self) -> Array:
+        """(N,) distances of its prepared points from their neighbours on a line; 0 of points on none.
+
+        Far and seen at a grazing angle, the points of a planar scan are metres apart.
+        """
+        prepared = self.deskewed.prepared
+        if prepared.tree is None or len(prepared.points) < _ON_A_LINE:
+            return np.zeros(len(prepared.points))
+        _, distances_m = prepared.tree.nearest_few(prepared.points, _ON_A_LINE)
+        return np.asarray(np.where(prepared.normals.any(axis=1), distances_m[:, -1], 0.0), np.float64)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScanFit:
     """A scan on a keyframe's surfaces. A pair is a point and the keyframe's point nearest to it.
 
     Attributes:
-        overlap: Share of the points with a partner in range.
+        overlap: Share of the points with a partner in range; of planar scans, of those in sight.
         rmse_m: Root mean square distance of these pairs.
-        agreement: Share that lies on the surfaces, of those that face the direction where the least does.
+        agreement: Share that lies on the surfaces, of those that face the direction where the least does; of
+            planar scans, of those in sight.
         contradicting: Share of the points in space that the keyframe's rays passed.
         rows: (M, 6) Jacobian of the pairs' distances from the keyframe's surfaces by the scan's tangent.
         residuals_m: (M,) these distances.
@@ -73,6 +88,7 @@ class ScanFit:
         degeneracy: Of what the normals of both scans show.
         observability: (6,) of the degeneracy's motions: probability that surfaces show it, not chance.
         unobservable: Names of the motions that are rather not measured, as in "translation along x".
+        is_planar: The scans are planar: z and tilt are not measured, but known to be 0.
     """
 
     overlap: float
@@ -85,6 +101,7 @@ class ScanFit:
     degeneracy: Degeneracy
     observability: Array
     unobservable: str
+    is_planar: bool
 
 
 def described(deskewed: DeskewedScan) -> ScanDescription:
@@ -132,7 +149,11 @@ def fit_of(
     target, source = keyframe.deskewed.prepared, deskewed.prepared
     points_key = apply(T_key_scan, source.points)
     indices, distances_m = target.nearest(points_key)
-    near = np.flatnonzero(distances_m <= max_pair_distance_m)
+    is_planar = deskewed.scan.is_planar
+    reach_m = (
+        np.maximum(max_pair_distance_m, keyframe.spacing_m[indices]) if is_planar else max_pair_distance_m
+    )
+    near = np.flatnonzero(distances_m <= reach_m)
     if len(near) < _MIN_PAIRS:
         return None
     partners, points = indices[near], source.points[near]
@@ -145,23 +166,28 @@ def fit_of(
     own += (1.0 - elsewhere) * _towards(source.near_normals[near], normals)
     rows = np.hstack([np.cross(points, normals), normals])
     own_rows = np.hstack([np.cross(points, own), own])
-    shown = np.einsum("ni,nj->ij", rows, own_rows)
-    if np.trace(shown[3:, 3:]) <= 0.0:
+    if np.einsum("ni,ni->", normals, own) <= 0.0:
         return None
     agree = np.zeros(len(source.points), dtype=bool)
     agree[near] = (np.abs(residuals_m) <= _SURFACE_VOXELS * source.voxel_m) & normals.any(axis=1)
-    agreement, _ = weakest_direction(source.normals, agree)
+    counting, seen = source.normals, len(source.points)
+    if is_planar:
+        in_sight = _in_sight(keyframe.description, points_key) | agree
+        counting, seen = counting * in_sight[:, None], max(int(in_sight.sum()), int(_LEAST_IN_SIGHT * seen))
+    agreement, _ = weakest_direction(counting, agree)
     counts = FreeSpaceCheck(_MARGIN_M).count(keyframe.description, _checked(deskewed), T_key_scan)
-    information = 0.5 * (shown + shown.T)
+    by_surfaces = _Pairs(points, rows, own_rows, agree[near])
+    pairs = by_surfaces.in_their_plane() if is_planar else by_surfaces
+    information = pairs.information()
     degeneracy = degeneracy_of(information, points=source.points)
     chance = len(near) * (_CHANCE + _CHANCE_NEAR * max(0.0, 1.0 - moved_voxels))
-    observability = _observability(degeneracy, points, rows, own_rows, agree[near], chance_pairs=chance)
+    observability = _observability(degeneracy, pairs, chance_pairs=chance)
     unobservable = ""
     if observability.min() < 0.5:
         least = 1.001 * float(degeneracy.shares[observability < 0.5].max())
         unobservable = degeneracy_of(information, points=source.points, min_share=max(least, 1e-9)).text
     return ScanFit(
-        overlap=len(near) / len(source.points),
+        overlap=min(1.0, len(near) / seen),
         rmse_m=float(np.sqrt(np.mean(distances_m[near] ** 2))),
         agreement=agreement,
         contradicting=counts.contradicting_ratio,
@@ -171,7 +197,21 @@ def fit_of(
         degeneracy=degeneracy,
         observability=observability,
         unobservable=unobservable,
+        is_planar=is_planar,
     )
+
+
+def _in_sight(keyframe: ScanDescription, points_key: Array) -> NDArray[np.bool_]:
+    """Return the mask of the points of a planar scan that are not hidden from a keyframe nor beside its view.
+
+    A scanner of 180° that turns sees half of its view anew within a second.
+    """
+    nearest_m = keyframe.ranges_m.min(axis=0)
+    offsets = points_key[:, :2] - keyframe.origin_body[:2]
+    columns = ((np.arctan2(offsets[:, 1], offsets[:, 0]) + np.pi) / keyframe.direction_rad).astype(np.intp)
+    beyond_m = np.hypot(*offsets.T) - nearest_m[columns % len(nearest_m)]
+    in_sight: NDArray[np.bool_] = beyond_m <= _MARGIN_M
+    return in_sight
 
 
 def _towards(normals: Array, others: Array) -> Array:
@@ -180,26 +220,47 @@ def _towards(normals: Array, others: Array) -> Array:
     return towards
 
 
-def _observability(
-    degeneracy: Degeneracy,
-    points: Array,
-    rows: Array,
-    own_rows: Array,
-    agree: NDArray[np.bool_],
-    *,
-    chance_pairs: float,
-) -> Array:
+@dataclass(frozen=True, slots=True, eq=False)
+class _Pairs:
+    """Pairs of points: those of the scan, the rows of both scans' normals, and whether they agree."""
+
+    points: Array
+    rows: Array
+    own_rows: Array
+    agree: NDArray[np.bool_]
+
+    def in_their_plane(self) -> "_Pairs":
+        """Return the pairs of planar scans with as many that lie on the plane: it shows z and tilt."""
+        up = np.broadcast_to([0.0, 0.0, 1.0], self.points.shape)
+        level = np.hstack([np.cross(self.points, up), up])
+        return _Pairs(
+            np.vstack([self.points, self.points]),
+            np.vstack([self.rows, level]),
+            np.vstack([self.own_rows, level]),
+            np.concatenate([self.agree, np.ones(len(level), np.bool_)]),
+        )
+
+    def information(self) -> Array:
+        """Return the (6, 6) information that is in the normals of both scans."""
+        shown = np.einsum("ni,nj->ij", self.rows, self.own_rows)
+        return np.asarray(0.5 * (shown + shown.T), np.float64)
+
+
+def _observability(degeneracy: Degeneracy, pairs: _Pairs, *, chance_pairs: float) -> Array:
     """Return (6,) probability that the pairs that show a motion are not there by chance.
 
     The pairs are counted (as Tuna et al. 2024, §III, count contributions), or, where all of them show a
     little, as on slopes, the squared cosines summed. Shares alone do not tell: normals off by a few degrees,
     a thousand times, make as large a share as one tree.
     """
-    displacements = np.cross(degeneracy.motions[:, None, :3], points) + degeneracy.motions[:, None, 3:]
+    displacements = np.cross(degeneracy.motions[:, None, :3], pairs.points)
+    displacements += degeneracy.motions[:, None, 3:]
     squares = np.maximum(np.einsum("kni,kni->kn", displacements, displacements), np.finfo(float).tiny)
-    along = agree * (degeneracy.motions @ rows.T) * (degeneracy.motions @ own_rows.T) / squares
-    pairs = np.maximum((along > _FACING).sum(axis=1), along.sum(axis=1))
-    observability: Array = 1.0 - np.exp(-np.maximum(pairs - chance_pairs, 0.0) / _CHANCE_PAIRS)
+    along = (
+        pairs.agree * (degeneracy.motions @ pairs.rows.T) * (degeneracy.motions @ pairs.own_rows.T) / squares
+    )
+    showing = np.maximum((along > _FACING).sum(axis=1), along.sum(axis=1))
+    observability: Array = 1.0 - np.exp(-np.maximum(showing - chance_pairs, 0.0) / _CHANCE_PAIRS)
     return observability
 
 

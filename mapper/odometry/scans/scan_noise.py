@@ -12,7 +12,8 @@ from mapper.odometry.scans.scan_fit import ScanFit
 
 _SECTORS = 12  # of azimuth, each of two elevations
 _FEWEST = 10  # points of a sector that tells how much its distances agree
-_MEDIAN_CHI2, _FREEDOM = 0.455, 6.0  # of one degree of freedom; of a pose
+_MEDIAN_CHI2 = 0.455  # of one degree of freedom
+_IN_PLANE = slice(2, 5)  # yaw, x and y of a tangent
 _LEAST_SHARE, _LEAST_SCATTER = 1e-9, 1e-2  # relative to the best known motion; to independent distances
 _SCATTER = 0.75
 """Weight of the scatter in the mean: with a half, one second in a bare field was 0.3 m and 6 sigma off."""
@@ -35,7 +36,8 @@ def surface_covariance(fit: ScanFit) -> Array:
     estimates allow for that: the one of independent distances, σ²H⁻¹, times their design effect (Kish 1965,
     §5.4), one number for all motions, and the scatter of the steps of 24 sectors (Liang & Zeger 1986, eq. 8),
     a matrix. The first is blind to motions that few sectors show; the second takes for errors of the pose
-    what a map of many keyframes averages. Theirs is the geometric mean, weighted 1 : 3.
+    what a map of many keyframes averages. Theirs is the geometric mean, weighted 1 : 3. Of planar scans z and
+    tilt have no covariance.
 
     To it comes the square of the step that would fit the scan to this keyframe best, as far as it exceeds
     what the scatter explains: a matcher that is biased, or a map that disagrees with the keyframe, is off by
@@ -44,7 +46,8 @@ def surface_covariance(fit: ScanFit) -> Array:
     Args:
         fit: With rows, distances and points.
     """
-    rows, residuals_m = fit.rows, fit.residuals_m
+    measured = _IN_PLANE if fit.is_planar else slice(6)
+    rows, residuals_m = fit.rows[:, measured], fit.residuals_m
     hessian = np.einsum("ni,nj->ij", rows, rows)
     scale = np.sqrt(np.maximum(np.diag(hessian), np.finfo(float).tiny))
     known, motions = np.linalg.eigh(hessian / np.outer(scale, scale))
@@ -57,14 +60,17 @@ def surface_covariance(fit: ScanFit) -> Array:
     columns = (rows / scale) @ (motions * (sigmas / np.sqrt(variance)))
     steps: Array = np.stack([np.bincount(sectors, column * residuals_m) for column in columns.T], axis=1)
     used = int((points > 0).sum())
-    scatter, axes = np.linalg.eigh(np.einsum("ci,cj->ij", steps, steps) * (used / max(used - 6, 1)))
+    freedom = rows.shape[1]
+    scatter, axes = np.linalg.eigh(np.einsum("ci,cj->ij", steps, steps) * (used / max(used - freedom, 1)))
     scatter = np.maximum(scatter, _LEAST_SCATTER)
     step = steps.sum(axis=0) @ axes
     chi2 = float(np.sum(step**2 / scatter))
-    unexplained = max(0.0, 1.0 - _FREEDOM / chi2) if chi2 > 0.0 else 0.0
+    unexplained = max(0.0, 1.0 - freedom / chi2) if chi2 > 0.0 else 0.0
     to_tangent = (motions * (sigmas * np.sqrt(variance))) @ axes / scale[:, None]
     along_axes = to_tangent @ (np.diag(scatter**_SCATTER) + unexplained * np.outer(step, step))
-    return np.asarray(along_axes @ to_tangent.T, np.float64)
+    covariance = np.zeros((6, 6))
+    covariance[measured, measured] = along_axes @ to_tangent.T
+    return covariance
 
 
 def _design_effect(residuals_m: Array, sectors: NDArray[np.intp], points: NDArray[np.intp]) -> float:
@@ -116,6 +122,8 @@ class ScanNoise:
         T_key_scan: Transform,
         elapsed_s: float,
         at_stamps: Array,
+        *,
+        errors_add_up: bool = True,
     ) -> PoseNoise:
         """Return the noise of the next scan.
 
@@ -125,6 +133,7 @@ class ScanNoise:
             T_key_scan: (4, 4) the pose relative to the keyframe.
             elapsed_s: Since the scan before.
             at_stamps: (6, 6) covariance of the motion from the stamps to the middles of both sweeps.
+            errors_add_up: An error of the prediction is one of the velocity that later ones are made with.
         """
         covariance = surface_covariance(fit)
         off_m, moved_m = float(np.median(np.abs(fit.residuals_m))), float(np.linalg.norm(T_key_scan[:3, 3]))
@@ -132,7 +141,7 @@ class ScanNoise:
         least_m = np.hypot(_LEAST_M + _MODEL_M_M * off_m, _MODEL_SHARE_M * off_m * moved_m)
         covariance = covariance + np.diag(np.square([least_rad] * 3 + [least_m] * 3)) + at_stamps
         is_open = 1.0 - float(fit.observability.min())
-        self._unseen = 1.0 + is_open * self._unseen
+        self._unseen = 1.0 + is_open * self._unseen * errors_add_up
         self._steps = self._unseen + is_open * self._steps
         motions = fit.degeneracy.motions
         added_m = np.minimum(open_m * self._steps, fit.degeneracy.extent_m)

@@ -15,8 +15,8 @@ from mapper.odometry.scans.scan_matcher import DeskewedScan
 from mapper.registration.surfaces import prepared
 from mapper.sources.base import Log
 
-_MIN_POINTS = 100
-"""Fewer points left after thinning do not constrain a pose."""
+_MIN_POINTS, _MIN_PLANAR_POINTS = 100, 30
+"""Fewer points left after thinning do not constrain a pose; in a plane it has half of the motions."""
 _LOOKED_AT = 6
 _FINER = 0.5  # voxel size of the first thinning, of whose points each prepared point is the mean
 
@@ -61,7 +61,9 @@ class ScanObservation:
     def view(self, motion: Motion | None) -> ScanView:
         """Return the points as taken all at once at the stamp, one per voxel; None is no motion."""
         points = deskewed(self.scan, motion or STILL).points_body
-        return ScanView(self.scan.stamp_ns, points[thin(points, self.voxel_m)])
+        return ScanView(
+            self.scan.stamp_ns, points if self.scan.is_planar else points[thin(points, self.voxel_m)]
+        )
 
     def sweep(self, moment_s: float) -> Scan:
         """Return the points with times from a moment after the stamp, seconds."""
@@ -77,15 +79,20 @@ def observe_scan(frame: Frame, config: ScanOdometryConfig) -> ScanObservation:
         FrameError: Too few points are in range.
     """
     scan = frame.scan()
+    if scan.is_planar:
+        scan = _in_its_plane(scan)
     range_m = np.linalg.norm(scan.points_body - scan.origin_body.astype(np.float32), axis=1)
+    fewest = _MIN_PLANAR_POINTS if scan.is_planar else _MIN_POINTS
     in_range = np.flatnonzero((range_m >= config.min_range_m) & (range_m <= config.max_range_m))
     points_body = scan.points_body[in_range]
     kept = thin(points_body, _FINER * config.voxel_m)
-    if len(kept) < _MIN_POINTS:
+    if scan.is_planar:  # it has few points, and the free-space check needs all of its rays
+        kept = np.arange(len(points_body))
+    if len(kept) < fewest:
         raise FrameError(
             f"scan {scan.stamp_ns}: {len(scan.points_body)} points, of which {len(kept)} are left between "
             f"{config.min_range_m:g} m and {config.max_range_m:g} m and {_FINER * config.voxel_m:g} m apart; "
-            f"want {_MIN_POINTS} (odometry.min_range_m, max_range_m, voxel_m; source.cloud_scale where these "
+            f"want {fewest} (odometry.min_range_m, max_range_m, voxel_m; source.cloud_scale where these "
             "are no metres)"
         )
     thinned = replace(scan, points_body=points_body[kept], colors=None, times_s=None, intensities=None)
@@ -113,5 +120,13 @@ def why_untrackable(log: Log, config: ScanOdometryConfig) -> str | None:
     return first
 
 
+def _in_its_plane(scan: Scan) -> Scan:
+    """Return a planar scan with z = 0: motions in the plane are the same at any height."""
+    level = np.array([1.0, 1.0, 0.0])
+    return replace(
+        scan, points_body=scan.points_body * level.astype(np.float32), origin_body=scan.origin_body * level
+    )
+
+
 def _prepared(scan: Scan, voxel_m: float) -> DeskewedScan:
-    return DeskewedScan(scan, prepared(scan.points_body, voxel_m=voxel_m))
+    return DeskewedScan(scan, prepared(scan.points_body, voxel_m=voxel_m, is_planar=scan.is_planar))

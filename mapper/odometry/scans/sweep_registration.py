@@ -73,6 +73,8 @@ class SweepRegistration:
         if measured is not None:
             return self._by_gyroscope(observation, path, measured)
         sigmas = motion.velocity_sigmas(time_ns)
+        if motion.is_by_wheels(time_ns):
+            return self._at_velocity(observation, path, np.diag((_CHANGED * sigmas) ** 2))
         if motion.spread(time_ns) is None or observation.displacement(float(sigmas[0])) <= _NEGLIGIBLE:
             return self._at_velocity(observation, path, np.diag((_CHANGED * sigmas) ** 2))
         placed = self._with_velocity(observation, path)
@@ -106,7 +108,7 @@ class SweepRegistration:
         self, observation: ScanObservation, path: KnownPath, covariance: Array | None
     ) -> PlacedScan | None:
         """Register a scan that is deskewed by the velocity until then; None is its expected covariance."""
-        deskewed = observation.deskew(path.motion.twist)
+        deskewed = observation.deskew(path.motion.during(observation.middle_ns, observation.half_s))
         found = self._search.find(deskewed, path, observation.middle_ns)
         if found is None:
             return None

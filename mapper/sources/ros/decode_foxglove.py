@@ -19,7 +19,9 @@ from google.protobuf.message_factory import GetMessages
 from google.protobuf.timestamp_pb2 import Timestamp
 
 from mapper.core.errors import DataError
+from mapper.core.geometry import Transform
 from mapper.core.timebase import NS_PER_S
+from mapper.sources.laser_scan import laser_records
 from mapper.sources.ros.cloud_messages import structured, usable_fields
 from mapper.sources.ros.messages import (
     CameraMessage,
@@ -99,10 +101,24 @@ def _cloud(m: Any) -> CloudMessage:
     stated = [(f.name, f.offset, f.type, 1) for f in m.fields]
     fields, notes = usable_fields(stated, _NUMERIC_TYPES, order="<", point_bytes=stride)
     points = structured(data, fields, point_bytes=stride, shape=(1, len(data) // max(stride, 1)))
+    return CloudMessage(_ns(m.timestamp), m.frame_id, points, _pose_of(m), notes)
+
+
+def _laser(m: Any) -> CloudMessage:
+    ranges_m = np.asarray(m.ranges, np.float64)
+    points = laser_records(
+        ranges_m,
+        first_rad=m.start_angle,
+        step_rad=(m.end_angle - m.start_angle) / max(len(ranges_m) - 1, 1),
+        intensities=np.asarray(m.intensities),
+    )
+    return CloudMessage(_ns(m.timestamp), m.frame_id, points, _pose_of(m))
+
+
+def _pose_of(m: Any) -> Transform:
+    """Return the pose of a message's points in its frame; protobuf leaves zeros out: an empty one is none."""
     T_frame_points = pose_from_numbers(np.array(_numbers(m.pose.position, m.pose.orientation)))
-    if T_frame_points is None:  # protobuf leaves zeros out: an empty pose is none
-        T_frame_points = np.eye(4)
-    return CloudMessage(_ns(m.timestamp), m.frame_id, points, T_frame_points, notes)
+    return np.eye(4) if T_frame_points is None else T_frame_points
 
 
 def _transform(m: Any) -> list[PoseMessage]:
@@ -124,6 +140,7 @@ _READERS: Mapping[str, Callable[[Any], Message]] = {
     "foxglove.CompressedImage": _file,
     "foxglove.CameraCalibration": _camera,
     "foxglove.PointCloud": _cloud,
+    "foxglove.LaserScan": _laser,
     "foxglove.FrameTransform": _transform,
     "foxglove.FrameTransforms": _transforms,
     "foxglove.PoseInFrame": _pose_in_frame,

@@ -10,6 +10,7 @@ from mapper.core.errors import DataError
 from mapper.core.geometry import is_rigid, transform
 from mapper.core.rotations import row_of_pose
 from mapper.core.timebase import NS_PER_S
+from mapper.sources.laser_scan import laser_records
 from mapper.sources.ros.cloud_messages import structured, usable_fields, without_noise
 from mapper.sources.ros.driver_messages import decode_driver_message
 from mapper.sources.ros.messages import (
@@ -102,6 +103,18 @@ def _cloud(m: Any) -> CloudMessage:
     return CloudMessage(_ns(m.header.stamp), m.header.frame_id, points, notes=[*notes, *noise_notes])
 
 
+def _laser(m: Any) -> CloudMessage:
+    points = laser_records(
+        m.ranges,
+        first_rad=m.angle_min,
+        step_rad=m.angle_increment,
+        limits_m=(m.range_min, m.range_max if m.range_max > 0.0 else np.inf),
+        step_s=m.time_increment,
+        intensities=m.intensities,
+    )
+    return CloudMessage(_ns(m.header.stamp), m.header.frame_id, points)
+
+
 def _imu(m: Any) -> ImuMessage:
     a = m.linear_acceleration
     return ImuMessage(_ns(m.header.stamp), m.header.frame_id, np.array([a.x, a.y, a.z]))
@@ -154,6 +167,7 @@ _READERS: Mapping[str, Callable[[Any], Message]] = {
     "sensor_msgs/msg/CompressedImage": _file,
     "sensor_msgs/msg/CameraInfo": _camera,
     "sensor_msgs/msg/PointCloud2": _cloud,
+    "sensor_msgs/msg/LaserScan": _laser,
     "sensor_msgs/msg/Imu": _imu,
     "sensor_msgs/msg/NavSatFix": _fix,
     "geometry_msgs/msg/PoseStamped": _pose_stamped,

@@ -11,6 +11,7 @@ from mapper.sources.base import ImageFiles
 from mapper.sources.image_files.decoded import DecodedColour, DecodedDepth
 from mapper.sources.image_files.image_sizes import RecordedCamera
 from mapper.sources.image_folders.rgbd import RgbdEntry
+from mapper.sources.laser_scan import planar
 from mapper.sources.ros.cloud_messages import scan_from
 from mapper.sources.ros.decode import decode
 from mapper.sources.ros.frame_tree import FrameTree, is_fixed
@@ -143,12 +144,14 @@ class CloudEntry:
         body: Coordinate frame of the scan.
         tree: Coordinate frames that tie each message's own frame to the body's.
         scale: Metres per unit of the points, as the user set it.
+        is_planar: They are of a 2D laser.
     """
 
     cloud: Located
     body: str
     tree: FrameTree
     scale: float | None = None
+    is_planar: bool = False
     files: ImageFiles | None = None
 
     @property
@@ -185,7 +188,7 @@ class CloudEntry:
         if frame != self.body and is_fixed(frame):
             # Where the sensor was is not stated; what turned its points into that frame has deskewed them.
             scan = replace(scan, origin_body=np.zeros(3), times_s=None)
-        return scan
+        return planar(scan) if self.is_planar else scan
 
     def scan(self) -> Scan:
         """Read the cloud without its colours.

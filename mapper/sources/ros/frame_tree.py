@@ -84,6 +84,16 @@ class FrameTree:
         between = self._ancestors(to).keys() ^ self._ancestors(from_).keys()
         return self.find(to, from_) is not None and any(map(self._moves_in_parent, between))
 
+    def path_in(self, fixed: str, frame: str) -> Trajectory | None:
+        """Return the poses of a frame in one that it moves in, at the times of tf; None if it does not."""
+        chain = list(self._ancestors(frame))
+        if fixed not in chain or not self.moves(fixed, frame):
+            return None
+        links = [self._parents[one][1] for one in chain[: chain.index(fixed)]]
+        stamps_ns = max(links, key=len).stamps_ns
+        known, T_fixed_frame = self.find_each(fixed, frame, stamps_ns)
+        return Trajectory(stamps_ns[known], T_fixed_frame)
+
     def carried_by(self, fixed: str) -> str | None:
         """Return the frame nearest below a fixed one that moves in it; None without one."""
         moving = filter(self._moves_in_parent, self._parents)

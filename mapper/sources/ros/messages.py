@@ -101,7 +101,7 @@ class CameraMessage:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CloudMessage:
-    """A point cloud (sensor_msgs/PointCloud2, foxglove.PointCloud, a LiDAR driver's own message).
+    """A point cloud (sensor_msgs/PointCloud2, foxglove.PointCloud, a driver's own), or a 2D laser's returns.
 
     Attributes:
         stamp_ns: Time of the cloud.
@@ -188,12 +188,13 @@ LIVOX = frozenset(
 )
 VELODYNE = frozenset({"velodyne_msgs/msg/VelodyneScan"})
 DRIVER_CLOUDS = LIVOX | VELODYNE
-CLOUDS = frozenset({"sensor_msgs/msg/PointCloud2", "foxglove.PointCloud"}) | DRIVER_CLOUDS
+LASERS = frozenset({"sensor_msgs/msg/LaserScan", "foxglove.LaserScan"})
+CLOUDS = frozenset({"sensor_msgs/msg/PointCloud2", "foxglove.PointCloud"}) | DRIVER_CLOUDS | LASERS
 IMUS = frozenset({"sensor_msgs/msg/Imu"})
 FIXES = frozenset({"sensor_msgs/msg/NavSatFix"})
-POSES = frozenset(
+ODOMETRY = frozenset({"nav_msgs/msg/Odometry"})
+POSES = ODOMETRY | frozenset(
     {
-        "nav_msgs/msg/Odometry",
         "geometry_msgs/msg/PoseStamped",
         "geometry_msgs/msg/PoseWithCovarianceStamped",
         "geometry_msgs/msg/TransformStamped",

@@ -114,6 +114,12 @@ class RecordingReader:
             )
         return replace(wheels, T_world_body=wheels.T_world_body @ mounting(config, sensor)), notes
 
+    def wheels_by_tf(self, body: str) -> tuple[Trajectory | None, list[str]]:
+        """Return T_odom_body by the transforms that a robot's base publishes (REP 105), and a note."""
+        odom = next((frame for frame in self.tree.frames if frame.split("/")[-1] == "odom"), None)
+        wheels = None if odom is None else self.whole_tree.path_in(odom, body)
+        return wheels, [] if wheels is None else [f"wheel odometry by tf: {odom} → {body}"]
+
     def accelerations(self, series: Series | None, *, body: str) -> tuple[Accelerations | None, list[str]]:
         """Return the readings of a topic, in the body's axes where tf ties the two, and notes."""
         if series is None:

@@ -15,6 +15,7 @@ from mapper.sources.config import SourceConfig
 from mapper.sources.image_files.image_sizes import recorded_camera
 from mapper.sources.image_files.reading import TUM_UNITS_PER_M
 from mapper.sources.image_folders.pairing import depth_offset_ns
+from mapper.sources.laser_scan import MAX_TILT_RAD, tilt_rad
 from mapper.sources.point_times import relative_times_s, time_field
 from mapper.sources.ros.cameras import calibrate
 from mapper.sources.ros.entries import CloudEntry, rgbd_entry, stereo_entry
@@ -23,6 +24,7 @@ from mapper.sources.ros.image_messages import has_float_depth, size_of
 from mapper.sources.ros.index import Series, why_unread
 from mapper.sources.ros.message_order import ordered, paired
 from mapper.sources.ros.messages import (
+    LASERS,
     READ,
     VELODYNE,
     CloudMessage,
@@ -90,6 +92,8 @@ def recording_log(reader: RecordingReader, config: SourceConfig) -> Log:
     wheels, wheel_notes = reader.wheels(
         choice.wheels, body=frames.body, config=config.wheels, sensor=frames.sensor
     )
+    if choice.wheels is None and frames.sensor == "lidar-2d":
+        wheels, wheel_notes = reader.wheels_by_tf(frames.body)
     gnss, gnss_notes = reader.gnss(choice.gnss, body=frames.body)
     return Log(
         path=recording.path,
@@ -234,14 +238,18 @@ def _lidar(reader: RecordingReader, clouds: Series, config: SourceConfig) -> _Fr
         times = time_field(first.points.dtype.names or ())
         if times and relative_times_s(first.points[times], first.stamp_ns) is None:
             notes.append(f"{clouds.topic.name}: field {times} holds no times; scans are not deskewed")
-    frame = frame_of(first)
+    frame, is_planar = frame_of(first), clouds.topic.type in LASERS
+    if is_planar and config.body_frame is None:
+        config = config.model_copy(update={"body_frame": reader.base_of(frame)})
     body, body_notes = _body_of(reader, frame, config, name=clouds.topic.name)
     notes += body_notes
+    if is_planar:
+        notes += _planar_notes(reader, frame, body, name=clouds.topic.name)
     if "optical" in body:
         notes.append(f"points are in {body}, whose z looks forward; source.body_frame can take another")
 
     def entry_at(index: int) -> FrameRef:
-        return CloudEntry(reader.located(clouds, int(i[index])), body, tree, config.cloud_scale)
+        return CloudEntry(reader.located(clouds, int(i[index])), body, tree, config.cloud_scale, is_planar)
 
     is_apart = np.array([reader.tree.find(body, one) is None for one in clouds.frames], np.bool_)
     if is_apart.any():
@@ -253,7 +261,26 @@ def _lidar(reader: RecordingReader, clouds: Series, config: SourceConfig) -> _Fr
         )
         i = i[~left_out[i]]
     tree = reader.tree_of(body, frame)
-    return _Frames("lidar", body, clouds.stamps_ns[i], entry_at, notes)
+    return _Frames("lidar-2d" if is_planar else "lidar", body, clouds.stamps_ns[i], entry_at, notes)
+
+
+def _planar_notes(reader: RecordingReader, frame: str, body: str, *, name: str) -> list[str]:
+    """Return a note where a 2D laser's mounting is not stated.
+
+    Raises:
+        SourceError: Its plane is not that in which the body moves.
+    """
+    if body == frame:
+        return [f"{name}: tf does not say where the robot carries {frame}, which is taken as the body"]
+    T_body_laser = reader.tree.find(body, frame)
+    assert T_body_laser is not None
+    if (angle_rad := tilt_rad(T_body_laser)) > MAX_TILT_RAD:
+        raise SourceError(
+            f"{reader.recording.path}: {name}: by tf the laser's plane is tilted by "
+            f"{np.degrees(angle_rad):.0f}° in {body}, want at most {np.degrees(MAX_TILT_RAD):.0f}°: the "
+            f"robot does not drive in it; source.body_frame={frame} maps the scans in their own plane"
+        )
+    return []
 
 
 def _body_of(

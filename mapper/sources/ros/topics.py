@@ -19,6 +19,8 @@ from mapper.sources.ros.messages import (
     FIXES,
     IMAGES,
     IMUS,
+    LASERS,
+    ODOMETRY,
     POSES,
     READ,
     ImageMessage,
@@ -28,6 +30,8 @@ from mapper.sources.ros.messages import (
 
 TRUTH, WHEELS = "/ground_truth", "/wheel_odometry"
 
+_ESTIMATED = re.compile("map|laser|lidar|icp|rf2o|visual|camera|gps|gnss|truth|amcl|slam")
+"""Names of odometry that is not of wheels, or not of them alone."""
 _TRANSPORTS = ("/compressedDepth", "/compressed")  # what image_transport appends to an image's own topic
 _OWN_TYPES = "mapper/msg/"
 _SIDES = re.compile(r"left|infra1|Infrared_1|cam0|camera0", re.IGNORECASE)
@@ -126,7 +130,7 @@ def choose(
     depth_images = pick.candidates("depth", config.depth, IMAGES, where=depths.__contains__)
     color, depth = _of_one_camera(colors, depth_images, firsts)
     clouds = pick.candidates("points", config.points, CLOUDS, where=lambda name: len(series[name]) > 1)
-    points = _best(clouds, _cloud_rank)
+    points = _best([one for one in clouds if one.topic.type not in LASERS] or clouds, _cloud_rank)
     imu = pick.one("imu", config.imu, IMUS, _plain_rank, where=lambda name: _feels_gravity(series[name]))
     gyroscope = imu if imu is not None and _turns(imu) and config.gyroscope is None else None
     if gyroscope is None:
@@ -136,6 +140,11 @@ def choose(
     gnss = pick.one("gnss", config.gnss, FIXES, _fix_rank, where=lambda _name: True)
     truth = pick.one("truth", config.truth, POSES, _plain_rank, where=lambda name: name == TRUTH)
     wheels = pick.one("wheels", config.wheels, POSES, _plain_rank, where=lambda name: name == WHEELS)
+    if wheels is None and points is not None and points.topic.type in LASERS:
+        driven = [
+            one for one in pick.all(ODOMETRY) if one is not truth and not _ESTIMATED.search(one.topic.name)
+        ]
+        wheels = _best(driven, _plain_rank)
     pick.refuse_own_runs()
     frames: CameraTopics | StereoTopics | Series
     if color is not None and depth is not None and config.points is None:

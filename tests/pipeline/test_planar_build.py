@@ -1,0 +1,113 @@
+"""Logs of 2D lasers become maps: planar poses, loops, a sharp layer, and floor where it is free."""
+
+import numpy as np
+import pytest
+
+from mapper.config.loading import load_config
+from mapper.core.trajectory import Trajectory
+from mapper.evaluators.metrics.evaluate import evaluate
+from mapper.octree.grid import FREE, OCCUPIED, read_grid
+from mapper.pipeline.build import build
+from mapper.sources import open_source
+from tests.support.planar import at
+from tests.support.planar_drives import (
+    FIRST_NS,
+    RPLIDAR,
+    SICK,
+    corridor,
+    drive,
+    flat,
+    write_carmen,
+    write_ros,
+)
+
+
+def truth_of(driven):
+    stamps_ns = FIRST_NS + np.rint(1e9 * driven.times_s).astype(np.int64)
+    return Trajectory(stamps_ns, np.array([at(*pose) for pose in driven.truth]))
+
+
+def wheels_of(driven):
+    return Trajectory(truth_of(driven).stamps_ns, np.array([at(*pose) for pose in driven.wheels]))
+
+
+def built(path, out):
+    log = open_source(path)
+    return build(log, load_config(None, ["mcap.frame_times=false"], sensor=log.sensor), out)
+
+
+def error_m(trajectory, driven):
+    return evaluate(trajectory, truth_of(driven)).ate_m
+
+
+@pytest.fixture(scope="module", params=["360° at 8 Hz, ROS 2", "180° at 5 Hz, CARMEN"])
+def rooms(request, tmp_path_factory):
+    """Two rooms twice around, with wheels that slip by 5 %."""
+    folder = tmp_path_factory.mktemp("flat")
+    if "ROS" in request.param:
+        driven = drive(flat(), RPLIDAR, speed_mps=0.8)
+        path = write_ros(folder / "log", driven)
+    else:
+        driven = drive(flat(), SICK, speed_mps=0.4)
+        path = write_carmen(folder / "log.log", driven)
+    return driven, built(path, folder / "run")
+
+
+def test_poses_are_a_hundredth_as_wrong_as_the_wheels(rooms):
+    driven, run = rooms
+
+    assert error_m(wheels_of(driven), driven) > 0.3
+    assert error_m(run.trajectory, driven) < 0.02
+    assert len(run.trajectory) > 0.98 * len(driven.times_s)
+
+
+def test_poses_stay_in_the_plane(rooms):
+    _, run = rooms
+    T = run.trajectory.T_world_body
+
+    assert np.ptp(T[:, 2, 3]) < 1e-6
+    assert np.abs(T[:, 2, 2] - 1.0).max() < 1e-9
+
+
+def test_loops_hold_and_the_run_is_trusted(rooms):
+    driven, run = rooms
+    truth = truth_of(driven)
+    index = {int(stamp_ns): k for k, stamp_ns in enumerate(truth.stamps_ns)}
+    accepted = [loop for loop in run.loops if loop.verdict == "accepted"]
+
+    assert len(accepted) >= 2
+    for loop in accepted:
+        T_i, T_j = (truth.T_world_body[index[ns]] for ns in (loop.stamp_i_ns, loop.stamp_j_ns))
+        assert np.linalg.norm((np.linalg.inv(loop.T_i_j) @ np.linalg.inv(T_i) @ T_j)[:2, 3]) < 0.1
+    assert run.manifest.verdict.state == "trusted"
+
+
+def test_octree_is_one_layer_and_the_slice_is_as_sharp_as_its_cells(rooms):
+    _, run = rooms
+    heights_m = run.octree.occupied()[:, 2]
+    grid = read_grid(run.path / "slice.yaml")
+
+    assert np.ptp(heights_m) < 1e-6
+    occupied = (grid.cells == OCCUPIED).sum() * grid.resolution_m
+    walls_m = sum(np.linalg.norm(wall[2:] - wall[:2]) for wall in flat()[0])
+    assert occupied < 4.0 * walls_m  # in cells a wall
+
+
+def test_free_cells_of_the_layer_are_floor(rooms):
+    _, run = rooms
+    grid = read_grid(run.path / "traversable.yaml")
+    x, y = run.trajectory.positions_world[::5, :2].T
+    columns = ((x - grid.origin_world_m[0]) / grid.resolution_m).astype(int)
+    rows = ((y - grid.origin_world_m[1]) / grid.resolution_m).astype(int)
+
+    assert (grid.cells[rows, columns] == FREE).all()
+    assert (grid.cells == OCCUPIED).any()
+
+
+def test_wheels_measure_the_length_of_a_bare_corridor(tmp_path):
+    driven = drive(corridor(20.0), RPLIDAR, speed_mps=1.0)
+
+    run = built(write_ros(tmp_path / "log.bag", driven), tmp_path / "run")
+
+    assert len(run.trajectory) > 0.95 * len(driven.times_s)
+    assert error_m(run.trajectory, driven) < 0.5 * error_m(wheels_of(driven), driven)
