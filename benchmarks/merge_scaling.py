@@ -32,7 +32,8 @@ from mapper.merging.placing import Placing, as_built
 from mapper.octree.map import OctreeMap, read_octree
 from mapper.octree.map_file import write_map
 from mapper.run.folder import Run, open_run
-from mapper.run.manifest import Input, Manifest
+from mapper.run.manifest import Manifest
+from mapper.run.manifest_logs import Input
 from mapper.run.writer import write_run
 from mapper.simulation.config import LIDAR_SCENES
 from mapper.simulation.lidar import write_lidar_log

@@ -9,6 +9,7 @@ from mapper.runtime.atomic import MANIFEST_NAME, FolderKind
 
 TRAJECTORY = "trajectory.tum"
 KEYFRAMES = "keyframes.tum"
+BASE = "base.tum"
 POSES = "poses.csv"
 TRUTH = "truth.tum"
 ODOMETRY = "odometry.tum"
@@ -70,6 +71,11 @@ def _grid(stem: str) -> tuple[str, ...]:
 RUN_FILES = (
     RunFiles(
         (TRAJECTORY, KEYFRAMES), "poses of the body in the levelled world: z up, floor at 0", "tracking"
+    ),
+    RunFiles(
+        (BASE,),
+        "those of the robot's base (`base_link`), if the recording's tf says where the sensor is on it",
+        "tracking",
     ),
     RunFiles(
         (POSES,),

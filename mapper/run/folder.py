@@ -24,13 +24,7 @@ from mapper.run.doubtful_frames import without_doubtful
 from mapper.run.frame_outcomes import FrameRecord, read_frame_ms, read_records, stamps_of
 from mapper.run.gnss_file import read_fixes
 from mapper.run.input_logs import open_inputs
-from mapper.run.manifest import (
-    Manifest,
-    Verdict,
-    is_localised_log,
-    is_merged_map,
-    read_manifest,
-)
+from mapper.run.manifest import Manifest, Verdict, is_localised_log, is_merged_map, read_manifest
 from mapper.run.pose_covariances import UncertainPoses, read_poses
 from mapper.run.results import RunResults, aligned_truth
 from mapper.runtime.atomic import partial_of

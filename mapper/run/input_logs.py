@@ -8,7 +8,8 @@ from pathlib import Path
 
 from mapper.core.errors import RunError
 from mapper.core.units import MIB
-from mapper.run.manifest import Input, InputLog, Manifest
+from mapper.run.manifest import Manifest
+from mapper.run.manifest_logs import Input, InputLog
 from mapper.sources import open_source
 from mapper.sources.base import Log
 from mapper.sources.chained import chained, sessions_of

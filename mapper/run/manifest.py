@@ -5,9 +5,8 @@ import sys
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
-from typing import Literal, Self, TypeVar
+from typing import Literal, TypeVar
 
-import numpy as np
 from pydantic import Field, ValidationError
 from pydantic_core import from_json
 
@@ -15,13 +14,12 @@ import mapper
 from mapper.core.config import Config, drop_unknown
 from mapper.core.errors import DataError, RunError
 from mapper.mapping.config import AppliedEdit
-from mapper.odometry.gyroscope_calibration import GyroscopeCalibration, with_body_rates
 from mapper.run.georeference import Georeference
+from mapper.run.manifest_logs import GyroscopeFit, Input
 from mapper.runtime.atomic import MANIFEST_NAME, write_text
 from mapper.runtime.regular_files import MOST_BYTES, read_regular, read_text
 from mapper.sensing.config import DepthNoiseConfig
 from mapper.sources.base import Log
-from mapper.sources.config import SourceConfig
 
 Status = Literal["building", "complete", "failed", "interrupted"]
 
@@ -39,73 +37,6 @@ _LIBRARIES = (
     "rosbags",
     "simplejpeg",
 )
-
-
-class GyroscopeFit(Config):
-    """Calibration of the log's gyroscope, by which scans are deskewed."""
-
-    R_body_imu: tuple[tuple[float, float, float], ...]
-    bias_radps: tuple[float, float, float]
-    offset_s: float
-    """Added to the frames' stamps it gives the readings'."""
-    scale: float
-    """Factor from the readings to rad/s; negative where their axes are left-handed."""
-
-    @classmethod
-    def of(cls, calibration: GyroscopeCalibration) -> Self:
-        """Return the record of a calibration."""
-        return cls(
-            R_body_imu=calibration.R_body_imu.tolist(),
-            bias_radps=calibration.bias.tolist(),
-            offset_s=calibration.offset_s,
-            scale=calibration.scale,
-        )
-
-    @property
-    def calibration(self) -> GyroscopeCalibration:
-        """The calibration, without its uncertainty."""
-        return GyroscopeCalibration(
-            np.array(self.R_body_imu), np.array(self.bias_radps), self.offset_s, self.scale, np.zeros((7, 7))
-        )
-
-    def applied_to(self, log: Log) -> Log:
-        """Return a log with the readings of its gyroscope calibrated."""
-        return with_body_rates(log, self.calibration)
-
-
-class InputLog(Config):
-    """A log that was read."""
-
-    path: str
-    """Absolute path."""
-    kind: str
-    fingerprint: str
-    notes: tuple[str, ...] = ()
-    """Notes: what was left out or assumed when the log was read, and what is suspicious in its frames."""
-
-
-class AppendedLog(InputLog):
-    """A later session of the same place."""
-
-    source: SourceConfig
-    """Selection of its frames; ``config.json`` holds that of the first log."""
-    shift_ns: int
-    """Nanoseconds added to its stamps."""
-    begins_ns: int
-    """Stamp of its first frame, on the run's clock."""
-    gyroscope: GyroscopeFit | None = None
-    """None where it has no gyroscope that was of use."""
-
-
-class Input(InputLog):
-    """The log that was read, and those that were appended since."""
-
-    appended: tuple[AppendedLog, ...] = ()
-
-    @property
-    def title(self) -> str:
-        """The logs' names."""
-        return " + ".join(Path(log.path).name for log in (self, *self.appended))
 
 
 class Counts(Config):

@@ -103,6 +103,10 @@ def save_tracking(writer: RunWriter, tracked: StoredTracking) -> None:
     """Write the files that keep it, and count what is in them; a graph without nodes is not written."""
     folder, graph = writer.folder, tracked.graph
     save_frames(writer, tracked, nodes=len(graph.T_world_node))
+    robot = writer.manifest.input.robot_of_all
+    if robot is not None:
+        T_world_base = tracked.trajectory.T_world_body @ robot.base_in_body
+        write_tum(folder / files.BASE, replace(tracked.trajectory, T_world_body=T_world_base))
     if graph.T_world_node:
         write_g2o(folder / files.GRAPH, graph)
         if graph.fixes:

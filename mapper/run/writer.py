@@ -11,16 +11,8 @@ from mapper.odometry.gyroscope_calibration import GyroscopeCalibration
 from mapper.run import files
 from mapper.run.digests import digests_of
 from mapper.run.input_logs import fingerprint
-from mapper.run.manifest import (
-    AppendedLog,
-    GyroscopeFit,
-    Input,
-    Manifest,
-    RunWarning,
-    Timing,
-    library_versions,
-    now_text,
-)
+from mapper.run.manifest import Manifest, RunWarning, Timing, library_versions, now_text
+from mapper.run.manifest_logs import AppendedLog, GyroscopeFit, Input, RobotFrames
 from mapper.runtime.atomic import FolderKind, atomic_folder, flush_to_disk, write_text
 from mapper.runtime.progress import Stopwatch, peak_memory_mb
 from mapper.sources.base import Log, Session
@@ -171,4 +163,5 @@ def _facts(source: Log) -> dict[str, Any]:
         "kind": source.kind,
         "fingerprint": fingerprint(source.path),
         "notes": tuple(source.notes),
+        "robot": RobotFrames.of(source),
     }

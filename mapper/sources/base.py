@@ -154,6 +154,8 @@ class Log:
         gnss: Fixes of a GNSS receiver, if the log has them.
         T_base_body: Mounting of the body on the robot, whose base has x forward and z up (REP 103), if the
             log states it.
+        base_frame: Name of the robot's base in the log.
+        body_frame: Name of the body in the log.
         wheels: T_odom_body by wheel odometry, in a frame of its own that drifts, if the log has it.
         depth_noise: Noise of its depth, if what made it states it.
         are_units_assumed: Nothing says how many units of its depth images a metre has.
@@ -173,6 +175,8 @@ class Log:
     gyroscope: Gyroscope | None = None
     gnss: GnssFixes | None = None
     T_base_body: Transform | None = None
+    base_frame: str = ""
+    body_frame: str = ""
     wheels: Trajectory | None = None
     depth_noise: DepthNoiseConfig | None = None
     are_units_assumed: bool = False

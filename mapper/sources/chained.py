@@ -89,6 +89,8 @@ def chained(first: Log, second: Log, *, shift_ns: int | None = None) -> Log:
         truth=truth,
         gyroscope=_joined_gyroscope(logs),
         T_base_body=logs[0].T_base_body,
+        base_frame=logs[0].base_frame,
+        body_frame=logs[0].body_frame,
         notes=notes,
         sessions=sessions,
     )

@@ -13,7 +13,8 @@ from mapper.navigation.config import PlanConfig
 from mapper.navigation.planner import plan_2d
 from mapper.octree.grid import FREE, OccupancyGrid
 from mapper.run.folder import Run
-from mapper.run.manifest import Input, Manifest
+from mapper.run.manifest import Manifest
+from mapper.run.manifest_logs import Input
 from mapper.sources.trajectory_files import write_tum
 
 START_NS = 1_700_000_000_000_000_000

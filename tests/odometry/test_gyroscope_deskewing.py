@@ -6,7 +6,7 @@ from mapper.core.deskew import Twist
 from mapper.core.geometry import inverse, rotation_log
 from mapper.core.timebase import NS_PER_S
 from mapper.odometry.gyroscope_calibration import calibrate, with_body_rates
-from mapper.run.manifest import GyroscopeFit
+from mapper.run.manifest_logs import GyroscopeFit
 from mapper.sensing.sweep_motion import motion_during
 from mapper.simulation.config import LidarSensorConfig, LidarSynthConfig, SynthImuConfig
 from mapper.simulation.lidar.source import LidarSimulator

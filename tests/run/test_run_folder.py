@@ -15,7 +15,8 @@ from mapper.run.files import RUN
 from mapper.run.folder import open_run
 from mapper.run.frame_outcomes import FrameRecord, read_frame_ms, read_records, write_frame_ms, write_records
 from mapper.run.input_logs import fingerprint
-from mapper.run.manifest import Input, Manifest, is_merged_map, read_manifest
+from mapper.run.manifest import Manifest, is_merged_map, read_manifest
+from mapper.run.manifest_logs import Input
 from mapper.run.pose_covariances import read_poses
 from mapper.run.writer import write_run
 from mapper.runtime.atomic import atomic_folder, partial_of

@@ -11,7 +11,8 @@ from mapper.core.trajectory import Trajectory
 from mapper.graph.model import BetweenFactor, PoseSigmas
 from mapper.loops.closure import Discrepancy, LoopClosure
 from mapper.run.frame_outcomes import DISCONNECTED
-from mapper.run.manifest import AppendedLog, Levelling, RunWarning, SkippedFrame
+from mapper.run.manifest import Levelling, RunWarning, SkippedFrame
+from mapper.run.manifest_logs import AppendedLog
 from mapper.run.pose_covariances import uncertain_poses
 from mapper.run.results import aligned_truth
 from mapper.run.verdict import find_warnings, merge_warnings

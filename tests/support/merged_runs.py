@@ -12,7 +12,8 @@ from mapper.octree.config import SliceConfig
 from mapper.octree.map_file import write_map
 from mapper.run.folder import open_run
 from mapper.run.frame_outcomes import write_records
-from mapper.run.manifest import Input, Manifest
+from mapper.run.manifest import Manifest
+from mapper.run.manifest_logs import Input
 from mapper.run.writer import write_run
 from mapper.sources.trajectory_files import write_tum
 

@@ -107,6 +107,8 @@ def recording_log(reader: RecordingReader, config: SourceConfig) -> Log:
         gyroscope=gyroscope,
         gnss=gnss,
         T_base_body=reader.mounting(frames.body),
+        base_frame=reader.base_of(frames.body) or "",
+        body_frame=frames.body,
         wheels=wheels,
         depth_noise=frames.depth_noise,
         notes=[

@@ -12,7 +12,8 @@ from mapper.evaluators.pictures.errors import write_trajectory_errors
 from mapper.evaluators.sweep.build_job import summary
 from mapper.run import files
 from mapper.run.folder import Run
-from mapper.run.manifest import Counts, Input, Manifest
+from mapper.run.manifest import Counts, Manifest
+from mapper.run.manifest_logs import Input
 from mapper.sources.trajectory_files import write_tum
 
 STAMPS_NS = 1_305_031_102_000_000_000 + np.arange(120, dtype=np.int64) * 100_000_000

@@ -1,0 +1,111 @@
+"""Logs of a run as its manifest keeps them: where they are, what was noted, and where the sensors were."""
+
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+
+from mapper.core.config import Config
+from mapper.core.geometry import Transform, inverse
+from mapper.core.rotations import pose_of_row, row_of_pose
+from mapper.odometry.gyroscope_calibration import GyroscopeCalibration, with_body_rates
+from mapper.sources.base import Log
+from mapper.sources.config import SourceConfig
+
+
+class GyroscopeFit(Config):
+    """Calibration of the log's gyroscope, by which scans are deskewed."""
+
+    R_body_imu: tuple[tuple[float, float, float], ...]
+    bias_radps: tuple[float, float, float]
+    offset_s: float
+    """Added to the frames' stamps it gives the readings'."""
+    scale: float
+    """Factor from the readings to rad/s; negative where their axes are left-handed."""
+
+    @classmethod
+    def of(cls, calibration: GyroscopeCalibration) -> Self:
+        """Return the record of a calibration."""
+        return cls(
+            R_body_imu=calibration.R_body_imu.tolist(),
+            bias_radps=calibration.bias.tolist(),
+            offset_s=calibration.offset_s,
+            scale=calibration.scale,
+        )
+
+    @property
+    def calibration(self) -> GyroscopeCalibration:
+        """The calibration, without its uncertainty."""
+        return GyroscopeCalibration(
+            np.array(self.R_body_imu), np.array(self.bias_radps), self.offset_s, self.scale, np.zeros((7, 7))
+        )
+
+    def applied_to(self, log: Log) -> Log:
+        """Return a log with the readings of its gyroscope calibrated."""
+        return with_body_rates(log, self.calibration)
+
+
+class RobotFrames(Config):
+    """Coordinate frames of a robot in a log, and where its sensor is."""
+
+    base: str
+    """Name of the robot's base, e.g. base_link."""
+    body: str
+    """Name of the frame whose poses are the run's trajectory."""
+    body_in_base: tuple[float, float, float, float, float, float, float]
+    """x y z (metres) qx qy qz qw."""
+
+    @classmethod
+    def of(cls, log: Log) -> Self | None:
+        """Return those of a log; None where it does not say where the sensor is on the robot."""
+        if log.T_base_body is None:
+            return None
+        row = row_of_pose(log.T_base_body).tolist()
+        return cls(base=log.base_frame, body=log.body_frame, body_in_base=row)
+
+    @property
+    def base_in_body(self) -> Transform:
+        """T_body_base, (4, 4)."""
+        return inverse(pose_of_row(np.array(self.body_in_base)))
+
+
+class InputLog(Config):
+    """A log that was read."""
+
+    path: str
+    """Absolute path."""
+    kind: str
+    fingerprint: str
+    notes: tuple[str, ...] = ()
+    """Notes: what was left out or assumed when the log was read, and what is suspicious in its frames."""
+    robot: RobotFrames | None = None
+    """None where the log does not say where its sensor is on a robot."""
+
+
+class AppendedLog(InputLog):
+    """A later session of the same place."""
+
+    source: SourceConfig
+    """Selection of its frames; ``config.json`` holds that of the first log."""
+    shift_ns: int
+    """Nanoseconds added to its stamps."""
+    begins_ns: int
+    """Stamp of its first frame, on the run's clock."""
+    gyroscope: GyroscopeFit | None = None
+    """None where it has no gyroscope that was of use."""
+
+
+class Input(InputLog):
+    """The log that was read, and those that were appended since."""
+
+    appended: tuple[AppendedLog, ...] = ()
+
+    @property
+    def robot_of_all(self) -> RobotFrames | None:
+        """The robot's frames where they are the same in all logs."""
+        return self.robot if all(log.robot == self.robot for log in self.appended) else None
+
+    @property
+    def title(self) -> str:
+        """The logs' names."""
+        return " + ".join(Path(log.path).name for log in (self, *self.appended))
