@@ -32,6 +32,7 @@ _FORMATS = (
     "image_folders.stereo_pairs",
     RECORDING,
     "scan_folders.velodyne_pcap",
+    "scan_folders.e57",
     "scan_folders.carmen",
     "scan_folders.clouds",
 )
@@ -55,9 +56,9 @@ def open_source(path: Path, config: SourceConfig = _DEFAULTS) -> "Log":
     """Return a recorded log, recognised by its files, with the configured selection of its frames.
 
     Args:
-        path: Folder of a TUM, ICL-NUIM, Poznań, 7-Scenes, Redwood, ScanNet, Replica or KITTI log, of an app's
-            export (Stray Scanner, Record3D, Polycam, nerfstudio) or of clouds, an mbag, .sens, .r3d
-            or .pcap file, an MCAP file, or a ROS bag.
+        path: Folder of a TUM, ICL-NUIM, Poznań, 7-Scenes, Redwood, ScanNet, Replica, EuRoC or KITTI log,
+            of an app's export (Stray Scanner, Record3D, Polycam, nerfstudio) or of clouds; an mbag, .sens,
+            .r3d, .e57, .pcap or MCAP file, a CARMEN log, or a ROS bag.
         config: Selection, pairing, camera, and what the files of a log do not state.
 
     Raises:
@@ -106,8 +107,8 @@ def open_source(path: Path, config: SourceConfig = _DEFAULTS) -> "Log":
         raise SourceError(f"{path}: {what}")
     hint = "; of clouds it has one, want two or more" if most_clouds(path) == 1 else _inner_hint(path)
     raise SourceError(
-        f"{path}: not a log of a known format (TUM, 7-Scenes, KITTI, clouds, exports of apps, .mcap, .bag, "
-        f".db3, .pcap, .mbag, .sens, .r3d); docs/your-sensor.md has them all{hint}"
+        f"{path}: not a log of a known format (TUM, 7-Scenes, KITTI, EuRoC, clouds, exports of apps, .mcap, "
+        f".bag, .db3, .mbag, .e57 …); docs/your-sensor.md has them all{hint}"
     )
 
 

@@ -92,6 +92,7 @@ HOMES = {
     "rerun": ("mapper/export/rerun/",),
     "distributed": ("mapper/runtime/executor.py",),
     "lzfse": ("mapper/sources/image_folders/record3d.py",),
+    "pye57": ("mapper/sources/scan_folders/e57.py",),
     "velodyne_decoder": ("mapper/sources/velodyne_packets.py",),
     "dpkt": ("mapper/sources/scan_folders/velodyne_pcap.py",),
     "pyarrow": ("evaluators/study/table.py",),
