@@ -26,6 +26,7 @@ class PlacedFrame:
         T_world_body: (4, 4) its final pose.
         trajectory: Final poses of all frames.
         gyroscope: Readings of the log, for deskewing.
+        wheels: T_odom_body of the log, for the same.
     """
 
     entry: FrameRef
@@ -33,11 +34,13 @@ class PlacedFrame:
     T_world_body: Transform
     trajectory: Trajectory
     gyroscope: Gyroscope | None
+    wheels: Trajectory | None
 
     def scan_of(self, frame: Frame) -> Scan:
         """Return the loaded frame as a scan, deskewed."""
         scan = frame.scan()
-        return deskewed(scan, motion_during(scan, self.trajectory, self.index, self.gyroscope))
+        motion = motion_during(scan, self.trajectory, self.index, self.gyroscope, self.wheels)
+        return deskewed(scan, motion)
 
 
 def placed_frames(source: Log, trajectory: Trajectory) -> Iterator[PlacedFrame]:
@@ -45,7 +48,8 @@ def placed_frames(source: Log, trajectory: Trajectory) -> Iterator[PlacedFrame]:
     index_of = {int(stamp_ns): index for index, stamp_ns in enumerate(trajectory.stamps_ns)}
     for entry in source.entries_of(index_of):
         index = index_of[entry.stamp_ns]
-        yield PlacedFrame(entry, index, trajectory.T_world_body[index], trajectory, source.gyroscope)
+        T_world_body = trajectory.T_world_body[index]
+        yield PlacedFrame(entry, index, T_world_body, trajectory, source.gyroscope, source.wheels)
 
 
 def within_reach(scan: Scan, T_world_body: Transform, config: OctreeConfig) -> tuple[Scan, int]:

@@ -19,7 +19,7 @@ from mapper.odometry.gyroscope_calibration import (
     uncalibrated,
 )
 from mapper.sensing.gyroscope import Gyroscope
-from mapper.sensing.sweep_motion import sampled_motion
+from mapper.sensing.sweep_motion import motion_by_wheels, sampled_motion
 from mapper.sensing.wheel_kinematics import pose_at
 
 _FIRST_FIT, _FITS_GROW, _MOST_BETWEEN_FITS = 8, 1.5, 100
@@ -101,6 +101,12 @@ class MotionPrior:
         if len(self._wheel_misses) >= _FEWEST_ERRORS and self._wheel_misses.median > _SLIPPED:
             return None
         return self._rolled(begin_ns, end_ns)
+
+    def rolling(self, begin_ns: int, zero_ns: int, end_ns: int) -> SampledMotion | None:
+        """Return the motion about a time by the wheels; None as for ``rolled``."""
+        if self._wheels is None or self.rolled(begin_ns, end_ns) is None:
+            return None
+        return motion_by_wheels(self._wheels, begin_ns, zero_ns, end_ns)
 
     def _rolled(self, begin_ns: int, end_ns: int) -> Transform | None:
         if self._wheels is None:

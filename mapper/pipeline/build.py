@@ -226,7 +226,7 @@ def level_of(source: Log, tracking: TrackingResult, config: BuildConfig) -> Leve
     scans = _spread_scans(source, trajectory, config.level.frames)
     placed = [
         (
-            deskewed(scan, motion_during(scan, trajectory, index, source.gyroscope)),
+            deskewed(scan, motion_during(scan, trajectory, index, source.gyroscope, source.wheels)),
             trajectory.T_world_body[index],
         )
         for index, scan in scans.items()

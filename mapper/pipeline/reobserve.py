@@ -40,7 +40,7 @@ def reobserve(
     def view(entry: FrameRef) -> tuple[int, FrameView]:
         observation, index = odometry.read(entry), index_of[entry.stamp_ns]
         if isinstance(observation, ScanObservation):
-            motion = motion_during(observation.scan, trajectory, index, source.gyroscope)
+            motion = motion_during(observation.scan, trajectory, index, source.gyroscope, source.wheels)
         else:
             motion = twist_at(trajectory, index)
         return entry.stamp_ns, odometry.view(observation, motion)

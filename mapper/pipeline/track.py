@@ -10,6 +10,7 @@ from mapper.config.build import BuildConfig
 from mapper.core.errors import ConfigError, FrameError
 from mapper.core.trajectory import Trajectory
 from mapper.features.frame_view import FrameView
+from mapper.graph.components import component_numbers
 from mapper.graph.model import BetweenFactor, PoseGraph
 from mapper.graph.wheel_factors import WheelMeasurements, wheel_conflict
 from mapper.loops.closure import LoopClosure, accepted_loops
@@ -112,7 +113,9 @@ def track_log(
         state = checkpoints.restore(odometry, checks)
         odometry, known = state.odometry, state.frames
     searches = start.searches or VerificationLog(None)
-    first_pass = _FirstPass(start, _wheel_measurements(source, config))
+    first_pass = _FirstPass(
+        start, _wheel_measurements(source, config), are_predicted=source.sensor == "lidar-2d"
+    )
     first_pass.repeat(known, searches)
     entries = map(checks.log.entry_at, range(len(known), len(source)))
     observations = ordered_map(partial(_observe, odometry), entries, workers=config.workers)
@@ -172,18 +175,19 @@ class _FirstPass:
         frame_ms: Wall milliseconds that each frame took, by stamp.
     """
 
-    def __init__(self, start: Start, wheels: WheelMeasurements) -> None:
+    def __init__(self, start: Start, wheels: WheelMeasurements, *, are_predicted: bool) -> None:
         """Begin behind earlier sessions.
 
         Args:
             start: Graph, loops and loop detector of these.
             wheels: Measurements of the log's wheels.
+            are_predicted: The odometry's own factors have what the wheels measured.
         """
         self.skipped: list[Skipped] = []
         self.frame_ms: dict[int, float] = {}
         self._start = start
         self.tracks: list[FrameResult] = []
-        self._wheels = wheels
+        self._wheels, self._are_predicted = wheels, are_predicted
         self._wheel_factors: list[BetweenFactor] = []
 
     def add(self, track: FrameResult, view: Callable[[], FrameView]) -> None:
@@ -224,7 +228,7 @@ class _FirstPass:
         warnings = self._warnings(graph, odometry, checks)
         for warning in warnings:
             progress.note(warning.sentence)
-        graph.add_factors(self._wheel_factors)
+        graph.add_factors(self._new_wheel_factors(graph))
         detector = self._start.detector
         loops = (*self._start.loops, *detector.closures())
         graph.add_factors(loop.factor for loop in accepted_loops(loops))
@@ -239,6 +243,16 @@ class _FirstPass:
             detector.places(),
             odometry.gyroscope_calibration() if isinstance(odometry, GyroscopeUser) else None,
         )
+
+    def _new_wheel_factors(self, graph: PoseGraph) -> list[BetweenFactor]:
+        """Return the wheel factors that tell more than the odometry's: none within a part that it predicted.
+
+        Wheels that slip alike all the time would stretch the path by a little in every step.
+        """
+        if not self._are_predicted:
+            return self._wheel_factors
+        part_of = component_numbers(graph)
+        return [factor for factor in self._wheel_factors if part_of[factor.i] != part_of[factor.j]]
 
     def _warnings(self, graph: PoseGraph, odometry: Odometry[Any], checks: ReadingChecks) -> list[RunWarning]:
         """Return what is suspicious about the frames that were read, and their graph without wheels."""

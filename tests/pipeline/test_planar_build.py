@@ -90,7 +90,7 @@ def test_octree_is_one_layer_and_the_slice_is_as_sharp_as_its_cells(rooms):
     assert np.ptp(heights_m) < 1e-6
     occupied = (grid.cells == OCCUPIED).sum() * grid.resolution_m
     walls_m = sum(np.linalg.norm(wall[2:] - wall[:2]) for wall in flat()[0])
-    assert occupied < 4.0 * walls_m  # in cells a wall
+    assert occupied < 2.5 * walls_m
 
 
 def test_free_cells_of_the_layer_are_floor(rooms):

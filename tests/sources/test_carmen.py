@@ -10,8 +10,7 @@ from tests.support.planar_drives import SICK, Drive, drive, flat, write_carmen
 
 @pytest.fixture(scope="module")
 def driven() -> Drive:
-    whole = drive(flat(), SICK, speed_mps=0.8)
-    return Drive(SICK, *(part[:30] for part in (whole.times_s, whole.truth, whole.wheels, whole.ranges_m)))
+    return drive(flat(), SICK, speed_mps=0.8).part(30)
 
 
 @pytest.mark.parametrize("message", ["FLASER", "ROBOTLASER1"])

@@ -4,7 +4,7 @@ The recordings follow the formats' own descriptions and not our readers: the hea
 writes into its files, and sensor_msgs/LaserScan, nav_msgs/Odometry and tf2_msgs/TFMessage by rosbags.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -55,8 +55,20 @@ class Drive:
     laser: Laser
     times_s: np.ndarray
     truth: np.ndarray
-    wheels: np.ndarray
+    readings_s: np.ndarray
+    readings: np.ndarray
     ranges_m: np.ndarray
+
+    @property
+    def wheels(self) -> np.ndarray:
+        """(N, 3) poses by the wheels at the scans' times."""
+        return _at(self.readings, self.times_s, self.readings_s[1])
+
+    def part(self, scans: int) -> "Drive":
+        """The first scans of the drive."""
+        return replace(
+            self, times_s=self.times_s[:scans], truth=self.truth[:scans], ranges_m=self.ranges_m[:scans]
+        )
 
 
 def room(x: float, y: float, width: float, depth: float, doors: tuple[tuple[str, float], ...] = ()) -> list:
@@ -172,7 +184,9 @@ def drive(
     times_s = np.arange(0.0, span_s - 1.5 / laser.rate_hz, 1.0 / laser.rate_hz)
     ranges_m = np.array([_scan(walls, laser, fine, time_s, fine_s, rng) for time_s in times_s])
     truth = _at(fine, times_s, fine_s)
-    return Drive(laser, times_s, truth, _wheels(truth, slip, rng), ranges_m)
+    readings_s = np.arange(0.0, span_s, 0.025)
+    readings = _wheels(_at(fine, readings_s, fine_s), slip, rng)
+    return Drive(laser, times_s, truth, readings_s, readings, ranges_m)
 
 
 def _path(way: np.ndarray, step_m: float, radius_m: float = 0.5) -> np.ndarray:
@@ -200,7 +214,14 @@ def _path(way: np.ndarray, step_m: float, radius_m: float = 0.5) -> np.ndarray:
         curve = (1 - blend) ** 2 * corner + 2 * blend * (1 - blend) * way[k] + blend**2 * exit_
         pieces.append(np.column_stack([curve, yaws]))
         begin, yaw = exit_, yaw + turn
-    return np.vstack(pieces)
+    return _smooth(np.vstack(pieces))
+
+
+def _smooth(path: np.ndarray, samples: int = 80) -> np.ndarray:
+    """A path without sudden turns: means over 0.4 s."""
+    padded = np.pad(path, ((samples // 2, samples - samples // 2 - 1), (0, 0)), mode="edge")
+    kernel = np.full(samples, 1.0 / samples)
+    return np.column_stack([np.convolve(column, kernel, "valid") for column in padded.T])
 
 
 def _at(fine: np.ndarray, times_s: np.ndarray, fine_s: float) -> np.ndarray:
@@ -309,10 +330,12 @@ def write_ros(
             y, w = float(np.sin(pitch_mount / 2)), float(np.cos(pitch_mount / 2))
             mount.transform.rotation = make("geometry_msgs/msg/Quaternion", x=0.0, y=y, z=0.0, w=w)
         bag.write(FIRST_NS, "/tf_static", transforms(mount))
-        for time_s, (x, y, yaw), ranges in zip(drive.times_s, drive.wheels, drive.ranges_m, strict=True):
+        messages: list[tuple[int, str, object]] = []
+        for time_s, (x, y, yaw) in zip(drive.readings_s, drive.readings, strict=True):
             stamp_ns = FIRST_NS + round(1e9 * time_s)
             if odometry == "tf":
-                bag.write(stamp_ns, "/tf", transforms(tf(stamp_ns, "odom", "base_link", (x, y, 0.0), yaw)))
+                moved = tf(stamp_ns, "odom", "base_link", (x, y, 0.0), yaw)
+                messages.append((stamp_ns, "/tf", transforms(moved)))
             else:
                 position = make("geometry_msgs/msg/Point", x=float(x), y=float(y), z=0.0)
                 pose = make("geometry_msgs/msg/Pose", position=position, orientation=quaternion(yaw))
@@ -326,24 +349,25 @@ def write_ros(
                     pose=make("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=none),
                     twist=make("geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=none),
                 )
-                bag.write(stamp_ns, "/odom", message)
-            bag.write(
-                stamp_ns,
-                "/scan",
-                make(
-                    "sensor_msgs/msg/LaserScan",
-                    header=bag.header(stamp_ns, "laser"),
-                    angle_min=float(laser.angles_rad[0]) - yaw_mount,
-                    angle_max=float(laser.angles_rad[-1]) - yaw_mount,
-                    angle_increment=laser.step_rad,
-                    time_increment=laser.beam_s,
-                    scan_time=1.0 / laser.rate_hz,
-                    range_min=0.05,
-                    range_max=laser.max_m,
-                    ranges=ranges.astype(np.float32),
-                    intensities=np.full(laser.beams, 100.0, np.float32),
-                ),
+                messages.append((stamp_ns, "/odom", message))
+        for time_s, ranges in zip(drive.times_s, drive.ranges_m, strict=True):
+            stamp_ns = FIRST_NS + round(1e9 * time_s)
+            message = make(
+                "sensor_msgs/msg/LaserScan",
+                header=bag.header(stamp_ns, "laser"),
+                angle_min=float(laser.angles_rad[0]) - yaw_mount,
+                angle_max=float(laser.angles_rad[-1]) - yaw_mount,
+                angle_increment=laser.step_rad,
+                time_increment=laser.beam_s,
+                scan_time=1.0 / laser.rate_hz,
+                range_min=0.05,
+                range_max=laser.max_m,
+                ranges=ranges.astype(np.float32),
+                intensities=np.full(laser.beams, 100.0, np.float32),
             )
+            messages.append((stamp_ns, "/scan", message))
+        for stamp_ns, topic, message in sorted(messages, key=lambda one: one[0]):
+            bag.write(stamp_ns, topic, message)
     return path
 
 

@@ -82,11 +82,10 @@ class MotionModel:
                 velocity_world = (T_world_middle[:3, 3] - self.T_world_last[:3, 3]) / elapsed_s
         return self.prior.sweep(middle_ns, half_s, R_world_middle.T @ velocity_world)
 
-    def during(self, middle_ns: int, half_s: float) -> Twist:
-        """Return the velocity during a sweep by the wheels, else the one until the last scan."""
+    def rolling(self, middle_ns: int, half_s: float) -> SampledMotion | None:
+        """Return the motion about the middle of a sweep by the wheels; None where none knows it."""
         half_ns = round(half_s * NS_PER_S)
-        rolled = self.prior.rolled(middle_ns - half_ns, middle_ns + half_ns) if half_ns else None
-        return self.twist if rolled is None else twist_between(np.eye(4), rolled, duration_s=2.0 * half_s)
+        return self.prior.rolling(middle_ns - half_ns, middle_ns, middle_ns + half_ns) if half_ns else None
 
     def spread(self, time_ns: int) -> Spread | None:
         """Return the spread of a predicted pose; None before enough predictions could be compared.

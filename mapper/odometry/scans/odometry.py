@@ -133,7 +133,7 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
             T_key_scan,
             self._motion.elapsed_s(observation.middle_ns),
             at_stamp + Ad @ found.keyframe.covariance_at_stamp @ Ad.T,
-            errors_add_up=not self._motion.is_by_wheels(observation.middle_ns),
+            is_by_wheels=self._motion.is_by_wheels(observation.middle_ns),
         )
 
     def _go_on_from(self, keyframe: ScanKeyframe) -> None:

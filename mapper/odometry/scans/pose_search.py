@@ -10,7 +10,7 @@ from mapper.odometry.scans.config import ScanOdometryConfig
 from mapper.odometry.scans.motion_model import MotionModel, Spread
 from mapper.odometry.scans.pose_assessment import PoseAssessment
 from mapper.odometry.scans.pose_candidate import PoseCandidate, Shares, fuse_with_prediction, jump_between
-from mapper.odometry.scans.scan_fit import ScanKeyframe, contradiction, described, fit_of
+from mapper.odometry.scans.scan_fit import ScanFit, ScanKeyframe, contradiction, described, fit_of
 from mapper.odometry.scans.scan_matcher import DeskewedScan, ScanMatcher
 from mapper.registration.base import Aligner
 from mapper.registration.factory import build_registration
@@ -157,9 +157,26 @@ class PoseSearch:
             )
         if scan.deskewed.scan.is_planar:
             T_world_middle = in_plane(T_world_middle)
+            fit = self._fit_again(scan, keyframe, fit, T_world_found, T_world_middle)
         jump = jump_between(scan.T_world_predicted, T_world_middle, scan.spread)
         shares = Shares(fit.overlap, fit.agreement, fit.contradicting)
         return PoseCandidate(keyframe, T_world_middle, fit, shares, jump, open_m, hypothesis.method)
+
+    def _fit_again(
+        self,
+        scan: _Scan,
+        keyframe: ScanKeyframe,
+        fit: ScanFit,
+        T_world_found: Transform,
+        T_world_middle: Transform,
+    ) -> ScanFit:
+        """Return the fit at the pose that the wheels made of another one, if it is far from that."""
+        moved = inverse(T_world_found) @ T_world_middle
+        farther_m = self._config.max_pair_distance_m
+        if np.linalg.norm(moved[:3, 3]) < farther_m and angle_between(np.eye(3), moved[:3, :3]) < _SAME_RAD:
+            return fit
+        T_key_scan = inverse(keyframe.T_world_middle) @ T_world_middle
+        return fit_of(keyframe, scan.deskewed, T_key_scan, max_pair_distance_m=farther_m) or fit
 
     def _preferred(self, one: PoseCandidate | None, other: PoseCandidate | None) -> PoseCandidate | None:
         """Return the one that is less suspect and whose keyframe shows more of the motion."""

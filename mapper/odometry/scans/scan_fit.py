@@ -21,6 +21,8 @@ _CHECKED_POINTS = 2000
 _GRAZING = 0.01  # least sine of the angle between a ray and a surface
 _PIXELS = 1.5  # a ray that is compared with a point is off by up to so many
 _LEAST_IN_SIGHT = 0.2  # of the points: fewer in sight tell nothing of the others
+_AT_EDGES = 5
+"""Points of a planar scan that edges put where rays passed: of some hundreds, they would be a share."""
 _ON_A_LINE = 3  # a point and its neighbours on both sides
 _FACING = 0.3
 """Share of one point's displacement along its normals, from which on its pair shows the motion: more than
@@ -190,7 +192,7 @@ def fit_of(
         overlap=min(1.0, len(near) / seen),
         rmse_m=float(np.sqrt(np.mean(distances_m[near] ** 2))),
         agreement=agreement,
-        contradicting=counts.contradicting_ratio,
+        contradicting=max(0, counts.contradicting - is_planar * _AT_EDGES) / max(counts.points, 1),
         rows=rows,
         residuals_m=residuals_m,
         points=points,
@@ -209,8 +211,8 @@ def _in_sight(keyframe: ScanDescription, points_key: Array) -> NDArray[np.bool_]
     nearest_m = keyframe.ranges_m.min(axis=0)
     offsets = points_key[:, :2] - keyframe.origin_body[:2]
     columns = ((np.arctan2(offsets[:, 1], offsets[:, 0]) + np.pi) / keyframe.direction_rad).astype(np.intp)
-    beyond_m = np.hypot(*offsets.T) - nearest_m[columns % len(nearest_m)]
-    in_sight: NDArray[np.bool_] = beyond_m <= _MARGIN_M
+    ray_m = nearest_m[columns % len(nearest_m)]
+    in_sight: NDArray[np.bool_] = np.isfinite(ray_m) & (np.hypot(*offsets.T) <= ray_m + _MARGIN_M)
     return in_sight
 
 

@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.doubts import Doubt
-from mapper.core.geometry import Array, Transform
+from mapper.core.geometry import Array, Transform, angle_between
+from mapper.graph.config import WheelNoiseConfig
 from mapper.odometry.scans.pose_candidate import Jump
 from mapper.odometry.scans.scan_fit import ScanFit
 
@@ -27,6 +28,7 @@ _TRUSTED_MPS, _TRUSTED_M = 0.1, 0.05
 """A prediction is doubtful when it may be off by more than both: single scans of stairs leave turns open by
 2 cm, and are right."""
 _SHORTEST_S = 0.01
+_WHEELS = WheelNoiseConfig()
 
 
 def surface_covariance(fit: ScanFit) -> Array:
@@ -89,6 +91,17 @@ def _sectors(points: Array) -> NDArray[np.intp]:
     return 2 * around + (points[:, 2] > np.median(points[:, 2]))
 
 
+def _with_wheels(covariance: Array, T_key_scan: Transform) -> Array:
+    """Return the (6, 6) covariance of a pose that surfaces and wheels measured."""
+    turned, moved = angle_between(np.eye(3), T_key_scan[:3, :3]), float(np.linalg.norm(T_key_scan[:3, 3]))
+    sigmas = [_WHEELS.least_rad + _WHEELS.turn_share * turned + _WHEELS.rad_per_m * moved] * 3
+    sigmas += [_WHEELS.least_m + _WHEELS.path_share * moved] * 3
+    reduced: Array = covariance - covariance @ np.linalg.solve(
+        covariance + np.diag(np.square(sigmas)), covariance
+    )
+    return 0.5 * (reduced + reduced.T)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseNoise:
     """Covariance (6, 6) of a scan's pose in its tangent, and why it may be more than it says."""
@@ -123,7 +136,7 @@ class ScanNoise:
         elapsed_s: float,
         at_stamps: Array,
         *,
-        errors_add_up: bool = True,
+        is_by_wheels: bool = False,
     ) -> PoseNoise:
         """Return the noise of the next scan.
 
@@ -133,15 +146,18 @@ class ScanNoise:
             T_key_scan: (4, 4) the pose relative to the keyframe.
             elapsed_s: Since the scan before.
             at_stamps: (6, 6) covariance of the motion from the stamps to the middles of both sweeps.
-            errors_add_up: An error of the prediction is one of the velocity that later ones are made with.
+            is_by_wheels: Wheels predicted the pose: their errors do not add up as those of a velocity do, and
+                limit how far it is off where surfaces show little.
         """
         covariance = surface_covariance(fit)
+        if is_by_wheels:
+            covariance = _with_wheels(covariance, T_key_scan)
         off_m, moved_m = float(np.median(np.abs(fit.residuals_m))), float(np.linalg.norm(T_key_scan[:3, 3]))
         least_rad = _LEAST_RAD + _MODEL_RAD_M * off_m
         least_m = np.hypot(_LEAST_M + _MODEL_M_M * off_m, _MODEL_SHARE_M * off_m * moved_m)
         covariance = covariance + np.diag(np.square([least_rad] * 3 + [least_m] * 3)) + at_stamps
         is_open = 1.0 - float(fit.observability.min())
-        self._unseen = 1.0 + is_open * self._unseen * errors_add_up
+        self._unseen = 1.0 + is_open * self._unseen * (not is_by_wheels)
         self._steps = self._unseen + is_open * self._steps
         motions = fit.degeneracy.motions
         added_m = np.minimum(open_m * self._steps, fit.degeneracy.extent_m)

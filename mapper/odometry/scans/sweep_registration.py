@@ -43,7 +43,7 @@ class PlacedScan:
         found: Its pose in the middle of the sweep.
         twist: Velocity then, if it was measured; None is the mean one since the scan before.
         velocity_covariance: (6, 6) of the velocity, (rad/s)² and (m/s)².
-        sweep: Motion about the middle of the sweep by a gyroscope; None if none knows it.
+        sweep: Motion about the middle of the sweep by a gyroscope or wheels; None if none knows it.
     """
 
     deskewed: DeskewedScan
@@ -108,13 +108,14 @@ class SweepRegistration:
         self, observation: ScanObservation, path: KnownPath, covariance: Array | None
     ) -> PlacedScan | None:
         """Register a scan that is deskewed by the velocity until then; None is its expected covariance."""
-        deskewed = observation.deskew(path.motion.during(observation.middle_ns, observation.half_s))
+        rolling = path.motion.rolling(observation.middle_ns, observation.half_s)
+        deskewed = observation.deskew(rolling or path.motion.twist)
         found = self._search.find(deskewed, path, observation.middle_ns)
         if found is None:
             return None
         if covariance is None:
             covariance = path.motion.velocity(observation.middle_ns, found.T_world_middle)[1]
-        return PlacedScan(deskewed, found, None, covariance)
+        return PlacedScan(deskewed, found, None, covariance, rolling)
 
     def _with_velocity(self, observation: ScanObservation, path: KnownPath) -> PlacedScan | None:
         """Find velocity and pose in turn: the sweep on the keyframes' surfaces, the scan in the map."""

@@ -165,7 +165,8 @@ def choose(
         used, image_reason = [color, depth, points], "one camera is mapped"
     elif points is not None:
         frames = points
-        notes = [_choice_note(f"point clouds {points.topic.name}", config.points, "points")]
+        kind = "laser scans" if points.topic.type in LASERS else "point clouds"
+        notes = [_choice_note(f"{kind} {points.topic.name}", config.points, "points")]
         both = color is not None and depth is not None
         image_reason = "point clouds are mapped" if both else "colour has no depth, or depth no colour"
         used = [points]

@@ -16,8 +16,7 @@ from tests.support.planar_drives import RPLIDAR, Drive, drive, flat, write_ros
 
 @pytest.fixture(scope="module")
 def driven() -> Drive:
-    whole = drive(flat(), RPLIDAR, speed_mps=0.8)
-    return Drive(RPLIDAR, *(part[:20] for part in (whole.times_s, whole.truth, whole.wheels, whole.ranges_m)))
+    return drive(flat(), RPLIDAR, speed_mps=0.8).part(20)
 
 
 @pytest.mark.parametrize(("name", "odometry"), [("run.bag", "topic"), ("run", "topic"), ("run", "tf")])
@@ -35,7 +34,7 @@ def test_scans_are_of_the_robot_with_its_wheels(tmp_path, driven, name, odometry
     assert scan.times_s == pytest.approx(RPLIDAR.beam_s * np.flatnonzero(hits), abs=1e-6)
     assert scan.intensities == pytest.approx(np.full(hits.sum(), 100.0))
     assert log.wheels is not None
-    assert log.wheels.positions_world[:, :2] == pytest.approx(driven.wheels[:, :2], abs=1e-6)
+    assert log.wheels.positions_world[:, :2] == pytest.approx(driven.readings[:, :2], abs=1e-6)
 
 
 def test_turned_laser_sees_the_same(tmp_path, driven):
