@@ -45,7 +45,10 @@ class PinholeCamera:
     def __post_init__(self) -> None:
         numbers = (self.fx_px, self.fy_px, self.cx_px, self.cy_px, *self.distortion)
         if not np.isfinite(numbers).all() or self.fx_px <= 0.0 or self.fy_px <= 0.0:
-            raise DataError(f"camera: focal lengths ({self.fx_px}, {self.fy_px}) px must be finite and > 0")
+            stated = ", ".join(f"{number:g}" for number in numbers)
+            raise DataError(
+                f"camera: fx fy cx cy and distortion {stated}: want finite numbers, focal lengths > 0"
+            )
         if self.width_px < 1 or self.height_px < 1:
             raise DataError(f"camera: image of {self.width_px}×{self.height_px} px has no pixels")
 

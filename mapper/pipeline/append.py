@@ -90,7 +90,7 @@ def append(
             writer.record_gyroscope(tracking.gyroscope)
             source = chained(first, with_body_rates(second, tracking.gyroscope))
         writer.warn([*warnings, *tracking.warnings])
-        refuse_a_fragment(tracking, config, sensor=source.sensor)
+        refuse_a_fragment(tracking, config, sensor=source.sensor, known=writer.manifest.warnings)
         _refuse_unconnected(second, run, tracking.loops, known)
         with writer.clock.stage("solve"):
             tracking = component_of(tracking, next(iter(known)), progress=progress)

@@ -153,7 +153,9 @@ class _Steps:
         save_tracking(self.writer, from_tracking(tracking, self.source.truth))
         if tracking.gyroscope is not None:
             self.writer.record_gyroscope(tracking.gyroscope)
-        refuse_a_fragment(tracking, self.config, sensor=self.source.sensor)
+        refuse_a_fragment(
+            tracking, self.config, sensor=self.source.sensor, known=self.writer.manifest.warnings
+        )
         return tracking
 
     def solve(self, tracking: TrackingResult) -> _Solved:

@@ -81,8 +81,16 @@ class TrackingResult:
         )
 
 
-def refuse_a_fragment(tracking: TrackingResult, config: BuildConfig, *, sensor: Sensor) -> None:
+def refuse_a_fragment(
+    tracking: TrackingResult, config: BuildConfig, *, sensor: Sensor, known: Sequence[RunWarning] = ()
+) -> None:
     """Refuse to make a map from too little.
+
+    Args:
+        tracking: Result of the first pass.
+        config: Settings, which say how much is enough.
+        sensor: Sensor of the log.
+        known: Warnings about the log, which are likelier causes than any usual one.
 
     Raises:
         TrackingError: Fewer frames were tracked, without a doubt, than the configuration requires.
@@ -103,13 +111,16 @@ def refuse_a_fragment(tracking: TrackingResult, config: BuildConfig, *, sensor: 
             f"only {read} {'frame was' if read == 1 else 'frames were'} read, want at least {enough:.0f} "
             f"(min_tracked_frames); give more of the log{unread}"
         )
-    hint = _HINTS[config.odometry.kind if config.odometry.kind in BY_POSES else sensor]
+    implausible = [warning.sentence for warning in known if warning.weight == "doubt"]
+    hint = (
+        "; ".join(implausible) or _HINTS[config.odometry.kind if config.odometry.kind in BY_POSES else sensor]
+    )
     doubtful = len(tracking.placed) - tracked
     found = f"only {tracked} of {read} frames read could be tracked"
     if doubtful:
         found += f", {doubtful} more are doubtful"
     unseen = [track for track in tracking.placed if track.doubts and track.diagnostics.unobservable]
-    if 2 * len(unseen) > read:
+    if 2 * len(unseen) > read and not implausible:
         found = f"{found} ({unseen[-1].doubts[-1].text})"
         hint = see_more(has_wheels=tracking.graph.has_wheels)
     raise TrackingError(

@@ -1,5 +1,6 @@
 """Lenses that five coefficients do not model, whose images are undistorted as they are read."""
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -9,12 +10,22 @@ from numpy.typing import NDArray
 
 from mapper.core.frames import PinholeCamera
 
-POLYNOMIAL_MODELS = frozenset({"plumb_bob", "brown_conrady", "rational_polynomial"})
+POLYNOMIAL_MODELS = frozenset({"plumb_bob", "brown_conrady", "radtan", "rational_polynomial"})
 """Names of OpenCV's model of 4, 5, 8 (rational), 12 (thin prism) or 14 (tilted) coefficients."""
 FISHEYE_MODELS = frozenset({"equidistant", "kannala_brandt", "kannala_brandt4", "fisheye"})
 """Names of the model of 4 coefficients of Kannala & Brandt (2006)."""
 _COEFFICIENTS = {True: (4,), False: (4, 5, 8, 12, 14)}
 COEFFICIENTS_TEXT = "5, 8, 12 or 14 as OpenCV orders them, or 4 of an equidistant lens"
+
+
+def lens_model(name: str, coefficients: int) -> str:
+    """Return a lens model's name as it is in the sets above, whatever its spelling.
+
+    No name is OpenCV's model where the number of coefficients is none of the fisheyes'.
+    """
+    spelled = re.sub(r"[^a-z0-9]+", "_", name.strip().lower())
+    is_opencv = spelled in ("", "none") and coefficients in _COEFFICIENTS[False]
+    return "rational_polynomial" if is_opencv and coefficients not in _COEFFICIENTS[True] else spelled
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -20,8 +20,8 @@ def frame(depth_m, camera=PLAIN, **more):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"fx_px": 0.0}, "focal lengths"),
-        ({"fy_px": -1.0}, "focal lengths"),
+        ({"fx_px": 0.0}, "focal lengths > 0"),
+        ({"fy_px": -1.0}, "focal lengths > 0"),
         ({"cx_px": np.nan}, "finite"),
         ({"distortion": (np.inf, 0, 0, 0, 0)}, "finite"),
         ({"width_px": 0}, "0×48 px has no pixels"),

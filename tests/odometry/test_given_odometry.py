@@ -18,6 +18,7 @@ from mapper.pipeline.build import build
 from mapper.pipeline.track import track_log
 from mapper.pipeline.tracking_result import refuse_a_fragment
 from mapper.run.folder import open_run
+from mapper.run.manifest import RunWarning
 from mapper.runtime.progress import SILENT
 from mapper.simulation import CameraSimulator, make_scene
 from mapper.simulation.lidar import LidarSimulator
@@ -167,6 +168,9 @@ def test_mistakes_are_named_with_the_remedy(flat, tmp_path):
         TrackingError, match="do the given poses cover the frames' times, without gaps beyond"
     ):
         refuse_a_fragment(tracking, config, sensor="rgbd")
+    known = [RunWarning(kind="depth", sentence="depth: 5 times too small", weight="doubt")]
+    with pytest.raises(TrackingError, match="; depth: 5 times too small"):
+        refuse_a_fragment(tracking, config, sensor="rgbd", known=known)
 
 
 def test_a_scan_is_deskewed_by_the_poses_around_it_unless_these_are_sparse(street):

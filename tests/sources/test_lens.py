@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from mapper.core.frames import PinholeCamera
-from mapper.sources.lens import Lens
+from mapper.sources.lens import POLYNOMIAL_MODELS, Lens, lens_model
 
 CAMERA = PinholeCamera(width_px=160, height_px=120, fx_px=131.0, fy_px=130.0, cx_px=79.5, cy_px=59.5)
 AZURE = (0.52, -2.6, 0.0006, -0.0002, 1.5, 0.4, -2.42, 1.43)
@@ -46,3 +46,22 @@ def test_a_pixel_s_ray_is_projected_to_the_pixel(lens):
 )
 def test_other_models_and_numbers_of_coefficients_are_not_known(model, count):
     assert not Lens(model, (0.1,) * count).is_known
+
+
+@pytest.mark.parametrize(
+    ("name", "count", "is_polynomial"),
+    [
+        ("", 5, True),
+        ("", 8, True),
+        ("", 4, False),
+        ("none", 5, True),
+        ("Plumb Bob", 5, True),
+        ("radtan", 4, True),
+        ("equidistant", 4, False),
+        ("double_sphere", 5, False),
+    ],
+)
+def test_a_model_is_known_by_any_spelling_and_without_a_name_by_its_number_of_coefficients(
+    name, count, is_polynomial
+):
+    assert (lens_model(name, count) in POLYNOMIAL_MODELS) == is_polynomial

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from mapper.core.errors import SourceError
+from mapper.core.errors import SourceError, listed
 from mapper.core.frames import NO_DISTORTION
 from mapper.core.geometry import Transform, angle_between, inverse
 from mapper.core.rotations import row_of_pose
@@ -17,9 +17,9 @@ from mapper.sources.calibration import (
 )
 from mapper.sources.config import CameraConfig
 from mapper.sources.image_files.image_sizes import Size, is_same_view
-from mapper.sources.lens import FISHEYE_MODELS, POLYNOMIAL_MODELS, Lens
+from mapper.sources.lens import FISHEYE_MODELS, POLYNOMIAL_MODELS, Lens, lens_model
 from mapper.sources.ros.index import Series
-from mapper.sources.ros.messages import EXTRINSICS, CameraMessage, Window
+from mapper.sources.ros.messages import CAMERAS, EXTRINSICS, CameraMessage, Window
 from mapper.sources.ros.reader import RecordingReader
 from mapper.sources.ros.topics import CameraTopics, is_called_registered, shared_namespaces
 from mapper.sources.text import pose_from_numbers
@@ -84,8 +84,10 @@ def _colour_calibration(
     name = topics.color.topic.name
     info = _first_info(reader, series)
     if series is None or info is None:
+        infos = [one for one in reader.series if reader.series[one].topic.type in CAMERAS]
+        others = f" of {listed(infos)}" if infos else ""
         raise SourceError(
-            f"{reader.recording.path}: no camera info for {name}; choose one with "
+            f"{reader.recording.path}: no camera info for {name}; choose one{others} with "
             "source.topics.camera_info=… or --set source.camera.fx_px=… and so on"
         )
     return calibration_of(info, colour_px, is_rectified="rect" in name, name=series.topic.name)
@@ -265,11 +267,12 @@ def _calibration(info: CameraMessage, *, is_rectified: bool, name: str) -> Calib
         raise SourceError(
             f"{name}: the camera is not calibrated, K is {K}; --set source.camera.fx_px=… and so on"
         )
-    if any(D) and (info.model not in POLYNOMIAL_MODELS or any(D[5:])):
-        lens = Lens(info.model, D)
+    model = lens_model(info.model, len(D))
+    if any(D) and (model not in POLYNOMIAL_MODELS or any(D[5:])):
+        lens = Lens(model, D)
         if not lens.is_known:
             raise SourceError(
-                f"{name}: distortion {info.model} with {len(D)} coefficients is not known; known are "
+                f"{name}: distortion {info.model!r} with {len(D)} coefficients is not known; known are "
                 f"{', '.join(sorted(POLYNOMIAL_MODELS | FISHEYE_MODELS))}: rectify the images, or --set "
                 "source.camera.fx_px=… and so on"
             )

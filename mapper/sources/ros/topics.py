@@ -1,15 +1,14 @@
 """Choice of the topics that a map is made from: the user's, or a guess that a note reports."""
 
 import re
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product, takewhile
 from pathlib import Path
 
 import numpy as np
 
-from mapper.core.errors import SourceError, listed
-from mapper.core.units import unit_of_gravity
+from mapper.core.errors import SourceError
 from mapper.sources.config import TopicsConfig
 from mapper.sources.ros.image_messages import is_depth
 from mapper.sources.ros.index import Series
@@ -27,6 +26,7 @@ from mapper.sources.ros.messages import (
     Message,
     frame_of,
 )
+from mapper.sources.ros.unused_topics import feels_gravity, unused_notes, usual_acceleration, what_there_is
 
 TRUTH, WHEELS = "/ground_truth", "/wheel_odometry"
 
@@ -43,12 +43,6 @@ _OTHER_SIDE = {
     "camera0": "camera1",
 }
 """Words in topics of left images, and in those of the right ones beside them."""
-_BOOKKEEPING = re.compile(
-    r"(?:action|bond|builtin_interfaces|control|diagnostic|dynamic_reconfigure|lifecycle|map|nav|rcl_interfaces"
-    r"|realsense2_camera|rosbag2_interfaces|rosgraph|statistics|std|tf2|visualization)(?:_msgs)?/|actionlib"
-    r"|foxglove\.Log|sensor_msgs/msg/Joy"
-)
-"""Beginnings of types of messages about programs, plans and pictures, which no sensor measured."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -131,7 +125,7 @@ def choose(
     color, depth = _of_one_camera(colors, depth_images, firsts)
     clouds = pick.candidates("points", config.points, CLOUDS, where=lambda name: len(series[name]) > 1)
     points = _best([one for one in clouds if one.topic.type not in LASERS] or clouds, _cloud_rank)
-    imu = pick.one("imu", config.imu, IMUS, _plain_rank, where=lambda name: _feels_gravity(series[name]))
+    imu = pick.one("imu", config.imu, IMUS, _plain_rank, where=lambda name: feels_gravity(series[name]))
     gyroscope = imu if imu is not None and _turns(imu) and config.gyroscope is None else None
     if gyroscope is None:
         gyroscope = pick.one(
@@ -150,12 +144,14 @@ def choose(
     if color is not None and depth is not None and config.points is None:
         infos = pick.all(CAMERAS)
         info = pick.one("camera_info", config.camera_info, CAMERAS, _plain_rank, where=set().__contains__)
-        only = infos if len(infos) == 1 else []
-        own = next(iter([*_beside(color, infos), *_of_frame(color, infos, firsts), *only]), None)
+        possible = _without_those_of_depth(infos, color, depth)
+        only = possible if len(possible) == 1 else []
+        own = next(iter([*_beside(color, possible), *_of_frame(color, possible, firsts), *only]), None)
         depth_info = next((one for one in _beside(depth, infos) if one is not own), None)
         frames = CameraTopics(color, depth, info or own, own, depth_info)
+        others = len(colors) * len(depth_images) > 1
         chosen = f"colour {color.topic.name}, depth {depth.topic.name}"
-        notes = [_choice_note(chosen, config.color and config.depth, "color=… and source.topics.depth")]
+        notes = [_choice_note(chosen, "color=… and source.topics.depth", others=others)]
         if info is not None and own not in (None, info):
             notes.append(f"camera info {info.topic.name} was chosen; that of the images is {own.topic.name}")
         if points is not None:
@@ -166,7 +162,7 @@ def choose(
     elif points is not None:
         frames = points
         kind = "laser scans" if points.topic.type in LASERS else "point clouds"
-        notes = [_choice_note(f"{kind} {points.topic.name}", config.points, "points")]
+        notes = [_choice_note(f"{kind} {points.topic.name}", "points", others=len(clouds) > 1)]
         both = color is not None and depth is not None
         image_reason = "point clouds are mapped" if both else "colour has no depth, or depth no colour"
         used = [points]
@@ -176,15 +172,23 @@ def choose(
         left_info, right_info = (next(iter(_beside(one, infos)), None) for one in (left, right))
         frames = StereoTopics(left, right, left_info, right_info)
         chosen = f"stereo pairs {left.topic.name} and {right.topic.name}"
-        notes = [_choice_note(chosen, config.color, "color")]
+        notes = [_choice_note(chosen, "color", others=len(pairs) > 1 and config.color is None)]
         used, image_reason = [left, right], "one pair is mapped"
     else:
-        raise SourceError(f"{path}: nothing to map: {_what_there_is(color, depth, series.values())}")
+        strange = [one for one in series.values() if one.topic.type not in READ]
+        unread = unused_notes(strange, firsts, image_reason=None)
+        found = what_there_is(color, depth, series.values())
+        raise SourceError("; ".join([f"{path}: nothing to map: {found}", *unread]))
     if wheels is not None:
-        notes.append(_choice_note(f"wheel odometry {wheels.topic.name}", config.wheels, "wheels"))
+        notes.append(
+            _choice_note(f"wheel odometry {wheels.topic.name}", "wheels", others=config.wheels is None)
+        )
     is_chosen = bool(config.points or config.color or config.depth)
-    unused = [one for one in series.values() if one not in (*used, imu, gyroscope, gnss, truth, wheels)]
-    notes += _unused_notes(unused, firsts, image_reason=None if is_chosen else image_reason)
+    used = [*used, imu, gnss, truth, wheels]
+    if gyroscope is not None and (feels_gravity(gyroscope) or not usual_acceleration(gyroscope) > 0.0):
+        used.append(gyroscope)
+    unused = [one for one in series.values() if one not in used]
+    notes += unused_notes(unused, firsts, image_reason=None if is_chosen else image_reason)
     return Choice(frames, imu, gyroscope, gnss, truth, wheels, notes)
 
 
@@ -283,8 +287,8 @@ def shared_namespaces(name: str, other: str) -> int:
     return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], parts))
 
 
-def _choice_note(choice: str, by_user: str | None, option: str) -> str:
-    return choice if by_user else f"{choice}; choose others with source.topics.{option}=…"
+def _choice_note(choice: str, option: str, *, others: bool) -> str:
+    return f"{choice}; choose others with source.topics.{option}=…" if others else choice
 
 
 def _color_rank(name: str) -> tuple[int, ...]:
@@ -342,6 +346,17 @@ def _beside(image: Series, infos: Sequence[Series]) -> list[Series]:
     return [infos[shared.index(most)]] if most and shared.count(most) == 1 else []
 
 
+def _without_those_of_depth(infos: Sequence[Series], color: Series, depth: Series) -> list[Series]:
+    """Return the calibrations that are not the depth camera's own, by the namespaces that they share."""
+    if is_called_registered(depth.topic.name):
+        return list(infos)
+
+    def nearness(one: Series, image: Series) -> int:
+        return shared_namespaces(image.topic.name, one.topic.name)
+
+    return [one for one in infos if nearness(one, color) >= nearness(one, depth)]
+
+
 def _of_frame(image: Series, infos: Sequence[Series], firsts: Mapping[str, Message]) -> list[Series]:
     """Return the calibration of an image's coordinate frame; none where several cameras name the same."""
     frame = frame_of(firsts.get(image.topic.name))
@@ -349,63 +364,6 @@ def _of_frame(image: Series, infos: Sequence[Series], firsts: Mapping[str, Messa
     return found if len(found) == 1 else []
 
 
-def _unused_notes(
-    unused: Iterable[Series], firsts: Mapping[str, Message], *, image_reason: str | None
-) -> list[str]:
-    """Return which sensors' topics are not used and why, a sentence for each kind.
-
-    Args:
-        unused: The topics.
-        firsts: The first message of those that can be read.
-        image_reason: Reason why images and clouds are not used; None where the user chose others.
-    """
-    kinds: dict[str, list[str]] = {}
-    for one in unused:
-        name, type_ = one.topic.name, one.topic.type
-        if type_ in IMAGES and name in firsts:
-            kind = image_reason and f"images that are not used, as {image_reason}"
-        elif type_ in CLOUDS and name in firsts:
-            reason = "there is a single one" if len(one) == 1 else "those of one topic are mapped"
-            kind = image_reason and f"point clouds that are not used, as {reason}"
-        elif type_ in IMUS and not _feels_gravity(one):
-            kind = "accelerations that are not used, as they are not as long as gravity"
-        elif type_ in IMUS:
-            kind = "accelerations that are not used, as one topic is enough (source.topics.imu)"
-        elif type_ in FIXES:
-            kind = "GNSS fixes that are not used, as one topic is enough (source.topics.gnss)"
-        elif type_ in POSES:
-            kind = "poses that are not used; source.topics.wheels reads those of wheels, .truth true ones"
-        elif type_ in READ or _BOOKKEEPING.match(type_):
-            kind = None
-        else:
-            name, kind = f"{name} ({type_})", "topics of types that are not read"
-        if kind is not None:
-            kinds.setdefault(kind, []).append(name)
-    return [f"{kind}: {listed(names)}" for kind, names in kinds.items()]
-
-
-def _feels_gravity(series: Series) -> bool:
-    """Return whether an accelerometer feels gravity: a gyroscope's empty accelerations do not."""
-    return unit_of_gravity(float(np.linalg.norm(series.imu[0, 3:]))) is not None
-
-
 def _turns(series: Series) -> bool:
     """Return whether a topic has angular velocities: an accelerometer's are empty."""
     return bool((np.nan_to_num(series.imu[:, :3]) != 0.0).any())
-
-
-def _what_there_is(color: Series | None, depth: Series | None, series: Iterable[Series]) -> str:
-    if color is not None:
-        others = [one for one in series if one.topic.type in IMAGES]
-        names = listed([color.topic.name, *(one.topic.name for one in others if one is not color)])
-        return f"colour images {names}, but neither depth images nor point clouds"
-    if depth is not None:
-        return f"depth images {depth.topic.name}, but neither colour images nor point clouds"
-    names = ", ".join(
-        f"{one.topic.name} ({one.topic.type}{', a single one' if len(one) == 1 else ''})" for one in series
-    )
-    return (
-        f"neither images with depth nor several point clouds, only {names}"
-        if names
-        else "no message of it can be read"
-    )

@@ -99,7 +99,7 @@ def test_topics_that_are_not_used_are_named_with_the_reason(tmp_path):
     named = [note.rpartition(": ")[2] for note in notes[1:]]
     assert sorted(named) == [
         "/fish/image_raw",
-        "/gyro",
+        "/gyro (0)",
         "/imu/other/data",
         "/map_cloud",
         "/nmea/fix",

@@ -1,0 +1,88 @@
+"""Topics of a recording that are not used, with the reason, as notes and refusals name them."""
+
+import re
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+
+from mapper.core.errors import listed
+from mapper.core.units import unit_of_gravity
+from mapper.sources.ros.index import Series
+from mapper.sources.ros.messages import CLOUDS, FIXES, IMAGES, IMUS, POSES, READ, Message
+
+_BOOKKEEPING = re.compile(
+    r"(?:action|bond|builtin_interfaces|control|diagnostic|dynamic_reconfigure|lifecycle|map|nav|rcl_interfaces"
+    r"|realsense2_camera|rosbag2_interfaces|rosgraph|statistics|std|tf2|visualization)(?:_msgs)?/|actionlib"
+    r"|foxglove\.Log|sensor_msgs/msg/Joy"
+)
+"""Beginnings of types of messages about programs, plans and pictures, which no sensor measured."""
+
+
+def unused_notes(
+    unused: Iterable[Series], firsts: Mapping[str, Message], *, image_reason: str | None
+) -> list[str]:
+    """Return which sensors' topics are not used and why, a sentence for each kind.
+
+    Args:
+        unused: The topics.
+        firsts: The first message of those that can be read.
+        image_reason: Reason why images and clouds are not used; None where the user chose others.
+    """
+    kinds: dict[str, list[str]] = {}
+    for one in unused:
+        name, type_ = one.topic.name, one.topic.type
+        if type_ in IMAGES and name in firsts:
+            kind = image_reason and f"images that are not used, as {image_reason}"
+        elif type_ in CLOUDS and name in firsts:
+            reason = "there is a single one" if len(one) == 1 else "those of one topic are mapped"
+            kind = image_reason and f"point clouds that are not used, as {reason}"
+        elif type_ in IMUS and not feels_gravity(one):
+            name = f"{name} ({usual_acceleration(one):.3g})"
+            kind = "accelerations that are not used, as they are not as long as gravity, 9.81 m/s² or 1 g"
+        elif type_ in IMUS:
+            kind = "accelerations that are not used, as one topic is enough (source.topics.imu)"
+        elif type_ in FIXES:
+            kind = "GNSS fixes that are not used, as one topic is enough (source.topics.gnss)"
+        elif type_ in POSES:
+            kind = "poses that are not used; source.topics.wheels reads those of wheels, .truth true ones"
+        elif type_ in READ or _BOOKKEEPING.match(type_):
+            kind = None
+        else:
+            name, kind = f"{name} ({type_})", "topics of types that are not read"
+        if kind is not None:
+            kinds.setdefault(kind, []).append(name)
+    return [f"{kind}: {listed(names)}" for kind, names in kinds.items()]
+
+
+def feels_gravity(series: Series) -> bool:
+    """Return whether an accelerometer feels gravity: a gyroscope's empty accelerations do not."""
+    return unit_of_gravity(usual_acceleration(series)) is not None
+
+
+def usual_acceleration(series: Series) -> float:
+    """Return the median length of an accelerometer's readings."""
+    return float(np.median(np.linalg.norm(np.nan_to_num(series.imu[:, 3:]), axis=1)))
+
+
+def what_there_is(color: Series | None, depth: Series | None, series: Iterable[Series]) -> str:
+    """Return what a recording has instead of something that can be mapped.
+
+    Args:
+        color: Its likeliest colour images, if there are any.
+        depth: Its likeliest depth images, if there are any.
+        series: Every topic.
+    """
+    if color is not None:
+        others = [one for one in series if one.topic.type in IMAGES]
+        names = listed([color.topic.name, *(one.topic.name for one in others if one is not color)])
+        return f"colour images {names}, but neither depth images nor point clouds"
+    if depth is not None:
+        return f"depth images {depth.topic.name}, but neither colour images nor point clouds"
+    names = ", ".join(
+        f"{one.topic.name} ({one.topic.type}{', a single one' if len(one) == 1 else ''})" for one in series
+    )
+    return (
+        f"neither images with depth nor several point clouds, only {names}"
+        if names
+        else "no message of it can be read"
+    )

@@ -1,0 +1,57 @@
+"""Topics that are not used: another camera's calibration, types that are not read, accelerations."""
+
+import numpy as np
+import pytest
+
+from mapper.core.errors import SourceError
+from mapper.core.frames import Scan
+from mapper.sources import open_source
+from mapper.sources.ros.encode_ros import cloud_message, imu_message
+from tests.support.recordings import COLOR, DEPTH, shots, write
+from tests.support.tum_logs import FIRST_NS, PERIOD_NS
+
+STAMPS_NS = [FIRST_NS + i * PERIOD_NS for i in range(4)]
+POINTS = np.random.default_rng(1).uniform(-9.0, 9.0, (20, 3)).astype(np.float32)
+
+
+def cloud(stamp_ns):
+    return cloud_message("/points", Scan(stamp_ns, POINTS), frame="lidar")
+
+
+def imu(stamp_ns, length):
+    up = np.array([0.0, 0.0, length])
+    rates = np.array([0.1, 0.0, 0.0])
+    return imu_message(stamp_ns, "/imu", rates_radps=rates, acceleration_mps2=up, frame="imu")
+
+
+def opened(path, messages):
+    return open_source(write(path, messages))
+
+
+def test_the_depth_camera_s_own_calibration_is_not_colour_s(tmp_path):
+    raw = "/cam/depth/image_raw"
+    messages = [one._replace(topic=raw) if one.topic == DEPTH else one for one in shots(2)]
+    of_depth = [
+        one._replace(topic="/cam/depth/camera_info") if "info" in one.topic else one for one in messages
+    ]
+    with pytest.raises(SourceError, match=r"no camera info for .*/cam/depth/camera_info"):
+        opened(tmp_path / "a.mcap", of_depth)
+    assert len(opened(tmp_path / "b.mcap", messages)) == 2
+
+
+def test_topics_that_cannot_be_read_are_named_where_nothing_can_be_mapped(tmp_path):
+    type_ = "sensor_msgs/msg/JointState"
+    packets = [
+        one._replace(topic=f"{COLOR}/h264", type=type_) if one.topic == COLOR else one for one in shots(2)
+    ]
+    with pytest.raises(SourceError, match=f"{COLOR}/h264 .{type_}"):
+        opened(tmp_path / "a.mcap", packets)
+
+
+def test_accelerations_that_are_not_used_beside_their_gyroscope_are_named(tmp_path):
+    for name, length, named in (("a", 1000.0, 1), ("b", 0.0, 0), ("c", 9.8, 0)):
+        readings = [imu(t, length) for t in STAMPS_NS]
+        log = opened(tmp_path / f"{name}.mcap", [*readings, *(cloud(t) for t in STAMPS_NS)])
+        assert log.gyroscope is not None
+        assert sum("/imu (1e+03)" in note for note in log.notes) == named
+        assert (log.accelerations is not None) == (length == 9.8)
