@@ -1,8 +1,8 @@
 """Pose graphs as g2o text (Kümmerle et al. 2011), as GTSAM, g2o and SE-Sync read it."""
 
-from collections.abc import Callable, Container
+from collections.abc import Callable, Container, Sequence
 from dataclasses import dataclass, field
-from itertools import chain
+from itertools import chain, pairwise
 from pathlib import Path
 from typing import get_args
 
@@ -124,15 +124,16 @@ def read_g2o(path: Path, *, guess_loops: bool = False, progress: Progress = SILE
 
     Args:
         path: The file.
-        guess_loops: An edge without an origin is a loop unless it joins a vertex to the one with the next
-            id; otherwise it counts as odometry.
+        guess_loops: An edge without an origin is a loop unless it joins a vertex to the next one, by the ids
+            or in the file, whichever has more edges between neighbours; otherwise it counts as odometry.
         progress: Receives a note of how many edges have such information or none, and of priors, which are
             left out.
 
     Raises:
         GraphError: The file cannot be read, has no vertices, or a line has an unknown tag, a wrong
             number of columns, a number that is not finite, an id that is unknown or taken, or
-            information whose diagonal is not positive; the message names file and line.
+            information whose diagonal is not positive; the message names file and line. Or loops are to
+            be guessed, and edges join fewer than half of the neighbours in either order.
     """
     tables = _tables(path, progress)
     graph = PoseGraph()
@@ -145,8 +146,11 @@ def read_g2o(path: Path, *, guess_loops: bool = False, progress: Progress = SILE
         raise GraphError(f"{path}: no vertices; want g2o text with {' or '.join(_VERTICES)} lines")
     graph.fixed = _fixed(path, tables.get(_FIX, _Table()), graph)
     informations = _informations(path, tables, progress)
-    rank = {node: k for k, node in enumerate(sorted(graph.T_world_node))}
-    for line, (i, j), note, T_i_j in _in_order(path, tables, _EDGES):
+    edges = _in_order(path, tables, _EDGES)
+    rank = {}
+    if guess_loops and not all(note.split()[:1] == ["origin"] for _, _, note, _ in edges):
+        rank = _order_of_travel(path, list(graph.T_world_node), [ids for _, ids, _, _ in edges])
+    for line, (i, j), note, T_i_j in edges:
         try:
             are_neighbours = abs(rank.get(i, 0) - rank.get(j, 0)) == 1
             unnamed: Origin = "loop" if guess_loops and not are_neighbours else "odometry"
@@ -154,6 +158,23 @@ def read_g2o(path: Path, *, guess_loops: bool = False, progress: Progress = SILE
         except MapperError as error:
             raise GraphError(f"{path}:{line}: {error}") from None
     return graph
+
+
+def _order_of_travel(path: Path, nodes: Sequence[int], edges: Sequence[Sequence[int]]) -> dict[int, int]:
+    """Return the position of each node on the way, by the order whose neighbours have more edges."""
+    pairs = {frozenset(ids) for ids in edges}
+
+    def joined(order: Sequence[int]) -> int:
+        return sum(frozenset(pair) in pairs for pair in pairwise(order))
+
+    order = max(sorted(nodes), nodes, key=joined)
+    if 2 * joined(order) < len(nodes) - 1:
+        raise GraphError(
+            f"{path}: edges join {joined(order)} of {len(nodes) - 1} pairs of neighbouring vertices, by their"
+            " ids or in the file, so nothing tells odometry from loops; write the vertices in the order of "
+            "the way, or --robust none keeps every edge"
+        )
+    return {node: k for k, node in enumerate(order)}
 
 
 @dataclass(frozen=True, slots=True)

@@ -144,6 +144,35 @@ def test_loops_of_a_foreign_file_are_guessed_by_their_ids(tmp_path):
     assert [factor.origin for factor in read_g2o(path).factors] == ["odometry"] * 4 + ["wheel"]
 
 
+def foreign_file(path, *, ids, order):
+    """Graph of a way with two loops; vertices have these ids and stand in the file in this order."""
+    vertices = "".join(f"VERTEX_SE2 {ids[k]} {k} 0 0\n" for k in order)
+    pairs = [*((k, k + 1) for k in range(7)), (0, 7), (2, 6)]
+    path.write_text(vertices + "".join(f"EDGE_SE2 {ids[i]} {ids[j]} 1 0 0 1 0 0 1 0 1\n" for i, j in pairs))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("ids", "order"),
+    [
+        pytest.param([70, 10, 50, 30, 0, 60, 20, 40], range(8), id="random ids in the order of the way"),
+        pytest.param([0, 10, 20, 30, 40, 50, 60, 70], [5, 2, 7, 0, 3, 6, 1, 4], id="ids along the way"),
+    ],
+)
+def test_odometry_joins_neighbours_by_the_ids_or_in_the_file(tmp_path, ids, order):
+    graph = read_g2o(foreign_file(tmp_path / "a.g2o", ids=ids, order=order), guess_loops=True)
+    assert [factor.origin for factor in graph.factors] == ["odometry"] * 7 + ["loop"] * 2
+
+
+def test_loops_are_not_guessed_where_no_order_is_that_of_the_way(tmp_path):
+    path = foreign_file(
+        tmp_path / "a.g2o", ids=[70, 10, 50, 30, 0, 60, 20, 40], order=[5, 2, 7, 0, 3, 6, 1, 4]
+    )
+    with pytest.raises(GraphError, match="of 7 pairs"):
+        read_g2o(path, guess_loops=True)
+    assert len(read_g2o(path).factors) == 9
+
+
 def test_lines_of_two_kinds_keep_their_order(tmp_path):
     path = tmp_path / "mixed.g2o"
     path.write_text(
