@@ -25,8 +25,8 @@ def beam_points(
         step_rad: From each beam to the next.
         limits_m: Least and largest range.
     """
-    ranges_m = np.asarray(ranges_m, np.float64)
-    with np.errstate(invalid="ignore"):
+    with np.errstate(invalid="ignore"):  # damaged numbers may be signalling NaN
+        ranges_m = np.asarray(ranges_m, np.float64)
         is_return = (ranges_m > 0.0) & (ranges_m >= limits_m[0]) & (ranges_m <= limits_m[1])
     beams = np.flatnonzero(is_return & np.isfinite(ranges_m))
     directions = first_rad + step_rad * beams
@@ -59,8 +59,9 @@ def laser_records(
     if step_s > 0.0:
         columns["time"] = step_s * beams
     records = np.empty(len(beams), [(name, "<f4") for name in columns])
-    for name, values in columns.items():
-        records[name] = values
+    with np.errstate(over="ignore", invalid="ignore"):  # what is too far is left out later
+        for name, values in columns.items():
+            records[name] = values
     return records
 
 

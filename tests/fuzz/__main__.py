@@ -61,6 +61,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description=__doc__)
     parser.add_argument("--cases", type=int, default=1000, help="how many inputs to damage")
     parser.add_argument("--seed", type=int, default=0, help="of the cases; another seed is other damage")
+    parser.add_argument("--formats", nargs="+", choices=FORMATS, default=[*FORMATS], help="which are damaged")
     parser.add_argument("--lines", action="store_true", help="command lines with hostile paths and files")
     options = parser.parse_args()
     with TemporaryDirectory(prefix="mapper-fuzz-") as scratch, Runner(Path(scratch)) as runner:
@@ -68,7 +69,7 @@ def main() -> int:
         if options.lines:
             found = fuzz(lines(), Sandbox(Path(scratch), runner).run, options.cases, options.seed)
         else:
-            found = fuzz(cases(), runner.run_case, options.cases, options.seed)
+            found = fuzz(cases(options.formats), runner.run_case, options.cases, options.seed)
         return 1 if found else 0
 
 

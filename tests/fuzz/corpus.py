@@ -26,10 +26,11 @@ from mapper.sources.base import Accelerations, Log
 from mapper.sources.calibration_file import calibration_text
 from mapper.sources.ros.typestore import typestore
 from mapper.sources.writers import LogKind, write_log
+from tests.fuzz.sensor_logs import SENSOR_LOGS
 from tests.support.clouds import save_cloud
 from tests.support.depth_cameras import write_unregistered
 from tests.support.desk import DESK, build_desk_run
-from tests.support.driver_recordings import street, write_livox, write_pcap, write_vlp16
+from tests.support.driver_recordings import write_livox
 from tests.support.logs import MemoryEntry, log_in_memory
 from tests.support.octree_maps import COLORED, mapped
 from tests.support.posed_scans import WRITERS, shots_of
@@ -294,14 +295,6 @@ def _livox(folder: Path) -> Path:
     return write_livox(folder / "log.bag", (scan for scan in lidar_log() if isinstance(scan, Scan)))
 
 
-def _velodyne(folder: Path) -> Path:
-    return write_vlp16(folder / "log.bag", street(azimuth_steps=90, duration_s=0.3), scans=2)[0]
-
-
-def _pcap(folder: Path) -> Path:
-    return write_pcap(folder / "log.pcap", street(azimuth_steps=90, duration_s=0.3), packets=200)
-
-
 FORMATS: Mapping[str, Maker] = {
     "tum": _written(rgbd_log, "tum", "log"),
     "mbag": _written(rgbd_log, "mbag", "log"),
@@ -330,8 +323,7 @@ FORMATS: Mapping[str, Maker] = {
     **{kind: _scan(kind) for kind in WRITERS if kind != "redwood"},
     "redwood, npy": _scan("redwood"),
     "bag, livox": _livox,
-    "bag, velodyne": _velodyne,
-    "pcap": _pcap,
+    **SENSOR_LOGS,
     "poznan": _poznan,
     **{
         f"clouds, {ending[1:]}": _clouds(ending)

@@ -4,32 +4,11 @@ import numpy as np
 import pytest
 
 from mapper.core.errors import FrameError, SourceError
-from mapper.core.geometry import exp
-from mapper.core.rotations import row_of_pose
 from mapper.sources import open_source
 from mapper.sources.config import SourceConfig
+from tests.support.e57_files import POSES, fields, write
 
 pye57 = pytest.importorskip("pye57")
-
-POSES = [exp(np.array([0.0, 0.0, 0.3 * k]), np.array([2.0 * k, 0.5, 1.0])) for k in range(3)]
-
-
-def fields(seed, *, count=50):
-    random = np.random.default_rng(seed)
-    xyz = random.uniform(-9.0, 9.0, (count, 3))
-    data = dict(zip(("cartesianX", "cartesianY", "cartesianZ"), xyz.T.copy(), strict=True))
-    data["intensity"] = random.uniform(0.0, 1.0, count).astype(np.float32)
-    for name in ("colorRed", "colorGreen", "colorBlue"):
-        data[name] = random.integers(0, 256, count).astype(np.uint8)
-    return xyz, data
-
-
-def write(path, *scans, poses=POSES):
-    with pye57.E57(str(path), mode="w") as file:
-        for data, T in zip(scans, poses, strict=False):
-            x, y, z, qx, qy, qz, qw = row_of_pose(T)
-            file.write_scan_raw(data, rotation=np.array([qw, qx, qy, qz]), translation=np.array([x, y, z]))
-    return path
 
 
 def test_scans_of_a_file_are_in_the_scanner_s_frame_with_their_poses(tmp_path):

@@ -19,6 +19,7 @@ from tests.support.stereo_rig import (
     SIZE_PX,
     T_IMU_LEFT,
     poses_world,
+    projections,
     recorded,
     write_euroc,
     write_imu,
@@ -27,11 +28,6 @@ from tests.support.stereo_rig import (
 
 RECT = ("/stereo/left/image_rect", "/stereo/right/image_rect")
 RAW = ("/stereo/left/image_raw", "/stereo/right/image_raw")
-
-
-def projections(baseline_m, camera=RECTIFIED[0]):
-    K = camera.matrix
-    return [np.column_stack([K, K @ [-x, 0.0, 0.0]]) for x in (0.0, baseline_m)]
 
 
 def off_wall_m(frame, T_world_body):

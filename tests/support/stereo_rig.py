@@ -210,3 +210,9 @@ def recorded(
             name = topic.rpartition("/")[0] + "/camera_info"
             messages.append(SerializedMessage(stamp_ns, name, "sensor_msgs/msg/CameraInfo", serialize(info)))
     return messages
+
+
+def projections(baseline_m: float, camera: RigCamera = RECTIFIED[0]) -> list[np.ndarray]:
+    """Return the (3, 4) projections of two rectified cameras."""
+    K = camera.matrix
+    return [np.column_stack([K, K @ [-x, 0.0, 0.0]]) for x in (0.0, baseline_m)]

@@ -1,0 +1,63 @@
+"""Small logs of stereo cameras, lasers and scanners, and of a Velodyne's packets, for the corpus."""
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import numpy as np
+
+from tests.support.driver_recordings import street, write_pcap, write_vlp16
+from tests.support.e57_files import fields as e57_fields
+from tests.support.e57_files import write as write_e57
+from tests.support.planar_drives import Drive, Laser, drive, hall, write_carmen, write_ros
+from tests.support.recordings import write
+from tests.support.stereo_rig import (
+    BARREL,
+    FISHEYE,
+    RECTIFIED,
+    projections,
+    recorded,
+    write_euroc,
+    write_imu,
+    write_kitti,
+)
+
+
+def _velodyne(folder: Path) -> Path:
+    return write_vlp16(folder / "log.bag", street(azimuth_steps=90, duration_s=0.3), scans=2)[0]
+
+
+def _pcap(folder: Path) -> Path:
+    return write_pcap(folder / "log.pcap", street(azimuth_steps=90, duration_s=0.3), packets=200)
+
+
+def _stereo(folder: Path) -> Path:
+    topics = "/stereo/left/image_rect", "/stereo/right/image_rect"
+    return write(folder / "log", recorded(RECTIFIED, topics, projections=projections(0.12)))
+
+
+def _euroc(folder: Path) -> Path:
+    write_imu(write_euroc(folder / "log", BARREL), 50)
+    return folder / "log"
+
+
+def _e57(folder: Path) -> Path:
+    return write_e57(folder / "log.e57", *(e57_fields(seed)[1] for seed in range(3)))
+
+
+def _laser() -> Drive:
+    walls, way = hall()
+    return drive((walls, np.array([way[0], 0.9 * way[0] + 0.1 * way[1]])), Laser(beams=61))
+
+
+SENSOR_LOGS: Mapping[str, Callable[[Path], Path]] = {
+    "bag, velodyne": _velodyne,
+    "pcap": _pcap,
+    "rosbag2, stereo": _stereo,
+    "euroc": _euroc,
+    "euroc, kalibr": lambda folder: write_euroc(folder / "log", FISHEYE, kalibr=True),
+    "kitti, stereo": lambda folder: write_kitti(folder / "log"),
+    "e57": _e57,
+    "bag, laser": lambda folder: write_ros(folder / "log.bag", _laser()),
+    "carmen": lambda folder: write_carmen(folder / "log.log", _laser()),
+}
+"""Makers of these inputs."""
