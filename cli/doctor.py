@@ -45,6 +45,14 @@ def doctor(
             help="Compile the kernels now, so that the first build does not have to; takes a minute.",
         ),
     ] = False,
+    bundle: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE.zip",
+            help="Write what a report of a fault needs: these checks, and of RUN its settings, outcomes and "
+            "what its log looks like; no images, points or trajectory.",
+        ),
+    ] = None,
     *,
     output: Output,
 ) -> Answer:
@@ -55,6 +63,9 @@ def doctor(
 
     Example: mapper doctor --json, or: mapper doctor runs/xyz, or after pip install: mapper doctor --warm
     """
+    if bundle is not None:
+        refuse_with("--bundle", {"--accept": accept, "--warm": warm})
+        return _bundled(bundle, run, output)
     if warm:
         refuse_with(
             "--warm", {"RUN": run, "--accept": accept}, remedy="it compiles the kernels of all builds"
@@ -77,6 +88,14 @@ def doctor(
     if failed:
         error = MapperError(f"doctor: {len(failed)} of {len(findings)} failed: {', '.join(failed)}")
     return Answer({"findings": findings}, _table(findings), error=error)
+
+
+def _bundled(path: Path, run: Path | None, output: Output) -> Answer:
+    from mapper.run.support_bundle import write_bundle
+    from mapper.runtime.doctor import examine
+
+    names = write_bundle(path, examine(progress=output.progress()), run)
+    return Answer({"path": path, "files": names}, f"{path}: {', '.join(names)}")
 
 
 def _warmed(progress: "Progress") -> "list[Finding]":
