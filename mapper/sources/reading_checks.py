@@ -29,13 +29,14 @@ _FROZEN: tuple[tuple[_Repeating, str, str, int], ...] = (
 
 @dataclass(frozen=True, slots=True)
 class _Reading:
-    """Checksums of a frame's images or of its points, and its numbers of returns that were left out."""
+    """Checksums of a frame's images or of its points, what was left out, and whether points have times."""
 
     image: int | None = None
     depth: int | None = None
     scan: int | None = None
     far_returns: int = 0
     untimed_returns: int = 0
+    is_timed: bool | None = None
 
 
 class ReadingChecks:
@@ -85,7 +86,7 @@ class ReadingChecks:
 
     def notes(self) -> list[str]:
         """Return what is suspicious about the frames loaded so far, a sentence each."""
-        return [*self.frozen(), *self.far_returns(), *self.untimed_returns()]
+        return [*self.frozen(), *self.far_returns(), *self.untimed_returns(), *self.untimed_scans()]
 
     def frozen(self) -> list[str]:
         """Return where a sensor seems to have been frozen, a sentence each."""
@@ -127,6 +128,15 @@ class ReadingChecks:
                 f"{MAX_SWEEP_S:g} s from those of their scan; left out"
             )
 
+    def untimed_scans(self) -> Iterator[str]:
+        """Yield a sentence about the scans without times among others that have them."""
+        are_timed = [reading.is_timed for reading in self._readings.values() if reading.is_timed is not None]
+        if any(are_timed) and not all(are_timed):
+            yield (
+                f"{are_timed.count(False)} of {len(are_timed)} scans have no times of their points and are "
+                "not deskewed, unlike the others"
+            )
+
 
 @dataclass(frozen=True, slots=True)
 class _CheckedEntry(WrappedEntry):
@@ -144,6 +154,9 @@ class _CheckedEntry(WrappedEntry):
 def _reading_of(frame: Frame) -> _Reading:
     if isinstance(frame, Scan):
         return _Reading(
-            scan=frame.checksum, far_returns=frame.far_returns, untimed_returns=frame.untimed_returns
+            scan=frame.checksum,
+            far_returns=frame.far_returns,
+            untimed_returns=frame.untimed_returns,
+            is_timed=frame.times_s is not None if len(frame.points_body) else None,
         )
     return _Reading(image=frame.image_checksum, depth=frame.depth_checksum)

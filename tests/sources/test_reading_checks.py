@@ -152,3 +152,13 @@ def test_a_build_notes_it_in_the_manifest(frozen_log, tmp_path):
     run = build(open_source(frozen_log), config, tmp_path / "run")
     assert NOTE in run.manifest.input.notes
     assert run.manifest.counts.listed == 31
+
+
+@pytest.mark.parametrize(("untimed", "noted"), [(range(0, 6, 2), 1), (range(0), 0), (range(6), 0)])
+def test_scans_without_times_among_others_with_times_are_counted(untimed, noted):
+    points = np.random.default_rng(2).uniform(1.0, 9.0, (6, 20, 3)).astype(np.float32)
+    times_s = np.linspace(0.0, 0.1, 20, dtype=np.float32)
+    scans = [Scan(k * 10**8, points[k], times_s=None if k in untimed else times_s) for k in range(6)]
+    notes = notes_on(log_in_memory([MemoryEntry(scan.stamp_ns, scan) for scan in scans], sensor="lidar"))
+    assert sum(note.startswith("3 of 6 scans have no times") for note in notes) == noted
+    assert len(notes) == noted
