@@ -42,7 +42,7 @@ def odometry_for(
     from mapper.odometry.given_poses import poses_for
     from mapper.odometry.scans.surroundings import adapted_to
 
-    if log.depth_noise is not None and getattr(config, "depth_noise", log.depth_noise) is None:
+    if isinstance(config, IsvdOdometryConfig | LocalMapConfig | PnpConfig) and config.depth_noise is None:
         config = config.model_copy(update={"depth_noise": log.depth_noise})
     wheels = log.wheels if log.sensor == "lidar-2d" else None
     return build_odometry(
