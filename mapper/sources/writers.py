@@ -78,14 +78,17 @@ def left_out(source: Log, kind: LogKind) -> list[str]:
         "accelerations": source.accelerations is not None,
         "angular velocities": source.gyroscope is not None,
         "GNSS fixes": source.gnss is not None,
+        "the plane of a 2D laser's scans": source.sensor == "lidar-2d",
+        "the noise of its depth": source.depth_noise is not None,
     }
+    of_all = ["the plane of a 2D laser's scans", "the noise of its depth"]
     no_place: dict[LogKind, list[str]] = {
         "mbag": ["wheel odometry", "device poses", "angular velocities", "GNSS fixes"],
         "mcap": ["device poses"],
         "bag": ["device poses"],
         "kitti": ["accelerations"],
     }
-    missing = [what for what in no_place.get(kind, []) if has[what]]
+    missing = [what for what in [*no_place.get(kind, []), *of_all] if has[what]]
     if kind == "mcap" or kind == "bag":
         from mapper.sources.ros.log_writing import early_readings  # loads rosbags
 

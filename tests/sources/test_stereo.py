@@ -8,7 +8,7 @@ from mapper.core.errors import SourceError
 from mapper.core.geometry import angle_between, apply, inverse
 from mapper.sensing.stereo import stereo_depth_m
 from mapper.sources import open_source
-from mapper.sources.writers import write_log
+from mapper.sources.writers import left_out, write_log
 from tests.support.recordings import transforms, write
 from tests.support.stereo_rig import (
     BARREL,
@@ -80,6 +80,7 @@ def test_kitti_folder_shows_the_wall_from_the_true_poses(tmp_path):
 def test_converted_log_has_the_same_depth(tmp_path):
     log = open_source(write_kitti(tmp_path / "00"))
     write_log(log, tmp_path / "tum", kind="tum")
+    assert len(left_out(log, "tum")) == 1  # the noise of its depth
     for found, wanted in zip(open_source(tmp_path / "tum"), log, strict=True):
         np.testing.assert_allclose(found.depth_m, wanted.depth_m, atol=1e-3)
         np.testing.assert_array_equal(found.image, wanted.image)

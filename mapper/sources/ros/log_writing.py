@@ -187,14 +187,14 @@ def _truth(source: Log) -> Iterator[SerializedMessage]:
 
 def _wheels(source: Log) -> Iterator[SerializedMessage]:
     if source.wheels is not None:
-        body = _LIDAR_FRAME if source.sensor == "lidar" else _CAMERA_FRAME
+        body = _CAMERA_FRAME if source.sensor == "rgbd" else _LIDAR_FRAME
         for stamp_ns, T in source.wheels[source.wheels.stamps_ns >= 0].items():
             yield odometry_message(stamp_ns, WHEELS, T, frame=_ODOM, child=body)
 
 
 def _imu(source: Log) -> Iterator[SerializedMessage]:
     felt, turned = source.accelerations, source.gyroscope
-    body = _LIDAR_FRAME if source.sensor == "lidar" else _CAMERA_FRAME
+    body = _CAMERA_FRAME if source.sensor == "rgbd" else _LIDAR_FRAME
     if turned is not None and turned.R_body_imu is not None:  # in the body's axes, where no tf is needed
         turned = replace(turned, rates_radps=turned.rates_radps @ turned.R_body_imu.T)
     stamps_ns = np.empty(0, np.int64) if felt is None else felt.stamps_ns
@@ -224,7 +224,7 @@ def _imu(source: Log) -> Iterator[SerializedMessage]:
 def _fixes(source: Log) -> Iterator[SerializedMessage]:
     if source.gnss is None:
         return
-    body = _LIDAR_FRAME if source.sensor == "lidar" else _CAMERA_FRAME
+    body = _CAMERA_FRAME if source.sensor == "rgbd" else _LIDAR_FRAME
     fixes = source.gnss.of(source.gnss.stamps_ns >= 0)
     for k, stamp_ns in enumerate(fixes.stamps_ns.tolist()):
         if k == 0 and fixes.antenna_body is not None:
