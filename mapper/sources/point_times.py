@@ -72,7 +72,7 @@ def relative_times_s(values: NDArray[np.number], stamp_ns: int) -> NDArray[np.fl
     """
     if len(values) == 0:
         return None
-    values = _counted_on(np.ascontiguousarray(values))  # contiguous ones are read faster, and three times
+    values = counted_on(np.ascontiguousarray(values))  # contiguous ones are read faster, and three times
     middle, units_per_s = _middle_and_unit(values)
     if units_per_s is None:
         return None
@@ -90,8 +90,8 @@ def without_untimed(scan: Scan) -> Scan:
     return replace(scan.select(timed), untimed_returns=int((~timed).sum()))
 
 
-def _counted_on(values: NDArray[np.number]) -> NDArray[np.number]:
-    """Return the values as if a counter had not begun anew during the sweep."""
+def counted_on(values: NDArray[np.number]) -> NDArray[np.number]:
+    """Return the values as if a counter had not begun anew during the sweep; the same array if it has not."""
     first, last = values.min(), values.max()
     if not (np.isfinite(first) and np.isfinite(last)):
         return values

@@ -156,6 +156,8 @@ def test_a_counter_that_wraps_costs_no_point():
     scans = scans_of("15_point_times_partly_wrong/wrapped")
     assert all(scan.untimed_returns == 0 for scan in scans)
     assert all(np.ptp(scan.times_s) < 0.11 for scan in scans)
+    log = open_source(case("15_point_times_partly_wrong/wrapped"), SourceConfig())
+    assert sum("begins anew" in note for note in log.notes) == 1
 
 
 def test_nanoseconds_without_leading_zeros_are_whole_numbers():

@@ -16,7 +16,7 @@ from mapper.sources.image_files.image_sizes import recorded_camera
 from mapper.sources.image_files.reading import TUM_UNITS_PER_M
 from mapper.sources.image_folders.pairing import depth_offset_ns
 from mapper.sources.laser_scan import MAX_TILT_RAD, tilt_rad
-from mapper.sources.point_times import relative_times_s, time_field
+from mapper.sources.point_times import counted_on, relative_times_s, time_field
 from mapper.sources.ros.cameras import calibrate
 from mapper.sources.ros.entries import CloudEntry, rgbd_entry, stereo_entry
 from mapper.sources.ros.frame_tree import is_fixed
@@ -238,8 +238,11 @@ def _lidar(reader: RecordingReader, clouds: Series, config: SourceConfig) -> _Fr
     if isinstance(first, CloudMessage):
         notes += [f"{clouds.topic.name}: {note}" for note in first.notes]
         times = time_field(first.points.dtype.names or ())
-        if times and relative_times_s(first.points[times], first.stamp_ns) is None:
+        values = None if times is None else first.points[times]
+        if values is not None and relative_times_s(values, first.stamp_ns) is None:
             notes.append(f"{clouds.topic.name}: field {times} holds no times; scans are not deskewed")
+        elif values is not None and counted_on(values) is not values:
+            notes.append(f"{clouds.topic.name}: field {times} begins anew during a sweep; counted on")
     frame, is_planar = frame_of(first), clouds.topic.type in LASERS
     if is_planar and config.body_frame is None:
         config = config.model_copy(update={"body_frame": reader.base_of(frame)})
