@@ -247,7 +247,8 @@ class _ScanViews:
 
     def describe(self, frames: Sequence[PlacedFrame], /) -> list[Prepared]:
         def prepare(frame: PlacedFrame) -> Prepared:
-            return prepared(frame.scan_of(frame.entry.scan()).points_body, voxel_m=_VOXEL_M)
+            scan = frame.scan_of(frame.entry.scan())
+            return prepared(scan.points_body, voxel_m=_VOXEL_M, is_planar=scan.is_planar)
 
         return list(ordered_map(prepare, frames))
 

@@ -37,6 +37,7 @@ _TILT_RAD = np.deg2rad(32.0)
 _TURN_RAD = np.deg2rad(-35.0)
 _WIDEST = 2.0  # width over height
 _GAP_IN = 0.15
+_FLAT_M = 1e-3  # a cloud of less height is of a 2D laser
 
 
 def write_cloud_views(
@@ -64,14 +65,14 @@ def write_cloud_views(
     if below.any():
         points, colors = points[below], colors[below]
     heights_m = None
-    if not has_colors:
+    is_flat = not has_colors and len(points) > 0 and float(np.ptp(points[:, 2])) < _FLAT_M
+    if not has_colors and not is_flat:
         low_m, high_m = np.percentile(points[:, 2], [STRAY_PERCENT, 100.0 - STRAY_PERCENT]).tolist()
         heights_m = low_m, high_m
         colors = height_colors(points[:, 2], between_m=heights_m)
-    views = {
-        "from above": _View(_turned(0.0, np.pi / 2), points, positions),
-        "from the side": _View(_turned(_TURN_RAD, _TILT_RAD), points, positions),
-    }
+    views = {"from above": _View(_turned(0.0, np.pi / 2), points, positions)}
+    if not is_flat:
+        views["from the side"] = _View(_turned(_TURN_RAD, _TILT_RAD), points, positions)
     figure, panels = _page_for(views.values())
     for axes, (name, view) in zip(panels, views.items(), strict=True):
         _draw_view(axes, view, colors)

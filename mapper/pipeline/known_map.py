@@ -100,7 +100,10 @@ def _members(merged: MergedMap) -> list[tuple[Run, dict[int, Transform]]]:
 
 def sensor_of(places: KnownPlaces[Any]) -> Sensor:
     """Return what places were seen by; there is at least one."""
-    return "rgbd" if isinstance(next(iter(places.places.values())), ImageView) else "lidar"
+    place = next(iter(places.places.values()))
+    if isinstance(place, ImageView):
+        return "rgbd"
+    return "lidar" if place.points_body[:, 2].any() else "lidar-2d"
 
 
 def loops_between_days(config: AnyLoops, sensor: Sensor) -> PlaceLoopsConfig | ScanLoopsConfig:

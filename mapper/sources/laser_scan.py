@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 from mapper.core.errors import DataError
 from mapper.core.frames import Scan
 from mapper.core.geometry import Array, Transform, apply
+from mapper.core.trajectory import Trajectory
 
 MAX_TILT_RAD = np.radians(5.0)
 """A plane tilted by less is taken as parallel to the floor: what is measured 10 m away is 4 cm nearer."""
@@ -82,6 +83,14 @@ def planar(scan: Scan) -> Scan:
         intensities=scan.intensities,
         is_planar=True,
     )
+
+
+def rolling(wheels: Trajectory | None) -> tuple[Trajectory | None, list[str]]:
+    """Return wheel odometry that moves, and a note where there is none, or it stands still as in a hand."""
+    if wheels is not None and wheels.path_length_m > 0.0:
+        return wheels, []
+    what = "no wheel odometry" if wheels is None else "the wheel odometry stands still"
+    return None, [f"{what}: it would show motions that walls do not; record /odom or /tf"]
 
 
 def planar_scan(stamp_ns: int, points_laser: Array, T_body_laser: Transform) -> Scan:

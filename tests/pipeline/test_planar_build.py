@@ -1,14 +1,23 @@
 """Logs of 2D lasers become maps: planar poses, loops, a sharp layer, and floor where it is free."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from mapper.config.loading import load_config
+from mapper.core.errors import SourceError
+from mapper.core.geometry import fit_rigid
+from mapper.core.timebase import nearest
 from mapper.core.trajectory import Trajectory
 from mapper.evaluators.metrics.evaluate import evaluate
 from mapper.octree.grid import FREE, OCCUPIED, read_grid
 from mapper.pipeline.build import build
+from mapper.pipeline.known_map import load_known_map
+from mapper.pipeline.localise import localise
 from mapper.sources import open_source
+from mapper.sources.trajectory_files import read_tum
+from mapper.sources.writers import write_log
 from tests.support.planar import at
 from tests.support.planar_drives import (
     FIRST_NS,
@@ -111,3 +120,37 @@ def test_wheels_measure_the_length_of_a_bare_corridor(tmp_path):
 
     assert len(run.trajectory) > 0.95 * len(driven.times_s)
     assert error_m(run.trajectory, driven) < 0.5 * error_m(wheels_of(driven), driven)
+
+
+def test_walls_alone_place_scans_without_wheels(tmp_path):
+    driven = drive(flat(), SICK, speed_mps=0.4)
+    path = write_carmen(tmp_path / "log.log", replace(driven, readings=np.zeros_like(driven.readings)))
+
+    run = built(path, tmp_path / "run")
+
+    assert error_m(run.trajectory, driven) < 0.03
+    assert len(run.trajectory) > 0.95 * len(driven.times_s)
+
+
+def test_another_drive_is_localised_in_the_map(rooms, tmp_path):
+    driven, run = rooms
+    again = drive(flat(), driven.laser, speed_mps=0.6, seed=5)
+    known = load_known_map(run.path)
+
+    localise(open_source(write_ros(tmp_path / "log", again)), known, known.config, tmp_path / "run")
+
+    truth, own = truth_of(driven), run.trajectory
+    true = truth.positions_world[nearest(truth.stamps_ns, own.stamps_ns)[0]]
+    T_map_truth, _ = fit_rigid(own.positions_world, true)
+    poses = read_tum(tmp_path / "run" / "trajectory.tum")
+    want = truth_of(again).moved(T_map_truth)
+    misses = poses.positions_world - want.positions_world[nearest(want.stamps_ns, poses.stamps_ns)[0]]
+    assert len(poses) > 0.9 * len(again.times_s)
+    assert np.median(np.linalg.norm(misses, axis=1)) < 0.05
+
+
+def test_scans_are_not_converted_to_clouds(tmp_path):
+    log = open_source(write_carmen(tmp_path / "log.log", drive(flat(), SICK).part(10)))
+
+    with pytest.raises(SourceError):
+        write_log(log, tmp_path / "clouds.mcap", kind="mcap")

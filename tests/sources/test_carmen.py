@@ -117,3 +117,14 @@ def test_other_text_is_no_log_of_it(tmp_path):
 
     with pytest.raises(SourceError):
         open_source(path)
+
+
+def test_odometry_that_stands_still_is_none(tmp_path):
+    ranges = " ".join(["3.00"] * 181)
+    path = tmp_path / "hand.log"
+    path.write_text("\n".join(f"FLASER 181 {ranges} 0 0 0 0 0 0 {k}.0 host {k}.0" for k in range(1, 5)))
+
+    log = open_source(path)
+
+    assert log.wheels is None
+    assert any("stands still" in note for note in log.notes)

@@ -66,8 +66,14 @@ class Drive:
 
     def part(self, scans: int) -> "Drive":
         """The first scans of the drive."""
+        read = self.readings_s <= self.times_s[scans]
         return replace(
-            self, times_s=self.times_s[:scans], truth=self.truth[:scans], ranges_m=self.ranges_m[:scans]
+            self,
+            times_s=self.times_s[:scans],
+            truth=self.truth[:scans],
+            readings_s=self.readings_s[read],
+            readings=self.readings[read],
+            ranges_m=self.ranges_m[:scans],
         )
 
 

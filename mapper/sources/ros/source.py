@@ -15,7 +15,7 @@ from mapper.sources.config import SourceConfig
 from mapper.sources.image_files.image_sizes import recorded_camera
 from mapper.sources.image_files.reading import TUM_UNITS_PER_M
 from mapper.sources.image_folders.pairing import depth_offset_ns
-from mapper.sources.laser_scan import MAX_TILT_RAD, tilt_rad
+from mapper.sources.laser_scan import MAX_TILT_RAD, rolling, tilt_rad
 from mapper.sources.point_times import counted_on, relative_times_s, time_field
 from mapper.sources.ros.cameras import calibrate
 from mapper.sources.ros.entries import CloudEntry, rgbd_entry, stereo_entry
@@ -94,6 +94,9 @@ def recording_log(reader: RecordingReader, config: SourceConfig) -> Log:
     )
     if choice.wheels is None and frames.sensor == "lidar-2d":
         wheels, wheel_notes = reader.wheels_by_tf(frames.body)
+    if frames.sensor == "lidar-2d":
+        wheels, still_notes = rolling(wheels)
+        wheel_notes = [*wheel_notes, *still_notes]
     gnss, gnss_notes = reader.gnss(choice.gnss, body=frames.body)
     return Log(
         path=recording.path,

@@ -20,7 +20,7 @@ from mapper.core.trajectory import Trajectory
 from mapper.runtime.regular_files import read_text
 from mapper.sources.base import ImageFiles, Log
 from mapper.sources.config import SourceConfig
-from mapper.sources.laser_scan import MOST_RAD, beam_points, planar_scan
+from mapper.sources.laser_scan import MOST_RAD, beam_points, planar_scan, rolling
 from mapper.sources.text import time_order
 
 _ENDINGS = (".log", ".clf")
@@ -109,6 +109,7 @@ def read_log(path: Path, config: SourceConfig) -> Log:  # noqa: ARG001
     if name in _OFFSET or not odometry:
         odometry = [(line.stamp_ns, line.robot) for line in scans if line.robot is not None]
     wheels, wheel_notes = _trajectory(odometry, what="wheel odometry")
+    wheels, still_notes = rolling(wheels)
     true_poses, truth_notes = _trajectory(truth, what="TRUEPOS")
     limit_m = _limit_m(parameters)
     return Log(
@@ -120,7 +121,7 @@ def read_log(path: Path, config: SourceConfig) -> Log:  # noqa: ARG001
         entry_at=lambda index: CarmenEntry(scans[index], T_robot_laser, limit_m),
         truth=true_poses,
         wheels=wheels,
-        notes=[*notes, *order_notes, *mounting_notes, *wheel_notes, *truth_notes],
+        notes=[*notes, *order_notes, *mounting_notes, *wheel_notes, *still_notes, *truth_notes],
     )
 
 
