@@ -33,7 +33,6 @@ from tests.support.desk import DESK, build_desk_run
 from tests.support.driver_recordings import write_livox
 from tests.support.logs import MemoryEntry, log_in_memory
 from tests.support.octree_maps import COLORED, mapped
-from tests.support.planar_drives import RPLIDAR, SICK, drive, flat, write_carmen, write_ros
 from tests.support.posed_scans import WRITERS, shots_of
 from tests.support.recordings import CAMERA, add_messages, shots, write, write_folder
 from tests.support.tum_logs import FIRST_NS, picture
@@ -325,11 +324,6 @@ FORMATS: Mapping[str, Maker] = {
     "redwood, npy": _scan("redwood"),
     "bag, livox": _livox,
     **SENSOR_LOGS,
-    "bag, 2D laser": lambda folder: write_ros(folder / "log.bag", drive(flat(), RPLIDAR).part(FRAMES)),
-    "carmen, FLASER": lambda folder: write_carmen(folder / "log.log", drive(flat(), SICK).part(FRAMES)),
-    "carmen, ROBOTLASER1": lambda folder: write_carmen(
-        folder / "log.clf", drive(flat(), SICK).part(FRAMES), message="ROBOTLASER1"
-    ),
     "poznan": _poznan,
     **{
         f"clouds, {ending[1:]}": _clouds(ending)

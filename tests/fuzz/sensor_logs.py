@@ -59,5 +59,6 @@ SENSOR_LOGS: Mapping[str, Callable[[Path], Path]] = {
     "e57": _e57,
     "bag, laser": lambda folder: write_ros(folder / "log.bag", _laser()),
     "carmen": lambda folder: write_carmen(folder / "log.log", _laser()),
+    "carmen, later": lambda folder: write_carmen(folder / "log.clf", _laser(), message="ROBOTLASER1"),
 }
 """Makers of these inputs."""
