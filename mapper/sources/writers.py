@@ -56,14 +56,9 @@ def write_log(
         on_progress: Receives the number of frames done, after each.
 
     Raises:
-        SourceError: OUT is not empty, the scans are planar, or no frame of the source can be read and is of a
-            kind that the format has room for.
+        SourceError: OUT is not empty, or no frame of the source can be read and is of a kind that the format
+            has room for.
     """
-    if source.sensor == "lidar-2d":
-        raise SourceError(
-            f"{source.path}: scans of a 2D laser, which no format that is written keeps apart from clouds; "
-            "use the log as it is"
-        )
     if kind == "mcap" or kind == "bag":
         from mapper.sources.ros.log_writing import write_recording  # loads rosbags
 

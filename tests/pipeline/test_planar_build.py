@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from mapper.config.loading import load_config
-from mapper.core.errors import SourceError
 from mapper.core.geometry import fit_rigid
 from mapper.core.timebase import nearest
 from mapper.core.trajectory import Trajectory
@@ -17,7 +16,6 @@ from mapper.pipeline.known_map import load_known_map
 from mapper.pipeline.localise import localise
 from mapper.sources import open_source
 from mapper.sources.trajectory_files import read_tum
-from mapper.sources.writers import write_log
 from tests.support.planar import at
 from tests.support.planar_drives import (
     FIRST_NS,
@@ -147,10 +145,3 @@ def test_another_drive_is_localised_in_the_map(rooms, tmp_path):
     misses = poses.positions_world - want.positions_world[nearest(want.stamps_ns, poses.stamps_ns)[0]]
     assert len(poses) > 0.9 * len(again.times_s)
     assert np.median(np.linalg.norm(misses, axis=1)) < 0.05
-
-
-def test_scans_are_not_converted_to_clouds(tmp_path):
-    log = open_source(write_carmen(tmp_path / "log.log", drive(flat(), SICK).part(10)))
-
-    with pytest.raises(SourceError):
-        write_log(log, tmp_path / "clouds.mcap", kind="mcap")
