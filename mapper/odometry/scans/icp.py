@@ -13,10 +13,10 @@ from mapper.registration.refining import Refiner, refine
 from mapper.registration.surfaces import Prepared, prepared
 
 _MAP_KEYFRAMES = 10
+"""Number of keyframes in the map, whose search tree is built anew for each."""
 _CELLS = 0.5  # of the likelihood field, in voxels
 _REACH: Mapping[Reach, tuple[float, float]] = {"near": (0.15, 0.06), "far": (0.5, 0.35)}
 """Errors of a predicted planar pose, metres and radians: of wheels that slip, and of a sudden turn."""
-"""Number of keyframes in the map, whose search tree is built anew for each."""
 
 
 class IcpMatcher:
