@@ -194,7 +194,7 @@ def test_two_runs_are_compared_without_a_common_world(halves, tmp_path):
 
 
 def test_a_run_whose_places_do_not_compare_is_left_out(halves, monkeypatch):
-    street = ScanPlace(0, np.zeros((1, 3), np.float32), np.eye(4))
+    street = ScanPlace(0, np.eye(3, dtype=np.float32), np.eye(4))
     known = {halves[0].path: [KnownPlaces({}, {}), KnownPlaces({0: street}, {0: np.eye(4)})]}
 
     def places_of(run, *, progress):

@@ -150,7 +150,7 @@ def test_what_a_record3d_recording_packs_has_a_limit(shots, tmp_path, part):
     import lzfse
 
     path = write_record3d(tmp_path / "scan", Shots(shots.camera, shots.frames[:2]))
-    (path / f"rgbd/0.{part}").write_bytes(lzfse.compress(bytes(2**28)))
+    (path / f"rgbd/0.{part}").write_bytes(64 * lzfse.compress(bytes(2**22)))
     with pytest.raises(FrameError, match="more than"):
         open_source(path).entry_at(0).load()
 
