@@ -15,6 +15,7 @@ from mapper.core.geometry import Transform, inverse, nearest_rotation, transform
 from mapper.sensing.config import DepthNoiseConfig
 from mapper.sensing.stereo import LEAST_DISPARITY_PX, stereo_depth_m, stereo_noise
 from mapper.sources.calibration import Calibration
+from mapper.sources.config import CameraConfig
 from mapper.sources.image_files.decoded import SATURATED, DecodedColour, DecodedDepth
 from mapper.sources.image_files.image_sizes import Size
 from mapper.sources.image_files.reading import TUM_UNITS_PER_M
@@ -86,6 +87,19 @@ class StereoCamera:
             want = f"{self.size_px[0]}×{self.size_px[1]}"
             raise FrameError(f"{where}: {width_px}×{height_px} px, but the other images have {want}")
         return recorded if self.maps is None else cv2.remap(recorded, *self.maps[side], cv2.INTER_LINEAR)
+
+
+def refuse_settings(camera: CameraConfig | None) -> None:
+    """Refuse settings of one camera for a pair, whose two cameras and their distance belong together.
+
+    Raises:
+        SourceError: There are some.
+    """
+    if camera is not None:
+        raise SourceError(
+            "source.camera: the cameras of stereo pairs are those that the log states; leave it out, and "
+            "correct the log's own calibration files"
+        )
 
 
 def rectified_pair(calibration: Calibration, baseline_m: float, size_px: Size) -> StereoCamera:

@@ -8,6 +8,7 @@ from mapper.core.errors import SourceError
 from mapper.core.geometry import angle_between, apply, inverse
 from mapper.sensing.stereo import stereo_depth_m
 from mapper.sources import open_source
+from mapper.sources.config import CameraConfig, SourceConfig
 from mapper.sources.writers import left_out, write_log
 from tests.support.recordings import transforms, write
 from tests.support.stereo_rig import (
@@ -129,6 +130,8 @@ def test_what_is_missing_or_swapped_is_named(tmp_path):
     folder = write_euroc(tmp_path / "d", BARREL[::-1])
     with pytest.raises(SourceError, match="right"):
         open_source(folder)
+    with pytest.raises(SourceError, match=r"source\.camera"):
+        open_source(folder, SourceConfig(camera=CameraConfig(depth_factor=1000.0)))
     folder = write_kitti(tmp_path / "e")
     (folder / "image_1/000001.png").unlink()
     with pytest.raises(SourceError, match="image_1"):

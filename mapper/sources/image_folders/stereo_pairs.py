@@ -28,7 +28,7 @@ from mapper.sources.image_folders.rgbd import FramePair, first_size, rgbd_log
 from mapper.sources.imu_files import read_euroc_imu
 from mapper.sources.listed_files import within
 from mapper.sources.scan_stamps import Wording, in_order, scan_stamps
-from mapper.sources.stereo import StereoCamera, rectified_pair, rectify
+from mapper.sources.stereo import StereoCamera, rectified_pair, rectify, refuse_settings
 from mapper.sources.text import parse_numbers, parse_stamp, pose_from_matrix, rows, time_order, truth_from
 from mapper.sources.trajectory_files import read_kitti, read_tum
 
@@ -48,9 +48,10 @@ def read_log(path: Path, config: SourceConfig) -> Log:
     """Return the log of a folder of stereo pairs; the body is the left camera, rectified.
 
     Raises:
-        SourceError: No two images pair, a file is malformed, or the cameras are unknown.
+        SourceError: No two images pair, a file is malformed, or the cameras are unknown or set by the user.
         DataError: A line of the truth is malformed.
     """
+    refuse_settings(config.camera)
     folder = _euroc(path)
     return _kitti_log(path, config) if folder is None else _euroc_log(path, folder, config)
 

@@ -35,6 +35,7 @@ from mapper.sources.ros.messages import (
 from mapper.sources.ros.reader import SAME_CLOCK_NS, RecordingReader
 from mapper.sources.ros.stereo_cameras import stereo_camera
 from mapper.sources.ros.topics import CameraTopics, Choice, StereoTopics, choose
+from mapper.sources.stereo import refuse_settings
 from mapper.sources.velodyne_packets import require_decoder
 
 _JPEG_START = b"\xff\xd8"
@@ -177,6 +178,7 @@ def _refuse_body_frame(reader: RecordingReader, config: SourceConfig) -> None:
 
 def _stereo(reader: RecordingReader, topics: StereoTopics, config: SourceConfig) -> _Frames:
     _refuse_body_frame(reader, config)
+    refuse_settings(config.camera)
     left, right, where = topics.left, topics.right, f"{reader.recording.path}"
     i, j, notes = paired(left, right, max_gap_s=config.max_pair_gap_s, where=where)
     first = _first_image(reader, left)
