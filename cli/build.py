@@ -29,7 +29,6 @@ from mapper.cli.options import (
     selection,
 )
 from mapper.core.errors import ConfigError, ViewerError
-from mapper.runtime.profiler import Profiler
 from mapper.runtime.result_paths import RUNS, name_of, place_of
 
 if TYPE_CHECKING:
@@ -39,6 +38,7 @@ if TYPE_CHECKING:
     from mapper.run.folder import Run
     from mapper.run.observers import Observer, Step
     from mapper.run.results import RunResults
+    from mapper.runtime.profiler import Profiler
     from mapper.runtime.progress import Progress
     from mapper.sources.base import Log
 
@@ -104,7 +104,11 @@ def build(
     out = place_of(out, RUNS / name_of(log), overwrite=overwrite)
     overrides = merged(selection(first, last, stride, require_truth), set_)
     make_observer = observer_factory(rerun, step=step, overwrite=overwrite)
-    profiler = Profiler(output.progress(prompts=step)) if profile else None
+    profiler = None
+    if profile:
+        from mapper.runtime.profiler import Profiler
+
+        profiler = Profiler(output.progress(prompts=step))
     if onto is None:
         with profiler or nullcontext():
             run = built(
@@ -130,7 +134,7 @@ def build(
     return answer if profiler is None else _with_profile(answer, profiler, run.path)
 
 
-def _with_profile(answer: Answer, profiler: Profiler, run: Path) -> Answer:
+def _with_profile(answer: Answer, profiler: "Profiler", run: Path) -> Answer:
     """Write the samples beside a run, and return its answer with the time of each stage."""
     file = run.with_name(f"{run.name}.speedscope.json")
     profiler.write(file, name=run.name)

@@ -6,7 +6,7 @@ from itertools import chain
 from pathlib import Path
 
 from mapper.core.frames import Cloud, Scan
-from mapper.core.geometry import inverse, stride_for
+from mapper.core.geometry import stride_for
 from mapper.export.export_folders import export_folder
 from mapper.export.mcap_messages import OCCUPANCY_GRID, encode_occupancy_grid
 from mapper.export.run_maps import maps_of, snapshots_of
@@ -58,7 +58,7 @@ def rosbag2(run: Run, path: Path, _progress: Progress) -> None:
 
 def _latched_messages(run: Run, image: Snapshot | None) -> Iterator[SerializedMessage]:
     begin_ns, maps, robot = int(run.trajectory.stamps_ns[0]), maps_of(run), run.manifest.input.robot_of_all
-    mounted = [] if robot is None else [(robot.base, robot.body, inverse(robot.base_in_body))]
+    mounted = [] if robot is None else [(robot.base, robot.body, robot.mounting)]
     if image is not None:
         mounted.append((BODY if robot is None else robot.body, CAMERA, image.T_body_camera))
     if mounted:
@@ -92,12 +92,10 @@ def _cloud_message(stamp_ns: int, topic: str, cloud: Cloud) -> SerializedMessage
 
 def _pose_messages(run: Run) -> Iterator[SerializedMessage]:
     robot = run.manifest.input.robot_of_all
-    for stamp_ns, T_world_body in run.trajectory.items():
-        if robot is None:
-            moved = MAP, BODY, T_world_body
-        else:
-            moved = MAP, robot.base, T_world_body @ robot.base_in_body
-        yield transforms_message(stamp_ns, "/tf", [moved])
+    moving = run.trajectory if robot is None else robot.trajectory_of_base(run.trajectory)
+    for stamp_ns, T_world_moving in moving.items():
+        child = BODY if robot is None else robot.base
+        yield transforms_message(stamp_ns, "/tf", [(MAP, child, T_world_moving)])
 
 
 def _image_messages(image: Snapshot) -> Iterator[SerializedMessage]:

@@ -132,10 +132,8 @@ def find_level(
     T_level_world = _frame(trajectory.T_world_body[0], up_world, floor.height_m, axes)
     details = [up_detail, floor.detail]
     if config.heading == "walls":
-        walls = wall_heading(patches, T_level_world[:3, :3])
-        if walls.determined:
-            T_level_world = exp(np.array([0.0, 0.0, -walls.angle_rad]), np.zeros(3)) @ T_level_world
-        details.append(_heading_text(walls))
+        T_level_world, heading = _turned_along_walls(T_level_world, patches)
+        details.append(heading)
     return Level(T_level_world, method, "; ".join(details), floor.is_seen, rough.conflict, rough.is_decided)
 
 
@@ -178,10 +176,8 @@ def level_in_plane(
             or [np.empty((0, 3))]
         )
         normals_world = normals_world[normals_world.any(axis=1)]
-        walls = wall_heading(Patches(normals_world, normals_world), T_level_world[:3, :3])
-        if walls.determined:
-            T_level_world = exp(np.array([0.0, 0.0, -walls.angle_rad]), np.zeros(3)) @ T_level_world
-        details.append(_heading_text(walls))
+        T_level_world, heading = _turned_along_walls(T_level_world, Patches(normals_world, normals_world))
+        details.append(heading)
     return Level(T_level_world, "laser plane", "; ".join(details), has_floor=True)
 
 
@@ -402,6 +398,14 @@ def _planes_text(vertical: Vertical, count: int) -> str:
         f"{100 * vertical.upright_ratio:.0f} % upright"
     )
     return text if vertical.determined else f"{text}, all facing one way: the tilt along them is the camera's"
+
+
+def _turned_along_walls(T_level_world: Transform, patches: Patches) -> tuple[Transform, str]:
+    """Return the level frame with x along walls, if most agree, and a sentence on x."""
+    walls = wall_heading(patches, T_level_world[:3, :3])
+    if walls.determined:
+        T_level_world = exp(np.array([0.0, 0.0, -walls.angle_rad]), np.zeros(3)) @ T_level_world
+    return T_level_world, _heading_text(walls)
 
 
 def _heading_text(walls: WallHeading) -> str:

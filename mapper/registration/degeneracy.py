@@ -80,6 +80,12 @@ def degeneracy_of(information: Array, *, points: Points, min_share: float = _MIN
     )
 
 
+def plane_rows(points: Points) -> Array:
+    """Return the (N, 6) Jacobian of the heights of (N, 3) points, metres, by a tangent: of z and tilt."""
+    up = np.broadcast_to([0.0, 0.0, 1.0], points.shape)
+    return np.hstack([np.cross(points, up), up])
+
+
 def plane_information(points: Points, *, like: Array) -> Array:
     """Return the (6, 6) information that points lie in a plane of constant z: it has z and tilt.
 
@@ -88,8 +94,7 @@ def plane_information(points: Points, *, like: Array) -> Array:
         like: (6, 6) information of the same points' distances along normals in the plane, which are as
             certain.
     """
-    up = np.broadcast_to([0.0, 0.0, 1.0], points.shape)
-    rows = np.hstack([np.cross(points, up), up])
+    rows = plane_rows(points)
     weight = float(np.trace(like[3:, 3:])) / max(len(points), 1)
     return np.asarray(weight * (rows.T @ rows), np.float64)
 

@@ -1,5 +1,6 @@
 """Logs of a run as its manifest keeps them: where they are, what was noted, and where the sensors were."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Self
 
@@ -8,6 +9,7 @@ import numpy as np
 from mapper.core.config import Config
 from mapper.core.geometry import Transform, inverse
 from mapper.core.rotations import pose_of_row, row_of_pose
+from mapper.core.trajectory import Trajectory
 from mapper.odometry.gyroscope_calibration import GyroscopeCalibration, with_body_rates
 from mapper.sources.base import Log
 from mapper.sources.config import SourceConfig
@@ -64,9 +66,13 @@ class RobotFrames(Config):
         return cls(base=log.base_frame, body=log.body_frame, body_in_base=row)
 
     @property
-    def base_in_body(self) -> Transform:
-        """T_body_base, (4, 4)."""
-        return inverse(pose_of_row(np.array(self.body_in_base)))
+    def mounting(self) -> Transform:
+        """T_base_body, (4, 4)."""
+        return pose_of_row(np.array(self.body_in_base))
+
+    def trajectory_of_base(self, trajectory: Trajectory) -> Trajectory:
+        """Return the poses of the base for those of the body."""
+        return replace(trajectory, T_world_body=trajectory.T_world_body @ inverse(self.mounting))
 
 
 class InputLog(Config):

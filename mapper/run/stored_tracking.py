@@ -105,8 +105,7 @@ def save_tracking(writer: RunWriter, tracked: StoredTracking) -> None:
     save_frames(writer, tracked, nodes=len(graph.T_world_node))
     robot = writer.manifest.input.robot_of_all
     if robot is not None:
-        T_world_base = tracked.trajectory.T_world_body @ robot.base_in_body
-        write_tum(folder / files.BASE, replace(tracked.trajectory, T_world_body=T_world_base))
+        write_tum(folder / files.BASE, robot.trajectory_of_base(tracked.trajectory))
     if graph.T_world_node:
         write_g2o(folder / files.GRAPH, graph)
         if graph.fixes:

@@ -50,7 +50,7 @@ def read_imu(folder: Path) -> tuple[Gyroscope | None, Accelerations | None, list
         return _stray_rates(path, lines)
     if not lines or "w_RS_S_x" not in lines[0]:
         return None, None, [f"{path.name}: its first line is not EuRoC's; not used"]
-    return read_euroc_imu(path)
+    return _readings(path, lines)
 
 
 def read_euroc_imu(path: Path) -> tuple[Gyroscope | None, Accelerations | None, list[str]]:
@@ -59,8 +59,12 @@ def read_euroc_imu(path: Path) -> tuple[Gyroscope | None, Accelerations | None, 
     Raises:
         SourceError: The file is malformed.
     """
+    return _readings(path, read_lines(path))
+
+
+def _readings(path: Path, lines: Sequence[str]) -> tuple[Gyroscope | None, Accelerations | None, list[str]]:
     try:
-        rows = np.loadtxt(read_lines(path), _COLUMNS, delimiter=",", ndmin=1)
+        rows = np.loadtxt(lines, _COLUMNS, delimiter=",", ndmin=1)
     except ValueError as error:
         raise SourceError(f"{path}: {error}; want stamp_ns,wx,wy,wz,ax,ay,az") from None
     gyroscope, notes = _gyroscope(path, rows["stamp_ns"], rows["rates"])

@@ -10,7 +10,7 @@ from mapper.core.frames import Points32
 from mapper.core.geometry import Array, Transform, apply
 from mapper.odometry.scans.scan_matcher import DeskewedScan
 from mapper.registration.acceptance import weakest_direction
-from mapper.registration.degeneracy import Degeneracy, degeneracy_of
+from mapper.registration.degeneracy import Degeneracy, degeneracy_of, plane_rows
 from mapper.registration.free_space import FreeSpaceCheck, ScanDescription, range_image
 
 _MIN_PAIRS = 20
@@ -233,8 +233,7 @@ class _Pairs:
 
     def in_their_plane(self) -> "_Pairs":
         """Return the pairs of planar scans with as many that lie on the plane: it shows z and tilt."""
-        up = np.broadcast_to([0.0, 0.0, 1.0], self.points.shape)
-        level = np.hstack([np.cross(self.points, up), up])
+        level = plane_rows(self.points)
         return _Pairs(
             np.vstack([self.points, self.points]),
             np.vstack([self.rows, level]),

@@ -85,9 +85,8 @@ def observe_scan(frame: Frame, config: ScanOdometryConfig) -> ScanObservation:
     fewest = _MIN_PLANAR_POINTS if scan.is_planar else _MIN_POINTS
     in_range = np.flatnonzero((range_m >= config.min_range_m) & (range_m <= config.max_range_m))
     points_body = scan.points_body[in_range]
-    kept = thin(points_body, _FINER * config.voxel_m)
-    if scan.is_planar:  # it has few points, and the free-space check needs all of its rays
-        kept = np.arange(len(points_body))
+    # A planar scan has few points, and the free-space check needs all of its rays.
+    kept = np.arange(len(points_body)) if scan.is_planar else thin(points_body, _FINER * config.voxel_m)
     if len(kept) < fewest:
         raise FrameError(
             f"scan {scan.stamp_ns}: {len(scan.points_body)} points, of which {len(kept)} are left between "

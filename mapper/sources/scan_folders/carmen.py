@@ -14,7 +14,7 @@ import numpy as np
 
 from mapper.core.errors import DataError, SourceError
 from mapper.core.frames import Scan
-from mapper.core.geometry import Array, Transform, exp, inverse
+from mapper.core.geometry import Array, Transform, inverse, planar_motion
 from mapper.core.timebase import ns_from_seconds_text
 from mapper.core.trajectory import Trajectory
 from mapper.runtime.regular_files import read_text
@@ -220,13 +220,6 @@ def _stamp(words: Sequence[str], at: int) -> int:
     return ns_from_seconds_text(words[at])
 
 
-def _pose(numbers: Array) -> Transform:
-    x, y, yaw = numbers
-    T = exp(np.array([0.0, 0.0, yaw]), np.zeros(3))
-    T[:2, 3] = x, y
-    return T
-
-
 def _mounting(
     name: str, scans: Sequence[_Line], parameters: Mapping[str, str]
 ) -> tuple[Transform, list[str]]:
@@ -234,10 +227,10 @@ def _mounting(
     parameter, yaw = _OFFSET.get(name, ("", 0.0))
     if parameter in parameters:
         offset_m = float(_numbers([parameters[parameter], "0", "0"])[0])
-        return _pose(np.array([offset_m if yaw == 0.0 else -abs(offset_m), 0.0, yaw])), []
+        return planar_motion(offset_m if yaw == 0.0 else -abs(offset_m), 0.0, yaw), []
     both = [(line.robot, line.laser) for line in scans if line.robot is not None and line.laser is not None]
     if both:
-        T = np.array([inverse(_pose(robot)) @ _pose(laser) for robot, laser in both])
+        T = np.array([inverse(planar_motion(*robot)) @ planar_motion(*laser) for robot, laser in both])
         typical = int(np.argsort(T[:, 0, 3])[len(T) // 2])
         is_same = np.linalg.norm((T - T[typical])[:, :2, 3], axis=1) < _SAME_M
         if is_same.mean() > 0.5:
@@ -246,7 +239,7 @@ def _mounting(
     notes = [f"where the laser is mounted is not stated: taken {at}"]
     if both:
         notes.append("the lines' poses were corrected by another program; those of the odometry are used")
-    return _pose(np.array([0.0, 0.0, yaw])), notes
+    return planar_motion(0.0, 0.0, yaw), notes
 
 
 def _trajectory(poses: Sequence[tuple[int, Array]], *, what: str) -> tuple[Trajectory | None, list[str]]:
@@ -254,7 +247,7 @@ def _trajectory(poses: Sequence[tuple[int, Array]], *, what: str) -> tuple[Traje
         return None, []
     stamps_ns = np.array([stamp_ns for stamp_ns, _ in poses])
     order, notes = time_order(stamps_ns, what=what)
-    return Trajectory(stamps_ns[order], np.array([_pose(poses[k][1]) for k in order])), notes
+    return Trajectory(stamps_ns[order], np.array([planar_motion(*poses[k][1]) for k in order])), notes
 
 
 def _limit_m(parameters: Mapping[str, str]) -> float:
