@@ -74,7 +74,7 @@ BLOCKS_AT_ONCE = 4096
 FIRST_BLOCKS = 64
 GROWTH = 1.25
 """Of what is reserved in a file, or written when it is reserved: more would hold half of it in reserve."""
-_MEMORY_GROWTH = 4.0
+_MEMORY_GROWTH = 2.0
 """Reserved memory is not written, so takes none; at 1.25 the copies took 5 % of a build of a street drive."""
 
 
