@@ -1,10 +1,12 @@
-"""``mapper edit``: a finished map cropped and cleaned by hand."""
+"""``mapper edit``: a finished run mended by hand, by options, by an edits file, or on its page."""
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from mapper.cli.answer import Answer, Output
+from mapper.cli.console import print_text
 from mapper.cli.options import MovedLogs, RunFolder, refuse_several, refuse_without
 from mapper.core.errors import ConfigError
 
@@ -40,7 +42,15 @@ def edit(
         str | None,
         typer.Option(metavar='"X,Y X,Y X,Y…"', help="Region: inside the polygon of these corners."),
     ] = None,
-    undo: Annotated[bool, typer.Option("--undo", help="Undo the last edit.")] = False,
+    undo: Annotated[bool, typer.Option("--undo", help="Undo the last edit of a region.")] = False,
+    from_: Annotated[
+        Path | None,
+        typer.Option("--from", metavar="FILE", help="Edits file, as the page saves it: loops and regions."),
+    ] = None,
+    page: Annotated[
+        bool,
+        typer.Option("--page", help="Serve the run's page, to edit on, until it is closed."),
+    ] = False,
     list_: Annotated[  # noqa: ARG001 - says what is done anyway
         bool, typer.Option("--list", help="Print the edits; the default without other options.")
     ] = False,
@@ -50,33 +60,47 @@ def edit(
 ) -> Answer:
     """Erase, keep or block the region of a map where all given conditions hold, and make the maps again.
 
+    On the page, and by the file that it saves, loops are accepted, rejected and added as well.
+
     Edits are kept in RUN/edits.toml, which can be changed by hand, and apply to every later fuse. Coordinates
     are those of slice.yaml and cloud.ply.
 
     Example: mapper edit runs/xyz --erase --box 2.1 0.3 0.1 2.9 1.05 1.5
     """
-    from mapper.pipeline.edit import add_region, undo_region
+    from mapper.config.loading import read_config
+    from mapper.pipeline.edit import add_region, apply_edits, undo_region
+    from mapper.run.edits_file import EditsFile
     from mapper.run.folder import moved_log, open_run
 
     given: dict[EditKind, bool] = {"erase": erase, "keep": keep, "keepout": keepout}
     kinds = [kind for kind, is_given in given.items() if is_given]
     region = _region(box, height, radius, polygon)
-    refuse_several({"--erase": erase, "--keep": keep, "--keepout": keepout, "--undo": undo})
-    if not (kinds or undo):
-        refuse_without("--erase, --keep, --keepout or --undo", {"--log": log})
+    other = {"--undo": undo, "--from": from_, "--page": page}
+    refuse_several({"--erase": erase, "--keep": keep, "--keepout": keepout, **other})
+    changes = bool(kinds or undo or from_ or page)
+    if not changes:
+        refuse_without("--erase, --keep, --keepout, --undo, --from or --page", {"--log": log})
     if kinds and region is None:
         raise ConfigError(f"--{kinds[0]}: want a region: --box, --height, --radius or --polygon")
     if region is not None and not kinds:
         raise ConfigError("a region alone changes nothing: want --erase, --keep or --keepout with it")
     built = open_run(run)
-    if kinds or undo:
+    if changes:
+        edits = None if from_ is None else read_config(from_, EditsFile)
         if log:
             built = moved_log(built, *log)
         source, progress = built.open_log(), output.progress()
-        if region is None:
-            built = undo_region(source, built, progress=progress)
-        else:
+        if page:
+            from mapper.api.edit_page import serve_edit_page
+
+            on_ready = progress.note if output.json else print_text
+            built = serve_edit_page(source, built, on_ready=on_ready, progress=progress)
+        elif edits is not None:
+            built = apply_edits(source, built, edits, progress=progress)
+        elif region is not None:
             built = add_region(source, built, kinds[0], region, progress=progress)
+        else:
+            built = undo_region(source, built, progress=progress)
     return Answer({"run": built.path, "edits": built.manifest.edits}, edits_table(built))
 
 

@@ -21,6 +21,7 @@ def document(
     main: Iterable[str],
     scripts: Iterable[str] = (),
     styles: Iterable[str] = (),
+    is_served: bool = False,
 ) -> str:
     """Return a page's HTML.
 
@@ -30,7 +31,9 @@ def document(
         main: HTML of the sections.
         scripts: HTML of script elements.
         styles: CSS after that of every page.
+        is_served: Let scripts ask the server that the page comes from.
     """
+    policy = f"{_POLICY}; connect-src 'self'" if is_served else _POLICY
     style = (resources.files("mapper.export.report") / "page.css").read_text(encoding="utf-8")
     return "\n".join(
         [
@@ -39,7 +42,7 @@ def document(
             "<head>",
             '<meta charset="utf-8">',
             '<meta name="viewport" content="width=device-width, initial-scale=1">',
-            f'<meta http-equiv="Content-Security-Policy" content="{escape(_POLICY, quote=False)}">',
+            f'<meta http-equiv="Content-Security-Policy" content="{escape(policy, quote=False)}">',
             f"<title>{escape(title)}</title>",
             f"<style>\n{_palette_css()}\n{style}</style>",
             *(f"<style>\n{more}</style>" for more in styles),

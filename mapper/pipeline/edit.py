@@ -15,8 +15,9 @@ from mapper.mapping.config import EditKind, Region
 from mapper.pipeline.fuse import fuse_changed
 from mapper.pipeline.reobserve import reobserve
 from mapper.pipeline.solve import solve
-from mapper.run.edits_file import edits_text, with_region, without_last
+from mapper.run.edits_file import EditsFile, edits_text, with_region, without_last
 from mapper.run.folder import Run
+from mapper.run.manifest import Solve
 from mapper.run.stored_tracking import StoredTracking, load_tracking
 from mapper.runtime.progress import SILENT, Progress
 from mapper.sources.base import Log
@@ -51,6 +52,38 @@ def edit_loops(
         LoopError: A node is unknown, a loop is there already or is not, two frames do not show one place, or
             the solver rejects a loop that was added.
     """
+    changed, report = _solve_edited(source, run, add, remove)
+    return fuse_changed(source, run, changed, solve=report, progress=progress)
+
+
+def apply_edits(source: Log, run: Run, edits: EditsFile, *, progress: Progress = SILENT) -> Run:
+    """Make all edits of an edits file: its loops in one solve, then its regions; then fuse once.
+
+    Args:
+        source: The log that the run was built from.
+        run: A finished run, which stays as it is unless all of it works.
+        edits: The edits; regions are added to those of the run.
+        progress: Receives stages, counts and notes.
+
+    Raises:
+        MapperError: There are none, or as :func:`edit_loops` and :func:`add_region`.
+    """
+    if not (edits.accept or edits.reject or len(edits)):
+        raise ConfigError("edits: none; want [[accept]], [[reject]], [[erase]], [[keep]], [[keepout]]")
+    text = edits_text(run.path)
+    for kind, region in edits.regions:
+        text = with_region(text, run.path, kind, region)
+    changed, report = None, None
+    if edits.accept or edits.reject:
+        pairs = ([loop.nodes for loop in loops] for loops in (edits.accept, edits.reject))
+        changed, report = _solve_edited(source, run, *pairs)
+    regions = text if len(edits) else None
+    return fuse_changed(source, run, changed, solve=report, edits=regions, progress=progress)
+
+
+def _solve_edited(
+    source: Log, run: Run, add: Sequence[Pair], remove: Sequence[Pair]
+) -> tuple[StoredTracking, Solve]:
     if run.config.graph.solve == "none":
         raise ConfigError(f"{run.path}: built with graph.solve=none, so loops change nothing; build it again")
     tracked = load_tracking(run)
@@ -74,8 +107,7 @@ def edit_loops(
         _refuse_rejected(loop)
     if len(components(solved.graph)) > len(components(graph)):
         raise LoopError(f"{run.path}: without these loops the graph falls apart; nothing removed")
-    changed = tracked.solved(solved.graph, solved.loops)
-    return fuse_changed(source, run, changed, solve=solved.report, progress=progress)
+    return tracked.solved(solved.graph, solved.loops), solved.report
 
 
 def _held(loops: Sequence[LoopClosure], pair: Pair) -> int | None:

@@ -1,9 +1,13 @@
-"""A run's ``edits.toml``: read, and changed with all that a user wrote into it left as it is."""
+"""A run's ``edits.toml``: read, and changed with all that a user wrote into it left as it is; edits files."""
 
 import re
+from collections.abc import Iterator
 from pathlib import Path
 
+from pydantic import NonNegativeInt
+
 from mapper.config.loading import parse_config
+from mapper.core.config import Config
 from mapper.core.errors import ConfigError
 from mapper.mapping.config import EditKind, Edits, Region
 from mapper.run import files
@@ -11,6 +15,27 @@ from mapper.runtime.atomic import write_text
 from mapper.runtime.regular_files import read_text
 
 _HEADER = re.compile(r"^[ \t]*\[\[", re.MULTILINE)
+
+
+class LoopEdit(Config):
+    """Loop that a user accepts or rejects."""
+
+    nodes: tuple[NonNegativeInt, NonNegativeInt]
+
+
+class EditsFile(Edits):
+    """Edits file, which the page saves and ``mapper edit --from`` takes: loops, and regions to be added."""
+
+    accept: tuple[LoopEdit, ...] = ()
+    """Pairs of nodes at one place, whether they are a candidate or not."""
+    reject: tuple[LoopEdit, ...] = ()
+    """Accepted loops that are wrong."""
+
+    @property
+    def regions(self) -> Iterator[tuple[EditKind, Region]]:
+        """The regions with their kinds."""
+        kinds: tuple[EditKind, ...] = ("erase", "keep", "keepout")
+        return ((kind, region) for kind in kinds for region in getattr(self, kind))
 
 
 def edits_text(folder: Path) -> str:

@@ -198,7 +198,7 @@ def atomic_folder(
         raise RunError(f"{partial}: is in the way and not {kind.name}; move it or choose another --out")
     with _filled(partial, named=partial, keeps=keeps):
         yield partial
-        _swap(partial, out)
+        put_in_place(partial, out)
         (out / _MARK).unlink(missing_ok=True)
 
 
@@ -321,7 +321,12 @@ def _empty(folder: Path, *, except_for: Collection[str]) -> None:
             child.unlink()
 
 
-def _swap(partial: Path, out: Path) -> None:
+def put_in_place(partial: Path, out: Path) -> None:
+    """Put a folder in the place of another one beside it, which is deleted, or where there is none.
+
+    Raises:
+        WriteError: The other one cannot be replaced.
+    """
     if not out.exists():
         partial.rename(out)
         flush_to_disk(out.parent)

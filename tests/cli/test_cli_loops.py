@@ -96,6 +96,20 @@ def test_several_edits_are_one_solve(run):
     assert [(f.i, f.j) for f in factors if f.origin == "loop"] == held(run)
 
 
+def test_an_edits_file_makes_the_same_of_loops_and_regions_at_once(run, built, tmp_path):
+    gone, new = held(run)[0], untied(run)
+    edits = tmp_path / "edits.toml"
+    edits.write_text(
+        f"[[reject]]\nnodes = {list(gone)}\n[[accept]]\nnodes = {list(new)}\n[[keep]]\npath_radius_m = 2.0\n"
+    )
+    assert "keep path_radius_m = 2.0: " in mapper("edit", run, "--from", edits).stdout
+    one_by_one = shutil.copytree(built, tmp_path / "one_by_one")
+    mapper("loops", one_by_one, "--remove", *gone, "--add", *new, "--quiet")
+    mapper("edit", one_by_one, "--keep", "--radius", 2.0, "--quiet")
+    for name in ("loops.jsonl", "graph.g2o", "edits.toml", "map.octree", "cloud.ply"):
+        assert (run / name).read_bytes() == (one_by_one / name).read_bytes()
+
+
 def test_the_maps_are_those_of_fusing_from_scratch(run):
     mapper("loops", run, "--add", *untied(run), "--quiet")
     edited = (run / "map.ot").read_bytes()

@@ -211,10 +211,10 @@ def test_a_phone_shows_all_of_a_run_s_tables(runs, tmp_path):
 
 
 @needs_browser
-def test_the_map_is_first_and_no_curve_begins_with_what_the_first_frame_lacks(page):
+def test_the_verdict_is_first_and_no_curve_begins_with_what_the_first_frame_lacks(page):
     with Page(page) as browser:
         titles = browser.run("[...document.querySelectorAll('h2')].map(e => e.textContent)")
-        assert titles[:4] == ["Map", "Verdict", "Plans and views", "Numbers"]
+        assert titles[:4] == ["Verdict", "Map", "Plans and views", "Numbers"]
         d = "document.querySelector('[data-curve={}] path.line').getAttribute('d')"
         begins = [browser.run(d.format(key)).split("L")[0] for key in ("features", "matches", "inliers")]
         left_px = [float(begin[1:].split()[0]) for begin in begins]

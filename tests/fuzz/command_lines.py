@@ -22,7 +22,7 @@ LINE = "line"
 """Word of ``tests.fuzz.child`` before the folder that a command line is run in, and before the line."""
 
 _RESULTS = ("--out", "--plot", "--rrd")
-_UNUSED = ("--spawn", "--connect", "--step", "--scheduler", "--rerun", "--warm")
+_UNUSED = ("--page", "--spawn", "--connect", "--step", "--scheduler", "--rerun", "--warm")
 """Options that open viewers, wait for a person or for another machine, or compile all kernels."""
 _BRIEF = {
     "demo": ("--seconds", "0.2"),

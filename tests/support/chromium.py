@@ -18,14 +18,15 @@ NO_AXE = f"axe-core is not installed (npm install --no-save --prefix {AXE.parent
 
 
 class Page:
-    """One page in a browser of its own, offline; a context manager.
+    """One page, a file or an address, in a browser of its own, offline; a context manager.
 
     Attributes:
         complaints: What the console and the page's own errors said, and every address it asked for.
     """
 
-    def __init__(self, path: Path, *, width_px: int = 1400, height_px: int = 1000) -> None:
-        self._path, self._size = path, (width_px, height_px)
+    def __init__(self, page: Path | str, *, width_px: int = 1400, height_px: int = 1000) -> None:
+        self._url = page if isinstance(page, str) else page.resolve().as_uri()
+        self._size = width_px, height_px
         self._numbers = itertools.count(1)
         self._session: str | None = None
         self.complaints: list[str] = []
@@ -73,7 +74,7 @@ class Page:
         for domain in ("Page", "Runtime", "Log", "Network"):
             self.call(f"{domain}.enable")
         self.resize(*self._size)
-        self.call("Page.navigate", url=self._path.resolve().as_uri())
+        self.call("Page.navigate", url=self._url)
         while self.run("document.readyState") != "complete":
             pass
         return self

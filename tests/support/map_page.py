@@ -1,6 +1,7 @@
 """A page with a map in 3D, in a browser, and what is seen on its pictures."""
 
 import base64
+import json
 import time
 
 import cv2
@@ -63,11 +64,17 @@ class MapPage(Page):
         )
         places = np.column_stack([x.ravel(), y.ravel()])
         from_middle = np.linalg.norm(places - [left + width / 2, top + height / 2], axis=1)
-        for x, y in places[np.argsort(from_middle, kind="stable")].tolist():
-            self.mouse("mouseMoved", x, y)
-            if wanted in (self.text(name) or ""):
-                return x, y
-        raise AssertionError(f"nothing tells {wanted!r}")
+        places = places[np.argsort(from_middle, kind="stable")].tolist()
+        found = self.run(
+            f"{json.dumps(places)}.find(([clientX, clientY]) => {{"
+            " const canvas = document.querySelector('.map canvas');"
+            " canvas.dispatchEvent(new PointerEvent('pointermove', {clientX, clientY}));"
+            f" const told = document.querySelector('[data-map={name}]');"
+            f" return !told.hidden && told.textContent.includes({json.dumps(wanted)}); }})"
+        )
+        assert found, f"nothing tells {wanted!r}"
+        self.mouse("mouseMoved", *found)
+        return found
 
 
 def change(before, after):
@@ -79,3 +86,33 @@ def lit(picture):
     """Return centre and spread of the map in a picture, each (x, y) in pixels."""
     y, x = np.nonzero(picture.max(axis=2) > 60)
     return np.array([x.mean(), y.mean()]), np.array([x.std(), y.std()])
+
+
+class EditedPage(MapPage):
+    """A page on which a run is edited."""
+
+    def edits(self):
+        return self.run("[...document.querySelectorAll('[data-map=edits] li')].map(e => e.textContent)")
+
+    def drag(self, begin, end):
+        """Drag with the left button from one place to another."""
+        self.mouse("mousePressed", *begin, clicks=1)
+        for x, y in np.linspace(begin, end, 5).tolist():
+            self.call("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y, button="left", buttons=1)
+        self.mouse("mouseReleased", *end, clicks=1)
+
+    def undo_by_key(self):
+        for kind in ("keyDown", "keyUp"):
+            self.call("Input.dispatchKeyEvent", type=kind, code="KeyZ", key="z", modifiers=2)
+
+    def facts(self):
+        return self.run("[...document.querySelectorAll('.facts')].map(e => e.textContent)")
+
+    def ask(self, name):
+        """Click on what asks the server, and wait until the page has been loaded again."""
+        self.run("window.isOld = true")
+        self.click(f"[data-map={name}]")
+        give_up = time.monotonic() + 90.0
+        while self.run("window.isOld || document.querySelector('.map')?.dataset.state !== 'ready'"):
+            assert time.monotonic() < give_up, self.text("edit-told")
+            time.sleep(0.1)

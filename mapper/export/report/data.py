@@ -91,6 +91,7 @@ def drawn(chapter: Chapter) -> dict[str, Any]:
     records = results.records
     return {
         "name": chapter.name,
+        "world": chapter.run.manifest.input.fingerprint,
         "frames": {
             "t": seconds([record.stamp_ns for record in records]),
             "outcome": [record.outcome for record in records],

@@ -131,6 +131,7 @@ def map_of(chapter: Chapter, *, runs: int = 1, most_points: int = MOST_POINTS) -
         "is_observed": observed is not None,
         "frames": list(_frames(chapter, [stamp_ns for stamp_ns, _ in images])),
         "images": [data_uri("jpeg", jpeg) for _, jpeg in images],
+        "has_north": run.manifest.georeference is not None,
         "headroom_m": four_digits(float(trajectory.positions_world[:, 2].max()) + MARGIN_M),
     }
     most, room = most_points // runs - shown["voxels"]["count"], _MOST_BYTES // runs - len(json.dumps(shown))

@@ -6,7 +6,7 @@ from html import escape
 from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 from urllib.parse import quote
 
 import numpy as np
@@ -27,6 +27,9 @@ _LAYERS = (
     ("accepted", "<b></b> loops that hold", "accepted", True),
     ("rejected", "<b></b> loops refused", "rejected", False),
 )
+Editing = Literal["to a file", "served"]
+"""What happens to edits of a page: it saves them as a file, or sends them to the server that it is from."""
+
 _AS_IS = " !\"$&'()*+,/:;<=>?@[\\]^`{|}~"  # what a data: address may hold as it is, and % and # may not
 
 
@@ -39,12 +42,41 @@ def write_map_page(path: Path, chapters: Sequence[Chapter]) -> None:
     """
     refuse_same_names(chapters)
     title = " · ".join(chapter.name for chapter in chapters)
+    write_text(path, run_page(title, chapters, editing="to a file" if len(chapters) == 1 else None))
+
+
+def run_page(title: str, chapters: Sequence[Chapter], *, editing: Editing | None = None) -> str:
+    """Return a page that shows the maps of some runs, with their verdicts and key figures.
+
+    Raises:
+        MapperError: A file of a run cannot be read.
+    """
     curves = [drawn(chapter) for chapter in chapters]
-    write_text(path, map_page(title, curves, maps_of(chapters), pictures=pictures_of(chapters)))
+    facts = "".join(_facts(chapter, names_it=len(chapters) > 1) for chapter in chapters)
+    pictures = pictures_of(chapters)
+    return map_page(title, curves, maps_of(chapters), pictures=pictures, facts=facts, editing=editing)
+
+
+def _facts(chapter: Chapter, *, names_it: bool) -> str:
+    verdict, counts = chapter.run.verdict, chapter.run.manifest.counts
+    name = f"{escape(chapter.name)}: " if names_it else ""
+    figures = [
+        f"{counts.tracked} of {counts.listed} frames",
+        f"{counts.loops} of {counts.loop_candidates} loops hold",
+        f"{counts.voxels_text} of {chapter.run.config.octree.resolution_m:g} m",
+    ]
+    why = escape(" ".join(verdict.sentences))
+    return f'<p class="facts" title="{why}">{name}<b>{verdict.state}</b> · {escape(" · ".join(figures))}</p>'
 
 
 def map_page(
-    title: str, curves: Sequence[dict[str, Any]], maps: Sequence[dict[str, Any]], *, pictures: str
+    title: str,
+    curves: Sequence[dict[str, Any]],
+    maps: Sequence[dict[str, Any]],
+    *,
+    pictures: str,
+    facts: str = "",
+    editing: Editing | None = None,
 ) -> str:
     """Return a page that shows maps in 3D, each with its path and its loops.
 
@@ -53,13 +85,21 @@ def map_page(
         curves: Name, path, truth and loops that belong to each map, see :func:`~.data.drawn`.
         maps: Points, voxels and layers, see :func:`~.map_data.map_of`.
         pictures: HTML that takes the maps' place where they cannot be shown.
+        facts: HTML of what the page says about them.
+        editing: Lets a person edit the last run.
     """
+    edited = {"name": title, "run": len(curves) - 1, "isServed": editing == "served"}
     return document(
         f"{title} – map",
-        header=f"<h1>{escape(title)}</h1>",
+        header=f"<h1>{escape(title)}</h1>{facts}",
         main=[map_html([one["name"] for one in curves], pictures, css="map whole")],
-        scripts=[json_element("data", curves), *map_scripts(maps)],
+        scripts=[
+            json_element("data", curves),
+            json_element("edited", edited if editing else None),
+            *map_scripts(maps),
+        ],
         styles=[map_style()],
+        is_served=editing == "served",
     )
 
 

@@ -62,8 +62,8 @@ def page_of(chapters: Sequence[Chapter]) -> str:
         f"{title} – mapper report",
         header=_header(chapters),
         main=[
-            section("Map", map_html(_names(chapters), pictures_of(chapters))),
             section("Verdict", _columns(starmap(_verdict, enumerate(chapters)))),
+            section("Map", map_html(_names(chapters), pictures_of(chapters))),
             section(
                 "Plans and views",
                 _HINT + _columns(one for of in (_plan, _view) for one in starmap(of, enumerate(chapters))),

@@ -39,9 +39,10 @@ void main() { painted = vec4(color, opacity); }`;
 export class Segments {
   /**
    * @param ends Six numbers of each segment: where it begins and where it ends, metres.
+   * @param options.isHidden By what lies before them.
    * @param options.halfWidths Two numbers of each segment, metres; none: as many pixels as width_px tells.
    */
-  constructor(ends, { color, width_px, halfWidths = null, opacity = 1 }) {
+  constructor(ends, { color, width_px, halfWidths = null, opacity = 1, isHidden = false }) {
     this.ends = Float32Array.from(ends);
     const geometry = new InstancedBufferGeometry();
     geometry.setAttribute("position", new BufferAttribute(new Float32Array([0, -1, 0, 1, -1, 0, 0, 1, 0, 1, 1, 0]), 3));
@@ -56,7 +57,7 @@ export class Segments {
     };
     this.object = new Mesh(geometry, new RawShaderMaterial({
       glslVersion: GLSL3, vertexShader: VERTEX, fragmentShader: FRAGMENT, uniforms: this.uniforms,
-      transparent: true, depthTest: false, depthWrite: false, side: DoubleSide,
+      transparent: true, depthTest: isHidden, depthWrite: false, side: DoubleSide,
     }));
     this.object.frustumCulled = false;
   }

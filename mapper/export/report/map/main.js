@@ -1,11 +1,13 @@
 // Start of the map: decode what the page holds, then draw it; pictures take its place where that fails.
 
+import { Editing } from "mapper/editing";
 import { MapView } from "mapper/map_view";
 import { Panel } from "mapper/panel";
 import { RunLayers } from "mapper/run_layers";
 
 const root = document.querySelector(".map");
-const parsed = (id) => JSON.parse(document.getElementById(id).textContent);
+const parsed = (id) => JSON.parse(document.getElementById(id)?.textContent ?? "null");
+const edited = parsed("edited"), server = edited?.isServed ? new EventSource("open") : null; // at once: it counts the tab
 
 function hasWebGl() {
   return Boolean(document.createElement("canvas").getContext("webgl2"));
@@ -22,6 +24,9 @@ async function start() {
   }
   const view = new MapView(root.querySelector("canvas"), layers, ramp);
   new Panel(root, view, { ramp, images: maps.map(({ images }) => images) });
+  if (edited) new Editing(root, view, { ...edited, server });
+  const [, seen] = /^#view=([-.\d,]+)$/.exec(location.hash) ?? [], numbers = (seen ?? "").split(",").map(Number);
+  if (numbers.length === 6 && numbers.every(Number.isFinite)) view.navigation.lookFrom(numbers.slice(0, 3), numbers.slice(3));
   root.dataset.state = "ready";
 }
 

@@ -1,13 +1,13 @@
 // The scene of all runs, drawn when something has changed: over each other, or side by side.
 
-import { Box3, Color, ColorManagement, LinearSRGBColorSpace, PerspectiveCamera, Scene, Vector3, WebGLRenderer } from "three";
+import { Box3, ColorManagement, Group, LinearSRGBColorSpace, PerspectiveCamera, Scene, Vector3, WebGLRenderer } from "three";
 import { Budget } from "mapper/budget";
-import { NEVER } from "mapper/points";
-import { Segments } from "mapper/lines";
-import { Markers } from "mapper/markers";
+import { groundLines } from "mapper/ground";
+import { NEVER, POINTS_LAYER } from "mapper/points";
 import { Navigation } from "mapper/navigation";
 import { ratio } from "mapper/screen";
 import { frameAt, loopAt, pointAt, Screen } from "mapper/picking";
+import { Shading } from "mapper/shading";
 
 const FOV_DEG = 50;
 const COARSE_SHARE = 0.3; // a motion that begins with fewer points is drawn with pixels twice as large
@@ -25,9 +25,12 @@ export class MapView {
     this.renderer.setClearColor(getComputedStyle(canvas).backgroundColor);
     this.camera = new PerspectiveCamera(FOV_DEG, 1, 0.01, 1000);
     this.scene = new Scene();
-    this.tools = new Scene(); // what is measured, drawn over every run
+    this.tools = new Scene(); // drawn over every run: what is measured, edits
+    this.drawn = {};
+    this.shading = new Shading();
+    this.onRest = []; // called when all of it is drawn
     this.shown = layers.map(() => true);
-    this.state = { points: "cloud", coloring: "height", isBeside: false, cut_m: Infinity, until: NEVER, size: 1 };
+    this.state = { points: "cloud", coloring: "height", isBeside: false, cut_m: Infinity, kept_m: [-Infinity, Infinity], until: NEVER, size: 1, isShaded: true };
     this.hidden = new Set();
     this.budget = new Budget();
     for (const one of layers) this.scene.add(one.group);
@@ -36,6 +39,7 @@ export class MapView {
     new ResizeObserver(() => this.resize()).observe(canvas.parentElement);
     this.resize();
     this.navigation.lookAt(this.box);
+    this.draw("ground", groundLines(this.box));
     this.update({});
     requestAnimationFrame((now) => this.#tick(now));
   }
@@ -79,14 +83,14 @@ export class MapView {
     if (asked === this.askedLayers) this.canvas.setAttribute("aria-busy", "false");
   }
 
-  /** Mark some points, and the line between two. */
-  measured(places) {
-    this.tools.clear();
-    const color = new Color("#ffffff");
-    const flat = places.flatMap((place) => place.toArray());
-    if (places.length) this.tools.add(new Markers(flat, { color: new Color("#e69f00"), size_px: 12 }).object);
-    this.line = places.length === 2 ? new Segments(flat, { color, width_px: 2 }) : null;
-    if (this.line) this.tools.add(this.line.object);
+  /** Draw lines and marks over every run, in place of those of the same name. */
+  draw(name, shapes) {
+    this.drawn[name]?.group.removeFromParent();
+    const group = new Group();
+    for (const { object } of shapes) group.add(object);
+    this.drawn[name] = { group, shapes };
+    if (name === "ground") group.renderOrder = -1;
+    (name === "ground" ? this.scene : this.tools).add(group);
     this.invalidate();
   }
 
@@ -103,6 +107,12 @@ export class MapView {
       const loop = loopAt(shown, screen, x, y);
       return loop && { layers: one, loop };
     });
+  }
+
+  /** The point at a height that is seen at a place. */
+  planeAt(x, y, height_m) {
+    const pane = this.#panes().findLast(({ left }) => x >= left);
+    return new Screen(this.camera, pane).onPlane(x, y, height_m);
   }
 
   pointAt(x, y) {
@@ -182,8 +192,22 @@ export class MapView {
     const points = this.layers.reduce((sum, one) => sum + one.points[this.state.points].count, 0);
     if (this.hasShaders) this.budget.learn(this.drawnShare, now - this.drawnAt, points);
     this.hasShaders = true; // which the first frame has waited for
-    if (!this.isStale) this.canvas.dataset.share = this.drawnShare;
+    if (this.isStale) return true;
+    this.canvas.dataset.share = this.drawnShare;
+    if (this.drawnShare === 1) for (const told of this.onRest) told();
     return true;
+  }
+
+  /** Return the picture of all points as a PNG. */
+  picture() {
+    this.#draw(1, performance.now());
+    return new Promise((done) => { this.canvas.toBlob(done); });
+  }
+
+  /** Metres of a pixel at the point that is looked at. */
+  get metresPerPixel() {
+    const { camera, navigation } = this, distance = camera.position.distanceTo(navigation.orbit.target);
+    return 2 * distance * Math.tan(camera.fov * Math.PI / 360) / this.canvas.clientHeight;
   }
 
   #sharpen(pixels) {
@@ -210,7 +234,11 @@ export class MapView {
         for (const set of Object.values(one.points)) set.fit(camera, { pixels, scale: this.state.size, share });
         for (const segments of Object.values(one.segments)) this.#fit(segments, pane, pixels);
       });
-      if (this.line) this.#fit(this.line, pane, pixels);
+      for (const { shapes } of Object.values(this.drawn)) for (const shape of shapes) if (shape.uniforms) this.#fit(shape, pane, pixels);
+      camera.layers.set(POINTS_LAYER);
+      if (this.state.isShaded && !this.isCoarse) this.shading.render(renderer, this.scene, camera, pane);
+      else renderer.render(this.scene, camera);
+      camera.layers.set(0);
       renderer.render(this.scene, camera);
       renderer.render(this.tools, camera);
     }

@@ -52,6 +52,14 @@ export class Navigation {
     this.onMove();
   }
 
+  /** Look from one place at another, each as (x, y, z). */
+  lookFrom(position, target) {
+    this.camera.position.fromArray(position);
+    this.orbit.target.fromArray(target);
+    this.orbit.update();
+    this.onMove();
+  }
+
   set flying(isFlying) {
     this.isFlying = isFlying;
     this.orbit.enabled = !isFlying;

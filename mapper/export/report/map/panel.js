@@ -1,7 +1,13 @@
 // The controls beside the map, and what is told about a frame, a loop or a distance.
 
+import { Color, Vector3 } from "three";
+import { roundLength } from "mapper/ground";
+import { Segments } from "mapper/lines";
+import { Markers } from "mapper/markers";
 import { HITS_PER_OCTAVE, NEVER } from "mapper/points";
+import { plyOf, save } from "mapper/saving";
 
+const SCALE_PX = 120;
 const UNITS = { height: "m", time: "s", hits: "scans" };
 
 export const short = (value) => value === null || value === undefined ? "–" : String(Number(value.toPrecision(3)));
@@ -18,6 +24,8 @@ export class Panel {
     this.#tools();
     this.#pointer();
     this.#legend();
+    this.#saving();
+    view.onRest.push(() => this.#orient());
   }
 
   find(name) {
@@ -33,7 +41,11 @@ export class Panel {
         view.shown[Number(box.dataset.mapRun)] = box.checked;
         view.update({});
       });
-    this.find("beside").addEventListener("change", ({ target }) => view.update({ isBeside: target.value === "beside" }));
+    const choose = (isBeside) => view.update({ isBeside });
+    this.find("beside").addEventListener("change", ({ target }) => choose(target.value === "beside"));
+    if (!layers.some(({ run }) => run.world !== layers[0].run.world)) return;
+    this.find("beside").querySelector("[value=beside]").checked = true; // over each other they would say nothing
+    choose(true);
   }
 
   #points() {
@@ -118,6 +130,8 @@ export class Panel {
   #tools() {
     const { view } = this, { navigation } = view, measure = this.find("measure"), fly = this.find("fly");
     this.find("home").addEventListener("click", () => navigation.lookAt(view.box));
+    for (const [name, change] of [["shading", (isOn) => view.update({ isShaded: isOn })], ["grid", (isOn) => { view.drawn.ground.group.visible = isOn; view.invalidate(); }]])
+      this.find(name).addEventListener("change", ({ target }) => change(target.checked));
     this.find("above").addEventListener("click", () => navigation.lookAt(view.box, { fromAbove: true }));
     const press = (button, isOn) => button.setAttribute("aria-pressed", String(isOn));
     fly.addEventListener("click", () => {
@@ -142,6 +156,27 @@ export class Panel {
       else if (event.code === "Escape") { this.#measure([]); this.#tellFrame(null); }
     });
     this.find("frame-close").addEventListener("click", () => this.#tellFrame(null));
+  }
+
+  #saving() {
+    const { view } = this, name = view.layers[0].name;
+    this.find("save-picture").addEventListener("click", async () => save(`${name}.png`, await view.picture()));
+    this.find("save-points").addEventListener("click", () => {
+      for (const [run, one] of view.layers.entries()) if (view.shown[run] && one.cells) save(`${one.name}.ply`, ...plyOf(one.points[view.state.points]));
+    });
+  }
+
+  /** Scale, north, and the address of the view. */
+  #orient() {
+    const { view } = this, { camera, navigation: { orbit } } = view;
+    const length = roundLength(SCALE_PX * view.metresPerPixel);
+    this.find("scale").style.width = `${length / view.metresPerPixel}px`;
+    this.find("scale-text").textContent = length < 1 ? `${Math.round(100 * length)} cm` : length < 1000 ? `${length} m` : `${length / 1000} km`;
+    const north = this.find("north");
+    north.hidden = !view.mapped.every(({ map }) => map.has_north);
+    const up = new Vector3(0, 1, 0).transformDirection(camera.matrixWorld);
+    north.style.transform = `rotate(${-Math.atan2(up.x, up.y)}rad)`;
+    if (this.root.matches(".whole")) history.replaceState(null, "", `#view=${[camera.position, orbit.target].flatMap((place) => place.toArray().map((v) => Number(v.toFixed(3))))}`);
   }
 
   #pointer() {
@@ -170,15 +205,20 @@ export class Panel {
       else this.find("distance").textContent = "no point there; click on one";
       return;
     }
-    const found = view.frameAt(x, y);
+    const found = view.frameAt(x, y), held = view.loopAt(x, y);
     if (found) this.#tellFrame(found);
+    if (found || held) view.canvas.dispatchEvent(new CustomEvent("pick", { detail: found ?? held }));
   }
 
   #measure(places) {
     const { view } = this, told = this.find("distance"), coordinates = (p) => p.toArray().map((v) => v.toFixed(2)).join(", ");
     const [a, b] = places;
     this.measured = places;
-    view.measured(places);
+    const flat = places.flatMap((place) => place.toArray());
+    view.draw("measured", [
+      ...places.length === 2 ? [new Segments(flat, { color: new Color("#ffffff"), width_px: 2 })] : [],
+      ...places.length ? [new Markers(flat, { color: new Color("#e69f00"), size_px: 12 })] : [],
+    ]);
     told.hidden = !this.isMeasuring;
     told.textContent = b ? `${a.distanceTo(b).toFixed(3)} m; level ${Math.hypot(b.x - a.x, b.y - a.y).toFixed(3)} m, up ${(b.z - a.z).toFixed(3)} m`
       : a ? `from ${coordinates(a)} m; click on the second point` : "click on two points of the map";

@@ -12,6 +12,14 @@ export class Screen {
     Object.assign(this, { left, width, height, place: new Vector3() });
   }
 
+  /** The point of the plane at a height that is seen at a place, as a Vector3; null above the horizon. */
+  onPlane(x, y, height_m) {
+    const inverse = this.matrix.clone().invert();
+    const [from, to] = [-1, 1].map((z) => new Vector3(2 * (x - this.left) / this.width - 1, 1 - 2 * y / this.height, z).applyMatrix4(inverse));
+    const share = (height_m - from.z) / (to.z - from.z);
+    return share > 0 && share < 1 ? from.lerp(to, share) : null;
+  }
+
   /** Pixels and depth of a point in the world; null behind the eye. */
   of(place) {
     const { elements: m } = this.matrix, { x, y, z } = place;

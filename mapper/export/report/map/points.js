@@ -5,6 +5,7 @@ import { ratio } from "mapper/screen";
 
 export const NEVER = 1023; // the time of the first hit of a point that no voxel's hit explains
 export const HITS_PER_OCTAVE = 16;
+export const POINTS_LAYER = 1; // of the camera: points are rendered before everything else
 const UNSEEN = [115, 115, 115];
 const SMALLEST_PX = 1.5, LARGEST_PX = 40;
 
@@ -12,7 +13,7 @@ const SMALLEST_PX = 1.5, LARGEST_PX = 40;
 const VERTEX = `
 precision highp float;
 uniform mat4 toClip;
-uniform float cut, until, size, least, most, ratio;
+uniform float cut, floor, until, size, least, most, ratio;
 in vec4 position;
 in vec3 shade;
 flat out vec3 color;
@@ -20,7 +21,7 @@ flat out vec3 color;
 void main() {
   gl_Position = toClip * vec4(position.xyz, 1.0);
   gl_PointSize = clamp(size / gl_Position.w, least * ratio, most * ratio);
-  if (position.z > cut || position.w > until) gl_Position.w = -1.0;
+  if (position.z > cut || position.z < floor || position.w > until) gl_Position.w = -1.0;
   color = shade;
 }`;
 
@@ -28,7 +29,11 @@ const FRAGMENT = `
 precision mediump float;
 flat in vec3 color;
 out vec4 painted;
-void main() { painted = vec4(color, 1.0); }`;
+void main() {
+  vec2 off = gl_PointCoord - 0.5;
+  if (dot(off, off) > 0.25) discard;
+  painted = vec4(color, 1.0);
+}`;
 
 const SQUARE = `
 precision mediump float;
@@ -53,13 +58,14 @@ export class PointSet {
     geometry.setAttribute("position", new BufferAttribute(this.places, 4));
     geometry.setAttribute("shade", new BufferAttribute(this.shades, 4, true));
     this.uniforms = {
-      toClip: { value: new Matrix4() }, cut: { value: Infinity }, until: { value: NEVER }, size: { value: 1 },
+      toClip: { value: new Matrix4() }, cut: { value: Infinity }, floor: { value: -Infinity }, until: { value: NEVER }, size: { value: 1 },
       least: { value: SMALLEST_PX }, most: { value: LARGEST_PX }, ratio,
     };
     this.object = new Points(geometry, new RawShaderMaterial({
       glslVersion: GLSL3, vertexShader: VERTEX, fragmentShader: isSquare ? SQUARE : FRAGMENT, uniforms: this.uniforms,
     }));
     this.object.frustumCulled = false;
+    this.object.layers.set(POINTS_LAYER);
     this.toWorld = new Matrix4().makeScale(this.step, this.step, this.step).setPosition(...this.low);
   }
 
@@ -82,10 +88,11 @@ export class PointSet {
     this.object.geometry.attributes.shade.needsUpdate = true;
   }
 
-  /** Hide what is higher than cut_m, or was first seen later than at a step of the time. */
-  hide({ cut_m, until }) {
-    Object.assign(this, { cut_m, until });
-    this.uniforms.cut.value = (cut_m - this.low[2]) / this.step;
+  /** Hide what is higher than cut_m, outside of the heights kept_m, or was first seen later than at a step of the time. */
+  hide({ cut_m, kept_m: [low_m, high_m], until }) {
+    Object.assign(this, { low_m, high_m: Math.min(cut_m, high_m), until });
+    this.uniforms.cut.value = (this.high_m - this.low[2]) / this.step;
+    this.uniforms.floor.value = (low_m - this.low[2]) / this.step;
     this.uniforms.until.value = until >= NEVER - 1 ? NEVER : until;
   }
 
@@ -111,7 +118,7 @@ export class PointSet {
   }
 
   isShown(index) {
-    const { places, low, step } = this;
-    return low[2] + step * places[4 * index + 2] <= this.cut_m && places[4 * index + 3] <= this.uniforms.until.value;
+    const { places, low, step } = this, height = low[2] + step * places[4 * index + 2];
+    return height <= this.high_m && height >= this.low_m && places[4 * index + 3] <= this.uniforms.until.value;
   }
 }

@@ -1,0 +1,298 @@
+"""A run's page to edit it on: served to browsers of this machine only, until its last tab is closed."""
+
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
+from contextlib import contextmanager, suppress
+from hmac import compare_digest
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from queue import Empty, Full, Queue
+from secrets import token_hex, token_urlsafe
+from threading import Lock, Thread
+from typing import Any, Self
+
+from mapper.config.loading import parse_config
+from mapper.core.errors import ConfigError, MapperError
+from mapper.export.report.data import Chapter, chapter_of
+from mapper.export.report.map_page import run_page
+from mapper.pipeline.edit import apply_edits
+from mapper.run.edits_file import EditsFile
+from mapper.run.folder import Run, moved_log, open_run
+from mapper.run.input_logs import paths_of
+from mapper.runtime.atomic import put_in_place
+from mapper.runtime.progress import SILENT, Progress, Report
+from mapper.sources.base import Log
+
+_MOST_BYTES = 1 << 16
+"""Of an edits file that a page sends."""
+_KEPT = 5
+"""Earlier states that can be restored: each has a run's maps."""
+_TICK_S = 0.5
+_ABSENT_S = 5.0
+"""Time without a tab after which the server ends: a tab that loads the page again has none meanwhile."""
+_TIMEOUT_S = 30.0
+"""Of a connection that says nothing."""
+_HEADERS = {
+    "Cache-Control": "no-store",
+    "Referrer-Policy": "same-origin",
+    "X-Content-Type-Options": "nosniff",
+    "Content-Security-Policy": "frame-ancestors 'none'",
+    "Cross-Origin-Resource-Policy": "same-origin",
+}
+
+
+def serve_edit_page(
+    source: Log, run: Run, *, on_ready: Callable[[str], None], progress: Progress = SILENT
+) -> Run:
+    """Serve a run's page on 127.0.0.1 until its tabs are closed, or Ctrl-C; return the run as it is then.
+
+    The page sends edits files, which :func:`~mapper.pipeline.edit.apply_edits` makes. Every request has to
+    know the token in the page's address, and to come from the page itself.
+
+    Args:
+        source: The log that the run was built from.
+        run: A finished run.
+        on_ready: Receives the page's address.
+        progress: Receives the stages of each solve and fuse.
+
+    Raises:
+        MapperError: A file of the run cannot be read.
+    """
+    session = _Session(source, run, progress)
+    with session, _Server(session) as server:
+        Thread(target=server.serve_forever, args=(_TICK_S,), daemon=True).start()
+        on_ready(f"{server.origin}/{server.token}/")
+        try:
+            session.work()
+        finally:
+            server.shutdown()
+    return session.run
+
+
+class _Session:
+    """One run while it is edited.
+
+    Attributes:
+        run: The run as it is now.
+        earlier: Copies of its folder before each solve, the last one last.
+        told: What is being done, for the page.
+    """
+
+    def __init__(self, source: Log, run: Run, progress: Progress) -> None:
+        self.run, self.earlier, self.told = run, list[Path](), ""
+        self._source, self._progress = source, progress
+        self._jobs = Queue[tuple[Callable[[], None], Future[None]]](maxsize=1)
+        self._busy, self._page = Lock(), ""
+        self._counting, self._tabs, self._left_at = Lock(), 0, float("inf")
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for folder in self.earlier:
+            shutil.rmtree(folder)
+
+    def work(self) -> None:
+        """Do what tabs ask for, in this thread, which Ctrl-C stops; return once all are closed."""
+        while self._tabs or time.monotonic() - self._left_at < _ABSENT_S:
+            try:
+                job, done = self._jobs.get(timeout=_TICK_S)
+            except Empty:
+                continue
+            except KeyboardInterrupt:
+                return
+            try:
+                with self._busy:
+                    job()
+                done.set_result(None)
+            except BaseException as error:
+                done.set_exception(error if isinstance(error, MapperError) else ConfigError("stopped"))
+                if not isinstance(error, MapperError):
+                    raise
+            finally:
+                self.told = ""
+
+    def ask(self, job: Callable[[], None]) -> None:
+        """Have a job done, and wait for it; called by the threads of requests.
+
+        Raises:
+            MapperError: The job failed, or another one is being done.
+        """
+        done = Future[None]()
+        try:
+            self._jobs.put_nowait((job, done))
+        except Full:
+            raise ConfigError("another solve has not ended yet; wait for it") from None
+        done.result()
+
+    def solve(self, text: str) -> None:
+        """Make the edits of an edits file; what the run was like before is kept."""
+        edits = parse_config(text, Path("edits"), EditsFile)
+        earlier = _copy_of(self.run.path)
+        try:
+            self.run = apply_edits(self._source, self.run, edits, progress=_Told(self, self._progress))
+        except BaseException:
+            shutil.rmtree(earlier)
+            raise
+        self.earlier.append(earlier)
+        for old in self.earlier[:-_KEPT]:
+            shutil.rmtree(old)
+        self.earlier, self._page = self.earlier[-_KEPT:], ""
+
+    def undo(self) -> None:
+        """Put back what the run was like before the last solve."""
+        if not self.earlier:
+            raise ConfigError("nothing was solved since mapper edit began; mapper edit RUN --undo")
+        put_in_place(self.earlier.pop(), self.run.path.resolve())
+        self.run = self._opened(self.run.path)
+        self._page = ""
+
+    def page(self) -> str:
+        """Return the page: the run, and beside it what it was like before the last solve."""
+        with self.tab(), self._busy:
+            if not self._page:
+                name = self.run.path.resolve().name
+                self._page = run_page(name, self._chapters(name), editing="served")
+            return self._page
+
+    def _chapters(self, name: str) -> list[Chapter]:
+        if not self.earlier:
+            return [chapter_of(self.run, name, ())]
+        return [chapter_of(self._opened(self.earlier[-1]), "before", ()), chapter_of(self.run, "after", ())]
+
+    def _opened(self, folder: Path) -> Run:
+        return moved_log(open_run(folder), *paths_of(self._source))
+
+    @contextmanager
+    def tab(self) -> Iterator[None]:
+        """Count a tab, while it is open."""
+        with self._counting:
+            self._tabs += 1
+        try:
+            yield
+        finally:
+            with self._counting:
+                self._tabs -= 1
+                self._left_at = time.monotonic()
+
+
+class _Told:
+    """Progress that tells the page of the stages, too."""
+
+    def __init__(self, session: _Session, progress: Progress) -> None:
+        self._session, self._progress = session, progress
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[Report]:
+        """Enter a stage."""
+        with self._progress.stage(name) as report:
+
+            def told(done: int, total: int) -> None:
+                self._session.told = f"{name}: {done} of {total}"
+                report(done, total)
+
+            self._session.told = name
+            yield told
+
+    def note(self, message: str) -> None:
+        """Pass a note on."""
+        self._progress.note(message)
+
+
+def _copy_of(folder: Path) -> Path:
+    """Return a hidden copy of a run beside it; its files are the same ones where the disk can do that."""
+    copy = folder.resolve().with_name(f".{folder.resolve().name}.{token_hex(8)}.part")
+
+    def link(source: str, target: str) -> None:
+        try:
+            Path(target).hardlink_to(source)
+        except OSError:
+            shutil.copy2(source, target)
+
+    shutil.copytree(folder, copy, copy_function=link, symlinks=True)
+    return copy
+
+
+class _Server(ThreadingHTTPServer):
+    """Server of a session's page, bound to this machine's own address."""
+
+    daemon_threads, block_on_close = True, False
+
+    def __init__(self, session: _Session) -> None:
+        super().__init__(("127.0.0.1", 0), _Handler)
+        self.session, self.token = session, token_urlsafe()
+        self.origin = f"http://127.0.0.1:{self.server_port}"
+
+
+class _Handler(BaseHTTPRequestHandler):
+    """Door to a session: refuses what does not come from its page, and knows four names."""
+
+    server: _Server
+    timeout = _TIMEOUT_S
+
+    def do_GET(self) -> None:
+        """Answer with the page, or tell it of the work while it is open."""
+        name = self._name()
+        if name == "":
+            try:
+                self._answer(HTTPStatus.OK, self.server.session.page(), "text/html")
+            except MapperError as error:
+                self._answer(HTTPStatus.INTERNAL_SERVER_ERROR, str(error))
+        elif name == "open":
+            self._tell()
+        else:
+            self._refuse()
+
+    def do_POST(self) -> None:
+        """Solve with an edits file, or undo the last solve; answer with nothing, or what is wrong."""
+        name, length = self._name(), self.headers.get("Content-Length", "")
+        if name not in ("solve", "undo") or "Origin" not in self.headers:
+            self._refuse()
+            return
+        try:
+            if not (length.isascii() and length.isdigit() and int(length) <= _MOST_BYTES):
+                raise ConfigError(f"edits: {length or 'unknown'} bytes, at most {_MOST_BYTES} at once")
+            text = self.rfile.read(int(length)).decode("utf-8")
+            session = self.server.session
+            session.ask(session.undo if name == "undo" else lambda: session.solve(text))
+        except (MapperError, UnicodeDecodeError) as error:
+            self._answer(HTTPStatus.BAD_REQUEST, str(error))
+        else:
+            self._answer(HTTPStatus.OK, "")
+
+    def _name(self) -> str | None:
+        """Return what is asked for behind the token; None if the request is not the page's own."""
+        origin = f"http://{self.headers.get('Host')}"
+        if not origin == self.headers.get("Origin", origin) == self.server.origin:
+            return None
+        _, _, rest = self.path.partition("/")
+        token, slash, name = rest.partition("/")
+        return name if slash and compare_digest(token.encode(), self.server.token.encode()) else None
+
+    def _tell(self) -> None:
+        """Send what is being done as server-sent events, until the tab is closed."""
+        self._head(HTTPStatus.OK, "text/event-stream")
+        with self.server.session.tab(), suppress(OSError):
+            while True:
+                self.wfile.write(f"data: {self.server.session.told}\n\n".encode())
+                time.sleep(_TICK_S)
+
+    def _refuse(self) -> None:
+        self._answer(HTTPStatus.FORBIDDEN, "refused: open the address that mapper edit --page has printed")
+
+    def _answer(self, status: HTTPStatus, text: str, kind: str = "text/plain") -> None:
+        with suppress(OSError):  # the tab was closed meanwhile
+            self._head(status, kind)
+            self.wfile.write(text.encode())
+
+    def _head(self, status: HTTPStatus, kind: str) -> None:
+        self.send_response(status)
+        for name, value in {"Content-Type": f"{kind}; charset=utf-8", **_HEADERS}.items():
+            self.send_header(name, value)
+        self.end_headers()
+
+    def log_message(self, *_: Any) -> None:
+        """Log nothing: addresses have the token."""
