@@ -22,7 +22,7 @@ from mapper.cli.options import (
     selection,
 )
 from mapper.core.errors import ConfigError
-from mapper.export.exporters import EXPORTERS
+from mapper.export.exporters import EXPORTERS, Frame
 from mapper.runtime.result_paths import LOGS, name_of, place_of
 
 LogFormat = Literal["tum", "mbag", "kitti", "mcap", "bag"]
@@ -97,6 +97,16 @@ def export(
         int | None,
         typer.Option(help="With --as octomap: levels of the tree to drop; each doubles the voxel size."),
     ] = None,
+    frame: Annotated[
+        Frame,
+        typer.Option(
+            help="Frame of poses and points: the map, or the body (start) or base_link at its first pose."
+        ),
+    ] = "map",
+    crop: Annotated[
+        tuple[float, float, float, float, float, float] | None,
+        typer.Option(metavar="X0 Y0 Z0 X1 Y1 Z1", help="Write what lies in this box of the map, metres."),
+    ] = None,
     set_: Overrides = None,
     log: MovedLogs = None,
     *,
@@ -120,5 +130,7 @@ def export(
     changes = merged(assignments({"octomap.level": level}), set_)
     config = overridden(built.config, changes) if changes else None
     progress = output.progress()
-    path = export_run(built, as_, out, config=config, overwrite=overwrite, progress=progress)
+    path = export_run(
+        built, as_, out, config=config, frame=frame, box_m=crop, overwrite=overwrite, progress=progress
+    )
     return made(path, kind=as_)

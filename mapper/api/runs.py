@@ -6,6 +6,7 @@ from pathlib import Path
 from mapper.api.progress import AnyProgress, receiver_of
 from mapper.config.loading import Settings, overridden
 from mapper.core.trajectory import Trajectory
+from mapper.export.exporters import Frame
 from mapper.export.exporters import export as export_kind
 from mapper.export.report.data import chapter_of
 from mapper.export.report.map_page import write_map_page
@@ -25,13 +26,24 @@ def export(
     path: AnyPath | None,
     *,
     settings: Settings | None,
+    frame: Frame,
+    crop: Sequence[float] | None,
     overwrite: bool,
     progress: AnyProgress,
 ) -> Path:
     """Write a run for another program; see :meth:`mapper.run.folder.Run.export`."""
     config = overridden(run.config, settings=settings) if settings else None
     out = None if path is None else Path(path)
-    return export_kind(run, kind, out, config=config, overwrite=overwrite, progress=receiver_of(progress))
+    return export_kind(
+        run,
+        kind,
+        out,
+        config=config,
+        frame=frame,
+        box_m=crop,
+        overwrite=overwrite,
+        progress=receiver_of(progress),
+    )
 
 
 def fuse(run: Run, *, settings: Settings | None, trajectory: Trajectory | None, progress: AnyProgress) -> Run:

@@ -232,14 +232,20 @@ class Cloud:
         points: (N, 3) float32, metres, levelled world: z up, floor at 0.
         colors: (N, 3) uint8 RGB.
         intensities: (N,) float32 in the sensor's own unit; None where the log has none.
+        times_s: (N,) float32, when each was first seen, seconds after the run's first pose; None if unknown.
     """
 
     points: Points32
     colors: NDArray[np.uint8]
     intensities: NDArray[np.float32] | None = None
+    times_s: NDArray[np.float32] | None = None
 
     def __len__(self) -> int:
         return len(self.points)
+
+    def __repr__(self) -> str:
+        more = ["colours", *(name for name in ("intensities", "times_s") if getattr(self, name) is not None)]
+        return f"Cloud of {len(self)} points with {', '.join(more)}"
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
         return np.array(self.points, dtype=dtype, copy=copy)
@@ -250,6 +256,7 @@ class Cloud:
             np.compress(kept, self.points, axis=0),
             np.compress(kept, self.colors, axis=0),
             None if self.intensities is None else self.intensities[kept],
+            None if self.times_s is None else self.times_s[kept],
         )
 
 

@@ -13,6 +13,11 @@ def place_of(run: MapFolder) -> Georeference | None:
     return run.manifest.georeference if isinstance(run, Run) else None
 
 
+def scale_of(place: Georeference) -> float:
+    """Return the scale of the projection at the map's height."""
+    return 1.0 + place.height_m / _MEAN_RADIUS_M
+
+
 def wkt_of(place: Georeference) -> str:
     """Return a transverse Mercator projection about the map's origin as WKT 1 (OGC 01-009).
 
@@ -20,11 +25,10 @@ def wkt_of(place: Georeference) -> str:
     scale of the map's height the two differ by less than 1 mm at 3 km from the origin, and by 8 mm at 10 km.
     Heights are the map's own, which is flat: the ellipsoid falls away from it by 8 cm at 1 km.
     """
-    scale = 1.0 + place.height_m / _MEAN_RADIUS_M
     parameters = {
         "latitude_of_origin": place.latitude_deg,
         "central_meridian": place.longitude_deg,
-        "scale_factor": scale,
+        "scale_factor": scale_of(place),
         "false_easting": 0.0,
         "false_northing": 0.0,
     }

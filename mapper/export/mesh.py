@@ -28,6 +28,7 @@ from mapper.core.frames import (
 from mapper.core.geometry import Transform, inverse
 from mapper.core.voxel_grid import DIAGONAL
 from mapper.export.mesh_files import Triangles, write_mesh
+from mapper.export.part_of_run import in_map, placed
 from mapper.mapping.cloud import Colors
 from mapper.mapping.config import edits_of
 from mapper.mapping.edits import MapEditor
@@ -163,7 +164,7 @@ def surface(run: Run, path: Path, progress: Progress) -> None:
     config = run.config.mesh
     octree, max_depth_m = run.octree, _max_depth_m(run)
     volume = Volume(o3d, config, max_depth_m=max_depth_m, blocks=_expected_blocks(octree, config))
-    for view in mesh_views(run, octree, progress):
+    for view in mesh_views(in_map(run), octree, progress):
         volume.add(view)
     found = volume.surface()
     if not len(found.triangles):
@@ -171,7 +172,7 @@ def surface(run: Run, path: Path, progress: Progress) -> None:
             f"{run.path}: no surface within {max_depth_m:g} m was seen in {config.min_observations} "
             "fused frames; lower mesh.min_observations or mesh.frame_stride"
         )
-    write_mesh(path, found.points_world, found.colors, found.triangles)
+    write_mesh(path, placed(run, found.points_world), found.colors, found.triangles)
 
 
 class Volume:

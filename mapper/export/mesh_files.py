@@ -1,21 +1,21 @@
-"""Coloured clouds and triangle meshes: PLY (Turk 1994), Wavefront OBJ and binary glTF 2.0 (Khronos 2021)."""
+"""Clouds and triangle meshes: PLY (Turk 1994), Wavefront OBJ, STL, and binary glTF 2.0 (Khronos 2021)."""
 
 import json
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.errors import DataError
-from mapper.core.frames import Points32
+from mapper.core.frames import Cloud, Points32
 from mapper.mapping.cloud import Colors
 from mapper.runtime.atomic import atomic_file, write_bytes, write_text
 
 _PLY_VERTEX = np.dtype([("position", "<f4", 3), ("color", "u1", 3)])
-_PLY_VERTEX_OF_LIDAR = np.dtype([*_PLY_VERTEX.descr, ("intensity", "<f4")])
 _CHUNK = 1_000_000  # vertices written at once
+_STL_FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attributes", "<u2")])
 _PLY_TRIANGLE = np.dtype([("corners", "u1"), ("vertices", "<i4", 3)])
 
 
@@ -25,7 +25,7 @@ def write_ply(
     colors: NDArray[np.uint8],
     *,
     triangles: NDArray[np.int32] | None = None,
-    intensities: NDArray[np.float32] | None = None,
+    scalars: Mapping[str, NDArray[np.float32] | None] | None = None,
 ) -> None:
     """Write a little-endian binary PLY, atomically.
 
@@ -34,13 +34,14 @@ def write_ply(
         points: (N, 3) float32 metres.
         colors: (N, 3) uint8 RGB.
         triangles: (T, 3) int32 indices of points, counterclockwise seen from outside; None for a cloud.
-        intensities: (N,) of the points; None leaves them out.
+        scalars: (N,) more numbers of the points by their names in the file; None leaves one out.
 
     Raises:
         DataError: Shapes that differ.
     """
     if points.ndim != 2 or points.shape[1] != 3 or colors.shape != points.shape:
         raise DataError(f"{path}: points {points.shape} and colors {colors.shape}, want two of (N, 3)")
+    known = {name: values for name, values in (scalars or {}).items() if values is not None}
     header = [
         "ply",
         "format binary_little_endian 1.0",
@@ -48,9 +49,9 @@ def write_ply(
         f"element vertex {len(points)}",
         *(f"property float {axis}" for axis in ("x", "y", "z")),
         *(f"property uchar {channel}" for channel in ("red", "green", "blue")),
-        *([] if intensities is None else ["property float intensity"]),
+        *(f"property float {name}" for name in known),
     ]
-    vertex = _PLY_VERTEX if intensities is None else _PLY_VERTEX_OF_LIDAR
+    vertex = np.dtype([*_PLY_VERTEX.descr, *((name, "<f4") for name in known)])
     if triangles is not None:
         header += [f"element face {len(triangles)}", "property list uchar int vertex_indices"]
     with atomic_file(path) as part, part.open("wb") as file:
@@ -60,8 +61,8 @@ def write_ply(
             vertices = np.empty(len(points[some]), vertex)
             vertices["position"] = points[some]
             vertices["color"] = colors[some]
-            if intensities is not None:
-                vertices["intensity"] = intensities[some]
+            for name, values in known.items():
+                vertices[name] = values[some]
             vertices.tofile(file)
         if triangles is not None:
             faces = np.full(len(triangles), 3, _PLY_TRIANGLE)
@@ -77,6 +78,12 @@ _VERTICES, _INDICES = 34962, 34963  # and of what a buffer is for
 
 # glTF's y is up; ours is z.
 _R_GLTF_WORLD = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]], np.float32)
+
+
+def write_cloud(path: Path, cloud: Cloud) -> None:
+    """Write a cloud as PLY with all that it has, atomically."""
+    scalars = {"intensity": cloud.intensities, "time": cloud.times_s}
+    write_ply(path, cloud.points, cloud.colors, scalars=scalars)
 
 
 def write_mesh(path: Path, points: Points32, colors: Colors, triangles: Triangles) -> None:
@@ -154,4 +161,20 @@ def _linear_light() -> NDArray[np.uint16]:
     return rounded
 
 
-MESH_WRITERS: dict[str, Write] = {".ply": _write_ply, ".obj": _write_obj, ".glb": _write_glb}
+def _write_stl(path: Path, points: Points32, _colors: Colors, triangles: Triangles) -> None:
+    """Write binary STL, which has no colours; each triangle has its normal."""
+    corners = points[triangles]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.finfo(np.float32).tiny)
+    facets = np.zeros(len(triangles), _STL_FACET)
+    facets["normal"], facets["corners"] = normals, corners
+    header = b"mapper: metres, z up".ljust(80) + struct.pack("<I", len(facets))
+    write_bytes(path, header + facets.tobytes())
+
+
+MESH_WRITERS: dict[str, Write] = {
+    ".ply": _write_ply,
+    ".obj": _write_obj,
+    ".glb": _write_glb,
+    ".stl": _write_stl,
+}

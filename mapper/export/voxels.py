@@ -9,7 +9,6 @@ from mapper.core.errors import RunError
 from mapper.export.mesh_files import Triangles, write_mesh, write_ply
 from mapper.mapping.cloud import height_colors
 from mapper.octree.keys import KEY_ZERO
-from mapper.octree.map import read_octree
 from mapper.octree.queries import Leaves
 from mapper.run import files
 from mapper.run.folder import Run
@@ -92,11 +91,11 @@ def _codes(lattice: Corners) -> Corners:
 
 
 def _occupied(run: Run) -> Leaves:
-    octree = read_octree(run.file(files.OCTREE_OT), run.config.octree)
+    octree = run.octree
     leaves = octree.leaves()
     is_occupied = leaves.log_odds >= octree.occupied_log_odds
     if not is_occupied.any():
         raise RunError(
-            f"{run.path / files.OCTREE_OT}: no voxel is occupied; lower octree.occupied_probability"
+            f"{run.path / files.OCTREE_MAP}: no voxel is occupied; lower octree.occupied_probability"
         )
     return Leaves(leaves.keys[is_occupied], leaves.log_odds[is_occupied], leaves.resolution_m)

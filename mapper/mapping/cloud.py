@@ -1,5 +1,6 @@
 """Coloured cloud: one averaged point per voxel, in memory that grows with the scene, not with the log."""
 
+from dataclasses import replace
 from typing import Any, TypeVar
 
 import cv2
@@ -49,14 +50,19 @@ class CloudBuilder:
         self._offsets = np.zeros((_BATCH, 3), np.float32)  # sums, in voxels
         self._counts = np.zeros((_BATCH, 4), np.uint32)  # sums of red, green and blue, and number of points
         self._intensities: NDArray[np.float32] | None = None  # sums, where every point has one
+        self._seen_s: list[tuple[int, float]] = []  # voxels that are new with a cloud, and its time
         self._index = voxel_index(_BATCH)
 
     def __len__(self) -> int:
         """Return the number of voxels with a point."""
         return self._size
 
-    def add(self, cloud: Cloud) -> None:
+    def add(self, cloud: Cloud, time_s: float = 0.0) -> None:
         """Add a cloud; intensities are kept where all clouds have them.
+
+        Args:
+            cloud: The cloud.
+            time_s: When it was seen.
 
         Raises:
             DataError: Shapes that differ, a coordinate that is not finite, or one beyond the key range.
@@ -79,6 +85,7 @@ class CloudBuilder:
             self._intensities = np.zeros((len(self._offsets), 1), np.float32)
         if intensities is None:
             self._intensities = None
+        before = self._size
         for first in range(0, len(points_world), _BATCH):
             batch = slice(first, first + _BATCH)
             self._reserve(_BATCH)
@@ -93,15 +100,18 @@ class CloudBuilder:
                 _NO_SUMS if self._intensities is None else self._intensities,
                 self._size,
             )
+        self._seen_s.append((self._size - before, time_s))
 
     def cloud(self) -> Cloud:
-        """Return the mean points, in the order of the first points in the voxels."""
+        """Return the mean points, in the order and with the times of the first points in the voxels."""
         points, colors = np.empty((self._size, 3), np.float32), np.empty((self._size, 3), np.uint8)
         _fill_means(self._index.keys, self._offsets, self._counts, self.voxel_m, points, colors)
+        new, seen_s = np.array(self._seen_s or [(0, 0.0)]).T
+        cloud = Cloud(points, colors, times_s=np.repeat(seen_s, new.astype(int)).astype(np.float32))
         if self._intensities is None:
-            return Cloud(points, colors)
+            return cloud
         counts = self._counts[: self._size, 3].astype(np.float32)
-        return Cloud(points, colors, self._intensities[: self._size, 0] / counts)
+        return replace(cloud, intensities=self._intensities[: self._size, 0] / counts)
 
     def _reserve(self, more: int) -> None:
         need = self._size + more

@@ -5,6 +5,7 @@ from numpy.typing import NDArray
 
 from mapper.core.errors import FrameError
 from mapper.core.frames import Cloud
+from mapper.core.timebase import NS_PER_S
 from mapper.core.trajectory import Trajectory
 from mapper.mapping.cloud import CloudBuilder, height_colors
 from mapper.mapping.config import FuseSettings
@@ -40,10 +41,10 @@ def fuse_clouds(
     still, moving = CloudBuilder(config.cloud.voxel_m), CloudBuilder(config.cloud.voxel_m)
     stride = config.cloud.frame_stride
     frames = [frame for frame in placed_frames(source, trajectory) if frame.index % stride == 0]
-    depth_limit = depth_limit_of(config.octree)
+    depth_limit, begin_ns = depth_limit_of(config.octree), int(trajectory.stamps_ns[0])
 
-    def read(frame: PlacedFrame) -> tuple[Cloud, NDArray[np.bool_]] | None:
-        """Return a frame's returns and which of them moved; None if it cannot be read."""
+    def read(frame: PlacedFrame) -> tuple[float, Cloud, NDArray[np.bool_]] | None:
+        """Return a frame's time, its returns and which of them moved; None if it cannot be read."""
         try:
             scan = frame.scan_of(frame.entry.load())
         except FrameError:
@@ -57,13 +58,13 @@ def fuse_clouds(
             colors = height_colors(points_world[:, 2], between_m=_COLOURED_HEIGHTS_M)
         cloud = Cloud(points_world, colors, scan.intensities)
         moved = np.zeros(len(cloud), np.bool_) if objects is None else objects.returns_of(points_world)
-        return cloud, moved
+        return (frame.entry.stamp_ns - begin_ns) / NS_PER_S, cloud, moved
 
     with progress.stage("cloud") as report:
         for done, returns in enumerate(ordered_map(read, frames, workers=config.workers), start=1):
             report(done, len(frames))
             if returns is not None:
-                cloud, moved = returns
-                still.add(cloud.select(~moved))
-                moving.add(cloud.select(moved))
+                time_s, cloud, moved = returns
+                still.add(cloud.select(~moved), time_s)
+                moving.add(cloud.select(moved), time_s)
     return still.cloud(), moving.cloud()

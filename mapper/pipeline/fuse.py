@@ -16,7 +16,7 @@ from mapper.core.trajectory import Trajectory
 from mapper.export.cloud_picture import write_cloud_views
 from mapper.export.grid import write_grid
 from mapper.export.mcap_log import McapLog
-from mapper.export.mesh_files import write_ply
+from mapper.export.mesh_files import write_cloud
 from mapper.export.picture import write_summary
 from mapper.export.run_mcap import log_maps, log_results, log_snapshot
 from mapper.mapping.config import Edits
@@ -270,7 +270,7 @@ def _write_maps(folder: Path, maps: Maps) -> None:
     write_ot(folder / files.OCTREE_OT, maps.octree)
     write_map(folder / files.OCTREE_MAP, maps.octree)
     for name, cloud in ((files.CLOUD, maps.cloud), (files.DYNAMIC, maps.dynamic)):
-        write_ply(folder / name, cloud.points, cloud.colors, intensities=cloud.intensities)
+        write_cloud(folder / name, cloud)
     write_grid(folder, files.SLICE, maps.grid)
     write_grid(folder, files.TRAVERSABLE, maps.traversable)
     if maps.keepout is not None:

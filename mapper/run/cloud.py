@@ -28,9 +28,11 @@ def read_cloud(path: Path) -> Cloud:
         first = np.flatnonzero(~(np.abs(points) <= FARTHEST_M).all(axis=1))[0]
         raise FrameError(f"{path}: point {first} is at {points[first]}, want finite metres")
     colors = _columns(columns, ("red", "green", "blue"), np.uint8, path)
-    if "intensity" not in columns:
-        return Cloud(points, colors)
-    return Cloud(points, colors, _columns(columns, ("intensity",), np.float32, path).ravel())
+    scalars = (
+        _columns(columns, (name,), np.float32, path).ravel() if name in columns else None
+        for name in ("intensity", "time")
+    )
+    return Cloud(points, colors, *scalars)
 
 
 def _columns(

@@ -40,6 +40,7 @@ VOXELS = "voxels.ply"
 VOXEL_MESH = "voxel_mesh.ply"
 CLOUD_LAZ = "cloud.laz"
 CLOUD_PCD = "cloud.pcd"
+CLOUD_E57 = "cloud.e57"
 COSTMAP = "costmap"
 FOXGLOVE_LAYOUT = "foxglove_layout.json"
 PLAN = "plan.json"
@@ -153,7 +154,9 @@ RUN_FILES = (
     RunFiles((KITTI,), "the trajectory as KITTI text, written by `mapper export --as kitti`", "poses"),
     RunFiles((MESH,), "a coloured surface, written by `mapper export --as mesh`", "poses"),
     RunFiles((VOXELS, VOXEL_MESH), "the octree's occupied voxels as points and as cubes", "exported maps"),
-    RunFiles((CLOUD_LAZ, CLOUD_PCD), "the coloured cloud for surveys, and for PCL", "exported maps"),
+    RunFiles(
+        (CLOUD_LAZ, CLOUD_PCD, CLOUD_E57), "the coloured cloud for surveys, and for PCL", "exported maps"
+    ),
     RunFiles(_grid(COSTMAP), "the slice inflated for nav2", "exported maps"),
     RunFiles((FOXGLOVE_LAYOUT,), "a layout of `run.mcap` for Foxglove", "exported maps"),
     RunFiles((PLAN, PLAN_VIEW), "the last path that `mapper plan` found", "exported maps"),
@@ -214,6 +217,7 @@ _REMEDIES = {
     VOXEL_MESH: "make it again with mapper export RUN --as voxel-mesh",
     CLOUD_LAZ: "make it again with mapper export RUN --as las",
     CLOUD_PCD: "make it again with mapper export RUN --as pcd",
+    CLOUD_E57: "make it again with mapper export RUN --as e57",
     FOXGLOVE_LAYOUT: "make it again with mapper export RUN --as foxglove-layout",
     RERUN: "make it again with mapper view RUN",
     **dict.fromkeys(_grid(COSTMAP), "make it again with mapper export RUN --as costmap"),

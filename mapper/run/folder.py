@@ -1,13 +1,13 @@
 """Run folder: a finished run, its log and its files, read on first access."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from functools import cached_property
 from importlib import import_module
 from pathlib import Path
 from shlex import quote
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal, Self
 
 from mapper.config.build import BuildConfig
 from mapper.config.loading import load_run_config
@@ -67,7 +67,7 @@ class Run:
         digests = read_manifest(self.path / files.MANIFEST).files  # exports and plans add theirs
         return checked(self.path, name, digests)
 
-    def with_config(self, config: BuildConfig) -> "Run":
+    def with_config(self, config: BuildConfig) -> Self:
         """Return the same run with other settings, for what is made from its files."""
         return replace(self, config=config)
 
@@ -200,6 +200,8 @@ class Run:
         path: AnyPath | None = None,
         *,
         settings: Mapping[str, Any] | None = None,
+        frame: Literal["map", "start", "base"] = "map",
+        crop: Sequence[float] | None = None,
         overwrite: bool = False,
         progress: "Progress | Callable[[str], object] | None" = None,
     ) -> Path:
@@ -209,15 +211,26 @@ class Run:
             kind: Such as "octomap", "las" or "rosbag2".
             path: File or folder to write; None keeps a file in the run.
             settings: Values by dotted name that this kind reads, such as ``{"mesh.voxel_m": 0.01}``.
+            frame: Frame of poses and points: "map", or "start" or "base", the body or the robot's base at its
+                first pose.
+            crop: Lowest and highest corner of what is written, x y z x y z, metres in the map; None is all.
             overwrite: Replace what is at PATH.
             progress: As for ``mapper.build``.
 
         Raises:
-            ConfigError: No such kind, a name that does not end like one, or settings that it does not read.
+            ConfigError: No such kind, a name that does not end like one, or settings, a frame or a crop that
+                this kind cannot have.
             RunError: PATH is there already, or a file or the log that the kind needs is missing.
         """
         written: Path = import_module("mapper.api.runs").export(
-            self, kind, path, settings=settings, overwrite=overwrite, progress=progress
+            self,
+            kind,
+            path,
+            settings=settings,
+            frame=frame,
+            crop=crop,
+            overwrite=overwrite,
+            progress=progress,
         )
         return written
 

@@ -3,6 +3,7 @@
 import laspy
 import numpy as np
 import pytest
+import yaml
 from pypcd4 import PointCloud
 
 from mapper.config.loading import load_config
@@ -42,18 +43,36 @@ def test_las(run, tmp_path, ending):
         np.column_stack([cloud.red, cloud.green, cloud.blue]) // 256, run.cloud.colors
     )
     assert cloud.red.max() > 255
-    assert_attributes(run, np.array(cloud.hits), np.array(cloud.time_s))
+    assert_attributes(run, np.array(cloud.hits), np.array(cloud.last_seen_s))
 
 
 def test_pcd(run, tmp_path):
     cloud = PointCloud.from_path(export(run, "pcd", tmp_path / "cloud.pcd"))
-    assert cloud.fields == ("x", "y", "z", "rgb", "time_s", "hits")
+    assert cloud.fields == ("x", "y", "z", "rgb", "time_s", "last_seen_s", "hits")
     np.testing.assert_array_equal(cloud.numpy(("x", "y", "z")), run.cloud.points)
     packed = np.ascontiguousarray(cloud.pc_data["rgb"]).view(np.uint32)
     np.testing.assert_array_equal(
         np.column_stack([packed >> 16, packed >> 8 & 255, packed & 255]), run.cloud.colors
     )
-    assert_attributes(run, cloud.pc_data["hits"], cloud.pc_data["time_s"])
+    assert_attributes(run, cloud.pc_data["hits"], cloud.pc_data["last_seen_s"])
+
+
+def test_autoware_tiles_hold_the_points_that_their_metadata_says(lidar_run, tmp_path):
+    run = lidar_run
+    folder = export(run, "autoware", tmp_path / "map")
+    metadata = yaml.safe_load((folder / "pointcloud_map_metadata.yaml").read_text())
+    size = metadata.pop("x_resolution"), metadata.pop("y_resolution")
+    assert size == (20.0, 20.0)
+    assert set(metadata) == {path.name for path in (folder / "pointcloud_map.pcd").iterdir()}
+    count = 0
+    for name, corner in metadata.items():
+        assert all(isinstance(value, int) for value in corner)  # as Autoware reads them
+        points = PointCloud.from_path(folder / "pointcloud_map.pcd" / name).numpy(("x", "y"))
+        assert ((points >= corner) & (points < np.add(corner, size))).all()
+        count += len(points)
+    assert count == len(run.cloud)
+    projector = yaml.safe_load((folder / "map_projector_info.yaml").read_text())
+    assert projector == {"projector_type": "Local"}
 
 
 @pytest.fixture(scope="module")

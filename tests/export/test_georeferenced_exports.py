@@ -96,3 +96,17 @@ def test_nav2_has_the_datum(placed, desk_run, tmp_path):
     assert datum == {"wait_for_datum": True, "datum": [47.4979, 19.0402, 0.0]}
     plain = yaml.safe_load((export(desk_run, "nav2", tmp_path / "b") / "nav2_params.yaml").read_text())
     assert plain == {name: value for name, value in parameters.items() if name != "navsat_transform"}
+
+
+def test_autoware_knows_the_place(placed, tmp_path):
+    projector = yaml.safe_load(
+        (export(placed, "autoware", tmp_path / "map") / "map_projector_info.yaml").read_text()
+    )
+    assert projector.pop("scale_factor") == pytest.approx(1.0 + 850.0 / 6371e3, abs=1e-8)
+    assert projector == {
+        "projector_type": "TransverseMercator",
+        "vertical_datum": "WGS84",
+        "map_origin": {"latitude": 47.4979, "longitude": 19.0402},
+    }
+    moved = export(placed, "autoware", tmp_path / "moved", frame="start")
+    assert (moved / "map_projector_info.yaml").read_text() == "projector_type: Local\n"

@@ -1,7 +1,7 @@
 """E57 files (ASTM E2807): the scans of a terrestrial scanner, in one file or a file each."""
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.errors import FrameError, SourceError
-from mapper.core.frames import Scan
+from mapper.core.frames import Cloud, Scan
 from mapper.core.geometry import Transform
 from mapper.core.rotations import pose_of_row
 from mapper.core.timebase import NS_PER_S, Stamps
+from mapper.runtime.atomic import atomic_file
 from mapper.runtime.extras import extra, require
 from mapper.sources.base import ImageFiles, Log
 from mapper.sources.cloud_files.parsing import MIN_POINTS
@@ -179,3 +180,24 @@ def _points(fields: Any) -> NDArray[np.float32]:
     level = r * np.cos(elevation)
     xyz = [level * np.cos(azimuth), level * np.sin(azimuth), r * np.sin(elevation)]
     return np.column_stack(xyz).astype(np.float32)
+
+
+def write_e57(path: Path, cloud: Cloud, *, name: str) -> None:
+    """Write a cloud as one scan without a pose, atomically; its times have no place in E57.
+
+    Args:
+        path: File to write.
+        cloud: The cloud.
+        name: Name of the scan.
+
+    Raises:
+        DependencyError: The library that writes them is not installed.
+    """
+    with extra(_EXTRA, "writing E57 files"):
+        from pye57 import E57
+    fields = dict(zip(_XYZ, cloud.points.T.astype(np.float64), strict=True))
+    fields |= dict(zip(_RGB, np.ascontiguousarray(cloud.colors.T), strict=True))
+    if cloud.intensities is not None:
+        fields["intensity"] = cloud.intensities
+    with atomic_file(path) as part, closing(E57(str(part), mode="w")) as file:
+        file.write_scan_raw(fields, name=name)

@@ -1,0 +1,139 @@
+"""Part of a run, as exports take it: what lies in a box, in the frame that was asked for."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapper.config.loading import checked_config
+from mapper.core.errors import ConfigError
+from mapper.core.frames import Cloud, Points32
+from mapper.core.geometry import Transform, apply, inverse
+from mapper.core.trajectory import Trajectory
+from mapper.mapping.config import Edits, Region
+from mapper.mapping.edits import MapEditor
+from mapper.octree.grid import OccupancyGrid
+from mapper.octree.map import OctreeMap
+from mapper.run.folder import Run
+from mapper.run.map_folder import MapFolder
+
+
+@dataclass(frozen=True, repr=False)
+class PartOfRun(Run):
+    """A run whose maps are cropped, and whose poses and points are in another frame.
+
+    Attributes:
+        T_frame_map: (4, 4) pose of the levelled world in the frame; octree and grids stay in the world.
+        region: What the maps are cropped to, in the levelled world; None leaves them whole.
+    """
+
+    T_frame_map: Transform = field(default_factory=lambda: np.eye(4))
+    region: Region | None = None
+
+    @cached_property
+    def trajectory(self) -> Trajectory:
+        """Poses of all placed frames."""
+        return super().trajectory.moved(self.T_frame_map)
+
+    @cached_property
+    def octree(self) -> OctreeMap:
+        """Occupancy map."""
+        octree = super().octree
+        if self.region is not None:
+            self._editor.crop(octree)
+            octree.drop_unknown()
+        return octree
+
+    @cached_property
+    def cloud(self) -> Cloud:
+        """Coloured cloud."""
+        cloud = super().cloud
+        if self.region is not None:
+            whole, cloud = cloud, cloud.select(self._editor.leave(cloud.points))
+            if not len(cloud):
+                raise ConfigError(f"crop: no point of the cloud is in it; {_reach(whole.points)}")
+        return replace(cloud, points=placed(self, cloud.points))
+
+    @cached_property
+    def slice(self) -> OccupancyGrid:
+        """2D navigation map."""
+        return self._cropped(super().slice)
+
+    @cached_property
+    def traversable(self) -> OccupancyGrid:
+        """Floor that a robot can drive on."""
+        return self._cropped(super().traversable)
+
+    @cached_property
+    def keepout(self) -> OccupancyGrid | None:
+        """Keep-out regions."""
+        grid = super().keepout
+        return None if grid is None else self._cropped(grid)
+
+    @property
+    def _editor(self) -> MapEditor:
+        keep = () if self.region is None else (self.region,)
+        return MapEditor(Edits(keep=keep), np.empty((0, 3)), room_m=0.0)
+
+    def _cropped(self, grid: OccupancyGrid) -> OccupancyGrid:
+        """Return the cells whose centres are in the box, seen from above."""
+        if self.region is None or self.region.box_m is None:
+            return grid
+        low, high = np.array(self.region.box_m)[:, :2]
+        begin, end = np.rint(((low, high) - grid.origin_world_m) / grid.resolution_m).astype(int)
+        begin, end = (np.clip(cells, 0, grid.shape[::-1]) for cells in (begin, end))
+        if not (begin < end).all():
+            corners = grid.origin_world_m + np.array([[0, 0], grid.shape[::-1]]) * grid.resolution_m
+            raise ConfigError(f"crop: no cell of the 2D map is in it; {_reach(corners)}")
+        cells = grid.cells[begin[1] : end[1], begin[0] : end[0]]
+        return replace(grid, cells=cells, origin_world_m=grid.origin_world_m + begin * grid.resolution_m)
+
+
+def part_of(run: MapFolder, frame: str, box_m: Sequence[float] | None) -> MapFolder:
+    """Return a run as an export takes it; the run itself if it is to be whole and in the levelled world.
+
+    Args:
+        run: The run.
+        frame: Frame of poses and points: "map", or "start" or "base", the body or the base at its first pose.
+        box_m: Lowest and highest corner, x y z x y z, in the levelled world; None crops nothing.
+
+    Raises:
+        ConfigError: It is a merged map, no such frame, a run whose log has no base, or no box.
+    """
+    if frame == "map" and box_m is None:
+        return run
+    if not isinstance(run, Run):
+        raise ConfigError(f"{run.path}: a merged map is exported whole; crop or move its runs")
+    if frame not in ("map", "start", "base"):
+        raise ConfigError(f"frame {frame!r}: want map, start or base")
+    T_frame_map, manifest, robot = np.eye(4), run.manifest, run.manifest.input.robot_of_all
+    if frame != "map":
+        if frame == "base" and robot is None:
+            raise ConfigError(f"{run.path}: frame base: its log has no base_link; start is the sensor itself")
+        first = robot.trajectory_of_base(run.trajectory) if frame == "base" and robot else run.trajectory
+        T_frame_map = inverse(first[0])
+        manifest = manifest.model_copy(update={"georeference": None})  # which is that of the levelled world
+    region = None if box_m is None else checked_config({"box_m": (box_m[:3], box_m[3:])}, Region, "crop")
+    return PartOfRun(run.path, run.config, manifest, T_frame_map, region)
+
+
+def in_map(run: Run) -> Run:
+    """Return the same part of a run in the levelled world."""
+    return replace(run, T_frame_map=np.eye(4)) if isinstance(run, PartOfRun) else run
+
+
+def placed(run: Run, points_map: Points32) -> Points32:
+    """Return (N, 3) points of the levelled world in the frame of a run."""
+    if not isinstance(run, PartOfRun):
+        return points_map
+    return apply(run.T_frame_map, points_map.astype(np.float64)).astype(np.float32)
+
+
+def _reach(points: NDArray[Any]) -> str:
+    low, high = (
+        " ".join(f"{value:.2f}" for value in ends) for ends in (points.min(axis=0), points.max(axis=0))
+    )
+    return f"the map reaches from {low} to {high} m"
