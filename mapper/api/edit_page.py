@@ -1,5 +1,7 @@
 """A run's page to edit it on: served to browsers of this machine only, until its last tab is closed."""
 
+import json
+import re
 import shutil
 import time
 from collections.abc import Callable, Iterator
@@ -18,6 +20,8 @@ from mapper.config.loading import parse_config
 from mapper.core.errors import ConfigError, MapperError
 from mapper.export.report.data import Chapter, chapter_of
 from mapper.export.report.map_page import run_page
+from mapper.export.report.packing import pack_points
+from mapper.mapping.placed_frames import placed_frames
 from mapper.pipeline.edit import apply_edits
 from mapper.run.edits_file import EditsFile
 from mapper.run.folder import Run, moved_log, open_run
@@ -33,6 +37,9 @@ _KEPT = 5
 _TICK_S = 0.5
 _ABSENT_S = 5.0
 """Time without a tab after which the server ends: a tab that loads the page again has none meanwhile."""
+_STEP_M, _MOST_POINTS = 0.005, 40_000
+"""Of a scan that is aligned by hand."""
+_SCANS = re.compile(r"scans/(\d{1,9})/(\d{1,9})", re.ASCII)
 _TIMEOUT_S = 30.0
 """Of a connection that says nothing."""
 _HEADERS = {
@@ -158,6 +165,25 @@ class _Session:
                 self._page = run_page(name, self._chapters(name), editing="served")
             return self._page
 
+    def scans(self, i: int, j: int) -> str:
+        """Return the scans of two nodes, with their poses in the world as rows of (4, 4), as JSON.
+
+        Raises:
+            MapperError: A node is unknown, or its frame cannot be read.
+        """
+        with self._busy:
+            graph = self.run.graph
+            if not {i, j} <= graph.stamps_ns.keys():
+                raise ConfigError(f"keyframes {i} and {j}: want two of the graph's nodes")
+            node_of = {graph.stamps_ns[node]: node for node in (i, j)}
+            shown = {}
+            for placed in placed_frames(self._source, self.run.trajectory):
+                if (node := node_of.get(placed.entry.stamp_ns)) is not None:
+                    points = placed.scan_of(placed.entry.load()).points_body
+                    packed = pack_points(points, [], step_m=_STEP_M, most=_MOST_POINTS)
+                    shown[node] = {"T_world_body": placed.T_world_body.tolist(), "points": packed}
+        return json.dumps([shown[node] for node in (i, j)])
+
     def _chapters(self, name: str) -> list[Chapter]:
         if not self.earlier:
             return [chapter_of(self.run, name, ())]
@@ -228,7 +254,7 @@ class _Server(ThreadingHTTPServer):
 
 
 class _Handler(BaseHTTPRequestHandler):
-    """Door to a session: refuses what does not come from its page, and knows four names."""
+    """Door to a session: refuses what does not come from its page, and knows a handful of names."""
 
     server: _Server
     timeout = _TIMEOUT_S
@@ -237,12 +263,11 @@ class _Handler(BaseHTTPRequestHandler):
         """Answer with the page, or tell it of the work while it is open."""
         name = self._name()
         if name == "":
-            try:
-                self._answer(HTTPStatus.OK, self.server.session.page(), "text/html")
-            except MapperError as error:
-                self._answer(HTTPStatus.INTERNAL_SERVER_ERROR, str(error))
+            self._answer_with(self.server.session.page, "text/html")
         elif name == "open":
             self._tell()
+        elif match := _SCANS.fullmatch(name or ""):
+            self._answer_with(lambda: self.server.session.scans(*map(int, match.groups())))
         else:
             self._refuse()
 
@@ -252,16 +277,16 @@ class _Handler(BaseHTTPRequestHandler):
         if name not in ("solve", "undo") or "Origin" not in self.headers:
             self._refuse()
             return
-        try:
+        session = self.server.session
+
+        def work() -> str:
             if not (length.isascii() and length.isdigit() and int(length) <= _MOST_BYTES):
                 raise ConfigError(f"edits: {length or 'unknown'} bytes, at most {_MOST_BYTES} at once")
-            text = self.rfile.read(int(length)).decode("utf-8")
-            session = self.server.session
+            text = self.rfile.read(int(length)).decode("utf-8", "replace")
             session.ask(session.undo if name == "undo" else lambda: session.solve(text))
-        except (MapperError, UnicodeDecodeError) as error:
-            self._answer(HTTPStatus.BAD_REQUEST, str(error))
-        else:
-            self._answer(HTTPStatus.OK, "")
+            return ""
+
+        self._answer_with(work)
 
     def _name(self) -> str | None:
         """Return what is asked for behind the token; None if the request is not the page's own."""
@@ -282,6 +307,14 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _refuse(self) -> None:
         self._answer(HTTPStatus.FORBIDDEN, "refused: open the address that mapper edit --page has printed")
+
+    def _answer_with(self, work: Callable[[], str], kind: str = "text/plain") -> None:
+        try:
+            text = work()
+        except MapperError as error:
+            self._answer(HTTPStatus.BAD_REQUEST, str(error))
+        else:
+            self._answer(HTTPStatus.OK, text, kind)
 
     def _answer(self, status: HTTPStatus, text: str, kind: str = "text/plain") -> None:
         with suppress(OSError):  # the tab was closed meanwhile

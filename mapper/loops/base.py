@@ -108,7 +108,11 @@ def verify_proposal(
         j: Description of the node's own place.
         verifier: Compares the two.
     """
-    found = verifier.verify(i, j)
+    return closure_of(proposal, node, i, j, verifier.verify(i, j))
+
+
+def closure_of(proposal: Proposal, node: int, i: Stamped, j: Stamped, found: Verification) -> LoopClosure:
+    """Return the result of comparing two places as a loop closure; arguments as of ``verify_proposal``."""
     return LoopClosure(
         i=proposal.node,
         j=node,

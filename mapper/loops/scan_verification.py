@@ -1,5 +1,6 @@
 """Verification of a loop between two scans: a guess by voting, GICP, and the free-space check of both."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 
@@ -91,14 +92,25 @@ class ScanVerifier:
 
     def verify(self, i: ScanPlace, j: ScanPlace) -> Verification:
         """Return the pose of scan j in scan i, or why they are not of one place."""
-        config = self._config
         guesses = self._guesses(i, j)
         if not guesses:
             return Verification(0, "vote: nothing stands in both that could agree on a motion")
         _, guess = guesses[0]
         found = self._compared(i, j, guess, self._coarse)
-        if found.reason:
-            return found
+        return found if found.reason else self.verify_near(i, j, guess, guesses)
+
+    def verify_near(
+        self, i: ScanPlace, j: ScanPlace, guess: Transform, guesses: Sequence[tuple[float, Transform]] = ()
+    ) -> Verification:
+        """Return the pose of scan j in scan i near a guess, or why they are not of one place.
+
+        Args:
+            i: The known scan.
+            j: The other.
+            guess: (4, 4) pose of j in i.
+            guesses: Scores and motions, none of which may fit as well; none of a guess by hand.
+        """
+        config = self._config
         alignment = refine(
             self._cloud(i),
             self._cloud(j),
@@ -108,6 +120,7 @@ class ScanVerifier:
             max_iterations=config.max_iterations,
         )
         if not alignment.converged:
+            found = self._compared(i, j, guess, self._coarse)
             return replace(found, reason=f"gicp: {alignment.reason}")
         T_i_j = alignment.T_target_source
         found = replace(self._compared(i, j, T_i_j, self._fine), rmse_m=alignment.inlier_rmse_m)

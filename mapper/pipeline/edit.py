@@ -1,16 +1,21 @@
 """Edits by hand of a finished run, of its loops or its maps: solved and fused again, but not tracked."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 from mapper.config.build import BuildConfig
+from mapper.core.doubts import Doubt
 from mapper.core.errors import ConfigError, LoopError
-from mapper.core.frames import Sensor
+from mapper.core.frames import RgbdFrame, Sensor
+from mapper.core.geometry import Transform, inverse
 from mapper.graph.components import by_odometry, components
 from mapper.graph.model import PoseGraph
-from mapper.loops.base import Proposal, Verifier, verify_proposal
+from mapper.loops.base import Proposal, Verification, Verifier, closure_of
 from mapper.loops.closure import LoopClosure, accepted_loops
 from mapper.loops.factory import build_verifier, keyframe_loops
+from mapper.loops.image_verification import verify_aligned
+from mapper.loops.scan_verification import ScanVerifier
 from mapper.mapping.config import EditKind, Region
 from mapper.pipeline.fuse import fuse_changed
 from mapper.pipeline.reobserve import reobserve
@@ -52,7 +57,7 @@ def edit_loops(
         LoopError: A node is unknown, a loop is there already or is not, two frames do not show one place, or
             the solver rejects a loop that was added.
     """
-    changed, report = _solve_edited(source, run, add, remove)
+    changed, report = _solve_edited(source, run, dict.fromkeys(add), remove)
     return fuse_changed(source, run, changed, solve=report, progress=progress)
 
 
@@ -68,37 +73,48 @@ def apply_edits(source: Log, run: Run, edits: EditsFile, *, progress: Progress =
     Raises:
         MapperError: There are none, or as :func:`edit_loops` and :func:`add_region`.
     """
-    if not (edits.accept or edits.reject or len(edits)):
-        raise ConfigError("edits: none; want [[accept]], [[reject]], [[erase]], [[keep]], [[keepout]]")
+    if edits == EditsFile():
+        raise ConfigError("edits: none; want accept, reject, drop, erase, keep or keepout")
     text = edits_text(run.path)
     for kind, region in edits.regions:
         text = with_region(text, run.path, kind, region)
     changed, report = None, None
-    if edits.accept or edits.reject:
-        pairs = ([loop.nodes for loop in loops] for loops in (edits.accept, edits.reject))
-        changed, report = _solve_edited(source, run, *pairs)
+    if edits.accept or edits.reject or edits.drop:
+        aligned = {loop.nodes: loop.aligned for loop in edits.accept}
+        if len(aligned) < len(edits.accept):
+            raise ConfigError("edits: accept: the same nodes twice")
+        rejected = [loop.nodes for loop in edits.reject]
+        changed, report = _solve_edited(source, run, aligned, rejected, edits.drop)
     regions = text if len(edits) else None
     return fuse_changed(source, run, changed, solve=report, edits=regions, progress=progress)
 
 
 def _solve_edited(
-    source: Log, run: Run, add: Sequence[Pair], remove: Sequence[Pair]
+    source: Log,
+    run: Run,
+    add: Mapping[Pair, Transform | None],
+    remove: Sequence[Pair],
+    drop: Sequence[int] = (),
 ) -> tuple[StoredTracking, Solve]:
+    """Solve with loops added, by how they were aligned by hand, and removed, and with nodes dropped."""
     if run.config.graph.solve == "none":
         raise ConfigError(f"{run.path}: built with graph.solve=none, so loops change nothing; build it again")
-    tracked = load_tracking(run)
+    tracked = _without(load_tracking(run), drop)
     graph, loops = tracked.graph, list(tracked.loops)
     for pair in remove:
         place = _held(loops, pair)
         if place is None:
             raise LoopError(f"loop {_text(pair)}: no loop of {run.path} to remove; mapper loops lists them")
         loops[place] = loops[place].rejected("hand", "removed")
-    pairs = [_in_time_order(graph, pair) for pair in add]
-    for pair in pairs:
-        if _held(loops, pair) is not None or pairs.count(pair) > 1:
-            raise LoopError(f"loop {_text(pair)}: there already")
+    aligned = {}
+    for pair, T in add.items():
+        i, j = _in_time_order(graph, pair)
+        if _held(loops, pair) is not None or (i, j) in aligned:
+            raise LoopError(f"loop {_text((i, j))}: there already")
+        aligned[i, j] = inverse(T) if T is not None and (i, j) != pair else T
+    pairs = list(aligned)
     if pairs:
-        found = _measured(source, tracked, pairs, run.config)
+        found = _measured(source, tracked, aligned, run.config)
         loops = [loop for loop in loops if (loop.i, loop.j) not in pairs] + found
     held = (loop.factor for loop in accepted_loops(loops))
     edited = graph.with_poses(by_odometry(graph)).with_loops(held)
@@ -108,6 +124,33 @@ def _solve_edited(
     if len(components(solved.graph)) > len(components(graph)):
         raise LoopError(f"{run.path}: without these loops the graph falls apart; nothing removed")
     return tracked.solved(solved.graph, solved.loops), solved.report
+
+
+def _without(tracked: StoredTracking, nodes: Sequence[int]) -> StoredTracking:
+    """Return the tracking with the frames of some nodes doubtful, so that no map has them."""
+    for node in nodes:
+        if node not in tracked.graph.T_world_node:
+            raise LoopError(
+                f"node {node}: cannot be dropped; the graph's nodes are {_range_of(tracked.graph)}"
+            )
+    doubt = Doubt("disagreement", "dropped by hand")
+    records = [
+        replace(record, outcome="doubtful", doubts=(*record.doubts, doubt))
+        if record.node in nodes and record.outcome in ("tracked", "doubtful")
+        else record
+        for record in tracked.records
+    ]
+    loops = [
+        loop.rejected("hand", "its keyframe was dropped")
+        if loop.verdict == "accepted" and (loop.i in nodes or loop.j in nodes)
+        else loop
+        for loop in tracked.loops
+    ]
+    return replace(tracked, records=records, loops=loops)
+
+
+def _range_of(graph: PoseGraph) -> str:
+    return f"0 … {max(graph.T_world_node)}"
 
 
 def _held(loops: Sequence[LoopClosure], pair: Pair) -> int | None:
@@ -121,8 +164,7 @@ def _held(loops: Sequence[LoopClosure], pair: Pair) -> int | None:
 def _in_time_order(graph: PoseGraph, pair: Pair) -> Pair:
     for node in pair:
         if node not in graph.T_world_node:
-            last = max(graph.T_world_node)
-            raise LoopError(f"loop {_text(pair)}: no node {node}; the graph's nodes are 0 … {last}")
+            raise LoopError(f"loop {_text(pair)}: no node {node}; the graph's nodes are {_range_of(graph)}")
     if pair[0] == pair[1]:
         raise LoopError(f"loop {_text(pair)}: a node cannot be connected to itself")
     i, j = sorted(pair, key=graph.stamps_ns.__getitem__)
@@ -130,18 +172,31 @@ def _in_time_order(graph: PoseGraph, pair: Pair) -> Pair:
 
 
 def _measured(
-    source: Log, tracked: StoredTracking, pairs: Sequence[Pair], config: BuildConfig
+    source: Log, tracked: StoredTracking, aligned: Mapping[Pair, Transform | None], config: BuildConfig
 ) -> list[LoopClosure]:
     verifier, graph = _verifier(config, source.sensor), tracked.graph
-    stamps_ns = {graph.stamps_ns[node] for pair in pairs for node in pair}
+    stamps_ns = {graph.stamps_ns[node] for pair in aligned for node in pair}
     views = reobserve(source, tracked.trajectory, stamps_ns, config)
     places = {stamp_ns: verifier.describe(seen) for stamp_ns, seen in views.items()}
     loops = []
-    for i, j in pairs:
+    for (i, j), T_i_j in aligned.items():
         place_i, place_j = (places[graph.stamps_ns[node]] for node in (i, j))
-        loops.append(verify_proposal(Proposal(i, "hand"), j, place_i, place_j, verifier))
+        found = _verify(source, verifier, place_i, place_j, T_i_j)
+        loops.append(closure_of(Proposal(i, "hand"), j, place_i, place_j, found))
         _refuse_rejected(loops[-1])
     return loops
+
+
+def _verify(source: Log, verifier: Verifier[Any], i: Any, j: Any, T_i_j: Transform | None) -> Verification:
+    """Return the result of comparing two places, which a person may have aligned."""
+    if T_i_j is not None and isinstance(verifier, ScanVerifier):
+        return verifier.verify_near(i, j, T_i_j)
+    found = verifier.verify(i, j)
+    if T_i_j is None or not found.reason:
+        return found
+    frames = (source.entry_of(place.stamp_ns).load() for place in (i, j))
+    frame_i, frame_j = (frame for frame in frames if isinstance(frame, RgbdFrame))
+    return verify_aligned(frame_i, frame_j, T_i_j)
 
 
 def _verifier(config: BuildConfig, sensor: Sensor) -> Verifier[Any]:

@@ -3,12 +3,16 @@
 import re
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Self
 
-from pydantic import NonNegativeInt
+import numpy as np
+from pydantic import NonNegativeInt, model_validator
 
 from mapper.config.loading import parse_config
 from mapper.core.config import Config
 from mapper.core.errors import ConfigError
+from mapper.core.geometry import Transform, transform
+from mapper.core.rotations import rotation_from_quaternion
 from mapper.mapping.config import EditKind, Edits, Region
 from mapper.run import files
 from mapper.runtime.atomic import write_text
@@ -18,18 +22,47 @@ _HEADER = re.compile(r"^[ \t]*\[\[", re.MULTILINE)
 
 
 class LoopEdit(Config):
-    """Loop that a user accepts or rejects."""
+    """Loop that a user rejects."""
 
     nodes: tuple[NonNegativeInt, NonNegativeInt]
+
+
+class AcceptedLoop(LoopEdit):
+    """Loop that a user accepts, and how the two frames were aligned by hand, if they were."""
+
+    translation_m: tuple[float, float, float] | None = None
+    """Position of the second node's frame in the first one's."""
+    rotation_xyzw: tuple[float, float, float, float] | None = None
+    """Its orientation there."""
+
+    @model_validator(mode="after")
+    def _is_whole(self) -> Self:
+        if (self.translation_m is None) != (self.rotation_xyzw is None):
+            raise ValueError("translation_m and rotation_xyzw: want both, or neither")
+        return self
+
+    @property
+    def aligned(self) -> Transform | None:
+        """(4, 4) pose of the second node's frame in the first one's, as aligned by hand.
+
+        Raises:
+            DataError: The orientation is none.
+        """
+        if self.translation_m is None or self.rotation_xyzw is None:
+            return None
+        rotation = rotation_from_quaternion(np.array(self.rotation_xyzw))
+        return transform(rotation, np.array(self.translation_m))
 
 
 class EditsFile(Edits):
     """Edits file, which the page saves and ``mapper edit --from`` takes: loops, and regions to be added."""
 
-    accept: tuple[LoopEdit, ...] = ()
+    accept: tuple[AcceptedLoop, ...] = ()
     """Pairs of nodes at one place, whether they are a candidate or not."""
     reject: tuple[LoopEdit, ...] = ()
     """Accepted loops that are wrong."""
+    drop: tuple[NonNegativeInt, ...] = ()
+    """Keyframes, by their nodes, whose frames no map has, and which no loops tie."""
 
     @property
     def regions(self) -> Iterator[tuple[EditKind, Region]]:

@@ -3,6 +3,7 @@
 import http.client
 import shutil
 import socket
+import time
 from queue import Queue
 from threading import Thread
 
@@ -12,7 +13,7 @@ from mapper.api.edit_page import serve_edit_page
 from mapper.run.folder import open_run
 from tests.support.chromium import CHROMIUM, MISSING
 from tests.support.files import files_of
-from tests.support.map_page import EditedPage
+from tests.support.map_page import EditedPage, change
 
 BOX = "[[erase]]\nbox_m = [[-9.0, -9.0, 0.3], [9.0, 9.0, 0.9]]\n"
 
@@ -68,6 +69,7 @@ def test_only_the_page_itself_may_ask(served):
         ("POST", f"/{token}/solve", {"Origin": other}),
         ("POST", f"/{token}/solve", {"Origin": "null"}),
         ("POST", "/guess/solve", {}),
+        ("GET", f"/{token}/scans/0/../1", {}),
         ("POST", f"/{token}/open", {}),
     ):
         assert served.ask(method, path, BOX if method == "POST" else None, **headers)[0] == 403
@@ -125,6 +127,31 @@ def test_a_person_erases_a_box_solves_and_undoes_it_in_the_page(served):
         assert after != before
         browser.ask("edit-undo")
         assert browser.facts() == counts
-        browser.choose("edit-region", "20 20 20 21 21 21")
-        browser.click("[data-map=edit-add]")
+        assert browser.complaints == []
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason=MISSING)
+def test_a_person_drags_one_keyframe_over_another_and_the_server_registers_them(served):
+    graph = open_run(served.folder).graph
+    i, j, *_ = graph.T_world_node
+    with EditedPage(served.url, height_px=800) as browser:
+        browser.choose("edit-i", str(i))
+        browser.choose("edit-j", str(j))
+        browser.click("[data-map=above]")
+        browser.click("[data-map=edit-align]")
+        while browser.run("document.querySelector('[data-map=edit-moved]').hidden"):
+            time.sleep(0.05)
+        still = browser.picture()
+        x, y = browser.centre(".map canvas")
+        browser.drag((x, y), (x + 24, y - 18))
+        assert change(still, browser.picture()) > 0.01
+        dx, dy, dz, turn = map(float, browser.value("edit-moved").split())
+        assert (dz, turn) == (0.0, 0.0)
+        assert dx / dy == pytest.approx(12.0 / 9.0, rel=0.05)
+        assert 0.02 < dx < 0.3
+        browser.click("[data-map=edit-accept]")
+        assert browser.edits() == [f"accept {i} – {j}, aligned"]
+        browser.ask("edit-solve")
+        assert open_run(served.folder).loops[-1].proposed_by == "hand"
+        browser.ask("edit-undo")
         assert browser.complaints == []

@@ -110,6 +110,22 @@ def test_an_edits_file_makes_the_same_of_loops_and_regions_at_once(run, built, t
         assert (run / name).read_bytes() == (one_by_one / name).read_bytes()
 
 
+def test_a_dropped_keyframe_is_in_no_map_and_ties_nothing(run, tmp_path):
+    (i, j), before = held(run)[0], open_run(run)
+    tracked = len(before.tracked_trajectory)
+    edits = tmp_path / "edits.toml"
+    edits.write_text(f"drop = [{j}]\n")
+    mapper("edit", run, "--from", edits, "--quiet")
+    after = open_run(run)
+    assert [pair for pair in held(run) if j in pair] == []
+    assert next(loop.rejected_by for loop in after.loops if (loop.i, loop.j) == (i, j)) == "hand"
+    gone = {record.stamp_ns for record in before.records if record.node == j}
+    assert gone.isdisjoint(after.tracked_trajectory.stamps_ns.tolist())
+    assert len(after.tracked_trajectory) == tracked - len(gone)
+    edits.write_text("drop = [900]\n")
+    assert "node 900: cannot be dropped" in mapper("edit", run, "--from", edits, status=1).stderr
+
+
 def test_the_maps_are_those_of_fusing_from_scratch(run):
     mapper("loops", run, "--add", *untied(run), "--quiet")
     edited = (run / "map.ot").read_bytes()

@@ -70,13 +70,13 @@ def test_loops_are_chosen_on_the_map_and_accepted_rejected_added_and_undone(brow
     assert browser.text("edit-told") == "no candidate: accepting adds it"
     browser.click("[data-map=edit-accept]")
     assert browser.edits() == [
-        f"reject [{first},{last}]",
-        f"accept [{second},{last}]",
-        f"accept [{first},{second}]",
+        f"reject {first} – {last}",
+        f"accept {second} – {last}",
+        f"accept {first} – {second}",
     ]
     browser.undo_by_key()
     browser.click("[data-map=edit-undo]")
-    assert browser.edits() == [f"reject [{first},{last}]"]
+    assert browser.edits() == [f"reject {first} – {last}"]
 
 
 def test_regions_are_drawn_or_typed_and_saved_as_a_file_that_the_verb_takes(browser, nodes, tmp_path):
@@ -84,6 +84,8 @@ def test_regions_are_drawn_or_typed_and_saved_as_a_file_that_the_verb_takes(brow
     browser.choose("edit-i", str(first))
     browser.choose("edit-j", str(last))
     browser.click("[data-map=edit-reject]")
+    browser.choose("edit-j", "")
+    browser.click("[data-map=edit-drop]")
     browser.click("[data-map=edit-draw]")
     x, y = browser.centre(".map canvas")
     browser.drag((x - 60, y - 40), (x + 60, y + 40))
@@ -105,7 +107,7 @@ def test_regions_are_drawn_or_typed_and_saved_as_a_file_that_the_verb_takes(brow
         time.sleep(0.05)
     edits = read_config(path, EditsFile)
 
-    assert edits.reject[0].nodes == (first, last)
+    assert (edits.reject[0].nodes, edits.drop) == ((first, last), (first,))
     (low, high), (polygon,) = edits.erase[0].box_m, [region.polygon_m for region in edits.keepout]
     aspect = (high[0] - low[0]) / (high[1] - low[1])
     assert aspect == pytest.approx(120.0 / 80.0, rel=0.02)

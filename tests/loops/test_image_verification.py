@@ -4,11 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from mapper.core.geometry import inverse, log
+from mapper.core.geometry import exp, inverse, log
 from mapper.loops.closure import discrepancy
 from mapper.loops.config import ImageVerificationConfig
-from mapper.loops.image_verification import ImageVerifier
+from mapper.loops.image_verification import ImageVerifier, verify_aligned
 from mapper.odometry.config import MatchConfig
+from mapper.sources import open_source
 from tests.support.feature_room import Room
 from tests.support.planar import at
 
@@ -91,3 +92,20 @@ def test_a_homography_filters_the_pairs_when_asked():
     plain = ImageVerifier(ImageVerificationConfig()).verify(room.view(at(0.0), 0), room.view(at(0.3, 0.2), 1))
     filtered = ImageVerifier(config).verify(room.view(at(0.0), 0), room.view(at(0.3, 0.2), 1))
     assert filtered.matches < plain.matches
+
+
+def test_frames_that_were_aligned_by_hand_are_registered_by_their_surfaces(desk_log):
+    log = open_source(desk_log)
+    i, j = (log.entry_at(index) for index in (0, 20))
+    T_i_j = inverse(log.truth.at(i.stamp_ns)) @ log.truth.at(j.stamp_ns)
+    by_hand = T_i_j @ exp(np.array([0.05, -0.08, 0.04]), np.array([0.15, 0.1, -0.12]))
+    found = verify_aligned(i.load(), j.load(), by_hand)
+    assert found.reason == ""
+    miss = discrepancy(found.T_i_j, np.eye(4), T_i_j)
+    assert miss.translation_m < 0.02
+    assert miss.rotation_rad < 0.01
+
+    elsewhere = T_i_j @ exp(np.array([0.0, 1.2, 0.0]), np.array([1.0, 0.5, 0.0]))
+    refused = verify_aligned(i.load(), j.load(), elsewhere)
+    assert refused.T_i_j is None
+    assert refused.reason.startswith(("gicp: ", "images: "))

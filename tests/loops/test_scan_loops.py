@@ -72,6 +72,19 @@ def worst_m(loops: Sequence[LoopClosure], truth: Sequence[Transform]) -> float:
     return max(discrepancy(loop.T_i_j, truth[loop.i], truth[loop.j]).translation_m for loop in loops)
 
 
+def test_scans_that_were_aligned_by_hand_are_registered_and_compared():
+    verifier = ScanVerifier(ScanVerificationConfig())
+    truth, views = drive(1, 0, 60, back=True)
+    i, j = verifier.describe(views[4]), verifier.describe(views[7])
+    T_i_j = inverse(truth[4]) @ truth[7]
+    by_hand = T_i_j @ exp(np.array([0.0, 0.0, 0.05]), np.array([1.0, -0.8, 0.1]))
+    found = verifier.verify_near(i, j, by_hand)
+    assert found.reason == ""
+    assert discrepancy(found.T_i_j, np.eye(4), T_i_j).translation_m < 0.15
+    across = T_i_j @ exp(np.array([0.0, 0.0, 1.5]), np.array([12.0, 9.0, 0.0]))
+    assert verifier.verify_near(i, j, across).T_i_j is None
+
+
 def test_a_lap_closes_on_its_beginning():
     truth, views = drive(1, 0, 180)
     detector = driven(truth, views)

@@ -105,6 +105,9 @@ class EditedPage(MapPage):
         for kind in ("keyDown", "keyUp"):
             self.call("Input.dispatchKeyEvent", type=kind, code="KeyZ", key="z", modifiers=2)
 
+    def value(self, name):
+        return self.run(f"document.querySelector('[data-map={name}]').value")
+
     def facts(self):
         return self.run("[...document.querySelectorAll('.facts')].map(e => e.textContent)")
 

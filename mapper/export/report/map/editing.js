@@ -3,9 +3,10 @@
 import { Color } from "three";
 import { Segments } from "mapper/lines";
 import { Markers } from "mapper/markers";
+import { Aligning } from "mapper/aligning";
 import { save } from "mapper/saving";
 
-const COLORS = { accept: "#5fc75f", reject: "#ff5a4d", erase: "#ff5a4d", keep: "#5a9bff", keepout: "#e69f00" };
+const COLORS = { accept: "#5fc75f", reject: "#ff5a4d", drop: "#ff5a4d", erase: "#ff5a4d", keep: "#5a9bff", keepout: "#e69f00" };
 const NUMBERS = { erase: "X0 Y0 Z0 X1 Y1 Z1", keep: "LOW HIGH", keepout: "X,Y X,Y X,Y …" };
 const CUBE = [0, 1, 3, 2].map((a, i, around) => [[a, around[(i + 1) % 4]], [a + 4, around[(i + 1) % 4] + 4], [a, a + 4]]).flat();
 const round = (value) => Number(value.toFixed(3));
@@ -27,7 +28,9 @@ export function conditionOf(kind, text) {
 
 /** The edits as the text of an edits file. */
 export function textOf(edits) {
-  return edits.map(({ kind, values }) => [`[[${kind}]]`, ...Object.entries(values).map(([name, value]) => `${name} = ${JSON.stringify(value)}`), ""].join("\n")).join("\n");
+  const dropped = edits.filter(({ kind }) => kind === "drop").map(({ values }) => values.node);
+  const tables = edits.filter(({ kind }) => kind !== "drop").map(({ kind, values }) => [`[[${kind}]]`, ...Object.entries(values).map(([name, value]) => `${name} = ${JSON.stringify(value)}`), ""].join("\n"));
+  return [...dropped.length ? [`drop = ${JSON.stringify(dropped)}\n`] : [], ...tables].join("\n");
 }
 
 export class Editing {
@@ -55,7 +58,7 @@ export class Editing {
   #loops() {
     const fields = ["edit-i", "edit-j"].map((name) => this.find(name));
     this.view.canvas.addEventListener("pick", ({ detail: { layers, frame, loop } }) => {
-      if (layers !== this.layers || this.isDrawing || frame?.node === null) return;
+      if (layers !== this.layers || this.isDrawing || this.aligning.isOn || frame?.node === null) return;
       if (loop) fields.forEach((field, k) => { field.value = loop["ij"[k]]; });
       else if (!fields[0].value || fields[1].value) fields.forEach((field, k) => { field.value = k ? "" : frame.node; });
       else fields[1].value = frame.node;
@@ -63,16 +66,23 @@ export class Editing {
     });
     for (const field of fields) field.addEventListener("input", () => this.#tellLoop());
     for (const kind of ["accept", "reject"]) this.find(`edit-${kind}`).addEventListener("click", () => {
-      const nodes = this.#pair(), wrong = nodes === null ? "want the numbers of two keyframes" : this.#misfit(kind, nodes);
+      const nodes = this.pair(), wrong = nodes === null ? "want the numbers of two keyframes" : this.#misfit(kind, nodes);
       if (wrong) this.tell(wrong);
-      else this.#add(kind, { nodes });
+      else this.#add(kind, { nodes, ...kind === "accept" ? this.aligning.motionOf(nodes) : {} });
+      this.aligning.end();
     });
+    this.find("edit-drop").addEventListener("click", () => {
+      const node = Number(fields[1].value || fields[0].value || NaN);
+      if (this.nodes.has(node)) this.#add("drop", { node }); else this.tell("want the number of a keyframe");
+    });
+    this.find("edit-align").hidden = !this.server;
+    this.aligning = new Aligning(this, this.find("edit-align"), this.find("edit-moved"), () => this.pair());
   }
 
   /** The two nodes in the fields; null if they are not two keyframes. */
-  #pair() {
+  pair() {
     const [i, j] = ["edit-i", "edit-j"].map((name) => this.find(name).value).map((text) => text ? Number(text) : null);
-    return i !== j && this.nodes.has(i) && this.nodes.has(j) ? [Math.min(i, j), Math.max(i, j)] : null;
+    return i !== j && this.nodes.has(i) && this.nodes.has(j) ? [i, j] : null;
   }
 
   #loopOf([a, b]) {
@@ -81,14 +91,14 @@ export class Editing {
   }
 
   #misfit(kind, nodes) {
-    const text = JSON.stringify(nodes), isHeld = this.#loopOf(nodes)?.verdict === "accepted";
-    if (this.edits.some(({ values }) => JSON.stringify(values.nodes) === text)) return "this loop is in the list already";
+    const isHeld = this.#loopOf(nodes)?.verdict === "accepted";
+    if (this.edits.some(({ values }) => values.nodes?.every((node) => nodes.includes(node)))) return "this loop is in the list already";
     if (kind === "accept" && isHeld) return "this loop holds already";
     return kind === "reject" && !isHeld ? "no loop holds between these" : "";
   }
 
   #tellLoop() {
-    const nodes = this.#pair(), loop = nodes && this.#loopOf(nodes);
+    const nodes = this.pair(), loop = nodes && this.#loopOf(nodes);
     this.tell(!nodes ? "" : !loop ? "no candidate: accepting adds it" : loop.verdict === "accepted" ? "this loop holds" : `refused: ${loop.reason}`);
   }
 
@@ -96,7 +106,7 @@ export class Editing {
     const { view } = this, kind = this.find("edit-kind"), field = this.find("edit-region"), draw = this.find("edit-draw");
     const press = (isOn) => {
       this.isDrawing = isOn;
-      view.navigation.orbit.enabled = !isOn;
+      view.navigation.isLeft = isOn;
       draw.setAttribute("aria-pressed", String(isOn));
       if (isOn) this.tell(kind.value === "erase" ? "drag over the floor" : "click on the corners");
     };
@@ -188,7 +198,8 @@ export class Editing {
     const { edits, server, isAsking } = this, count = edits.length;
     this.find("edits").replaceChildren(...edits.map(({ kind, values }) => {
       const item = document.createElement("li");
-      item.textContent = `${kind} ${Object.values(values).map((value) => JSON.stringify(value)).join(" ")}`;
+      const { node, nodes, translation_m, ...region } = values;
+      item.textContent = `${kind} ${node ?? nodes?.join(" – ") ?? JSON.stringify(Object.values(region)[0])}${translation_m ? ", aligned" : ""}`;
       return item;
     }));
     this.find("edit-undo").disabled = isAsking || (!count && !server);
@@ -209,9 +220,10 @@ export class Editing {
     view.draw("edits", shapes);
   }
 
-  #shapesOf({ kind, values: { nodes, box_m, polygon_m } }) {
+  #shapesOf({ kind, values: { node, nodes, box_m, polygon_m } }) {
     const { x, y, z } = this.layers.run.path;
     let ends = [];
+    if (node !== undefined) return [new Markers([x, y, z].map((axis) => axis[this.nodes.get(node)]), { color: new Color(COLORS.drop), size_px: 14, isSquare: true })];
     if (nodes) ends = nodes.map((node) => this.nodes.get(node)).flatMap((pose) => [x[pose], y[pose], z[pose]]);
     if (box_m) ends = CUBE.flat().flatMap((corner) => [0, 1, 2].map((axis) => box_m[corner >> axis & 1][axis]));
     if (polygon_m) ends = polygon_m.flatMap((corner, i) => [...corner, 0, ...polygon_m[(i + 1) % polygon_m.length], 0]);

@@ -3,7 +3,7 @@
 import { Box3, ColorManagement, Group, LinearSRGBColorSpace, PerspectiveCamera, Scene, Vector3, WebGLRenderer } from "three";
 import { Budget } from "mapper/budget";
 import { groundLines } from "mapper/ground";
-import { NEVER, POINTS_LAYER } from "mapper/points";
+import { NEVER, POINTS_LAYER, PointSet } from "mapper/points";
 import { Navigation } from "mapper/navigation";
 import { ratio } from "mapper/screen";
 import { frameAt, loopAt, pointAt, Screen } from "mapper/picking";
@@ -30,7 +30,7 @@ export class MapView {
     this.shading = new Shading();
     this.onRest = []; // called when all of it is drawn
     this.shown = layers.map(() => true);
-    this.state = { points: "cloud", coloring: "height", isBeside: false, cut_m: Infinity, kept_m: [-Infinity, Infinity], until: NEVER, size: 1, isShaded: true };
+    this.state = { points: "cloud", coloring: "height", isBeside: false, cut_m: Infinity, kept_m: [-Infinity, Infinity], until: NEVER, size: 1, isShaded: true, isAside: false };
     this.hidden = new Set();
     this.budget = new Budget();
     for (const one of layers) this.scene.add(one.group);
@@ -39,7 +39,7 @@ export class MapView {
     new ResizeObserver(() => this.resize()).observe(canvas.parentElement);
     this.resize();
     this.navigation.lookAt(this.box);
-    this.draw("ground", groundLines(this.box));
+    this.draw("ground", groundLines(this.box), { isOver: false });
     this.update({});
     requestAnimationFrame((now) => this.#tick(now));
   }
@@ -52,7 +52,7 @@ export class MapView {
     this.layers.forEach((one, run) => {
       one.group.visible = this.shown[run];
       for (const [id, set] of Object.entries(one.points)) {
-        set.object.visible = id === kind;
+        set.object.visible = id === kind && !this.state.isAside;
         set.hide(this.state);
         if (isRepainted && id === kind) set.paint(coloring, range, { ramp: this.ramp, runColor: one.runColor });
       }
@@ -83,14 +83,14 @@ export class MapView {
     if (asked === this.askedLayers) this.canvas.setAttribute("aria-busy", "false");
   }
 
-  /** Draw lines and marks over every run, in place of those of the same name. */
-  draw(name, shapes) {
+  /** Draw lines and marks over every run, or points and lines below, in place of those of the same name. */
+  draw(name, shapes, { isOver = true } = {}) {
     this.drawn[name]?.group.removeFromParent();
     const group = new Group();
     for (const { object } of shapes) group.add(object);
     this.drawn[name] = { group, shapes };
-    if (name === "ground") group.renderOrder = -1;
-    (name === "ground" ? this.scene : this.tools).add(group);
+    if (!isOver) group.renderOrder = -1;
+    (isOver ? this.tools : this.scene).add(group);
     this.invalidate();
   }
 
@@ -234,7 +234,10 @@ export class MapView {
         for (const set of Object.values(one.points)) set.fit(camera, { pixels, scale: this.state.size, share });
         for (const segments of Object.values(one.segments)) this.#fit(segments, pane, pixels);
       });
-      for (const { shapes } of Object.values(this.drawn)) for (const shape of shapes) if (shape.uniforms) this.#fit(shape, pane, pixels);
+      for (const { shapes } of Object.values(this.drawn)) for (const shape of shapes) {
+        if (shape instanceof PointSet) shape.fit(camera, { pixels, scale: this.state.size, share: 1 });
+        else if (shape.uniforms) this.#fit(shape, pane, pixels);
+      }
       camera.layers.set(POINTS_LAYER);
       if (this.state.isShaded && !this.isCoarse) this.shading.render(renderer, this.scene, camera, pane);
       else renderer.render(this.scene, camera);

@@ -1,6 +1,6 @@
 // Moving the eye: orbit around a point, or fly; with the mouse, by touch and by keys.
 
-import { Vector3 } from "three";
+import { MOUSE, TOUCH, Vector3 } from "three";
 import { OrbitControls } from "three/OrbitControls";
 
 const FLYING = { KeyW: [0, 0, 1], KeyS: [0, 0, -1], KeyA: [-1, 0, 0], KeyD: [1, 0, 0], KeyE: [0, 1, 0], KeyQ: [0, -1, 0] };
@@ -58,6 +58,12 @@ export class Navigation {
     this.orbit.target.fromArray(target);
     this.orbit.update();
     this.onMove();
+  }
+
+  /** Whether dragging with the left button or one finger is someone else's. */
+  set isLeft(isLeft) {
+    this.orbit.mouseButtons.LEFT = isLeft ? null : MOUSE.ROTATE;
+    this.orbit.touches.ONE = isLeft ? null : TOUCH.ROTATE;
   }
 
   set flying(isFlying) {
