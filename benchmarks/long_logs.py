@@ -70,7 +70,7 @@ class Clock:
 
 
 class Meter(Observers):
-    """Prints a row for every so many frames that are tracked."""
+    """Prints a row at intervals of tracked frames."""
 
     def __init__(self, out: Path, frames: int) -> None:
         self._checkpoints, self._frames = partial_of(out) / files.CHECKPOINTS, frames
@@ -118,7 +118,7 @@ def size_of(folder: Path) -> int:
 
 
 def building(frames: int) -> Log:
-    """Return an RGB-D log through a building with so many rooms that none is seen twice."""
+    """Return an RGB-D log through a building with enough rooms that none is seen twice."""
     rooms = max(4, 2 * -(-frames // (2 * FRAMES_PER_ROOM)))
     config = SynthConfig(
         rooms=rooms, frame_rate_hz=10.0, width_px=320, height_px=240, texture_px_per_m=64, posters_per_room=6

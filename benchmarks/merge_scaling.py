@@ -42,7 +42,7 @@ from mapper.sources.base import Log
 from mapper.sources.trajectory_files import write_tum
 
 RUNS = 8
-SHARE = 1.4  # a run is so much longer than its step along the log: neighbours overlap
+SHARE = 1.4  # a run is longer by this ratio than its step along the log: neighbours overlap
 PEER_RUNS = 2
 
 

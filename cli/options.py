@@ -135,7 +135,7 @@ def merged(short_options: Sequence[str], overrides: Sequence[str] | None) -> lis
 
 
 def workers_for(processes: int | None, scheduler: str | None, *, default: int) -> "Workers":
-    """Return where jobs run: on so many processes of this machine, or on a scheduler's workers.
+    """Return where jobs run: on processes of this machine, or on a scheduler's workers.
 
     Raises:
         ConfigError: There are no processes, or both are given.

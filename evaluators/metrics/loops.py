@@ -16,7 +16,7 @@ from mapper.run.folder import Run
 MAX_ERROR_M, MAX_ERROR_RAD = 0.2, 0.1
 """A loop that is farther from the truth is wrong."""
 REVISIT_M, REVISIT_RAD, REVISIT_S = 0.5, np.deg2rad(20.0), 5.0
-"""A keyframe revisits a place if an earlier one was so near, turned so nearly alike, so long ago."""
+"""A keyframe revisits a place if an earlier one was within this distance and turn, and before this time."""
 
 
 def loop_metrics_of_run(run: Run, truth: Trajectory) -> list[Metric]:

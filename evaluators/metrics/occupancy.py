@@ -198,7 +198,7 @@ def _lattice(points_world: Points, resolution_m: float) -> Keys:
 
 
 def _near(keys: Keys, others: Keys, *, voxels: int) -> Mask:
-    """Return for each of (N, 3) keys whether another is at most so many steps away along each axis."""
+    """Return for each of (N, 3) keys whether another is at most a number of steps away along each axis."""
     if not len(others):
         return np.zeros(len(keys), np.bool_)
     steps, _ = cKDTree(others).query(keys, p=np.inf, distance_upper_bound=voxels + 0.5)

@@ -45,7 +45,7 @@ class PathErrors:
         rpe_rad: Root mean square error of the rotation over a step, likewise.
         drift_ratio: Mean error of the translation over a stretch of the path, as a share of its length. The
             stretches are a tenth to a half of the path (Geiger et al. 2012 take 100 to 800 m); None where
-            no two poses are so far apart.
+            no two poses are that distance apart.
     """
 
     ate_m: float | None = None

@@ -13,7 +13,7 @@ from mapper.evaluators.study.table import Column, Record, degrees, percent
 
 KITTI_LENGTHS_M = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
 EVERY_FRAMES = 10
-"""Each so many-th pose begins a segment: a second of KITTI's."""
+"""Distance in poses between the beginnings of segments: a second of KITTI's."""
 
 _SHORTER_LENGTHS = 4
 _LONGEST_SHARE = 0.5  # of the path: longer segments would all share its middle

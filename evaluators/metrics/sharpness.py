@@ -29,8 +29,8 @@ _MIN_NEIGHBOURS = 15
 _BREADTH_RATIO = 0.2
 """A patch's second variance against its largest: below, it is a line, for instance one LiDAR ring."""
 _SHEETS_APART, _SHEET_SHARE = 5.0, 0.2
-"""Two sheets are so many of their spreads apart, and hold so many of the points: of one sheet with normal
-noise the parts are 2.7 apart, of an evenly filled one 3.5."""
+"""Two sheets are this multiple of their spread apart, and hold this share of the points: of one sheet with
+normal noise the parts are 2.7 apart, of an evenly filled one 3.5."""
 _LEAST_VARIANCE_M2 = 1e-12
 
 

@@ -13,7 +13,7 @@ from mapper.core.trajectory import Trajectory
 from mapper.run.frame_outcomes import FrameRecord, stamps_of
 
 WRONG_M, WRONG_RAD, WRONG_SIGMAS = 0.2, float(np.deg2rad(5.0)), 5.0
-"""A relative pose is wrong if it is farther off than either, and than so many of its standard deviations."""
+"""A relative pose is wrong if it is farther off than either, and than this many sigmas."""
 RIGHT_M, RIGHT_RAD = 0.25 * WRONG_M, 0.25 * WRONG_RAD
 """A frame is right if it is no farther off than this, seen from the nearest frame that is not doubtful."""
 _WINDOW_NS = NS_PER_S

@@ -31,7 +31,7 @@ EXTRINSIC_M, EXTRINSIC_DEG = 0.5, 2.5
 """RELLIS-3D's extrinsic calibration is itself good to about 0.1 m and 1° only."""
 SCANS_PER_LOG = 4
 MAP_SCANS = 20
-"""The map is made of so many scans before the one that is left out, and as many after it."""
+"""Number of scans before the one that is left out, and after it, of which the map is made."""
 MAP_VOXEL_M = 0.02
 """The map has one point in each voxel: MPD cannot fall much below half of its edge."""
 
@@ -318,7 +318,7 @@ def perturbed(
     *,
     offset_m: float,
 ) -> tuple[Scan, Transform]:
-    """Return a scan in a frame of any yaw, at most so far from the target, and that frame's pose."""
+    """Return a scan in a frame of any yaw, at most a distance from the target, and that frame's pose."""
     yaw, bearing = rng.uniform(-np.pi, np.pi, 2)
     reach_m = offset_m * np.sqrt(rng.random())
     c, s = np.cos(yaw), np.sin(yaw)

@@ -179,7 +179,7 @@ class Cut:
         return f"{self.first} … {'end' if self.last is None else self.last}"
 
     def overrides(self, most: int | None = None) -> list[str]:
-        """Return the settings that choose these frames; a paper may itself use so many frames at most."""
+        """Return the settings that choose these frames; a paper may itself limit the number of frames."""
         ends = [] if self.last is None else [self.last]
         if most is not None:
             ends.append(most - 1)

@@ -134,7 +134,7 @@ def _errors(
 
 
 def _iterations(count: str) -> Setting:
-    """Return ISVD with so many iterations: even the first plain fit is accepted.
+    """Return ISVD with a number of iterations: even the first plain fit is accepted.
 
     Too few pairs end the iterations in every row, as alg. 7, line 19 has it; without that the error rises
     after the 9th, which none of the thesis's logs shows. "Auto" ends by the smallest threshold as well.

@@ -12,7 +12,7 @@ from mapper.core.geometry import Array
 from mapper.sources.base import FrameRef, Log
 
 _WORST = 100
-"""One in so many pixels is among the worst 1 %."""
+"""One in this number of pixels is among the worst 1 %."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -188,7 +188,7 @@ def _check_distance(source: Log, shown_m: float, distance_m: float) -> None:
 
 
 _BLOCKS = 5
-"""A tile is so many blocks wide and high; what moves whole blocks is shape, not noise."""
+"""Width and height of a tile in blocks; what moves whole blocks is shape, not noise."""
 _MIN_TILE_MEASURED_RATIO = 0.95
 _MAX_SHAPE_RATIO = 0.6
 _MAX_SHAPE_STEPS = 0.5
@@ -211,7 +211,7 @@ def depth_of_planes(
     Args:
         source: RGB-D log.
         patch: Part of the image that is used; None is all.
-        most_frames: About so many, evenly chosen, are enough; None takes all.
+        most_frames: Approximate number of frames, evenly chosen; None takes all.
         progress: Receives stages, counts and notes.
 
     Returns:

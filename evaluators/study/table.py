@@ -87,7 +87,7 @@ class Table:
 
 
 def decimals(count: int, *, times: float = 1.0) -> Callable[[float], str]:
-    """Return what shows a number, in another unit if it is multiplied, with so many decimals."""
+    """Return what shows a number, in another unit if it is multiplied, with a number of decimals."""
     return lambda value: f"{times * value:.{count}f}"
 
 

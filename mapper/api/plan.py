@@ -38,7 +38,7 @@ def plan(
 
     Raises:
         PlanError: There is no such path.
-        DataError: A point is not of so many numbers.
+        DataError: A point has another number of coordinates.
         ConfigError: A setting is unknown or has no such value.
         RunError: The folder is no map.
     """

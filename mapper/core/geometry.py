@@ -265,5 +265,5 @@ def _is_rigid_rows(rows: list[list[float]], tolerance: float) -> bool:
 
 
 def stride_for(count: int, most: int) -> int:
-    """Return the smallest step, from the first row on, at which at most so many of the rows are taken."""
+    """Return the smallest step, from the first row on, at which at most ``most`` of the rows are taken."""
     return max(1, -(-count // most))

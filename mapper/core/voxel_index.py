@@ -36,7 +36,7 @@ class VoxelIndex(NamedTuple):
 
 
 def voxel_index(capacity: int, keys: NDArray[np.int64] | None = None) -> VoxelIndex:
-    """Return an index with room for so many keys, of which (N,) distinct ones get the rows 0 … N − 1."""
+    """Return an index with room for a number of keys, of which (N,) distinct ones get the rows 0 … N − 1."""
     rows = np.full(1 << (2 * capacity - 1).bit_length(), VACANT, np.int32)
     index = VoxelIndex(rows, np.empty(capacity, np.int64))
     if keys is not None:

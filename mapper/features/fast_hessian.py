@@ -142,7 +142,7 @@ def _mixed_difference(
 
 @njit(cache=True, nogil=True)
 def _scaled(ninths: int, lobe: int) -> int:
-    """Return the nearest pixel to so many ninths of a filter of three lobes; never half-way."""
+    """Return the nearest pixel to a number of ninths of a filter of three lobes; never half-way."""
     return (2 * ninths * lobe + 3) // 6
 
 

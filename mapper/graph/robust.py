@@ -35,7 +35,7 @@ _DRIFT_SLACK = 3.0
 _UNUSED_LOOP_RATIO = 4.0
 """Factor on the limit of an unused loop: the path has not been optimised with it."""
 _CLUSTER_NODES = 10
-"""Loops whose ends are at most so many nodes apart, in the order of ids, form a cluster, tried as one."""
+"""Loops whose ends are at most this far apart, in nodes by order of id, form a cluster, tried as one."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

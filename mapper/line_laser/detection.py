@@ -102,7 +102,7 @@ def stripe_rows(response: Response, *, join_px: int) -> Array:
 
     Args:
         response: (H, W), 0 where a method saw nothing.
-        join_px: Pixels of one column with at most so many others in between are one run; the sum of its
+        join_px: Pixels of one column with at most this number of others between are one run; the sum of its
             responses is its strength. Of a stripe that is burnt in, edges and colour leave the rims only.
     """
     height, width = response.shape

@@ -88,7 +88,7 @@ def find_shared_places(
     Args:
         runs: Their places, each in its own world; one run may have none.
         config: Settings by which places are proposed and verified.
-        searched: So many of the first runs are not searched in each other: what they share is known.
+        searched: This number of the first runs are not searched in each other: what they share is known.
         workers: Workers that verify pairs, a job for any two runs.
         progress: Receives how many runs are searched, and how many pairs of runs verified.
 

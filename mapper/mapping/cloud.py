@@ -160,7 +160,7 @@ def _fill_means(keys, offsets, counts, voxel_m, points, colors):  # type: ignore
 
 
 def thinned_to_view(points: NDArray[Real], colors: Colors) -> tuple[NDArray[Real], Colors]:
-    """Return every n-th of (N, 3) points and their colours, so few that a viewer or a picture shows them."""
+    """Return every n-th of (N, 3) points and their colours, few enough for a viewer or a picture."""
     step = stride_for(len(points), MOST_TO_VIEW)
     return points[::step], colors[::step]
 

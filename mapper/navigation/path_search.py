@@ -132,7 +132,7 @@ def _search(
 
 @njit(cache=True, nogil=True)
 def _octile(a: int, b: int, c: int) -> float:
-    """Return the length of a shortest path over so many cells along each axis without obstacles."""
+    """Return the length of a shortest path over this many cells along each axis without obstacles."""
     longest, shortest = max(a, b, c), min(a, b, c)
     middle = a + b + c - longest - shortest
     return float(DIAGONAL * shortest + _ROOT_2 * (middle - shortest) + (longest - middle))

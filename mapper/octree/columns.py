@@ -118,11 +118,11 @@ def columns_of(
     Args:
         voxels: (N,) from ``occupied_voxels``, those of all parts of the map; they are sorted in place.
         extent: Extent of all parts, from ``block_extent``.
-        margin: So many columns are added around it.
+        margin: Number of columns added around it.
         resolution_m: Edge of a voxel.
 
     Raises:
-        MapSizeError: The floor of so many columns would not fit into memory.
+        MapSizeError: The floor of all columns would not fit into memory.
     """
     first, last = np.maximum(extent[0] - margin, 0), np.minimum(extent[1] + margin, KEY_COUNT)
     width, height = (int(n) for n in last - first)

@@ -8,6 +8,6 @@ from mapper.odometry.scans.config import ScanOdometryConfig
 def is_far(
     T_keyframe_body: Transform, config: WheelsOdometryConfig | GivenOdometryConfig | ScanOdometryConfig
 ) -> bool:
-    """Return whether the body is so far from the last keyframe, or turned so much, as to need another."""
+    """Return whether the body's distance or turn from the last keyframe asks for another."""
     distance_m, angle_rad = length_and_angle(T_keyframe_body)
     return distance_m >= config.keyframe_distance_m or angle_rad >= config.keyframe_angle_rad

@@ -4,7 +4,7 @@ from mapper.core.errors import ConfigError
 
 
 class SharpestKeyframes:
-    """Selector of the sharpest frame, the one with most features, of each run of so many frames."""
+    """Selector of the sharpest frame, the one with most features, of each run of frames."""
 
     def __init__(self, interval: int) -> None:
         """Start before the first frame.

@@ -222,7 +222,7 @@ def _carried(information: Array, T_j_k: Transform) -> Array:
 
 
 def _spread(frames: list[FrameResult], count: int) -> list[FrameResult]:
-    """Return so many of the frames and at least two, evenly spread from the first to the last."""
+    """Return this number of the frames, at least two, evenly spread from the first to the last."""
     indices = np.linspace(0, len(frames) - 1, max(min(count, len(frames)), min(2, len(frames))))
     return [frames[index] for index in np.unique(indices.round().astype(int)).tolist()]
 

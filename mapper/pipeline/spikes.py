@@ -23,7 +23,7 @@ acceleration a, what has returned after a time t went at most a·t²/8 aside."""
 class _Spike(NamedTuple):
     """Frames first … last of a path.
 
-    ``size`` is their step off it, in what would be much; the sigmas are that step, for rotation and
+    ``size`` is their step off it, as a multiple of the limit; the sigmas are that step, for rotation and
     translation.
     """
 

@@ -38,8 +38,8 @@ def correlate(
         reach_m: Largest translation along x and along y.
         cell_m: Edge of a cell.
         peaks: Largest number of motions.
-        apart_m: Two motions differ by so much, or
-        apart_rad: in heading by so much.
+        apart_m: Two motions differ by this distance, or
+        apart_rad: by this angle in heading.
 
     Returns:
         Support, 0 … 1, and the (4, 4) motion T_target_source.

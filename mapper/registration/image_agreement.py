@@ -16,8 +16,8 @@ _ROWS = 120
 """Rows of the pixels that are compared."""
 _MIN_DEPTH_M = 0.2
 _SIGMAS, _SHARE, _LEAST_M = 3.0, 0.06, 0.03
-"""Depths are the same within so many of their standard deviations, this share of the depth, which an error of
-the motion by a degree gives at grazing incidence, and this distance."""
+"""Depths are the same within this multiple of their sigma, this share of the depth, which an error
+of the motion by a degree gives at grazing incidence, and this distance."""
 _BLUR = 0.5
 """Standard deviation of the blur, in pixels of the image with the coarser view."""
 _LOCAL, _NOISE_LEVELS = 0.05, 2.0
@@ -99,7 +99,7 @@ def image_agreement(i: RgbdFrame, j: RgbdFrame, T_j_i: Transform) -> ImageAgreem
 
 
 def _blurred(grey: Image, zoom: float) -> Image:
-    """Return an image as another one shows it whose pixels are so many times as large."""
+    """Return an image as another one of larger pixels shows it."""
     return grey if zoom <= 1.0 else np.asarray(cv2.GaussianBlur(grey, (0, 0), _BLUR * zoom), np.uint8)
 
 

@@ -193,7 +193,7 @@ def _heights_cost(patches: Patches, up: Array, tolerance_m: float) -> Array:
 
 
 def least_support(patches: int) -> int:
-    """Return the fewest level patches, of so many, that make a surface rather than a coincidence."""
+    """Return the fewest level patches, of all patches, that make a surface rather than a coincidence."""
     return max(_MIN_LEVEL_PATCHES, int(_MIN_SUPPORT_RATIO * patches))
 
 

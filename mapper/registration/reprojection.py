@@ -302,7 +302,7 @@ def residual_statistics(
     """Return the statistics of a pose's residuals.
 
     The design effect is the cluster-robust covariance of the scores (Liang & Zeger 1986, eq. 8) relative to
-    that of independent ones: one number for all directions, as so few cells do not determine a matrix.
+    that of independent ones: one number for all directions, as a few cells do not determine a matrix.
 
     Args:
         T_camera_world: (4, 4) at the least squares.

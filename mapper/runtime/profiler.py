@@ -17,7 +17,7 @@ from mapper.runtime.progress import Progress, Report
 
 _PERIOD_S = 0.01
 _MOST_SAMPLES = 200_000
-"""The period doubles each time so many more are kept: 30 MB."""
+"""The period doubles each time this number more are kept: 30 MB."""
 _SCHEMA = "https://www.speedscope.app/file-format-schema.json"
 _WAITING = ("threading.py", "queue.py", "concurrent/futures/thread.py", "concurrent/futures/_base.py")
 """Files whose functions wait for other threads when they are innermost."""

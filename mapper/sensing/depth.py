@@ -14,7 +14,7 @@ from mapper.sensing.config import DepthNoiseConfig
 
 _FARTHEST_M = 100.0
 _FREE_SIGMAS = 2.0
-"""A noisy return frees space up to so many standard deviations before it."""
+"""A noisy return frees space up to this number of standard deviations before it."""
 
 
 def dif(depth_m: DepthImage) -> DepthImage:

@@ -89,7 +89,7 @@ def _whole_normals(rng: np.random.Generator, shape: tuple[int, ...], *, sigma: f
 
 
 def _warped(depth_m: DepthImage, warp_px: Field32) -> DepthImage:
-    """Return depths whose disparities are wrong by so much (Herrera et al. 2012, eq. 5)."""
+    """Return depths whose disparities are wrong by these errors (Herrera et al. 2012, eq. 5)."""
     inverse_m = 1.0 / np.maximum(depth_m, _TINY_M) + warp_px / np.float32(BASELINE_M * DISPARITY_FOCAL_PX)
     return np.asarray(1.0 / np.maximum(inverse_m, _TINY_M), dtype=np.float32)
 

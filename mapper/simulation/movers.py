@@ -116,7 +116,7 @@ class Movers:
         return len(self.still)
 
     def boxes_at(self, time_s: float) -> Boxes:
-        """Return the boxes where they are so many seconds after the start."""
+        """Return the boxes at a time in seconds after the start."""
         parameter, along_m = _lengths(self.route)
         here_m = np.mod(self.starts_m + self.speeds_mps * time_s, along_m[-1])
         xy = closed_spline(self.route, np.interp(here_m, along_m, parameter))

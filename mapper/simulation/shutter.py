@@ -79,7 +79,7 @@ class Shutter:
         camera: The ideal camera.
         sensor: Its exposure, its readout, its lens and the delay of its depth.
         motion: Its pose at any time.
-        scene_at: Returns the world so many seconds after the start.
+        scene_at: Returns the world at a time in seconds after the start.
     """
 
     def __init__(

@@ -45,7 +45,7 @@ _COLOUR_PNG = (
 )
 _DEPTH_PNG = (cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_SUB)
 _GOOD_JPG = (cv2.IMWRITE_JPEG_QUALITY, 92)
-_IMU_AFTER_S = 0.5  # readings go on for so long after the last stamp, beyond the last sweep
+_IMU_AFTER_S = 0.5  # readings go on for this time after the last stamp, beyond the last sweep
 
 
 def camera_of(config: SynthConfig) -> PinholeCamera:

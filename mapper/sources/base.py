@@ -234,7 +234,7 @@ class Log:
         return self.entry_at(int(np.searchsorted(self.stamps_ns, stamp_ns)))
 
     def spread_entries(self, most: int) -> Iterator[FrameRef]:
-        """Yield the entries of at most so many frames, evenly spread over the log."""
+        """Yield the entries of at most ``most`` frames, evenly spread over the log."""
         indices = np.unique(np.linspace(0, len(self) - 1, min(most, len(self))).round().astype(int))
         return map(self.entry_at, indices.tolist())
 

@@ -66,7 +66,7 @@ class ReadingChecks:
             self._readings[index] = reading
 
     def repeated(self, what: _Repeating, *, fewest: int) -> list[range]:
-        """Return the runs of so many frames or more, or of a second and more, with the same data.
+        """Return the runs of a number of frames or more, or of a second and more, with the same data.
 
         A frame that was not loaded, or could not be, counts as those around it.
         """

@@ -14,7 +14,7 @@ _LOOKED_AT, _LOOKED_AT_AT_FIRST = 6, 3
 """Scans, spread over the log; where the middle of what the first of them show stays, no others are read."""
 _DIRECTION_RAD = np.radians(1.0)
 _BEHIND_RATIO, _BEHIND_M = 1.3, 0.3
-"""A point is behind another in its direction if it is so much farther; neighbours on a wall are not."""
+"""A point is behind another in its direction if it is farther by this ratio; neighbours on a wall are not."""
 _MOST_BEHIND = 0.1
 """Share of the points behind others as seen from their origin: up to 0.07 among trees; where the sensor is
 metres off the origin 0.1 to 0.4 in streets and rooms, less in fields, tunnels and thin clouds."""
@@ -23,7 +23,7 @@ _FEWER_BEHIND = 1.5
 1.3, in a map that begins at the sensor 1.4 to 30, where the sensor is metres off."""
 _MOVED_M = 0.5
 _STAYED_SHARE = 0.2
-"""Scans lie in a map if surfaces move by less than so much of the way of the scans' middle."""
+"""Scans lie in a map if surfaces move by less than this share of the way of the scans' middle."""
 _VOXEL_M, _PAIR_DISTANCES_M = 0.3, (1.0, 0.5)
 
 

@@ -36,7 +36,7 @@ class _Scale:
         cell_m: Edge of the cells that returns are counted in.
         vehicle_m: The vehicle is within this distance.
         around_m: Returns up to here are used to distinguish walls that stand beside it.
-        ground_m: Returns up to so far above the ground are the ground's; None where up is not known.
+        ground_m: Height up to which returns are the ground's; None where up is not known.
     """
 
     cell_m: float

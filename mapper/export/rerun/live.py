@@ -29,7 +29,7 @@ from mapper.sources.base import Log
 
 _LIVE = "world/live"
 _BODY = f"{_LIVE}/body"
-_GROWTH = 0.02  # a path is logged anew once it has grown by so much: all of it, so in all 50 times its length
+_GROWTH = 0.02  # a path is logged anew once it has grown by this share: so in all 50 times its length
 _LOGGED_DIAGNOSTICS = ("features", "matches", "inliers", "residual")
 _UPRIGHT: dict[Sensor, Transform] = {
     # x right, y down, z forward, held level, becomes x right, y forward, z up.

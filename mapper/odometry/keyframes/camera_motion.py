@@ -12,7 +12,7 @@ from mapper.odometry.keyframes.pose_tracker import refined
 from mapper.registration.reprojection import classify
 
 _ENOUGH_ESTABLISHED = 30
-"""So many landmarks decide which motion is the camera's."""
+"""Landmarks that decide which motion is the camera's."""
 _LEAST_OBSERVERS, _MOST_OBSERVERS = 2, 6
 """Keyframes that observe an established landmark, and from how many on all count alike."""
 _MIN_KEPT_RATIO = 0.5

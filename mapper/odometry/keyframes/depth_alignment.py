@@ -27,7 +27,7 @@ from mapper.sensing.config import KINECT_NOISE, DepthNoiseConfig
 
 _GATES_M = (0.3, 0.1, 0.04)
 _EVERY = (4, 4, 1)
-"""One point in so many is used with each of these gates."""
+"""One point in this number is used with each of these gates."""
 _ITERATIONS = 8
 _MIN_POINTS = 300
 _MIN_SHARE, _NOISE_SHARES = 0.004, 2.5

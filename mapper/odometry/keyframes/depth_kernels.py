@@ -176,7 +176,7 @@ def descend(  # type: ignore[no-untyped-def]
         cell_px: Edge of their cells.
         kept: (6, 6) projection of tangents to the motions that planes may decide.
         gates_m: (G,) largest distances from a plane, from coarse to fine.
-        every: (G,) with each of these, one point in so many is used.
+        every: (G,) with each of these, one point in this number is used.
         iterations: Largest number of steps at each of these.
         landmarks: (L, 3) world.
         measured: (L, 3) u, v, bf/z.

@@ -30,9 +30,9 @@ _MAX_CONTRADICTING_RATIO = 0.3
 _SPEED_SIGMA = 0.5
 """Metres and radians per second by which a predicted motion may err: one sigma for a camera in a hand."""
 _SURE_S = 0.1
-"""So long a prediction is trusted: it errs by 5 cm."""
+"""Time for which a prediction is trusted: it errs by 5 cm."""
 _MAX_UNOBSERVED_S = 2.0
-"""After so long on a prediction in any direction a frame is lost."""
+"""After this time on a prediction in any direction a frame is lost."""
 _MAX_GAP_S = 0.5
 """After a longer gap without frames another corner may be in view that looks alike."""
 _LEAST_ELAPSED_S = 0.01

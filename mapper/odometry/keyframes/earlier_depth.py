@@ -21,7 +21,7 @@ from mapper.sensing.config import KINECT_NOISE, DepthNoiseConfig
 _APART_S, _MOST = 0.4, 6
 """Time between the keyframes that are compared: someone who walks moves on by his own width in it."""
 _MARGIN_M, _MARGIN_SIGMAS, _MARGIN_RATIO = 0.1, 4.0, 0.02
-"""What has moved stands so far in front of a surface: more than the errors of poses, noise and scale."""
+"""What has moved stands this far in front of a surface: more than the errors of poses, noise and scale."""
 _MOST_MOVED_RATIO = 0.6
 """When more has moved it was the camera, and the pose is wrong."""
 _SAME_M, _SAME_SIGMAS, _SAME_RATIO = 0.02, 3.0, 0.01

@@ -1,4 +1,4 @@
-"""Doubts of RGB-D frames: what speaks against a tracked pose, measured against what is usual in this log."""
+"""Doubts of RGB-D frames: tests of a tracked pose against the medians of this log."""
 
 import math
 from dataclasses import dataclass
@@ -89,7 +89,7 @@ class FrameDoubts:
         shown_s = 1e-9 * (stamp_ns - self._shown_since_ns)
 
         doubts = list(tracked_pose.doubts)
-        if tracked_pose.depth is not None:  # landmarks were few, so what is usual of them says nothing
+        if tracked_pose.depth is not None:  # landmarks were few, so the medians of their figures say nothing
             return Assessment(tuple(doubts), sigma_rad, sigma_m) if doubts else UNDOUBTED
         usual_m, usual_agreement = self._median("sigma_m"), self._median("agreement")
         agreement = tracked_pose.agreement

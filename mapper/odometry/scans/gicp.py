@@ -6,7 +6,7 @@ from mapper.odometry.scans.scan_matcher import DeskewedScan, Reach
 from mapper.registration.gaussian_cells import GaussianCells
 
 _MAP_KEYFRAMES = 100
-"""Cells that so many keyframes in a row have not touched are removed, so that the map stays local."""
+"""Cells that this number of keyframes in a row have not touched are removed, so that the map stays local."""
 _STEP_CELLS = 0.01  # shorter steps end the refinement: they are below a scan's noise
 _STEP_RAD = 0.002
 

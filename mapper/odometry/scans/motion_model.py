@@ -11,7 +11,7 @@ from mapper.core.timebase import NS_PER_S
 from mapper.odometry.motion_prior import MotionPrior
 
 _MIN_ELAPSED_S = 0.005  # over less, an error of millimetres becomes a large velocity
-_ERRORS, _FEWEST_ERRORS = 50, 5  # of recent predictions: of so many the median is taken, of fewer none
+_ERRORS, _FEWEST_ERRORS = 50, 5  # of predictions' errors: the newest in the median, and fewest for one
 _MEDIAN_LENGTH = 1.538  # of a vector of three independent normal errors, in standard deviations
 _LEAST_M, _LEAST_RAD, _LEAST_SHARE = 2e-3, 1e-3, 0.02
 _WHEELS_SHARE = 0.05  # of the way and of the turn, as graph.wheels has it

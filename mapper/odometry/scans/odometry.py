@@ -35,13 +35,14 @@ _DISPLACED = 0.5
 
 
 class ScanOdometry(FrameOdometry[ScanObservation]):
-    """Odometry by constant-velocity prediction, a scan matcher, and acceptance by what is usual in this log.
+    """Odometry by constant-velocity prediction, a scan matcher, and acceptance by this log's medians.
 
     A pose is compared with the last keyframe: the share of the points that have a partner there, the share
     that agrees in the direction where the least does, the points in space that rays passed, and the jump from
-    the predicted pose. What is unusual is searched by other ways; what stays so is doubtful, and where next
-    to nothing agrees, lost. A doubtful scan does not enter the map; if it is far, it is a keyframe with an
-    inflated covariance, from which tracking goes on once another scan fits it and not the keyframe before.
+    the predicted pose. Where these differ from the log's medians, other hypotheses are tried; a pose that
+    still differs is doubtful, and where next to nothing agrees, lost. A doubtful scan does not enter the map;
+    if it is far, it is a keyframe with an inflated covariance, from which tracking goes on once another scan
+    fits it and not the keyframe before.
     Keyframes are the nodes, numbered from 0, each with a factor to an earlier one. Motions that the surfaces
     do not show are predicted, with a covariance that grows until they are seen again.
     """

@@ -13,7 +13,8 @@ _LEAST_OVERLAP_SPREAD = 0.04
 _LEAST_AGREEMENT_SPREAD = 0.06
 _MAX_CONTRADICTING, _TIMES_CONTRADICTING = 0.012, 4.0
 """Share of points in space that rays passed, none of them by a grazing ray: right poses have up to 0.007,
-wrong ones 0.013 to 0.03 and more. It may be so many times the usual one where people or traffic move."""
+wrong ones 0.013 to 0.03 and more. This multiple of the log's median is allowed where people or
+traffic move."""
 _OTHER_PLACE, _HARDLY = 0.1, 0.2
 
 

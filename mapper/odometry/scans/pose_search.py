@@ -300,7 +300,7 @@ def _best(candidates: Sequence[PoseCandidate]) -> PoseCandidate | None:
 
 
 def _surprise(candidate: PoseCandidate) -> float:
-    """Return the jump in units of what would be much, or of 1 m and 1 rad where that is unknown."""
+    """Return the jump in units of its limits, or of 1 m and 1 rad where that is unknown."""
     jump = candidate.jump
     if not np.isfinite(jump.limit_m):
         return jump.translation_m + jump.rotation_rad

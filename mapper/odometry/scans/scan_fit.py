@@ -19,7 +19,7 @@ _DIRECTION_RAD = 0.0175  # of the range images: one degree
 _MARGIN_M = 0.2
 _CHECKED_POINTS = 2000
 _GRAZING = 0.01  # least sine of the angle between a ray and a surface
-_PIXELS = 1.5  # a ray that is compared with a point is off by up to so many
+_PIXELS = 1.5  # a ray that is compared with a point is off by up to this number
 _LEAST_IN_SIGHT = 0.2  # of the points: fewer in sight tell nothing of the others
 _AT_EDGES = 5
 """Points of a planar scan that edges put where rays passed: of some hundreds, they would be a share."""

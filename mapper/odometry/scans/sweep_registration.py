@@ -18,10 +18,10 @@ from mapper.odometry.scans.scan_observation import ScanObservation
 
 _POINTS = 3000
 _FIT_ROUNDS = 10
-_WIDE_ROUNDS, _WIDE = 4, 3.0  # the first rounds take pairs so many times as far apart
+_WIDE_ROUNDS, _WIDE = 4, 3.0  # the first rounds take pairs this multiple of the distance apart
 _FEWEST_PAIRS = 60
 _KERNEL = 3.0  # Cauchy's, in median distances from the surfaces
-_ALIKE = 10.0  # points whose distances err alike: their surfaces' normals are fitted to so many neighbours
+_ALIKE = 10.0  # points whose distances err alike: neighbours to which a normal is fitted
 _RANGE_VOXELS = 16.0  # median distance of points, as chosen in surroundings.py
 _FITTED = 0.02  # of a voxel: displacement of the sweep's first points by the last step
 
@@ -64,7 +64,7 @@ class SweepRegistration:
     def register(self, observation: ScanObservation, path: KnownPath) -> PlacedScan | None:
         """Return where a scan fits best; None if next to nothing agrees with any pose.
 
-        Where the velocity may have changed so much that it displaces the points of the sweep, it is found
+        Where the velocity may have changed enough to displace the points of the sweep, it is found
         together with the pose; not before the errors of a few predictions are known, as two scans, each with
         a velocity of its own, fit under wrong ones, too. Nor where a gyroscope knows the rotation.
         """

@@ -38,7 +38,7 @@ MAX_CONTRADICTING_RATIO_OF_MANY = 0.03
 """The same where both scans have many centres, whose agreement is no chance: traffic may contradict more.
 Right answers had 0.023 and less, wrong ones 0.1 and more."""
 CONTRADICTION_WEIGHT = 5.0
-"""A motion's score is the share of obstacles that agree, less so many times the share that contradicts."""
+"""A motion's score is the share of obstacles that agree, less this multiple of the share that contradicts."""
 NEAR_SCORE = 0.3
 """Candidates are refined whose scores are this near to the best."""
 

@@ -128,7 +128,7 @@ def _courtyard(site: Site, route: Route, rng: np.random.Generator) -> None:
 def _scatter(
     site: Site, route: Route, rng: np.random.Generator, counts: Sequence[Count], *, margin_m: float
 ) -> None:
-    """Set things anywhere but on the way, up to so far outside of it."""
+    """Set things anywhere but on the way, up to a distance outside of it."""
     width, depth = (size + 2 * margin_m for size in route.size_m)
     free, taken = _free_points(route), np.empty((0, 2))
     for build, fewest, most in counts:

@@ -235,7 +235,7 @@ def heights_m(points_xy: Array, laps: Array) -> Array:
 
 
 def build_staircase(site: Site, *, storeys: int) -> None:
-    """Add the stairs of so many storeys, their railings, a door and a radiator on each, walls and roof."""
+    """Add the stairs of all storeys, their railings, a door and a radiator on each, walls and roof."""
     top_m = STOREY_M * (storeys + 1)
     length_m, width_m = 2.0 * _HALF_LENGTH_M, 2.0 * _HALF_WIDTH_M
 
@@ -271,5 +271,5 @@ def build_staircase(site: Site, *, storeys: int) -> None:
 
 
 def storeys_of(laps: float) -> int:
-    """Return how many storeys one needs to go round so often."""
+    """Return the number of storeys for a number of laps."""
     return math.ceil(laps) + 1

@@ -197,7 +197,7 @@ def _unpack(data: bytes, where: str, *, most_bytes: int) -> bytes:
 
 
 def _shape(metadata: _Metadata, pixels: int) -> tuple[int, int] | None:
-    """Return rows and columns of depth: stated, or those of so many pixels with the images' aspect ratio."""
+    """Return rows and columns of depth: stated, or those of a number of pixels with the images' aspect."""
     if metadata.dw and metadata.dh:
         return metadata.dh, metadata.dw
     columns = round((pixels * metadata.w / metadata.h) ** 0.5)

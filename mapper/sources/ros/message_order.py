@@ -19,7 +19,7 @@ _MAX_STRAY_NS = NS_PER_S
 """A stamp further from the median of itself and its neighbours is damaged: even where frames are lost."""
 _STOPPED_S = 1.0
 _MAX_OVERTAKEN = 4
-"""So many messages may follow one that they should have preceded; more say that the clock was set back."""
+"""Messages that may follow one they should have preceded; more say that the clock was set back."""
 
 
 def ordered(series: Series) -> tuple[_Indices, list[str]]:
