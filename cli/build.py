@@ -175,7 +175,7 @@ def built(
     config = load_config(config_file, overrides, sensor=source.sensor)
     progress = progress or output.progress()
     note_compilation(progress)
-    for note in source.notes:
+    for note in source.sentences:
         progress.note(note)
     preview = _preview(source, out, progress)
     with nullcontext(preview) if make_observer is None else make_observer(source, config) as observer:

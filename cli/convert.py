@@ -69,7 +69,7 @@ def convert(
     ending = f".{as_}" if as_ in _FILES else ""
     out = place_of(out, LOGS / f"{name_of(log)}{ending}")
     progress = output.progress()
-    for note in (*source.notes, *left_out(source, as_)):
+    for note in (*source.sentences, *left_out(source, as_)):
         progress.note(note)
     checks = ReadingChecks(source)
     with progress.stage("convert") as report:

@@ -49,6 +49,6 @@ def localise(
     base = finished.config.model_copy(update={"source": SourceConfig()})
     config = overridden(base, overrides, settings=settings)
     source = open_source(path, config.source)
-    for note in source.notes:
+    for note in source.sentences:
         receiver.note(note)
     return localise_log(source, finished, config, folder, progress=receiver, overwrite=overwrite)

@@ -22,6 +22,7 @@ Colors = NDArray[np.uint8]
 MOST_TO_VIEW = 5_000_000
 """Largest number of points of a cloud that is made to be looked at."""
 
+_ALL, _GREY = np.empty(0, np.bool_), 128
 _NO_INTENSITIES, _NO_SUMS = np.empty(0, np.float32), np.empty((0, 1), np.float32)
 _BATCH = 65_536  # points added at once: bounds the memory reserved ahead of need
 _LOWEST_LEVEL = 30.0  # of 255: where the palette of heights begins
@@ -30,7 +31,7 @@ _LOWEST_LEVEL = 30.0  # of 255: where the palette of heights begins
 class CloudBuilder:
     """Builder of a cloud whose points are the mean position, colour and intensity of those in each voxel.
 
-    Memory is about 60 bytes a voxel and does not depend on the number of points added: positions are summed
+    Memory is about 64 bytes a voxel and does not depend on the number of points added: positions are summed
     as offsets from the voxel's centre, for which single precision does.
     """
 
@@ -48,7 +49,7 @@ class CloudBuilder:
         self.voxel_m = voxel_m
         self._size = 0
         self._offsets = np.zeros((_BATCH, 3), np.float32)  # sums, in voxels
-        self._counts = np.zeros((_BATCH, 4), np.uint32)  # sums of red, green and blue, and number of points
+        self._counts = np.zeros((_BATCH, 5), np.uint32)  # sums of R, G and B; numbers of points and colours
         self._intensities: NDArray[np.float32] | None = None  # sums, where every point has one
         self._seen_s: list[tuple[int, float]] = []  # voxels that are new with a cloud, and its time
         self._index = voxel_index(_BATCH)
@@ -57,11 +58,17 @@ class CloudBuilder:
         """Return the number of voxels with a point."""
         return self._size
 
-    def add(self, cloud: Cloud, time_s: float = 0.0) -> None:
+    @property
+    def coloured_share(self) -> float:
+        """Share of the voxels with a point that has a colour."""
+        return float((self._counts[: self._size, 4] > 0).mean()) if self._size else 0.0
+
+    def add(self, cloud: Cloud, time_s: float = 0.0, *, has_color: NDArray[np.bool_] | None = None) -> None:
         """Add a cloud; intensities are kept where all clouds have them.
 
         Args:
             cloud: The cloud.
+            has_color: (N,) which of its points have a colour; None are all. Voxels without any are grey.
             time_s: When it was seen.
 
         Raises:
@@ -92,6 +99,7 @@ class CloudBuilder:
             self._size = _fold(
                 points_world[batch],
                 colors[batch],
+                _ALL if has_color is None else has_color[batch],
                 _NO_INTENSITIES if intensities is None else intensities[batch],
                 1.0 / self.voxel_m,
                 self._index,
@@ -125,7 +133,7 @@ class CloudBuilder:
 
 @njit(cache=True, nogil=True)
 def _fold(  # type: ignore[no-untyped-def]
-    points, colors, intensities, voxels_per_m, index, offsets, counts, intensity_sums, size
+    points, colors, has_color, intensities, voxels_per_m, index, offsets, counts, intensity_sums, size
 ):
     """Add each point to its voxel's sums; return the number of voxels."""
     last_key, voxel = np.int64(-1), np.int64(-1)
@@ -140,9 +148,11 @@ def _fold(  # type: ignore[no-untyped-def]
         offsets[voxel, 0] += x - np.floor(x) - 0.5
         offsets[voxel, 1] += y - np.floor(y) - 0.5
         offsets[voxel, 2] += z - np.floor(z) - 0.5
-        for channel in range(3):
-            counts[voxel, channel] += colors[i, channel]
         counts[voxel, 3] += 1
+        if len(has_color) == 0 or has_color[i]:
+            for channel in range(3):
+                counts[voxel, channel] += colors[i, channel]
+            counts[voxel, 4] += 1
         if len(intensity_sums):
             intensity_sums[voxel, 0] += intensities[i]
     return size
@@ -152,11 +162,11 @@ def _fold(  # type: ignore[no-untyped-def]
 def _fill_means(keys, offsets, counts, voxel_m, points, colors):  # type: ignore[no-untyped-def]
     """Fill in the mean position and colour of each voxel."""
     for row in range(len(points)):
-        count = float(counts[row, 3])
+        count, colored = float(counts[row, 3]), float(counts[row, 4])
         cell = cell_of(keys[row])
         for axis in range(3):
             points[row, axis] = (cell[axis] + 0.5 + offsets[row, axis] / count) * voxel_m
-            colors[row, axis] = np.rint(counts[row, axis] / count)
+            colors[row, axis] = np.rint(counts[row, axis] / colored) if colored else _GREY
 
 
 def thinned_to_view(points: NDArray[Real], colors: Colors) -> tuple[NDArray[Real], Colors]:

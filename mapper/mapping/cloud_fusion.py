@@ -3,11 +3,12 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.core.errors import FrameError
+from mapper.core.errors import FrameError, listed
 from mapper.core.frames import Cloud
 from mapper.core.timebase import NS_PER_S
 from mapper.core.trajectory import Trajectory
 from mapper.mapping.cloud import CloudBuilder, height_colors
+from mapper.mapping.colouring import ScanColouring
 from mapper.mapping.config import FuseSettings
 from mapper.mapping.placed_frames import PlacedFrame, placed_frames, within_reach
 from mapper.octree.casting import depth_limit_of
@@ -43,8 +44,10 @@ def fuse_clouds(
     frames = [frame for frame in placed_frames(source, trajectory) if frame.index % stride == 0]
     depth_limit, begin_ns = depth_limit_of(config.octree), int(trajectory.stamps_ns[0])
 
-    def read(frame: PlacedFrame) -> tuple[float, Cloud, NDArray[np.bool_]] | None:
-        """Return a frame's time, its returns and which of them moved; None if it cannot be read."""
+    colouring = ScanColouring(source.images, trajectory) if source.images else None
+
+    def read(frame: PlacedFrame) -> tuple[float, Cloud, NDArray[np.bool_], NDArray[np.bool_] | None] | None:
+        """Return a frame's time, returns, which moved and which have a colour (None: all); None if unread."""
         try:
             scan = frame.scan_of(frame.entry.load())
         except FrameError:
@@ -53,18 +56,26 @@ def fuse_clouds(
         if depth_limit is not None:
             scan, _ = depth_limit.split(scan)
         R, t = (part.astype(np.float32) for part in (frame.T_world_body[:3, :3], frame.T_world_body[:3, 3]))
-        points_world, colors = scan.points_body @ R.T + t, scan.colors
-        if colors is None:  # the sensor has no colour: heights are shown by it
+        points_world, colors, has_color = scan.points_body @ R.T + t, scan.colors, None
+        if colors is None and colouring is not None:
+            colors, has_color = colouring.colour(points_world, scan.stamp_ns)
+        elif colors is None:  # the sensor has no colour: heights are shown by it
             colors = height_colors(points_world[:, 2], between_m=_COLOURED_HEIGHTS_M)
         cloud = Cloud(points_world, colors, scan.intensities)
         moved = np.zeros(len(cloud), np.bool_) if objects is None else objects.returns_of(points_world)
-        return (frame.entry.stamp_ns - begin_ns) / NS_PER_S, cloud, moved
+        return (frame.entry.stamp_ns - begin_ns) / NS_PER_S, cloud, moved, has_color
 
     with progress.stage("cloud") as report:
         for done, returns in enumerate(ordered_map(read, frames, workers=config.workers), start=1):
             report(done, len(frames))
             if returns is not None:
-                time_s, cloud, moved = returns
-                still.add(cloud.select(~moved), time_s)
-                moving.add(cloud.select(moved), time_s)
+                time_s, cloud, moved, has_color = returns
+                for builder, kept in ((still, ~moved), (moving, moved)):
+                    coloured = None if has_color is None else has_color[kept]
+                    builder.add(cloud.select(kept), time_s, has_color=coloured)
+    if colouring is not None:
+        names = listed([images.name for images in source.images])
+        progress.note(
+            f"cloud: {still.coloured_share:.0%} of the points have a colour by {names}, others are grey"
+        )
     return still.cloud(), moving.cloud()

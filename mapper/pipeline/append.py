@@ -72,7 +72,7 @@ def append(
     wanted = parse_edits(edits, run.path)
     first = run.open_log()
     source = chained(first, second)
-    for note in source.notes:
+    for note in source.sentences:
         progress.note(note)
     warnings = noted_log_warnings(second, progress)
     whole = config.model_copy(update={"source": run.config.source})

@@ -220,7 +220,7 @@ def fuse_into(
             log_results(log, results)
             log_maps(log, maps, stamp_ns=int(results.trajectory.stamps_ns[0]))
             _write_maps(writer.folder, maps)
-            _write_pictures(writer, maps, results, has_colors=source.sensor == "rgbd")
+            _write_pictures(writer, maps, results, has_colors=source.has_colours)
     others = [warning for warning in writer.manifest.warnings if warning.kind != FLOOR]
     found = floor_warnings(config.traversable, config.octree.resolution_m, has_path=maps.has_path)
     writer.update(warnings=(*others, *found), edits=maps.edits)

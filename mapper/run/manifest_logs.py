@@ -82,8 +82,12 @@ class InputLog(Config):
     """Absolute path."""
     kind: str
     fingerprint: str
+    choices: tuple[str, ...] = ()
+    """Which of its topics and files were used, where that was chosen."""
     notes: tuple[str, ...] = ()
     """Notes: what was left out or assumed when the log was read, and what is suspicious in its frames."""
+    images: tuple[str, ...] = ()
+    """Names of the images beside a LiDAR, which colour the cloud."""
     robot: RobotFrames | None = None
     """None where the log does not say where its sensor is on a robot."""
 

@@ -162,6 +162,8 @@ def _facts(source: Log) -> dict[str, Any]:
         "path": str(source.path.resolve()),
         "kind": source.kind,
         "fingerprint": fingerprint(source.path),
+        "choices": tuple(source.choices),
         "notes": tuple(source.notes),
+        "images": tuple(images.name for images in source.images),
         "robot": RobotFrames.of(source),
     }

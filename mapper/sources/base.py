@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.errors import DataError, FrameError
-from mapper.core.frames import Frame, RgbdFrame, Scan, Sensor
+from mapper.core.frames import Frame, Image, PinholeCamera, RgbdFrame, Scan, Sensor
 from mapper.core.geometry import Array, Transform
 from mapper.core.timebase import Stamps
 from mapper.core.trajectory import Trajectory
@@ -136,6 +136,31 @@ class Accelerations:
     are_axes_stated: bool = False
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraImages:
+    """Images of a camera beside the sensor that is mapped.
+
+    Attributes:
+        name: Name of their topic or folder.
+        stamps_ns: (N,) int64 time of each image, nanoseconds, increasing.
+        camera: Camera of the images as ``image_at`` returns them.
+        T_body_camera: (4, 4) pose of the camera in the body.
+        image_at: Returns image 0 … N − 1, (H, W, 3) RGB or (H, W) grey; safe in any thread; raises
+            ``FrameError`` where it cannot be read.
+    """
+
+    name: str
+    stamps_ns: Stamps
+    camera: PinholeCamera
+    T_body_camera: Transform
+    image_at: Callable[[int], Image]
+
+    @property
+    def choice(self) -> str:
+        """What they are used for, in a sentence."""
+        return f"the cloud gets its colours from {self.name}"
+
+
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Log:
     """A recorded log: the same frames in time order, however often it is read.
@@ -152,6 +177,7 @@ class Log:
         accelerations: Accelerometer readings, if the log has them.
         gyroscope: Gyroscope readings, if the log has them.
         gnss: Fixes of a GNSS receiver, if the log has them.
+        images: Images of the cameras beside a LiDAR, which colour its cloud.
         T_base_body: Mounting of the body on the robot, whose base has x forward and z up (REP 103), if the
             log states it.
         base_frame: Name of the robot's base in the log.
@@ -159,6 +185,7 @@ class Log:
         wheels: T_odom_body by wheel odometry, in a frame of its own that drifts, if the log has it.
         depth_noise: Noise of its depth, if what made it states it.
         are_units_assumed: Nothing says how many units of its depth images a metre has.
+        choices: Sentences on which of its topics and files are used, where that was chosen.
         notes: Sentences on what opening it left out or assumed.
         sessions: The logs that a chained log is made of, oldest first; empty for any other.
     """
@@ -174,17 +201,29 @@ class Log:
     accelerations: Accelerations | None = None
     gyroscope: Gyroscope | None = None
     gnss: GnssFixes | None = None
+    images: Sequence[CameraImages] = ()
     T_base_body: Transform | None = None
     base_frame: str = ""
     body_frame: str = ""
     wheels: Trajectory | None = None
     depth_noise: DepthNoiseConfig | None = None
     are_units_assumed: bool = False
+    choices: Sequence[str] = ()
     notes: Sequence[str] = ()
     sessions: "Sequence[Session]" = ()
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
+
+    @property
+    def sentences(self) -> Sequence[str]:
+        """All that is reported when it is opened: choices and notes."""
+        return [*self.choices, *self.notes]
+
+    @property
+    def has_colours(self) -> bool:
+        """Whether points of the cloud have the colours of images."""
+        return self.sensor == "rgbd" or len(self.images) > 0
 
     def __enter__(self) -> Self:
         """Return the log itself: nothing stays open between its frames."""

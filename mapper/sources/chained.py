@@ -88,9 +88,11 @@ def chained(first: Log, second: Log, *, shift_ns: int | None = None) -> Log:
         entry_at=entry_at,
         truth=truth,
         gyroscope=_joined_gyroscope(logs),
+        images=[images for log in logs for images in log.images],
         T_base_body=logs[0].T_base_body,
         base_frame=logs[0].base_frame,
         body_frame=logs[0].body_frame,
+        choices=[f"{log.name}: {choice}" for log in logs for choice in log.choices],
         notes=notes,
         sessions=sessions,
     )
@@ -115,6 +117,7 @@ def _shifted(log: Log, shift_ns: int) -> Log:
         accelerations=_later(log.accelerations, shift_ns),
         gyroscope=_later(log.gyroscope, shift_ns),
         gnss=_later(log.gnss, shift_ns),
+        images=[replace(one, stamps_ns=one.stamps_ns + shift_ns) for one in log.images],
     )
 
 

@@ -193,7 +193,7 @@ def _inspected(
         gnss=None if source.gnss is None else timing_of(source.gnss.stamps_ns),
         gnss_status="" if source.gnss is None else source.gnss.status_text,
         gnss_sigma_m=None if source.gnss is None else source.gnss.median_sigma_m,
-        notes=[*source.notes, *damage, *checks.notes()],
+        notes=[*source.sentences, *damage, *checks.notes()],
         warnings=[*time_warnings(source), *depth_warnings(source), *scan_frame_warnings(source)],
         vehicle=vehicle_box(source),
     )

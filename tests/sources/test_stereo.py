@@ -90,7 +90,7 @@ def test_converted_log_has_the_same_depth(tmp_path):
 def test_rectified_topics_have_the_baseline_in_their_projections(tmp_path):
     log = open_source(write(tmp_path / "bag", recorded(RECTIFIED, RECT, projections=projections(0.12))))
     assert_shows_wall(log, poses_world(2))
-    assert RECT[1] in log.notes[0]
+    assert RECT[1] in log.choices[0]
 
 
 def test_raw_topics_are_rectified_by_their_calibrations(tmp_path):

@@ -44,7 +44,7 @@ def test_a_cameras_wheels_come_back(flat, tmp_path, name):
     mounted = SourceConfig(wheels=WheelsConfig(body_in_base=(1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)))
     if kind != "tum":  # the poses are the camera's own, and no mounting moves them
         assert_same_wheels(flat, open_source(tmp_path / name, mounted))
-        assert any(note.startswith("wheel odometry /wheel_odometry") for note in again.notes)
+        assert any(note.startswith("wheel odometry /wheel_odometry") for note in again.choices)
     config = load_config(None, ["odometry.kind=wheels", "loops.kind=none"])
     path, expected = (track_log(log, config, progress=SILENT).trajectory() for log in (again, flat))
     np.testing.assert_array_equal(path.stamps_ns, expected.stamps_ns)

@@ -26,10 +26,11 @@ from mapper.sources.image_files.reading import read_colour, read_grey
 from mapper.sources.image_folders.pairing import ImageList, pair_images
 from mapper.sources.image_folders.rgbd import FramePair, first_size, rgbd_log
 from mapper.sources.imu_files import read_euroc_imu
+from mapper.sources.kitti_calibration import read_matrix
 from mapper.sources.listed_files import within
 from mapper.sources.scan_stamps import Wording, in_order, scan_stamps
 from mapper.sources.stereo import StereoCamera, rectified_pair, rectify, refuse_settings
-from mapper.sources.text import parse_numbers, parse_stamp, pose_from_matrix, rows, time_order, truth_from
+from mapper.sources.text import parse_stamp, pose_from_matrix, rows, time_order, truth_from
 from mapper.sources.trajectory_files import read_kitti, read_tum
 
 _TRUTH = ("state_groundtruth_estimate0", "mocap0")
@@ -255,10 +256,7 @@ def _kitti_log(path: Path, config: SourceConfig) -> Log:
 
 
 def _projection(path: Path, name: str) -> Array:
-    for number, words in rows(path):
-        if words[0].rstrip(":") == name:
-            where = f"{path}:{number}"
-            if len(words) != 13:
-                raise SourceError(f"{where}: {len(words) - 1} numbers, want 12: a 3×4 projection")
-            return parse_numbers(words[1:], where=where).reshape(3, 4)
-    raise SourceError(f"{path}: no line {name}:, the projection of a camera")
+    projection = read_matrix(path, name, 3, 4)
+    if projection is None:
+        raise SourceError(f"{path}: no line {name}:, the projection of a camera")
+    return projection

@@ -4,10 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from mapper.core.errors import SourceError, listed
-from mapper.core.frames import NO_DISTORTION
+from mapper.core.errors import FrameError, SourceError, listed
+from mapper.core.frames import NO_DISTORTION, Image
 from mapper.core.geometry import Transform, angle_between, inverse
 from mapper.core.rotations import row_of_pose
+from mapper.sources.base import CameraImages
 from mapper.sources.calibration import (
     Calibration,
     DepthCamera,
@@ -16,12 +17,14 @@ from mapper.sources.calibration import (
     configured_depth_pose,
 )
 from mapper.sources.config import CameraConfig
-from mapper.sources.image_files.image_sizes import Size, is_same_view
+from mapper.sources.image_files.image_sizes import Size, is_same_view, recorded_camera
 from mapper.sources.lens import FISHEYE_MODELS, POLYNOMIAL_MODELS, Lens, lens_model
+from mapper.sources.ros.image_messages import image_of, size_of
 from mapper.sources.ros.index import Series
-from mapper.sources.ros.messages import CAMERAS, EXTRINSICS, CameraMessage, Window
+from mapper.sources.ros.message_order import ordered
+from mapper.sources.ros.messages import CAMERAS, EXTRINSICS, CameraMessage, ImageMessage, Window, frame_of
 from mapper.sources.ros.reader import RecordingReader
-from mapper.sources.ros.topics import CameraTopics, is_called_registered, shared_namespaces
+from mapper.sources.ros.topics import CameraTopics, ImageTopics, is_called_registered, shared_namespaces
 from mapper.sources.text import pose_from_numbers
 
 _SAME_LENS_RATIO = 0.01
@@ -68,6 +71,28 @@ def calibrate(
     if frames[0] != frames[1]:
         notes.append(f"depth in frame {frames[1]} is taken to be registered to colour in {frames[0]}")
     return calibration, notes
+
+
+def images_beside(reader: RecordingReader, topics: ImageTopics, *, body: str) -> CameraImages | str:
+    """Return the images of a camera beside a LiDAR; why there are none without its pose or calibration."""
+    images, name = topics.images, topics.images.topic.name
+    first, info = reader.firsts.get(name), _first_info(reader, topics.info)
+    T_body_camera = reader.tree.find(body, frame_of(first))
+    if not isinstance(first, ImageMessage) or info is None or T_body_camera is None:
+        return f"{name}: colours no points, as tf does not say where {frame_of(first)} is on {body}"
+    try:
+        size_px = size_of(first, where=name)
+        calibration = calibration_of(info, size_px, is_rectified="rect" in name, name=topics.info.topic.name)
+        recorded = recorded_camera(calibration, colour_px=size_px, depth_px=size_px, where=name)
+    except (SourceError, FrameError) as error:
+        return f"{name}: colours no points: {error}"
+    order, _ = ordered(images)
+
+    def image_at(index: int) -> Image:
+        located = reader.located(images, int(order[index]))
+        return recorded.image(image_of(located.image(), colour=True, where=f"{located}"), f"{located}")
+
+    return CameraImages(name, images.stamps_ns[order], recorded.camera, T_body_camera, image_at)
 
 
 def _colour_calibration(

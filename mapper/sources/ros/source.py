@@ -10,14 +10,14 @@ from mapper.core.frames import Sensor
 from mapper.core.timebase import NS_PER_S, Stamps
 from mapper.core.units import MM_PER_M
 from mapper.sensing.config import DepthNoiseConfig
-from mapper.sources.base import FrameRef, Log
+from mapper.sources.base import CameraImages, FrameRef, Log
 from mapper.sources.config import SourceConfig
 from mapper.sources.image_files.image_sizes import recorded_camera
 from mapper.sources.image_files.reading import TUM_UNITS_PER_M
 from mapper.sources.image_folders.pairing import depth_offset_ns
 from mapper.sources.laser_scan import MAX_TILT_RAD, rolling, tilt_rad
 from mapper.sources.point_times import counted_on, relative_times_s, time_field
-from mapper.sources.ros.cameras import calibrate
+from mapper.sources.ros.cameras import calibrate, images_beside
 from mapper.sources.ros.entries import CloudEntry, rgbd_entry, stereo_entry
 from mapper.sources.ros.frame_tree import is_fixed
 from mapper.sources.ros.image_messages import has_float_depth, size_of
@@ -99,6 +99,8 @@ def recording_log(reader: RecordingReader, config: SourceConfig) -> Log:
         wheels, still_notes = rolling(wheels)
         wheel_notes = [*wheel_notes, *still_notes]
     gnss, gnss_notes = reader.gnss(choice.gnss, body=frames.body)
+    beside = [images_beside(reader, camera, body=frames.body) for camera in choice.cameras]
+    images = [one for one in beside if isinstance(one, CameraImages)]
     return Log(
         path=recording.path,
         name=recording.path.resolve().stem,
@@ -110,11 +112,16 @@ def recording_log(reader: RecordingReader, config: SourceConfig) -> Log:
         accelerations=accelerations,
         gyroscope=gyroscope,
         gnss=gnss,
+        images=images,
         T_base_body=reader.mounting(frames.body),
         base_frame=reader.base_of(frames.body) or "",
         body_frame=frames.body,
         wheels=wheels,
         depth_noise=frames.depth_noise,
+        choices=[
+            *choice.choices,
+            *(one.choice if isinstance(one, CameraImages) else one for one in beside),
+        ],
         notes=[
             *choice.notes,
             *problems,
@@ -151,8 +158,16 @@ def _on_clock_of(main: Series, choice: Choice) -> tuple[Choice, list[str]]:
         frames = replace(frames, right=moved(frames.right))
     others = (choice.imu, choice.gyroscope, choice.gnss, choice.truth, choice.wheels)
     imu, gyroscope, gnss, truth, wheels = (one and moved(one) for one in others)
+    cameras = [replace(camera, images=moved(camera.images)) for camera in choice.cameras]
     followed = replace(
-        choice, frames=frames, imu=imu, gyroscope=gyroscope, gnss=gnss, truth=truth, wheels=wheels
+        choice,
+        frames=frames,
+        imu=imu,
+        gyroscope=gyroscope,
+        gnss=gnss,
+        truth=truth,
+        wheels=wheels,
+        cameras=cameras,
     )
     return followed, list(dict.fromkeys(notes))
 

@@ -82,6 +82,19 @@ class StereoTopics:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class ImageTopics:
+    """Topics of a camera beside a LiDAR.
+
+    Attributes:
+        images: Colour or grey images.
+        info: Their calibration.
+    """
+
+    images: Series
+    info: Series
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Choice:
     """Topics that are read.
 
@@ -92,7 +105,9 @@ class Choice:
         gnss: Fixes of a GNSS receiver, if there are any.
         truth: True poses, if there are any.
         wheels: Wheel odometry, if it was requested or is called so.
-        notes: Guesses, a sentence each.
+        cameras: Cameras beside the clouds, one of each coordinate frame, which colour them.
+        choices: What is used, a sentence each.
+        notes: What is not, or may be wrong, a sentence each.
     """
 
     frames: CameraTopics | StereoTopics | Series
@@ -101,6 +116,8 @@ class Choice:
     gnss: Series | None
     truth: Series | None
     wheels: Series | None
+    cameras: Sequence[ImageTopics]
+    choices: Sequence[str]
     notes: Sequence[str]
 
 
@@ -141,38 +158,40 @@ def choose(
         wheels = _best(driven, _plain_rank)
     pick.refuse_own_runs()
     frames: CameraTopics | StereoTopics | Series
+    cameras: list[ImageTopics] = []
+    notes: list[str] = []
     if color is not None and depth is not None and config.points is None:
         infos = pick.all(CAMERAS)
         info = pick.one("camera_info", config.camera_info, CAMERAS, _plain_rank, where=set().__contains__)
-        possible = _without_those_of_depth(infos, color, depth)
-        only = possible if len(possible) == 1 else []
-        own = next(iter([*_beside(color, possible), *_of_frame(color, possible, firsts), *only]), None)
+        own = _info_of(color, _without_those_of_depth(infos, color, depth), firsts)
         depth_info = next((one for one in _beside(depth, infos) if one is not own), None)
         frames = CameraTopics(color, depth, info or own, own, depth_info)
         others = len(colors) * len(depth_images) > 1
         chosen = f"colour {color.topic.name}, depth {depth.topic.name}"
-        notes = [_choice_note(chosen, "color=… and source.topics.depth", others=others)]
+        choices = [_choice_note(chosen, "color=… and source.topics.depth", others=others)]
         if info is not None and own not in (None, info):
             notes.append(f"camera info {info.topic.name} was chosen; that of the images is {own.topic.name}")
         if points is not None:
-            notes.append(
+            choices.append(
                 f"there are point clouds too: to map those, source.topics.points={points.topic.name}"
             )
         used, image_reason = [color, depth, points], "one camera is mapped"
     elif points is not None:
         frames = points
         kind = "laser scans" if points.topic.type in LASERS else "point clouds"
-        notes = [_choice_note(f"{kind} {points.topic.name}", "points", others=len(clouds) > 1)]
+        choices = [_choice_note(f"{kind} {points.topic.name}", "points", others=len(clouds) > 1)]
         both = color is not None and depth is not None
         image_reason = "point clouds are mapped" if both else "colour has no depth, or depth no colour"
-        used = [points]
+        if points.topic.type not in LASERS:
+            cameras = _cameras(colors, pick.all(CAMERAS), firsts)
+        used = [points, *(camera.images for camera in cameras)]
     elif pairs := _stereo_pairs(colors, pick.all(IMAGES)):
         left, right = pairs[0]
         infos = pick.all(CAMERAS)
         left_info, right_info = (next(iter(_beside(one, infos)), None) for one in (left, right))
         frames = StereoTopics(left, right, left_info, right_info)
         chosen = f"stereo pairs {left.topic.name} and {right.topic.name}"
-        notes = [_choice_note(chosen, "color", others=len(pairs) > 1 and config.color is None)]
+        choices = [_choice_note(chosen, "color", others=len(pairs) > 1 and config.color is None)]
         used, image_reason = [left, right], "one pair is mapped"
     else:
         strange = [one for one in series.values() if one.topic.type not in READ]
@@ -180,7 +199,7 @@ def choose(
         found = what_there_is(color, depth, series.values())
         raise SourceError("; ".join([f"{path}: nothing to map: {found}", *unread]))
     if wheels is not None:
-        notes.append(
+        choices.append(
             _choice_note(f"wheel odometry {wheels.topic.name}", "wheels", others=config.wheels is None)
         )
     is_chosen = bool(config.points or config.color or config.depth)
@@ -189,7 +208,7 @@ def choose(
         used.append(gyroscope)
     unused = [one for one in series.values() if one not in used]
     notes += unused_notes(unused, firsts, image_reason=None if is_chosen else image_reason)
-    return Choice(frames, imu, gyroscope, gnss, truth, wheels, notes)
+    return Choice(frames, imu, gyroscope, gnss, truth, wheels, cameras, choices, notes)
 
 
 class _Picker:
@@ -344,6 +363,24 @@ def _beside(image: Series, infos: Sequence[Series]) -> list[Series]:
     shared = [shared_namespaces(name, one.topic.name) for one in infos]
     most = max(shared, default=0)
     return [infos[shared.index(most)]] if most and shared.count(most) == 1 else []
+
+
+def _info_of(image: Series, infos: Sequence[Series], firsts: Mapping[str, Message]) -> Series | None:
+    """Return the calibration of an image topic, by its namespace or frame, or as there is no other."""
+    only = infos if len(infos) == 1 else []
+    return next(iter([*_beside(image, infos), *_of_frame(image, infos, firsts), *only]), None)
+
+
+def _cameras(
+    colors: Sequence[Series], infos: Sequence[Series], firsts: Mapping[str, Message]
+) -> list[ImageTopics]:
+    """Return the calibrated cameras of some images, of each coordinate frame the one that ranks first."""
+    found: dict[str, ImageTopics] = {}
+    for one in sorted(colors, key=lambda one: (_color_rank(one.topic.name), one.topic.name)):
+        frame, info = frame_of(firsts.get(one.topic.name)), _info_of(one, infos, firsts)
+        if frame and info is not None:
+            found.setdefault(frame, ImageTopics(one, info))
+    return list(found.values())
 
 
 def _without_those_of_depth(infos: Sequence[Series], color: Series, depth: Series) -> list[Series]:

@@ -3,7 +3,8 @@
 The benchmark keeps ``sequences/00/velodyne`` and ``poses/00.txt``; SemanticKITTI and converters of other
 logs put ``poses.txt`` beside ``velodyne``. Where ``calib.txt`` has the pose of the LiDAR in the camera, poses
 are the camera's; else they are the LiDAR's own. Raw recordings (Geiger et al. 2013) keep scans in
-``velodyne_points/data`` and their times in ``velodyne_points/timestamps.txt``, without poses.
+``velodyne_points/data`` and their times in ``velodyne_points/timestamps.txt``, without poses. The left colour
+camera's images colour the cloud.
 """
 
 from dataclasses import replace
@@ -12,12 +13,12 @@ from pathlib import Path
 import numpy as np
 
 from mapper.core.errors import SourceError
-from mapper.core.geometry import Transform, nearest_rotation, transform
 from mapper.core.trajectory import Trajectory
 from mapper.sources.base import Log
 from mapper.sources.config import SourceConfig
+from mapper.sources.kitti_calibration import read_matrix, rigid_motion
+from mapper.sources.scan_folders.kitti_images import with_images
 from mapper.sources.scan_folders.scan_folder import STAMP_FILES, clouds_in, first_of, most_clouds, scan_log
-from mapper.sources.text import ROUNDING, parse_numbers, rows
 
 _ALONG_Z_RATIO = 0.9
 _CAMERAS_NOTE = (
@@ -47,7 +48,8 @@ def read_log(path: Path, config: SourceConfig) -> Log:
     if not files:
         raise SourceError(f"{sequence}: no scan matches source.pattern={config.pattern}")
     at = sequence.resolve()
-    T_camera_lidar = _read_calibration(sequence / "calib.txt")
+    mounting = read_matrix(calibration := sequence / "calib.txt", "Tr", 3, 4)
+    T_camera_lidar = None if mounting is None else rigid_motion(mounting, f"{calibration}: Tr")
     log = scan_log(
         sequence,
         files,
@@ -59,8 +61,8 @@ def read_log(path: Path, config: SourceConfig) -> Log:
         notes=notes,
     )
     if T_camera_lidar is None and log.truth is not None and _moves_as_a_camera(log.truth):
-        return replace(log, notes=[*log.notes, _CAMERAS_NOTE])
-    return log
+        log = replace(log, notes=[*log.notes, _CAMERAS_NOTE])
+    return with_images(log, sequence)
 
 
 def _moves_as_a_camera(truth: Trajectory) -> bool:
@@ -82,23 +84,3 @@ def _scans(sequence: Path) -> Path:
     """Return the folder of a sequence's scans, which need not exist."""
     raw = sequence / "velodyne_points" / "data"
     return raw if most_clouds(raw) else sequence / "velodyne"
-
-
-def _read_calibration(path: Path) -> Transform | None:
-    """Return T_camera_lidar of the line ``Tr: …``; None without the file or the line."""
-    if not path.is_file():
-        return None
-    for number, words in rows(path):
-        if words[0] not in ("Tr:", "Tr"):
-            continue
-        where = f"{path}:{number}"
-        if len(words) != 13:
-            raise SourceError(
-                f"{where}: {len(words) - 1} numbers, want 12: the LiDAR's 3×4 pose in the camera"
-            )
-        T = parse_numbers(words[1:], where=where).reshape(3, 4)
-        R = nearest_rotation(T[:, :3]) if np.isfinite(T).all() else np.full((3, 3), np.nan)
-        if not np.abs(R - T[:, :3]).max() < ROUNDING:
-            raise SourceError(f"{where}: not a rigid motion; want the LiDAR's 3×4 pose in the camera")
-        return transform(R, T[:, 3])
-    return None

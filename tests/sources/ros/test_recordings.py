@@ -63,7 +63,7 @@ def test_a_recording_is_a_log(tmp_path, name):
         np.testing.assert_array_equal(frame.depth_m, units.astype(np.float32) / np.float32(1000))
         np.testing.assert_array_equal(entry.scan().points_body, frame.scan().points_body)
         assert entry.load(colour=False).image.shape == (48, 64)
-    assert source.notes == [f"colour {COLOR}, depth {DEPTH}"]
+    assert source.choices == [f"colour {COLOR}, depth {DEPTH}"]
 
 
 def test_a_folder_of_mcap_files_is_one_log(tmp_path):

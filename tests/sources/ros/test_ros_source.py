@@ -56,19 +56,20 @@ def test_images_go_before_clouds_unless_clouds_are_asked_for(tmp_path):
     messages = [*shots(3), *(cloud(t) for t in stamps(4))]
     source = opened(tmp_path / "a.mcap", messages)
     assert (source.sensor, len(source)) == ("rgbd", 3)
-    assert "there are point clouds too: to map those, source.topics.points=/velodyne_points" in source.notes
+    assert "there are point clouds too: to map those, source.topics.points=/velodyne_points" in source.choices
     source = open_source(tmp_path / "a.mcap", SourceConfig(topics=TopicsConfig(points="/velodyne_points")))
     assert (source.sensor, len(source)) == ("lidar", 4)
-    assert source.notes == ["point clouds /velodyne_points"]
+    assert source.choices[0] == "point clouds /velodyne_points"
+    assert [one for one in source.choices[1:] if "/cam/color/image_raw" in one] == source.choices[1:]
 
 
 def test_clouds_of_a_second_lidar_are_said_to_be_left_out(tmp_path):
     messages = [cloud(t, topic) for t in stamps(4) for topic in ("/rear/points", "/front/points")]
     source = opened(tmp_path / "a.mcap", messages)
-    assert len(source.notes) == 2
-    assert source.notes[1].endswith(": /rear/points")
+    assert len(source.sentences) == 2
+    assert source.notes[0].endswith(": /rear/points")
     chosen = open_source(tmp_path / "a.mcap", SourceConfig(topics=TopicsConfig(points="/rear/points")))
-    assert chosen.notes == ["point clouds /rear/points"]
+    assert chosen.choices == ["point clouds /rear/points"]
 
 
 def test_topics_that_are_not_used_are_named_with_the_reason(tmp_path):
@@ -96,7 +97,7 @@ def test_topics_that_are_not_used_are_named_with_the_reason(tmp_path):
         transforms(("lidar", "imu", np.eye(4))),
     ]
     notes = opened(tmp_path / "a.mcap", messages).notes
-    named = [note.rpartition(": ")[2] for note in notes[1:]]
+    named = [note.rpartition(": ")[2] for note in notes]
     assert sorted(named) == [
         "/fish/image_raw",
         "/gyro (0)",
@@ -117,7 +118,7 @@ def test_infrared_of_16_bits_is_not_taken_for_depth(tmp_path):
     messages = [message for message in shots(3) if message.topic != DEPTH]
     for i, t in enumerate(stamps(3)):
         messages += [image(t, f"/cam/{name}/image", picture(i)[1], "16UC1") for name in ("ir", "z")]
-    assert opened(tmp_path / "a.mcap", messages).notes[0].startswith(f"colour {COLOR}, depth /cam/z/image")
+    assert opened(tmp_path / "a.mcap", messages).choices[0].startswith(f"colour {COLOR}, depth /cam/z/image")
 
 
 def test_the_likeliest_of_several_topics_is_taken_and_another_can_be_chosen(tmp_path):
@@ -132,7 +133,7 @@ def test_the_likeliest_of_several_topics_is_taken_and_another_can_be_chosen(tmp_
             camera_info(t),
         ]
     source = opened(tmp_path / "a.mcap", messages)
-    assert source.notes[0].startswith(
+    assert source.choices[0].startswith(
         "colour /cam/color/image_raw, depth /cam/aligned_depth_to_color/image_raw;"
     )
     topics = TopicsConfig(color="/cam/infra1/image_rect_raw", depth="/cam/depth/image_rect_raw")
@@ -141,7 +142,7 @@ def test_the_likeliest_of_several_topics_is_taken_and_another_can_be_chosen(tmp_
     frame = next(chosen.entries()).load()
     assert frame.image.ndim == 2
     assert frame.camera == PinholeCamera(64, 48, 50, 50, 32, 24)
-    assert chosen.notes[0] == "colour /cam/infra1/image_rect_raw, depth /cam/depth/image_rect_raw"
+    assert chosen.choices[0] == "colour /cam/infra1/image_rect_raw, depth /cam/depth/image_rect_raw"
 
 
 @pytest.mark.parametrize(
@@ -235,10 +236,10 @@ def test_depth_of_one_camera_is_not_paired_with_colour_of_another(tmp_path):
             ]
             messages += [message for message in one if i or without not in message.topic]
     source = opened(tmp_path / "a.mcap", messages)
-    assert source.notes[0].startswith("colour /a/color/image_raw, depth /a/depth/image_raw;")
+    assert source.choices[0].startswith("colour /a/color/image_raw, depth /a/depth/image_raw;")
     config = SourceConfig(topics=TopicsConfig(color="/b/color/image_raw"))
     source = open_source(tmp_path / "a.mcap", config)
-    assert source.notes[0].startswith("colour /b/color/image_raw, depth /b/depth/image_raw;")
+    assert source.choices[0].startswith("colour /b/color/image_raw, depth /b/depth/image_raw;")
 
 
 def test_a_camera_that_nothing_tells_is_an_error_with_a_remedy(tmp_path):

@@ -1,0 +1,89 @@
+"""Colour images beside KITTI's scans: ``image_2``, or ``image_02/data`` of a raw recording."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from mapper.core.errors import FrameError, SourceError
+from mapper.core.frames import Image
+from mapper.core.geometry import Array, Transform, inverse, transform
+from mapper.sources.base import CameraImages, Log
+from mapper.sources.calibration import Calibration
+from mapper.sources.image_files.image_sizes import recorded_camera
+from mapper.sources.image_files.reading import read_colour
+from mapper.sources.kitti_calibration import read_matrix, rigid_motion
+from mapper.sources.listed_files import refuse_links_out
+from mapper.sources.scan_folders.scans import ScanEntry
+
+_FOLDERS = ("image_2", "image_02/data")
+_ENDINGS = {".png", ".jpg"}
+
+
+def with_images(log: Log, sequence: Path) -> Log:
+    """Return the log with the images of the left colour camera that are named as scans.
+
+    They are taken at the times of their scans: the LiDAR triggers the camera when it looks forward.
+
+    Raises:
+        SourceError: An image is a link out of the log.
+    """
+    folder = next((sequence / name for name in _FOLDERS if (sequence / name).is_dir()), None)
+    if folder is None:
+        return log
+    by_stem = {path.stem: path for path in sorted(folder.iterdir()) if path.suffix.lower() in _ENDINGS}
+    scans = (entry for entry in log.entries() if isinstance(entry, ScanEntry))
+    paired = [(scan.stamp_ns, by_stem[scan.path.stem]) for scan in scans if scan.path.stem in by_stem]
+    if not paired:
+        why = f"images that are not used, as none has the name of a scan: {folder}"
+        return replace(log, notes=[*log.notes, why])
+    stamps_ns, files = zip(*paired, strict=True)
+    refuse_links_out(files, log=sequence)
+    try:
+        first = read_colour(files[0])
+        projection, T_camera_lidar = _camera(sequence, is_raw=folder.name == "data")
+        fx, fy, cx, cy = (projection[k] for k in ((0, 0), (1, 1), (0, 2), (1, 2)))
+        size_px = first.shape[1], first.shape[0]
+        recorded = recorded_camera(
+            Calibration(f"{folder}", fx, fy, cx, cy), colour_px=size_px, depth_px=size_px, where=f"{folder}"
+        )
+    except (SourceError, FrameError) as error:
+        return replace(log, notes=[*log.notes, f"images that are not used: {error}"])
+
+    def image_at(index: int) -> Image:
+        return recorded.image(read_colour(files[index]), f"{files[index]}")
+
+    name = folder.relative_to(sequence).as_posix()
+    images = CameraImages(
+        name, np.array(stamps_ns, np.int64), recorded.camera, inverse(T_camera_lidar), image_at
+    )
+    return replace(log, images=[images], choices=[*log.choices, images.choice])
+
+
+def _camera(sequence: Path, *, is_raw: bool) -> tuple[Array, Transform]:
+    """Return the 3×4 projection of the colour camera, and T_camera_lidar.
+
+    Raises:
+        SourceError: They are not there, or malformed.
+    """
+    if is_raw:
+        folder = sequence.resolve().parent
+        cameras, lidar = folder / "calib_cam_to_cam.txt", folder / "calib_velo_to_cam.txt"
+        projection = read_matrix(cameras, "P_rect_02", 3, 4)
+        R_rectified = read_matrix(cameras, "R_rect_00", 3, 3)
+        R, t = read_matrix(lidar, "R", 3, 3), read_matrix(lidar, "T", 3, 1)
+        if projection is None or R_rectified is None or R is None or t is None:
+            raise SourceError(
+                f"{folder}: want P_rect_02 and R_rect_00 in {cameras.name}, R and T in {lidar.name}"
+            )
+        mounting, where = R_rectified @ np.hstack([R, t]), f"{lidar}"
+    else:
+        path = sequence / "calib.txt"
+        projection, mounted = read_matrix(path, "P2", 3, 4), read_matrix(path, "Tr", 3, 4)
+        if projection is None or mounted is None:
+            raise SourceError(f"{path}: want P2, the camera's projection, and Tr, the LiDAR's pose")
+        mounting, where = mounted, f"{path}: Tr"
+    T_camera_first = transform(
+        np.eye(3), np.linalg.solve(projection[:, :3], projection[:, 3]).astype(np.float64)
+    )
+    return projection, T_camera_first @ rigid_motion(mounting, where)
