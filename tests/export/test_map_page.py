@@ -19,7 +19,7 @@ from mapper.octree.map import read_octree
 from mapper.octree.scan_updates import open_scan_updates
 from tests.support.chromium import AXE, CHROMIUM, MISSING, NO_AXE
 from tests.support.command_line import invoke
-from tests.support.map_page import MapPage, change
+from tests.support.map_page import MapPage, change, lit
 
 needs_browser = pytest.mark.skipif(CHROMIUM is None, reason=MISSING)
 
@@ -237,6 +237,23 @@ def test_two_runs_lie_over_each_other_or_side_by_side_and_loops_tell_their_reaso
         browser.click("[data-map-run='0']")
         browser.click("[data-map-run='1']")
         assert (browser.picture().max(axis=2) > 60).mean() < 0.01
+        assert browser.complaints == []
+
+
+@needs_browser
+def test_runs_of_different_logs_stand_side_by_side_each_as_large_as_its_pane(desk_run, tmp_path):
+    one = chapter_of(desk_run, "one", [])
+    log = desk_run.manifest.input.model_copy(update={"fingerprint": "sha256:another"})
+    other = replace(desk_run, manifest=desk_run.manifest.model_copy(update={"input": log}))
+    write_map_page(tmp_path / "two.html", [one, chapter_of(other, "other", [])])
+    with MapPage(tmp_path / "two.html", height_px=800) as browser:
+        assert browser.run("document.querySelector('input[value=beside]').checked")
+        seen = browser.picture()
+        half = seen.shape[1] // 2
+        (left, spread), (right, as_large) = lit(seen[:, :half]), lit(seen[:, -half:])
+        np.testing.assert_allclose(left, right, atol=4.0)
+        np.testing.assert_allclose(spread, as_large, rtol=0.05)
+        assert spread[0] > 0.12 * half
         assert browser.complaints == []
 
 

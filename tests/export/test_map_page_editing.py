@@ -97,7 +97,9 @@ def test_regions_are_drawn_or_typed_and_saved_as_a_file_that_the_verb_takes(brow
     browser.click("[data-map=edit-add]")
     browser.choose("edit-kind", "keep")
     browser.choose("edit-region", "1.9 -0.2")
-    browser.click("[data-map=edit-add]")
+    browser.click("[data-map=edit-region]")
+    browser.key("keyDown", "Enter")
+    browser.key("keyUp", "Enter")
 
     browser.call("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(tmp_path))
     browser.click("[data-map=edit-save]")

@@ -30,16 +30,19 @@ export class MapView {
     this.shading = new Shading();
     this.onRest = []; // called when all of it is drawn
     this.shown = layers.map(() => true);
-    this.state = { points: "cloud", coloring: "height", isBeside: false, cut_m: Infinity, kept_m: [-Infinity, Infinity], until: NEVER, size: 1, isShaded: true, isAside: false };
+    this.state = { points: "cloud", coloring: "height", isBeside: false, cut_m: Infinity, kept_m: [-Infinity, Infinity], until: NEVER, size: 1, isShaded: true, hasGrid: true, isAside: false };
     this.hidden = new Set();
     this.budget = new Budget();
     for (const one of layers) this.scene.add(one.group);
-    this.box = this.#box();
+    this.isApart = layers.some(({ run }) => run.world !== layers[0].run.world); // then each is seen as if it lay where the first lies
+    this.boxes = layers.map((one) => boxOf([one]));
+    this.box = this.isApart ? this.boxes[0] : boxOf(layers);
     this.navigation = new Navigation(this.camera, canvas, () => this.#moved());
     new ResizeObserver(() => this.resize()).observe(canvas.parentElement);
     this.resize();
     this.navigation.lookAt(this.box);
-    this.draw("ground", groundLines(this.box), { isOver: false });
+    if (this.isApart) this.boxes.forEach((box, run) => this.draw(`ground${run}`, groundLines(box), { isOver: false, isGround: true, run }));
+    else this.draw("ground", groundLines(this.box), { isOver: false, isGround: true });
     this.update({});
     requestAnimationFrame((now) => this.#tick(now));
   }
@@ -84,11 +87,11 @@ export class MapView {
   }
 
   /** Draw lines and marks over every run, or points and lines below, in place of those of the same name. */
-  draw(name, shapes, { isOver = true } = {}) {
+  draw(name, shapes, { isOver = true, isGround = false, run = null } = {}) {
     this.drawn[name]?.group.removeFromParent();
     const group = new Group();
     for (const { object } of shapes) group.add(object);
-    this.drawn[name] = { group, shapes };
+    this.drawn[name] = { group, shapes, run, isGround };
     if (!isOver) group.renderOrder = -1;
     (isOver ? this.tools : this.scene).add(group);
     this.invalidate();
@@ -112,7 +115,7 @@ export class MapView {
   /** The point at a height that is seen at a place. */
   planeAt(x, y, height_m) {
     const pane = this.#panes().findLast(({ left }) => x >= left);
-    return new Screen(this.camera, pane).onPlane(x, y, height_m);
+    return new Screen(pane.camera, pane).onPlane(x, y, height_m);
   }
 
   pointAt(x, y) {
@@ -143,15 +146,26 @@ export class MapView {
   #panes() {
     const { clientWidth: width, clientHeight: height } = this.canvas;
     const runs = this.layers.map((_, run) => run).filter((run) => this.shown[run]);
-    if (!this.state.isBeside || runs.length < 2) return [{ left: 0, width, height, runs }];
+    if (!this.state.isBeside || runs.length < 2) return [{ left: 0, width, height, runs, camera: this.isApart && runs.length === 1 ? this.#cameraAt(runs[0]) : this.camera }];
     const each = width / runs.length;
-    return runs.map((run, i) => ({ left: i * each, width: each, height, runs: [run] }));
+    return runs.map((run, i) => ({ left: i * each, width: each, height, runs: [run], camera: this.isApart ? this.#cameraAt(run) : this.camera }));
+  }
+
+  /** The camera as it sees a run of another world: at the same place relative to that run's box. */
+  #cameraAt(run) {
+    const camera = this.camera.clone(), [from, to] = [this.box, this.boxes[run]].map((box) => box.getCenter(new Vector3()));
+    const scale = this.boxes[run].getSize(new Vector3()).length() / this.box.getSize(new Vector3()).length();
+    camera.position.sub(from).multiplyScalar(scale).add(to);
+    Object.assign(camera, { near: camera.near * scale, far: camera.far * scale });
+    camera.updateProjectionMatrix();
+    camera.updateMatrixWorld();
+    return camera;
   }
 
   #pick(x, y, find) {
     for (const pane of this.#panes()) {
       if (x < pane.left || x >= pane.left + pane.width) continue;
-      const screen = new Screen(this.camera, pane);
+      const screen = new Screen(pane.camera, pane);
       for (const run of pane.runs) {
         const found = find(this.layers[run], screen);
         if (found) return found;
@@ -161,8 +175,8 @@ export class MapView {
   }
 
   #aspect() {
-    const [{ width, height }] = this.#panes();
-    this.camera.aspect = width / Math.max(height, 1);
+    const { clientWidth: width, clientHeight: height } = this.canvas, count = this.shown.filter(Boolean).length;
+    this.camera.aspect = width / (this.state.isBeside ? Math.max(count, 1) : 1) / Math.max(height, 1);
     this.camera.updateProjectionMatrix();
   }
 
@@ -220,12 +234,13 @@ export class MapView {
     this.drawnShare = share;
     this.drawnAt = now;
     this.#aspect();
-    const { renderer, camera } = this;
+    const { renderer } = this;
     const panes = this.#panes();
     renderer.setScissorTest(panes.length > 1);
     renderer.autoClear = false;
     renderer.clear();
     for (const pane of panes) {
+      const { camera } = pane;
       renderer.setViewport(pane.left, 0, pane.width, pane.height);
       renderer.setScissor(pane.left, 0, pane.width, pane.height);
       const pixels = ratio.value * pane.height / (2 * Math.tan(camera.fov * Math.PI / 360));
@@ -234,9 +249,12 @@ export class MapView {
         for (const set of Object.values(one.points)) set.fit(camera, { pixels, scale: this.state.size, share });
         for (const segments of Object.values(one.segments)) this.#fit(segments, pane, pixels);
       });
-      for (const { shapes } of Object.values(this.drawn)) for (const shape of shapes) {
-        if (shape instanceof PointSet) shape.fit(camera, { pixels, scale: this.state.size, share: 1 });
-        else if (shape.uniforms) this.#fit(shape, pane, pixels);
+      for (const { group, shapes, run, isGround } of Object.values(this.drawn)) {
+        if (isGround) group.visible = this.state.hasGrid && (run === null || pane.runs.includes(run));
+        for (const shape of shapes) {
+          if (shape instanceof PointSet) shape.fit(camera, { pixels, scale: this.state.size, share: 1 });
+          else if (shape.uniforms) this.#fit(shape, pane, pixels);
+        }
       }
       camera.layers.set(POINTS_LAYER);
       if (this.state.isShaded && !this.isCoarse) this.shading.render(renderer, this.scene, camera, pane);
@@ -254,16 +272,16 @@ export class MapView {
     uniforms.viewport.value.set(width * ratio.value, height * ratio.value);
     uniforms.pixels.value = pixels;
   }
+}
 
-  /** Around the paths and all but a few stray points. */
-  #box() {
-    const box = new Box3(), at = new Vector3();
-    for (const one of this.layers) {
-      const { cloud } = one.points, axes = [0, 1, 2].map((axis) => cloud.spread((set, i) => set.low[axis] + set.step * set.places[4 * i + axis]));
-      if (cloud.count) box.expandByPoint(at.fromArray(axes.map(([low]) => low))).expandByPoint(at.fromArray(axes.map(([, high]) => high)));
-      const { x, y, z } = one.run.path;
-      for (let i = 0; i < x.length; i++) box.expandByPoint(at.set(x[i], y[i], z[i]));
-    }
-    return box;
+/** Around the paths and all but a few stray points of some runs. */
+function boxOf(layers) {
+  const box = new Box3(), at = new Vector3();
+  for (const one of layers) {
+    const { cloud } = one.points, axes = [0, 1, 2].map((axis) => cloud.spread((set, i) => set.low[axis] + set.step * set.places[4 * i + axis]));
+    if (cloud.count) box.expandByPoint(at.fromArray(axes.map(([low]) => low))).expandByPoint(at.fromArray(axes.map(([, high]) => high)));
+    const { x, y, z } = one.run.path;
+    for (let i = 0; i < x.length; i++) box.expandByPoint(at.set(x[i], y[i], z[i]));
   }
+  return box;
 }

@@ -43,9 +43,11 @@ export class Panel {
       });
     const choose = (isBeside) => view.update({ isBeside });
     this.find("beside").addEventListener("change", ({ target }) => choose(target.value === "beside"));
-    if (!layers.some(({ run }) => run.world !== layers[0].run.world)) return;
+    if (!view.isApart) return;
     this.find("beside").querySelector("[value=beside]").checked = true; // over each other they would say nothing
     choose(true);
+    view.resize();
+    view.navigation.lookAt(view.box);
   }
 
   #points() {
@@ -130,7 +132,7 @@ export class Panel {
   #tools() {
     const { view } = this, { navigation } = view, measure = this.find("measure"), fly = this.find("fly");
     this.find("home").addEventListener("click", () => navigation.lookAt(view.box));
-    for (const [name, change] of [["shading", (isOn) => view.update({ isShaded: isOn })], ["grid", (isOn) => { view.drawn.ground.group.visible = isOn; view.invalidate(); }]])
+    for (const [name, change] of [["shading", (isOn) => view.update({ isShaded: isOn })], ["grid", (isOn) => view.update({ hasGrid: isOn })]])
       this.find(name).addEventListener("change", ({ target }) => change(target.checked));
     this.find("above").addEventListener("click", () => navigation.lookAt(view.box, { fromAbove: true }));
     const press = (button, isOn) => button.setAttribute("aria-pressed", String(isOn));
@@ -169,6 +171,7 @@ export class Panel {
   /** Scale, north, and the address of the view. */
   #orient() {
     const { view } = this, { camera, navigation: { orbit } } = view;
+    this.find("scale").parentElement.hidden = view.isApart && view.shown.filter(Boolean).length > 1; // each has its own
     const length = roundLength(SCALE_PX * view.metresPerPixel);
     this.find("scale").style.width = `${length / view.metresPerPixel}px`;
     this.find("scale-text").textContent = length < 1 ? `${Math.round(100 * length)} cm` : length < 1000 ? `${length} m` : `${length / 1000} km`;

@@ -3,7 +3,7 @@
 import { DepthTexture, GLSL3, Mesh, PlaneGeometry, RawShaderMaterial, Scene, UnsignedIntType, WebGLRenderTarget } from "three";
 import { POINTS_LAYER } from "mapper/points";
 
-const STRENGTH = 18;
+const STRENGTH = 12;
 
 const VERTEX = `
 in vec3 position;
