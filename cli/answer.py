@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.models import OptionInfo
 
-from mapper.cli.console import print_text, progress_for
+from mapper.cli.console import LOG, Both, log_kept, print_text, progress_for
 from mapper.cli.options import refuse_several
 from mapper.core.errors import LINE_WIDTH, MapperError, UntrustedError
 from mapper.runtime.atomic import MANIFEST_NAME
@@ -41,7 +41,8 @@ class Output:
     def progress(self, *, prompts: bool = False) -> Progress:
         """Return the progress of a job, on stderr; bars would overdraw prompts."""
         quiet = self.quiet or (self.json and not sys.stderr.isatty())
-        return progress_for(quiet=quiet, prompts=prompts, every_note=self.verbose)
+        shown = progress_for(quiet=quiet, prompts=prompts, every_note=self.verbose)
+        return Both(shown) if LOG.handlers else shown
 
     @contextmanager
     def waiting(self, name: str) -> Iterator[None]:
@@ -87,22 +88,27 @@ def record_in(folder: Path, name: str = MANIFEST_NAME) -> dict[str, Any]:
 
 
 def verb(function: Callable[..., Answer]) -> Callable[..., None]:
-    """Return a command with ``--json``, ``--verbose`` and ``--quiet``, which prints the function's answer.
+    """Return a command with the options of every verb, which prints the function's answer.
 
     The function takes its :class:`Output` as the keyword ``output``.
     """
 
     @functools.wraps(function)
-    def command(*, json: bool, verbose: bool, quiet: bool, **given: Any) -> None:
-        refuse_several({"--verbose": verbose, "--quiet": quiet})
+    def command(*, json: bool, verbose: bool, quiet: bool, log_file: Path | None, **given: Any) -> None:
         output = Output(json=json, quiet=quiet, verbose=verbose)
-        given |= {
-            name: result_path(given[name]) for name in _RESULTS & given.keys() if given[name] is not None
-        }
-        answer = function(**given, output=output)
-        _show(answer, output)
-        if answer.error is not None:
-            raise answer.error
+        with log_kept(log_file):
+            try:
+                refuse_several({"--verbose": verbose, "--quiet": quiet})
+                for name in _RESULTS & given.keys():
+                    given[name] = None if given[name] is None else result_path(given[name])
+                answer = function(**given, output=output)
+            except Exception as error:
+                if json:
+                    print_json(error_document(type(error).__name__, str(error)))
+                raise
+            _show(answer, output)
+            if answer.error is not None:
+                raise answer.error
 
     own = [p for p in inspect.signature(function).parameters.values() if p.name != "output"]
     for parameter in own:
@@ -110,8 +116,8 @@ def verb(function: Callable[..., Answer]) -> Callable[..., None]:
             option.param_decls = ("--out", "-o")
     own = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in own]
     options = [
-        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=False, annotation=annotation)
-        for name, annotation in _COMMON.items()
+        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
+        for name, (annotation, default) in _COMMON.items()
     ]
     command.__signature__ = inspect.Signature([*own, *options])  # type: ignore[attr-defined]
     command.__annotations__ = {p.name: p.annotation for p in (*own, *options)}
@@ -121,20 +127,43 @@ def verb(function: Callable[..., Answer]) -> Callable[..., None]:
 
 _RESULTS = frozenset({"out", "plot"})
 """Parameters of verbs that name what they write."""
-_COMMON = {
-    "json": Annotated[bool, typer.Option("--json", help="Print one JSON document.")],
-    "verbose": Annotated[bool, typer.Option("--verbose", "-v", help="Print every row and every note.")],
-    "quiet": Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")],
+_COMMON: dict[str, tuple[Any, bool | None]] = {
+    "json": (
+        Annotated[bool, typer.Option("--json", help="Print one JSON document, also of an error.")],
+        False,
+    ),
+    "verbose": (
+        Annotated[bool, typer.Option("--verbose", "-v", help="Print every row and every note.")],
+        False,
+    ),
+    "quiet": (Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")], False),
+    "log_file": (
+        Annotated[Path | None, typer.Option(help="File that what is printed is appended to, with times.")],
+        None,
+    ),
 }
 
 
 def _show(answer: Answer, output: Output) -> None:
+    text = (output.verbose and answer.details) or answer.text
+    for line in text.splitlines():
+        LOG.info(line)
     if output.quiet:
         return
     if output.json:
-        print(json.dumps(plain(answer.document), indent=2, ensure_ascii=False, allow_nan=False))
-    elif text := (output.verbose and answer.details) or answer.text:
+        print_json(answer.document)
+    elif text:
         print_text(text)
+
+
+def print_json(document: Mapping[str, Any]) -> None:
+    """Print a document of ``--json``."""
+    print(json.dumps(plain(document), indent=2, ensure_ascii=False, allow_nan=False))
+
+
+def error_document(kind: str, message: str) -> dict[str, Any]:
+    """Return the document of an error: its class, and its line."""
+    return {"error": {"kind": kind, "message": message}}
 
 
 def plain(value: Any) -> Any:

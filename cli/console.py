@@ -1,15 +1,19 @@
 """Text and progress on the console: escaped, coloured on a terminal; bars there, lines elsewhere."""
 
+import logging
 import os
 import re
+import shlex
 import sys
 import time
 from collections import deque
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, TextIO
 
+from mapper import __version__
+from mapper.core.errors import ConfigError
 from mapper.runtime.progress import SILENT, Progress, Report
 
 _CONTROLS = re.compile(
@@ -40,6 +44,11 @@ def escaped(text: str, *, one_line: bool = False) -> str:
     return text.replace("\n", "\\n") if one_line else text
 
 
+def print_error(line: str) -> None:
+    """Print a line to standard error, escaped."""
+    print(escaped(line, one_line=True), file=sys.stderr)
+
+
 class EscapingStream:
     """Text stream that escapes what is written to it; everything else is the wrapped stream's."""
 
@@ -58,6 +67,39 @@ class EscapingStream:
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self.raw, name)
+
+
+LOG = logging.getLogger("mapper.log-file")
+"""What ``--log-file`` keeps, with times: what was asked, and all that is printed, also with ``--quiet``."""
+
+
+@contextmanager
+def log_kept(path: Path | None) -> Iterator[None]:
+    """Append what is printed inside to a file, and what ends it.
+
+    Raises:
+        ConfigError: The file cannot be written.
+    """
+    if path is None:
+        yield
+        return
+    try:
+        handler = logging.FileHandler(path, encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"--log-file {path}: {error.strerror}") from None
+    handler.setFormatter(logging.Formatter("%(asctime)s %(message)s"))
+    LOG.setLevel(logging.INFO)
+    LOG.propagate = False
+    LOG.addHandler(handler)
+    try:
+        LOG.info("%s: %s", __version__, shlex.join(["mapper", *sys.argv[1:]]))
+        yield
+    except BaseException as error:
+        LOG.info("%s: %s", type(error).__name__, error)
+        raise
+    finally:
+        LOG.removeHandler(handler)
+        handler.close()
 
 
 def print_text(text: str) -> None:
@@ -112,6 +154,30 @@ def progress_for(*, quiet: bool, prompts: bool = False, every_note: bool = False
     return Bars(most_notes) if sys.stderr.isatty() and not prompts else Lines(most_notes)
 
 
+class Both:
+    """Progress shown, and kept in the log file."""
+
+    def __init__(self, shown: Progress) -> None:
+        self._all = (shown, Lines(sys.maxsize, show=LOG.info))
+
+    def note(self, message: str) -> None:
+        """Print the message."""
+        for one in self._all:
+            one.note(message)
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[Report]:
+        """Show the stage while inside."""
+        with ExitStack() as stages:
+            reports = [stages.enter_context(one.stage(name)) for one in self._all]
+
+            def report_all(done: int, total: int) -> None:
+                for report in reports:
+                    report(done, total)
+
+            yield report_all
+
+
 def files_text(out: Path, names: Iterable[str] = (), *, width: int = 7) -> str:
     """Return what a verb has left in a folder, as two rows: the names given, or all that is there."""
     names = names or sorted(child.name for child in out.iterdir())
@@ -121,9 +187,10 @@ def files_text(out: Path, names: Iterable[str] = (), *, width: int = 7) -> str:
 class _Notes:
     """Notes as lines, the first few only: a damaged log may have thousands."""
 
-    def __init__(self, most_notes: int = _MOST_NOTES) -> None:
+    def __init__(self, most_notes: int = _MOST_NOTES, *, show: Callable[[str], None] | None = None) -> None:
         self._most = most_notes
         self._seen = 0
+        self._show = show or print_error
 
     def note(self, message: str) -> None:
         """Print the message."""
@@ -132,9 +199,6 @@ class _Notes:
             self._show(f"mapper: {message}")
         elif self._seen == self._most + 1:
             self._show("mapper: … and more of these; --verbose prints all")
-
-    def _show(self, line: str) -> None:
-        print(escaped(line, one_line=True), file=sys.stderr)
 
 
 class Bars(_Notes):

@@ -1,7 +1,6 @@
 """Verbs and groups of verbs as Typer runs them: their help, and one line for a slip of the keyboard."""
 
 import re
-import sys
 from collections.abc import Sequence
 from difflib import get_close_matches
 from pathlib import Path
@@ -10,7 +9,8 @@ from typing import Any
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from mapper.cli.console import escaped, print_help
+from mapper.cli.answer import error_document, print_json
+from mapper.cli.console import print_error, print_help
 from mapper.core.errors import LINE_WIDTH
 
 HELP = {"help_option_names": ["-h", "--help"], "max_content_width": LINE_WIDTH}
@@ -45,10 +45,11 @@ class VerbGroup(TyperGroup):
             ctx.exit()
         return super().parse_args(ctx, args)
 
-    def make_context(self, *arguments: Any, **options: Any) -> Any:
+    def make_context(self, info_name: str | None, args: list[str], *more: Any, **options: Any) -> Any:
         """Read the options before the verb."""
+        self.is_json = "--json" in args
         try:
-            return super().make_context(*arguments, **options)
+            return super().make_context(info_name, args, *more, **options)
         except _UsageError as error:
             raise _refused(error, self) from None
 
@@ -98,7 +99,7 @@ def _printing_help(option: Any) -> Any:
     return option
 
 
-def _refused(error: Any, group: TyperGroup) -> typer.Exit:
+def _refused(error: Any, group: VerbGroup) -> typer.Exit:
     """Print what is wrong with a command line, and what to do, in one line."""
     below = error.ctx.command_path.split()[1:] if error.ctx else []  # below the program's own name
     path = " ".join(["mapper", *below])
@@ -111,7 +112,9 @@ def _refused(error: Any, group: TyperGroup) -> typer.Exit:
     else:
         what = f"{what[:1].lower()}{' '.join(what[1:].split())}; {path} -h shows how"
     line = ": ".join(["mapper", *([" ".join(below)] if below else []), what])
-    print(escaped(line, one_line=True), file=sys.stderr)
+    print_error(line)
+    if group.is_json:
+        print_json(error_document("UsageError", line.removeprefix("mapper: ")))
     return typer.Exit(_MISUSED)
 
 

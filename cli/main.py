@@ -14,7 +14,7 @@ from mapper import __version__
 from mapper.cli import completion
 from mapper.cli.answer import Answer, verb
 from mapper.cli.build import build, demo, fuse
-from mapper.cli.console import EscapingStream, escaped
+from mapper.cli.console import LOG, EscapingStream, print_error
 from mapper.cli.convert import convert, export
 from mapper.cli.diff import diff
 from mapper.cli.doctor import doctor
@@ -82,7 +82,7 @@ class Guarded(VerbGroup):
 
 def _say(what: str, error: BaseException) -> None:
     line = "; ".join([f"mapper: {what}", *getattr(error, "__notes__", ())])
-    print(escaped(line, one_line=True), file=sys.stderr)
+    print_error(line)
 
 
 def _show_warning(
@@ -94,7 +94,8 @@ def _show_warning(
     line: str | None = None,
 ) -> None:
     if issubclass(category, MapperWarning):
-        print(escaped(f"mapper: {message}", one_line=True), file=sys.stderr)
+        print_error(f"mapper: {message}")
+        LOG.info(f"mapper: {message}")
     else:
         _python_shows_warning(message, category, filename, lineno, file, line)
 

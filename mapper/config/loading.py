@@ -3,14 +3,14 @@
 import json
 import os
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
-from difflib import get_close_matches
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from pydantic import ValidationError
 
 from mapper.config.build import BuildConfig
+from mapper.config.refusals import refusal, refuse_other_units
 from mapper.core.config import Config, drop_unknown, flattened, kind_of, members_of
 from mapper.core.errors import ConfigError, MapperWarning
 from mapper.loops.config import PLANAR_LOOPS
@@ -96,7 +96,9 @@ def load_config(
         _validated(BuildConfig, _over(DEFAULTS[sensor], tree), str(path))
     _put_all(tree, overrides, settings)
     where = None if overrides or settings or path is None else str(path)
-    return _validated(BuildConfig, _over(DEFAULTS[sensor], tree), where)
+    config = _validated(BuildConfig, _over(DEFAULTS[sensor], tree), where)
+    refuse_other_units(config, _validated(BuildConfig, dict(DEFAULTS[sensor]), None))
+    return config
 
 
 def load_run_config(path: Path) -> BuildConfig:
@@ -223,7 +225,10 @@ def overridden(
     _put_all(changed, overrides, settings)
     _drop_other_kinds(tree, changed)
     _put_all(tree, overrides, settings)
-    return _validated(type(config), tree, None)
+    found = _validated(type(config), tree, None)
+    if isinstance(config, BuildConfig):
+        refuse_other_units(found, config)
+    return found
 
 
 def _drop_other_kinds(tree: dict[str, Any], changed: Mapping[str, Any]) -> None:
@@ -308,64 +313,5 @@ def checked_config(tree: Mapping[str, Any], model: type[AnyConfig], where: str |
     try:
         return model.model_validate(tree)
     except ValidationError as error:
-        refused = _refusal(model, error.errors()[0])
+        refused = refusal(model, error.errors()[0])
         raise ConfigError(refused if where is None else f"{where}: {refused}") from None
-
-
-def _refusal(model: type[Config], error: Mapping[str, Any]) -> str:
-    """Return ``name: reason`` of one of pydantic's errors.
-
-    Args:
-        model: The class that refused.
-        error: One of ``ValidationError.errors()``.
-    """
-    loc: Sequence[int | str] = error["loc"]
-    reason = error["msg"]
-    if error["type"] == "extra_forbidden":
-        reason = f"unknown; {_hint(model, loc)}"
-    elif error["type"] == "value_error":  # one of ours, which names the setting where several are concerned
-        reason = str(error["ctx"]["error"])
-        if not loc:
-            return reason
-    elif error["type"] == "missing" and isinstance(loc[-1], int):
-        loc, reason = loc[:-1], f"{loc[-1]} values are too few"
-    elif error["type"] == "tuple_type" and isinstance(error["input"], str):
-        reason = "want a list, as in 1,2,3"
-    elif isinstance(error["input"], (str, int, float)) and error["type"] != "missing":
-        reason = f"{reason}, not {error['input']}"
-    return f"{'.'.join(map(str, loc)) or 'configuration'}: {reason}"
-
-
-def _hint(model: type[Config], loc: Sequence[int | str]) -> str:
-    """Return what was perhaps meant by an unknown name, or else which names are known."""
-    *parents, name = loc
-    alternatives = _members_at(model, parents[:-1])
-    if len(alternatives) > 1 and (kinds := [kind_of(m) for m in alternatives if name in m.model_fields]):
-        return f"{'.'.join(map(str, parents[:-1]))}.kind={' or '.join(kinds)} has it"
-    known = [field for member in _members_at(model, parents)[:1] for field in member.model_fields]
-    if close := get_close_matches(str(name), known, n=1):
-        return f"did you mean {close[0]}?"
-    if elsewhere := [path for path in _setting_names(model) if path.split(".")[-1] == name]:
-        return f"did you mean {' or '.join(elsewhere)}?"
-    return f"known are {', '.join(known)}"
-
-
-def _members_at(model: type[Config], loc: Sequence[int | str]) -> list[type[Config]]:
-    """Return the classes of the settings that a location leads to: several where it ends before a kind."""
-    members = [model]
-    for part in loc:
-        if isinstance(part, int):  # an element of a list
-            continue
-        if len(members) > 1:
-            members = [member for member in members if kind_of(member) == part]
-        elif members and part in members[0].model_fields:
-            members = members_of(members[0].model_fields[part].annotation)
-    return members
-
-
-def _setting_names(model: type[Config]) -> Iterator[str]:
-    for name, field in model.model_fields.items():
-        yield name
-        default = field.get_default(call_default_factory=False)
-        if isinstance(default, Config):
-            yield from (f"{name}.{path}" for path in _setting_names(type(default)))

@@ -14,7 +14,6 @@ from mapper.core.errors import ConfigError, RunError
 from mapper.run import files
 from mapper.runtime.atomic import atomic_file, refuse_existing
 from mapper.runtime.progress import SILENT, Progress
-from mapper.sources.trajectory_files import write_kitti, write_tum
 
 if TYPE_CHECKING:
     from mapper.config.build import BuildConfig
@@ -246,11 +245,15 @@ def native(run: "Run", path: Path, _progress: Progress) -> None:
 
 def tum(run: "Run", path: Path, _progress: Progress) -> None:
     """Write the trajectory with its stamps."""
+    from mapper.sources.trajectory_files import write_tum
+
     write_tum(path, run.trajectory)
 
 
 def kitti(run: "Run", path: Path, _progress: Progress) -> None:
     """Write the trajectory without its stamps, for which KITTI text has no place."""
+    from mapper.sources.trajectory_files import write_kitti
+
     write_kitti(path, run.trajectory)
 
 

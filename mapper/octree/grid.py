@@ -76,6 +76,10 @@ class OccupancyGrid:
         axes.imshow(shades, cmap="gray", vmin=0.0, vmax=1.0, origin="lower", extent=extent)
         return axes
 
+    def __repr__(self) -> str:
+        rows, columns = self.shape
+        return f"OccupancyGrid of {rows} × {columns} cells of {self.resolution_m:g} m"
+
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
         return np.array(self.cells, dtype=dtype, copy=copy)
 

@@ -246,14 +246,14 @@ class MapView:
 
         Args:
             origins_world: (N, 3) metres, or (3,) of all rays.
-            directions_world: (N, 3) of any length but zero.
+            directions_world: (N, 3) of any length but zero, or (3,) of one ray.
             max_range_m: Rays end without a hit once a voxel's centre is further away.
             through_unknown: Pass unknown voxels; otherwise a ray ends, without a hit, in the first.
 
         Raises:
             DataError: Shapes differ, a direction is zero or not finite, or an origin has no key.
         """
-        directions = np.ascontiguousarray(directions_world, dtype=np.float32)
+        directions = np.ascontiguousarray(np.atleast_2d(directions_world), dtype=np.float32)
         given_world = np.asarray(origins_world)
         if given_world.shape == (3,):
             given_world = np.broadcast_to(given_world, directions.shape)
@@ -281,13 +281,13 @@ class MapView:
         """Return the occupied voxel whose centre is nearest to each point, without a distance field.
 
         Args:
-            points_world: (N, 3) metres, inside the map or not.
+            points_world: (N, 3) metres, or (3,) of one point, inside the map or not.
             max_range_m: Range of the search; inf searches everywhere.
 
         Raises:
             DataError: The points are not (N, 3) or not finite, or the range is negative.
         """
-        points = np.asarray(points_world, dtype=np.float64)
+        points = np.atleast_2d(np.asarray(points_world, dtype=np.float64))
         expect_shape(points, "N,3", "octree: nearest obstacles of points")
         if not np.isfinite(points).all() or not max_range_m >= 0.0:
             raise DataError(

@@ -74,9 +74,11 @@ def open_source(path: Path, config: SourceConfig = _DEFAULTS) -> "Log":
     from mapper.sources.wheel_files import read_wheels
 
     if not path.exists():
-        address = _ADDRESS.match(f"{path}")
-        what = "an address; download it, and open the file" if address else "no such file or folder"
-        raise SourceError(f"{path}: {what}")
+        if address := _ADDRESS.match(f"{path}"):  # of whose two slashes a path keeps one
+            raise SourceError(
+                f"{address[0]}/{f'{path}'[address.end() :]}: an address; download it, and open the file"
+            )
+        raise SourceError(f"{path}: no such file or folder")
     if not (path.is_dir() or path.is_file()):
         raise SourceError(f"{path}: a device or a pipe; want a file or a folder")
     if name := format_of(path):

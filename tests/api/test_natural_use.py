@@ -152,6 +152,9 @@ def test_what_a_prompt_shows_is_short(run, desk_log):
     loops = sum(factor.origin == "loop" for factor in run.graph.factors)
     nodes, factors = len(run.graph.nodes), len(run.graph.factors)
     assert repr(run.graph) == f"PoseGraph of {nodes} nodes and {factors} factors, {loops} of them loops"
+    rows, columns = run.slice.shape
+    assert repr(run.slice) == f"OccupancyGrid of {rows} × {columns} cells of 0.05 m"
+    assert repr(run.cloud) == f"Cloud of {len(run.cloud)} points with colours, times_s"
     log = mapper.open_log(desk_log)
     for shown in (run.graph.factors[0], *run.loops[:1], mapper.register(log[1], log[0], method="isvd")):
         assert "information" not in repr(shown)
@@ -249,6 +252,8 @@ def test_the_octree_is_asked_by_coordinates(run):
     assert rays.hits.shape == (2,)
     above = [[float(x), float(y), float(z) + 100.0]]
     assert octree.nearest_obstacles(above).distances_m < 110.0
+    assert octree.nearest_obstacles(above[0]).distances_m == octree.nearest_obstacles(above).distances_m
+    assert octree.cast_rays(run.trajectory.positions[0], [0.0, 0.0, -1.0]).hits == rays.hits[:1]
 
 
 def test_a_log_may_be_opened_in_a_block(desk_log):

@@ -3,6 +3,7 @@
 import io
 import json
 import math
+import re
 import shutil
 from dataclasses import dataclass
 from enum import StrEnum
@@ -95,6 +96,52 @@ def test_json_is_one_document_with_the_keys_of_its_verb(verb, desk_run, desk_log
     document = json.loads(result.stdout)
     assert set(keys.split()) == document.keys() if verb != "config" else set(keys.split()) <= document.keys()
     assert result.stderr == "", "machines read errors there"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "status", "kind"),
+    [
+        (["inspect", "NOWHERE"], 1, "SourceError"),
+        (["export", "RUN", "--as", "las", "--quiet", "--verbose"], 1, "ConfigError"),
+        (["build", "LOG", "--nonsense"], 2, "UsageError"),
+        (["sensor", "nonsense"], 2, "UsageError"),
+    ],
+)
+def test_an_error_is_a_document_too(arguments, status, kind, desk_run):
+    arguments = [desk_run.path if word == "RUN" else word for word in arguments]
+    result = mapper(*arguments, "--json", status=status)
+    error = json.loads(result.stdout)["error"]
+    assert error["kind"] == kind
+    assert result.stderr == f"mapper: {error['message']}\n"
+    assert mapper(*arguments, status=status).stdout == ""
+
+
+def test_an_answer_that_is_an_error_is_one_document(desk_run):
+    result = mapper("eval", desk_run.path, "--gate", "ATE RMSE=0", "--json", status=1)
+    assert "metrics" in json.loads(result.stdout)
+
+
+def test_a_log_file_keeps_what_is_printed_with_times(desk_run, tmp_path):
+    log = tmp_path / "mapper.log"
+    shown = mapper("loops", desk_run.path, "--log-file", log).stdout
+    assert mapper("loops", desk_run.path, "--log-file", log, "--quiet").output == ""
+    mapper("inspect", tmp_path / "none", "--log-file", log, status=1)
+    lines = [
+        re.fullmatch(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d,\d{3} (.*)", line)[1]
+        for line in log.read_text().splitlines()
+    ]
+    printed = [line for line in shown.splitlines() if line]
+    assert [line for line in lines if line in printed] == 2 * printed
+    assert lines[-1] == f"SourceError: {tmp_path / 'none'}: no such file or folder"
+    mapper("inspect", tmp_path, "--log-file", tmp_path / "none" / "a.log", status=1)
+
+
+def test_progress_is_in_the_log_file(desk_log, tmp_path):
+    log = tmp_path / "mapper.log"
+    mapper("build", desk_log, "--last", 11, "--out", tmp_path / "run", "--quiet", "--log-file", log)
+    text = log.read_text()
+    for row in ("track: 12/12 in", "fuse: 12/12 in", "frames ", "verdict "):
+        assert f" {row}" in text
 
 
 def test_verbose_prints_every_row_and_quiet_none(desk_run):

@@ -151,9 +151,9 @@ def test_a_summary_ends_with_a_command_that_works(run_folder, monkeypatch, absen
             "mapper: --as: want one of tum, mbag, kitti, mcap, bag; an --out that ends in .mcap",
         ),
         (["convert", "LOG", "--out", "folder"], "mapper: --as: want one of"),
-        (["synth", "log", "--rooms", "5"], "mapper: rooms: Input should be a multiple of 2"),
-        (["demo", "--out", "LOG", "--set", "workers=x"], "mapper: workers: Input should be"),
-        (["config", "--set", "odometry.kind=zip"], "mapper: odometry: Input tag 'zip' found"),
+        (["synth", "log", "--rooms", "5"], "mapper: rooms: want a multiple of 2"),
+        (["demo", "--out", "LOG", "--set", "workers=x"], "mapper: workers: want a whole number"),
+        (["config", "--set", "odometry.kind=zip"], "mapper: odometry: no kind 'zip'; want one of"),
     ],
 )
 def test_a_mistake_is_one_line(run_folder, desk_log, tmp_path, monkeypatch, arguments, message):

@@ -122,7 +122,7 @@ def test_a_keepout_blocks_the_traversable_floor_and_plans_but_not_the_slice(run_
             ["--erase", "--box", 1, 0, 0, 0, 1, 1],
             "region: box_m = [[1.0, 0.0, 0.0], ",
         ),
-        (["--erase", "--polygon", "0,0 1,0 x,1"], "region: polygon_m.2.0: Input should be a valid number"),
+        (["--erase", "--polygon", "0,0 1,0 x,1"], "region: polygon_m.2.0: want a number"),
         (["--keep", "--height", 50, 60], "the map has no voxel in a region to keep"),
     ],
 )

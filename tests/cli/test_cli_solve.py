@@ -118,7 +118,7 @@ def test_every_knob_of_the_graph_turns(tmp_path):
     ("setting", "message"),
     [
         ("octree.resolution_m=1", "octree: unknown; known are"),
-        ("max_iterations=0", "max_iterations: Input should be greater than 0"),
+        ("max_iterations=0", "max_iterations: want more than 0"),
     ],
 )
 def test_a_knob_that_is_none_is_refused(tmp_path, setting, message):

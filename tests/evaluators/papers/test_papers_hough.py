@@ -167,9 +167,9 @@ def test_given_pairs_are_read_with_their_pose(tmp_path):
     ("text", "complaint"),
     [
         ('[[pair]]\nname = "a"\nscan = "no.bin"\nmap = "no.bin"', "no such file"),
-        ('[[pair]]\nname = "a"\nscan = "a.bin"', "pair.0.map: Field required"),
+        ('[[pair]]\nname = "a"\nscan = "a.bin"', "pair.0.map: want a value, which is missing"),
         ('[[pair]]\nname = "a"\nscan = "a.bin"\nmap = "a.bin"\npose = [1, 2]', "pair.0.pose"),
-        ("pair = []", "pair: Tuple should have at least 1 item"),
+        ("pair = []", "pair: want 1 or more"),
         ("[[pair]", "not valid TOML"),
         ('[[pair]]\nname = "a"\nscan = "a.bin"\nmap = "a.bin"\n' * 2, "more than one is called 'a'"),
     ],

@@ -166,23 +166,23 @@ def test_a_key_tells_what_is_built_and_not_what_it_is_called(swept, desk_log, ti
 @pytest.mark.parametrize(
     ("lines", "error", "message"),
     [
-        (["logs = 3"], ConfigError, "sweep.toml: logs: Input should be a valid tuple"),
-        (["logs = []", method("a")], ConfigError, "sweep.toml: logs: Tuple should have at least 1 item"),
-        (["logs = ['LOG']"], ConfigError, "sweep.toml: method: Field required"),
+        (["logs = 3"], ConfigError, "sweep.toml: logs: want a list"),
+        (["logs = []", method("a")], ConfigError, "sweep.toml: logs: want 1 or more"),
+        (["logs = ['LOG']"], ConfigError, "sweep.toml: method: want a value, which is missing"),
         (["logs = ['LOG'"], ConfigError, "sweep.toml: not valid TOML: "),
         (
             ["logs = ['LOG']", "[[method]]\nnam = 'a'"],
             ConfigError,
-            "sweep.toml: method.0.name: Field required",
+            "sweep.toml: method.0.name: want a value, which is missing",
         ),
-        (["log = ['LOG']", method("a")], ConfigError, "sweep.toml: logs: Field required"),
+        (["log = ['LOG']", method("a")], ConfigError, "sweep.toml: logs: want a value, which is missing"),
         (["logs = ['LOG']", method("a"), method("a")], ConfigError, "two of [[method]] are called 'a'"),
         (["logs = ['no*where']", method("a")], ConfigError, "sweep.toml: logs: nothing fits 'no*where'"),
         (["logs = ['nowhere']", method("a")], SourceError, "nowhere: no such file or folder"),
         (
             ["logs = ['LOG']", method("a", "odometry.kind=zip")],
             ConfigError,
-            "sweep.toml: method 'a', configuration 'default': odometry: Input tag 'zip'",
+            "sweep.toml: method 'a', configuration 'default': odometry: no kind 'zip'",
         ),
         (
             ["logs = ['LOG']", "[[method]]\nname = 'a'\nconfig = 'no.toml'"],
