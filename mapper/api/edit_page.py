@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+import sys
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
@@ -252,6 +253,11 @@ class _Server(ThreadingHTTPServer):
         self.session, self.token = session, token_urlsafe()
         self.origin = f"http://127.0.0.1:{self.server_port}"
 
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Pass over connections that the other side ended."""
+        if not isinstance(sys.exception(), OSError):
+            super().handle_error(request, client_address)
+
 
 class _Handler(BaseHTTPRequestHandler):
     """Door to a session: refuses what does not come from its page, and knows a handful of names."""
@@ -319,7 +325,7 @@ class _Handler(BaseHTTPRequestHandler):
     def _answer(self, status: HTTPStatus, text: str, kind: str = "text/plain") -> None:
         with suppress(OSError):  # the tab was closed meanwhile
             self._head(status, kind)
-            self.wfile.write(text.encode())
+            self.wfile.write(text.encode("utf-8", "replace"))
 
     def _head(self, status: HTTPStatus, kind: str) -> None:
         self.send_response(status)

@@ -4,7 +4,9 @@ import re
 import zlib
 from dataclasses import replace
 
+import cv2
 import numpy as np
+import open3d as o3d
 import pytest
 
 from mapper.core.errors import ConfigError
@@ -255,6 +257,25 @@ def test_runs_of_different_logs_stand_side_by_side_each_as_large_as_its_pane(des
         np.testing.assert_allclose(spread, as_large, rtol=0.05)
         assert spread[0] > 0.12 * half
         assert browser.complaints == []
+
+
+@needs_browser
+def test_the_address_keeps_the_view_and_picture_and_points_are_saved(page, shown, tmp_path):
+    with MapPage(page, height_px=800) as browser:
+        browser.click("[data-map=above]")
+        above = browser.picture()
+        assert re.fullmatch(r"[125]0* (cm|m)", browser.text("scale-text"))
+        address = browser.run("location.href")
+        picture = cv2.imread(str(browser.saved("save-picture", tmp_path / "desk.png")))
+        assert np.abs(np.subtract(picture.shape, above.shape)).max() <= 1
+        inner = slice(60, -120)  # overlays are at the edges
+        assert change(above[: len(picture)][inner], picture[: len(above)][inner].astype(int)) < 0.01
+        cloud = o3d.io.read_point_cloud(str(browser.saved("save-points", tmp_path / "desk.ply")))
+        assert len(cloud.points) == shown["cloud"]["count"]
+        browser.click("[data-map=shading]")
+        assert change(above, browser.picture()) > 0.002  # edges are thin from above
+    with MapPage(address, height_px=800) as browser:
+        assert change(above, browser.picture()) < 0.01
 
 
 @needs_browser

@@ -1,6 +1,5 @@
 """Edits made on the page of a map, as a person makes them, and the file that it saves."""
 
-import time
 from dataclasses import replace
 
 import pytest
@@ -101,12 +100,7 @@ def test_regions_are_drawn_or_typed_and_saved_as_a_file_that_the_verb_takes(brow
     browser.key("keyDown", "Enter")
     browser.key("keyUp", "Enter")
 
-    browser.call("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(tmp_path))
-    browser.click("[data-map=edit-save]")
-    path, give_up = tmp_path / "desk.edits.toml", time.monotonic() + 10.0
-    while not path.is_file():
-        assert time.monotonic() < give_up
-        time.sleep(0.05)
+    path = browser.saved("edit-save", tmp_path / "desk.edits.toml")
     edits = read_config(path, EditsFile)
 
     assert (edits.reject[0].nodes, edits.drop) == ((first, last), (first,))

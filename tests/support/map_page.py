@@ -51,6 +51,16 @@ class MapPage(Page):
         data = self.call("Page.captureScreenshot", format="png", clip=clip)["data"]
         return cv2.imdecode(np.frombuffer(base64.b64decode(data), np.uint8), cv2.IMREAD_COLOR).astype(int)
 
+    def saved(self, button, path):
+        """Click on what saves a file, and wait for it to be in its folder."""
+        self.call("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(path.parent))
+        self.click(f"[data-map={button}]")
+        give_up = time.monotonic() + 10.0
+        while not path.is_file():
+            assert time.monotonic() < give_up
+            time.sleep(0.05)
+        return path
+
     def tap(self, x, y):
         self.mouse("mouseMoved", x, y)
         self.mouse("mousePressed", x, y, clicks=1)
