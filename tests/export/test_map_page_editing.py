@@ -91,8 +91,9 @@ def test_regions_are_drawn_or_typed_and_saved_as_a_file_that_the_verb_takes(brow
     browser.click("[data-map=edit-add]")
     browser.choose("edit-kind", "keepout")
     browser.click("[data-map=edit-draw]")
+    browser.call("Emulation.setTouchEmulationEnabled", enabled=True, maxTouchPoints=1)
     for off in ((-90, -90), (90, -90), (0, 90)):
-        browser.tap(x + off[0], y + off[1])
+        browser.touch([(x + off[0], y + off[1])])
     browser.click("[data-map=edit-add]")
     browser.choose("edit-kind", "keep")
     browser.choose("edit-region", "1.9 -0.2")

@@ -52,21 +52,26 @@ def run_page(title: str, chapters: Sequence[Chapter], *, editing: Editing | None
         MapperError: A file of a run cannot be read.
     """
     curves = [drawn(chapter) for chapter in chapters]
-    facts = "".join(_facts(chapter, names_it=len(chapters) > 1) for chapter in chapters)
+    facts = (
+        "".join(map(_facts, chapters, curves)) if len(chapters) > 1 else _facts(chapters[0], curves[0], "")
+    )
     pictures = pictures_of(chapters)
     return map_page(title, curves, maps_of(chapters), pictures=pictures, facts=facts, editing=editing)
 
 
-def _facts(chapter: Chapter, *, names_it: bool) -> str:
+def _facts(chapter: Chapter, curves: dict[str, Any], name: str | None = None) -> str:
+    """Return a run's verdict and key figures, under its own name if no other is given."""
     verdict, counts = chapter.run.verdict, chapter.run.manifest.counts
-    name = f"{escape(chapter.name)}: " if names_it else ""
     figures = [
         f"{counts.tracked} of {counts.listed} frames",
         f"{counts.loops} of {counts.loop_candidates} loops hold",
         f"{counts.voxels_text} of {chapter.run.config.octree.resolution_m:g} m",
     ]
+    if curves["error"] and (misses_m := curves["error"]["m"]):
+        figures.insert(0, f"ATE RMSE {np.sqrt(np.mean(np.square(misses_m))):.4f} m")
+    title = escape(f"{chapter.name}: " if name is None else name)
     why = escape(" ".join(verdict.sentences))
-    return f'<p class="facts" title="{why}">{name}<b>{verdict.state}</b> · {escape(" · ".join(figures))}</p>'
+    return f'<p class="facts" title="{why}">{title}<b>{verdict.state}</b> · {escape(" · ".join(figures))}</p>'
 
 
 def map_page(
