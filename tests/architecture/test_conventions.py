@@ -1,4 +1,4 @@
-"""The conventions of docs/ARCHITECTURE.md, a test each: what a number means is nowhere a matter of taste."""
+"""The conventions of docs/architecture.md, a test each: what a number means is nowhere a matter of taste."""
 
 import gtsam
 import numpy as np

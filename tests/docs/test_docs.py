@@ -16,7 +16,7 @@ from tests.support.pages import PAGES
 from tests.support.paths import ROOT
 
 IDS = [path.name for path in PAGES]
-LINKED_TO_CODE = [ROOT / "docs" / name for name in ("ARCHITECTURE.md", "algorithms.md")]
+LINKED_TO_CODE = [ROOT / "docs" / name for name in ("architecture.md", "algorithms.md")]
 
 LINK = re.compile(r"\[([^\]]*)\]\(([^)\s]+)\)")
 CODE = re.compile(r"`([^`\n]+)`")
@@ -120,7 +120,7 @@ def test_files_and_dotted_names_exist(path):
 
 
 def test_files_in_the_picture_exist():
-    pictures = FENCE.findall((ROOT / "docs/ARCHITECTURE.md").read_text(encoding="utf-8"))
+    pictures = FENCE.findall((ROOT / "docs/architecture.md").read_text(encoding="utf-8"))
     drawn = DRAWN.findall("".join(pictures))
     assert len(drawn) > 10
     for file in drawn:
@@ -141,7 +141,7 @@ def folders_of(package: str, marker: str = "__init__.py") -> set[str]:
 
 
 def test_every_folder_has_its_line_in_the_order_of_the_layers():
-    text = (ROOT / "docs/ARCHITECTURE.md").read_text(encoding="utf-8")
+    text = (ROOT / "docs/architecture.md").read_text(encoding="utf-8")
     named = {
         package: re.findall(rf"^\| `{package}/(\w+)/` \|", text, re.MULTILINE)
         for package in ("mapper", "evaluators", "tests")
@@ -163,9 +163,9 @@ def layers() -> tuple[str, ...]:
 
 
 def test_what_does_not_exist_is_found():
-    assert {"seams", "decisions"} <= anchors_of(ROOT / "docs/ARCHITECTURE.md")
+    assert {"seams", "decisions"} <= anchors_of(ROOT / "docs/architecture.md")
     assert "the-sensors-own-vehicle" in anchors_of(ROOT / "docs/your-sensor.md")
-    assert "seems" not in anchors_of(ROOT / "docs/ARCHITECTURE.md")
+    assert "seems" not in anchors_of(ROOT / "docs/architecture.md")
     assert "Isvd.fit_weighted" in names_in(ROOT / "mapper/registration/isvd.py")
     assert "Isvd.weighted_fit" not in names_in(ROOT / "mapper/registration/isvd.py")
     assert resolves("mapper.pipeline.build.build")

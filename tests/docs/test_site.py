@@ -4,12 +4,14 @@ import os
 import re
 import subprocess
 import sys
+import time
 from html import unescape
 from pathlib import Path
 
 import pytest
 
 from mapper.config.describe import settings
+from tests.support.chromium import CHROMIUM, MISSING, Page
 from tests.support.pages import PAGES
 from tests.support.paths import ROOT
 
@@ -20,21 +22,35 @@ ASSET = re.compile(
     r"<(?:script|img|iframe|source|video|audio|embed)\b[^>]*\bsrc=[\"']?([^\"'\s>]+)"
     r"|<link\b(?=[^>]*\brel=[\"']?(?:stylesheet|icon|preload|preconnect|dns-prefetch))[^>]*\bhref=[\"']?([^\"'\s>]+)"
 )
+SEARCHED = {
+    "localization": "localising",
+    "relocalization": "localising",
+    "splatting": "splatting",
+    "QGIS": "gis",
+    "AMCL": "nav2",
+    "Autoware": "viewing",
+    "octree.resolution_m": "settings",
+}
+"""Words that are typed into the search, and the page that each must find."""
 FETCHED = re.compile(r"@import\s+[\"']?([^\"';\s)]+)|url\([\"']?([^\"')]+)")
 
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory):
-    out = tmp_path_factory.mktemp("site")
-    done = subprocess.run(
-        [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", out],
-        cwd=ROOT,
-        env={**os.environ, "NO_MKDOCS_2_WARNING": "1"},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
+    out, pages = tmp_path_factory.mktemp("site"), tmp_path_factory.mktemp("pages")
+    for command in (
+        ["scripts/make_pages.py", pages],
+        ["-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", out],
+    ):
+        done = subprocess.run(
+            [sys.executable, *command],
+            cwd=ROOT,
+            env={**os.environ, "NO_MKDOCS_2_WARNING": "1", "PAGES": str(pages), "PYTHONPATH": str(ROOT)},
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert done.returncode == 0, done.stdout + done.stderr
     return out
 
 
@@ -84,3 +100,21 @@ def test_every_setting_and_every_verb_is_in_the_reference(site):
     for verb in ("build", "fuse", "export", "sensor depth", "vocabulary train"):
         assert f"mapper {verb}" in commands
     assert "--require-truth" in commands
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not CHROMIUM, reason=MISSING)
+def test_the_search_works_from_disk_and_knows_other_spellings_and_names(site):
+    field = "document.querySelector('input[data-md-component=\"search-query\"]')"
+    found = (
+        "Array.from(document.querySelectorAll('.md-search-result__item a')).map(a => a.pathname).join(' ')"
+    )
+    with Page(site / "index.html") as page:
+        for word, name in SEARCHED.items():
+            page.run(f"{field}.focus(); {field}.value = {word!r}; {field}.dispatchEvent(new Event('keyup'))")
+            for _ in range(100):
+                if f"/{name}.html" in (places := page.run(found)):
+                    break
+                time.sleep(0.1)
+            assert f"/{name}.html" in places, word
+        assert not [address for address in page.asked_for if not address.startswith(("file:", "data:"))]

@@ -1,69 +1,40 @@
-"""Hooks of MkDocs: pages generated from the code, and links from pages to files of the repository.
+"""The pages as the site has them, in build/pages: any generator of Markdown sites takes them from there.
 
 A line such as ``<!-- generated: settings -->`` in a page and the paragraph below it are replaced by the
-reference. README.md is the first page. Files of the repository that pages link to are copied into the site as
-text, so that the site is complete without a network.
+reference. README.md is the first page. Files of the repository that pages link to are copied as text, so that
+the site is complete without a network.
 """
 
 import os
 import re
+import shutil
+import sys
 from collections.abc import Iterator
 from itertools import groupby
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from mkdocs.config.defaults import MkDocsConfig
-from mkdocs.structure.files import File, Files
-from mkdocs.structure.pages import Page
-
 ROOT = Path(__file__).resolve().parent.parent
+PAGES = ROOT / "build" / "pages"
 _GENERATED = re.compile(r"^<!-- generated: (\w+) -->\n\n(?:[^\n#].*\n)+", re.MULTILINE)
 _LINK = re.compile(r"(?<!\!)\[((?:[^\[\]]|\[[^\]]*\])*)\]\(([^)\s]+)\)")
-_CODE = re.compile(r"^```.*?^```|``.*?``|`[^`\n]*`", re.DOTALL | re.MULTILINE)
 _NAMES = {"rgbd": "RGB-D", "lidar": "LiDAR"}
 
 
-def on_config(config: MkDocsConfig) -> MkDocsConfig:
-    """Leave pages out of the navigation that are not there."""
-    config.nav = _present(config.nav or [])
-    return config
-
-
-def _present(nav: list[Any]) -> list[Any]:
-    """Return the entries of a part of the navigation whose pages are there."""
-    kept: list[Any] = []
-    for entry in nav:
-        if isinstance(entry, dict):
-            kept.append({title: _present(entries) for title, entries in entry.items()})
-        elif entry == "index.md" or (ROOT / "docs" / entry).is_file():
-            kept.append(entry)
-    return kept
-
-
-def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Add the first page, and the files that pages link to."""
-    readme = (ROOT / "README.md").read_text(encoding="utf-8")
-    files.append(File.generated(config, "index.md", content=_moved(readme)))
-    linked = {
-        target for page in files.documentation_pages() for target in _outside(page.content_string, page)
-    }
-    for target in sorted(linked):
-        files.append(File.generated(config, _copy_of(target), abs_src_path=str(ROOT / target)))
-    return files
-
-
-def on_page_markdown(markdown: str, page: Page, **_: Any) -> str:
-    """Put in what is generated, and point links at the copies of the repository's files."""
-    markdown = _GENERATED.sub(lambda found: "\n".join(_REFERENCES[found[1]]()), markdown)
-    return _relinked(markdown, page.file)
-
-
-def on_page_content(html: str, page: Page, **_: Any) -> str:
-    """Take Sphinx's roles, which docstrings use, out of the reference of the library."""
-    if page.file.src_uri != "api.md":
-        return html
-    html = re.sub(r":(?:func|class|attr|meth|mod|data|exc):(<code>)~?(?:[a-z]\w*\.)*", r"\1", html)
-    return re.sub(r"(<code>[\w.]+) &lt;[\w.]+&gt;(</code>)", r"\1\2", html)
+def make_pages(out: Path = PAGES) -> None:
+    """Write all pages, with what they show and link to."""
+    shutil.rmtree(out, ignore_errors=True)
+    shutil.copytree(ROOT / "docs", out)
+    (out / "index.md").write_text(_moved((ROOT / "README.md").read_text(encoding="utf-8")), encoding="utf-8")
+    for page in sorted(out.glob("*.md")):
+        text = _GENERATED.sub(
+            lambda found: "\n".join(_REFERENCES[found[1]]()), page.read_text(encoding="utf-8")
+        )
+        for target in _outside(text):
+            copy = out / _copy_of(target)
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(ROOT / target, copy)
+        page.write_text(_relinked(text), encoding="utf-8")
 
 
 def _moved(readme: str) -> str:
@@ -79,18 +50,18 @@ def _moved(readme: str) -> str:
     return re.sub(r"(\!?\[[^\]]*\])\(([^)\s]+)\)", link, readme)
 
 
-def _target(link: str, page: File) -> str | None:
+def _target(link: str) -> str | None:
     """Return the path in the repository of a file outside of docs/ that a link of a page leads to, if any."""
     path = link.partition("#")[0]
     if "://" in link or not path:
         return None
-    full = os.path.normpath(PurePosixPath("docs", page.src_uri).parent / path)
+    full = os.path.normpath(PurePosixPath("docs") / path)
     return None if full.startswith("docs/") else full
 
 
-def _outside(markdown: str, page: File) -> Iterator[str]:
+def _outside(markdown: str) -> Iterator[str]:
     for _, link in _LINK.findall(markdown):
-        target = _target(link, page)
+        target = _target(link)
         if target is not None and (ROOT / target).is_file():
             yield target
 
@@ -99,15 +70,15 @@ def _copy_of(target: str) -> str:
     return f"source/{target}.txt"
 
 
-def _relinked(markdown: str, page: File) -> str:
+def _relinked(markdown: str) -> str:
     def link(found: re.Match[str]) -> str:
-        target = _target(found[2], page)
+        target = _target(found[2])
         if target is None:
             return found[0]
         if target == "README.md":
             return f"[{found[1]}](index.md)"
         if (ROOT / target).is_file():
-            return f"[{found[1]}]({os.path.relpath(_copy_of(target), PurePosixPath(page.src_uri).parent)})"
+            return f"[{found[1]}]({_copy_of(target)})"
         return found[1] if (ROOT / target).is_dir() else found[0]
 
     return _LINK.sub(link, markdown)
@@ -207,3 +178,7 @@ def _api() -> Iterator[str]:
 
 
 _REFERENCES = {"api": _api, "settings": _settings, "commands": _commands}
+
+
+if __name__ == "__main__":
+    make_pages(*map(Path, sys.argv[1:2]))
