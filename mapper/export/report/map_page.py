@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Iterator, Sequence
+from functools import partial
 from html import escape
 from importlib import resources
 from importlib.resources.abc import Traversable
@@ -52,15 +53,13 @@ def run_page(title: str, chapters: Sequence[Chapter], *, editing: Editing | None
         MapperError: A file of a run cannot be read.
     """
     curves = [drawn(chapter) for chapter in chapters]
-    facts = (
-        "".join(map(_facts, chapters, curves)) if len(chapters) > 1 else _facts(chapters[0], curves[0], "")
-    )
+    facts_of = partial(_facts, names_it=len(chapters) > 1)
+    facts = "".join(map(facts_of, chapters, curves))
     pictures = pictures_of(chapters)
     return map_page(title, curves, maps_of(chapters), pictures=pictures, facts=facts, editing=editing)
 
 
-def _facts(chapter: Chapter, curves: dict[str, Any], name: str | None = None) -> str:
-    """Return a run's verdict and key figures, under its own name if no other is given."""
+def _facts(chapter: Chapter, curves: dict[str, Any], *, names_it: bool) -> str:
     verdict, counts = chapter.run.verdict, chapter.run.manifest.counts
     figures = [
         f"{counts.tracked} of {counts.listed} frames",
@@ -69,7 +68,7 @@ def _facts(chapter: Chapter, curves: dict[str, Any], name: str | None = None) ->
     ]
     if curves["error"] and (misses_m := curves["error"]["m"]):
         figures.insert(0, f"ATE RMSE {np.sqrt(np.mean(np.square(misses_m))):.4f} m")
-    title = escape(f"{chapter.name}: " if name is None else name)
+    title = f"{escape(chapter.name)}: " if names_it else ""
     why = escape(" ".join(verdict.sentences))
     return f'<p class="facts" title="{why}">{title}<b>{verdict.state}</b> · {escape(" · ".join(figures))}</p>'
 
