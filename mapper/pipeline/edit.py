@@ -1,7 +1,7 @@
 """Edits by hand of a finished run, of its loops or its maps: solved and fused again, but not tracked."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 from mapper.config.build import BuildConfig
@@ -10,7 +10,7 @@ from mapper.core.errors import ConfigError, LoopError
 from mapper.core.frames import RgbdFrame, Sensor
 from mapper.core.geometry import Transform, inverse
 from mapper.graph.components import by_odometry, components
-from mapper.graph.model import PoseGraph
+from mapper.graph.model import PoseGraph, PoseSigmas
 from mapper.loops.base import Proposal, Verification, Verifier, closure_of
 from mapper.loops.closure import LoopClosure, accepted_loops
 from mapper.loops.factory import build_verifier, keyframe_loops
@@ -29,6 +29,25 @@ from mapper.sources.base import Log
 
 Pair = tuple[int, int]
 """Two nodes."""
+_BY_EYE_VOXELS, _BY_EYE_RAD = 2.0, 0.03
+"""Error of an alignment by eye, along and about each axis: people see clouds as sharp as the octree."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Alignment:
+    """Alignment of two frames by hand, if there was one.
+
+    Attributes:
+        T_i_j: (4, 4) pose of the second frame in the first.
+        by_eye: It is the measurement, and not where that begins.
+    """
+
+    T_i_j: Transform | None = None
+    by_eye: bool = False
+
+    @property
+    def inverse(self) -> "_Alignment":
+        return replace(self, T_i_j=None if self.T_i_j is None else inverse(self.T_i_j))
 
 
 def edit_loops(
@@ -57,7 +76,7 @@ def edit_loops(
         LoopError: A node is unknown, a loop is there already or is not, two frames do not show one place, or
             the solver rejects a loop that was added.
     """
-    changed, report = _solve_edited(source, run, dict.fromkeys(add), remove)
+    changed, report = _solve_edited(source, run, dict.fromkeys(add, _Alignment()), remove)
     return fuse_changed(source, run, changed, solve=report, progress=progress)
 
 
@@ -80,7 +99,7 @@ def apply_edits(source: Log, run: Run, edits: EditsFile, *, progress: Progress =
         text = with_region(text, run.path, kind, region)
     changed, report = None, None
     if edits.accept or edits.reject or edits.drop:
-        aligned = {loop.nodes: loop.aligned for loop in edits.accept}
+        aligned = {loop.nodes: _Alignment(loop.aligned, by_eye=loop.by_eye) for loop in edits.accept}
         if len(aligned) < len(edits.accept):
             raise ConfigError("edits: accept: the same nodes twice")
         rejected = [loop.nodes for loop in edits.reject]
@@ -92,7 +111,7 @@ def apply_edits(source: Log, run: Run, edits: EditsFile, *, progress: Progress =
 def _solve_edited(
     source: Log,
     run: Run,
-    add: Mapping[Pair, Transform | None],
+    add: Mapping[Pair, _Alignment],
     remove: Sequence[Pair],
     drop: Sequence[int] = (),
 ) -> tuple[StoredTracking, Solve]:
@@ -107,11 +126,11 @@ def _solve_edited(
             raise LoopError(f"loop {_text(pair)}: no loop of {run.path} to remove; mapper loops lists them")
         loops[place] = loops[place].rejected("hand", "removed")
     aligned = {}
-    for pair, T in add.items():
+    for pair, alignment in add.items():
         i, j = _in_time_order(graph, pair)
         if _held(loops, pair) is not None or (i, j) in aligned:
             raise LoopError(f"loop {_text((i, j))}: there already")
-        aligned[i, j] = inverse(T) if T is not None and (i, j) != pair else T
+        aligned[i, j] = alignment if (i, j) == pair else alignment.inverse
     pairs = list(aligned)
     if pairs:
         found = _measured(source, tracked, aligned, run.config)
@@ -172,16 +191,21 @@ def _in_time_order(graph: PoseGraph, pair: Pair) -> Pair:
 
 
 def _measured(
-    source: Log, tracked: StoredTracking, aligned: Mapping[Pair, Transform | None], config: BuildConfig
+    source: Log, tracked: StoredTracking, aligned: Mapping[Pair, _Alignment], config: BuildConfig
 ) -> list[LoopClosure]:
     verifier, graph = _verifier(config, source.sensor), tracked.graph
     stamps_ns = {graph.stamps_ns[node] for pair in aligned for node in pair}
     views = reobserve(source, tracked.trajectory, stamps_ns, config)
     places = {stamp_ns: verifier.describe(seen) for stamp_ns, seen in views.items()}
     loops = []
-    for (i, j), T_i_j in aligned.items():
+    for (i, j), alignment in aligned.items():
         place_i, place_j = (places[graph.stamps_ns[node]] for node in (i, j))
-        found = _verify(source, verifier, place_i, place_j, T_i_j)
+        if alignment.by_eye:
+            sigma_m = _BY_EYE_VOXELS * config.octree.resolution_m
+            information = PoseSigmas(rotation_rad=_BY_EYE_RAD, translation_m=sigma_m).information
+            found = Verification(0, "", T_i_j=alignment.T_i_j, information=information)
+        else:
+            found = _verify(source, verifier, place_i, place_j, alignment.T_i_j)
         loops.append(closure_of(Proposal(i, "hand"), j, place_i, place_j, found))
         _refuse_rejected(loops[-1])
     return loops

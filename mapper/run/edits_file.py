@@ -35,8 +35,13 @@ class AcceptedLoop(LoopEdit):
     rotation_xyzw: tuple[float, float, float, float] | None = None
     """Its orientation there."""
 
+    by_eye: bool = False
+    """The alignment itself is the measurement: the first one's scan need not show the second one's place."""
+
     @model_validator(mode="after")
     def _is_whole(self) -> Self:
+        if self.by_eye and self.translation_m is None:
+            raise ValueError("by_eye: want translation_m and rotation_xyzw with it")
         if (self.translation_m is None) != (self.rotation_xyzw is None):
             raise ValueError("translation_m and rotation_xyzw: want both, or neither")
         return self

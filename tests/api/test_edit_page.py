@@ -149,6 +149,14 @@ def test_a_person_drags_one_keyframe_over_another_and_the_server_registers_them(
         assert (dz, turn) == (0.0, 0.0)
         assert dx / dy == pytest.approx(12.0 / 9.0, rel=0.05)
         assert 0.02 < dx < 0.3
+        browser.click("[data-map=edit-by-eye]")
+        browser.click("[data-map=edit-accept]")
+        assert browser.edits() == [f"accept {i} – {j}, by eye"]
+        browser.click("[data-map=edit-undo]")
+        browser.click("[data-map=edit-align]")
+        while browser.run("document.querySelector('[data-map=edit-moved]').hidden"):
+            time.sleep(0.05)
+        browser.click("[data-map=edit-by-eye]")
         browser.click("[data-map=edit-accept]")
         assert browser.edits() == [f"accept {i} – {j}, aligned"]
         browser.ask("edit-solve")

@@ -8,7 +8,8 @@ import pytest
 
 from mapper.config.loading import load_config
 from mapper.core.errors import ConfigError
-from mapper.core.geometry import exp
+from mapper.core.geometry import exp, inverse, transform
+from mapper.core.rotations import row_of_pose
 from mapper.graph.components import by_odometry
 from mapper.graph.model import BetweenFactor, PoseGraph
 from mapper.pipeline.build import build
@@ -108,6 +109,25 @@ def test_an_edits_file_makes_the_same_of_loops_and_regions_at_once(run, built, t
     mapper("edit", one_by_one, "--keep", "--radius", 2.0, "--quiet")
     for name in ("loops.jsonl", "graph.g2o", "edits.toml", "map.octree", "cloud.ply"):
         assert (run / name).read_bytes() == (one_by_one / name).read_bytes()
+
+
+def test_a_keyframe_that_was_moved_by_eye_moves_the_path(run, tmp_path):
+    graph = open_run(run).graph
+    i, *_, j = graph.T_world_node
+    T_i_j = inverse(graph.T_world_node[i]) @ graph.T_world_node[j]
+    up_m = np.array([0.0, -0.05, 0.0])  # of the camera
+    edits = tmp_path / "edits.toml"
+    nodes = f"[[accept]]\nnodes = [{j}, {i}]\nby_eye = true\n"
+    row = row_of_pose(inverse(transform(T_i_j[:3, :3], T_i_j[:3, 3] + up_m))).tolist()
+    edits.write_text(f"{nodes}translation_m = {row[:3]}\nrotation_xyzw = {row[3:]}\n")
+    mapper("edit", run, "--from", edits, "--quiet")
+    after = open_run(run)
+    (loop,) = [loop for loop in after.loops if loop.proposed_by == "hand"]
+    np.testing.assert_allclose(loop.T_i_j[:3, 3] - T_i_j[:3, 3], up_m, atol=1e-6)
+    T_after = inverse(after.graph.T_world_node[i]) @ after.graph.T_world_node[j]
+    assert -0.05 < (T_after - T_i_j)[1, 3] < 0.0
+    edits.write_text(nodes)
+    assert "by_eye: want translation_m" in mapper("edit", run, "--from", edits, status=1).stderr
 
 
 def test_a_dropped_keyframe_is_in_no_map_and_ties_nothing(run, tmp_path):

@@ -10,7 +10,7 @@ const TURN_DEG_PER_PX = 0.2;
 export class Aligning {
   /** @param button Begins and ends it. @param field Has the motion: x, y, z in metres, and degrees about the vertical. */
   constructor(editing, button, field, pairOf) {
-    Object.assign(this, { editing, view: editing.view, button, field, pairOf, isOn: false });
+    Object.assign(this, { editing, view: editing.view, button, field, pairOf, isOn: false, byEye: editing.find("edit-by-eye") });
     button.addEventListener("click", () => { if (this.isOn) this.end(); else this.#begin(); });
     field.addEventListener("input", () => this.#place());
     this.#dragging();
@@ -22,7 +22,7 @@ export class Aligning {
     const T_i_j = this.poses[0].clone().invert().multiply(this.#pose()), at = new Vector3(), turn = new Quaternion();
     T_i_j.decompose(at, turn, new Vector3());
     const [translation_m, rotation_xyzw] = [at, turn].map((one) => one.toArray().map((value) => Number(value.toFixed(5))));
-    return { translation_m, rotation_xyzw };
+    return { translation_m, rotation_xyzw, ...this.byEye.checked ? { by_eye: true } : {} };
   }
 
   end() {
@@ -56,7 +56,7 @@ export class Aligning {
   #show(isOn) {
     this.isOn = isOn;
     this.button.setAttribute("aria-pressed", String(isOn));
-    this.field.hidden = !isOn;
+    this.field.hidden = this.byEye.closest("label").hidden = !isOn;
     this.view.navigation.isLeft = isOn;
     this.view.update({ isAside: isOn });
   }

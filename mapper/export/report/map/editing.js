@@ -198,8 +198,8 @@ export class Editing {
     const { edits, server, isAsking } = this, count = edits.length;
     this.find("edits").replaceChildren(...edits.map(({ kind, values }) => {
       const item = document.createElement("li");
-      const { node, nodes, translation_m, ...region } = values;
-      item.textContent = `${kind} ${node ?? nodes?.join(" – ") ?? JSON.stringify(Object.values(region)[0])}${translation_m ? ", aligned" : ""}`;
+      const { node, nodes, translation_m, by_eye, ...region } = values;
+      item.textContent = `${kind} ${node ?? nodes?.join(" – ") ?? JSON.stringify(Object.values(region)[0])}${by_eye ? ", by eye" : translation_m ? ", aligned" : ""}`;
       return item;
     }));
     this.find("edit-undo").disabled = isAsking || (!count && !server);
