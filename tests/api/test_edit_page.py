@@ -102,6 +102,7 @@ def test_a_solve_is_shown_beside_what_was_and_undone_to_the_byte(served):
     assert open_run(served.folder).manifest.edits[0].count > 10
     status, page = served.ask("GET", f"/{served.token}/")
     assert (status, page.count('class="facts"')) == (200, 2)
+    assert '"regions":[{"kind":"erase","values":{"box_m":[[-9.0,-9.0,0.3],[9.0,9.0,0.9]]}}]' in page
     assert served.ask("POST", f"/{served.token}/undo", "") == (200, "")
     assert files_of(served.folder) == before
 

@@ -264,8 +264,26 @@ def _tiny_desk(folder: Path) -> Path:
     return folder / "log"
 
 
+_EDITS = """\
+drop = []
+[[accept]]
+nodes = [0, 1]
+translation_m = [0.1, 0.0, 0.02]
+rotation_xyzw = [0.0, 0.0, 0.1, 0.995]
+by_eye = true
+[[erase]]
+box_m = [[0.5, -0.5, 0.3], [0.9, 0.5, 0.9]]
+[[keep]]
+height_m = [-1.0, 2.5]
+path_radius_m = 9.0
+[[keepout]]
+polygon_m = [[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]]
+"""
+
+
 def _run(folder: Path) -> Path:
     build_desk_run(_tiny_desk(folder), folder / "run")
+    (folder / "run/mine.toml").write_text(_EDITS)
     return folder / "run"
 
 
@@ -355,6 +373,7 @@ _OF_A_RUN = (
         for kind, exporter in EXPORTERS.items()
         if exporter.file_name and kind != "mesh"
     ),
+    "edit {} --from {}/mine.toml --quiet",
 )
 _VERBS: Mapping[str, tuple[str, ...]] = {
     "built log": ("inspect {}", "convert {} --as mcap --out {}/../o.mcap", "build {} --out {}/../o --quiet"),

@@ -49,6 +49,11 @@ def write_map_page(path: Path, chapters: Sequence[Chapter]) -> None:
 def run_page(title: str, chapters: Sequence[Chapter], *, editing: Editing | None = None) -> str:
     """Return a page that shows the maps of some runs, with their verdicts and key figures.
 
+    Args:
+        title: Title of the page.
+        chapters: The runs.
+        editing: Lets a person edit the last run.
+
     Raises:
         MapperError: A file of a run cannot be read.
     """
@@ -56,7 +61,22 @@ def run_page(title: str, chapters: Sequence[Chapter], *, editing: Editing | None
     facts_of = partial(_facts, names_it=len(chapters) > 1)
     facts = "".join(map(facts_of, chapters, curves))
     pictures = pictures_of(chapters)
-    return map_page(title, curves, maps_of(chapters), pictures=pictures, facts=facts, editing=editing)
+    edited = None if editing is None else _edited(title, chapters, editing)
+    return map_page(title, curves, maps_of(chapters), pictures=pictures, facts=facts, edited=edited)
+
+
+def _edited(title: str, chapters: Sequence[Chapter], editing: Editing) -> dict[str, Any]:
+    """Return what the page has to know of the run that is edited, with the regions that it has already."""
+    regions = [
+        {"kind": edit.kind, "values": edit.region.model_dump(exclude_none=True)}
+        for edit in chapters[-1].run.manifest.edits
+    ]
+    return {
+        "name": title,
+        "run": len(chapters) - 1,
+        "isServed": editing == "served",
+        "regions": regions,
+    }
 
 
 def _facts(chapter: Chapter, curves: dict[str, Any], *, names_it: bool) -> str:
@@ -80,7 +100,7 @@ def map_page(
     *,
     pictures: str,
     facts: str = "",
-    editing: Editing | None = None,
+    edited: dict[str, Any] | None = None,
 ) -> str:
     """Return a page that shows maps in 3D, each with its path and its loops.
 
@@ -90,20 +110,19 @@ def map_page(
         maps: Points, voxels and layers, see :func:`~.map_data.map_of`.
         pictures: HTML that takes the maps' place where they cannot be shown.
         facts: HTML of what the page says about them.
-        editing: Lets a person edit the last run.
+        edited: Name and index of a run that may be edited, see :func:`run_page`; None if none may.
     """
-    edited = {"name": title, "run": len(curves) - 1, "isServed": editing == "served"}
     return document(
         f"{title} – map",
         header=f"<h1>{escape(title)}</h1>{facts}",
         main=[map_html([one["name"] for one in curves], pictures, css="map whole")],
         scripts=[
             json_element("data", curves),
-            json_element("edited", edited if editing else None),
+            json_element("edited", edited),
             *map_scripts(maps),
         ],
         styles=[map_style()],
-        is_served=editing == "served",
+        is_served=bool(edited and edited["isServed"]),
     )
 
 

@@ -34,9 +34,9 @@ export function textOf(edits) {
 }
 
 export class Editing {
-  /** @param options.run Index of the run that is edited. @param options.server Its event source; null without one. */
-  constructor(root, view, { name, run, server }) {
-    Object.assign(this, { root, view, name, server, layers: view.layers[run], edits: [], isDrawing: false });
+  /** @param options.run Index of the run that is edited. @param options.regions That it has. @param options.server Its event source; null without one. */
+  constructor(root, view, { name, run, regions, server }) {
+    Object.assign(this, { root, view, name, regions, server, layers: view.layers[run], edits: [], isDrawing: false });
     this.nodes = new Map(this.layers.frames.filter(({ node }) => node !== null).map((frame) => [frame.node, frame.pose]));
     this.find("edit").hidden = false;
     this.find("edit").open = Boolean(server);
@@ -214,7 +214,7 @@ export class Editing {
     const bands = [...this.edits, { values }].map((edit) => edit.values?.height_m).filter(Boolean);
     view.update({ kept_m: bands.length ? [Math.min(...bands.map(([low]) => low)), Math.max(...bands.map(([, high]) => high))] : [-Infinity, Infinity] });
     const corners = this.find("edit-region").value.trim().split(/[\s,]+/).map(Number);
-    const shapes = [...this.edits, ...values ? [{ kind, values }] : []].flatMap((edit) => this.#shapesOf(edit));
+    const shapes = [...this.regions, ...this.edits, ...values ? [{ kind, values }] : []].flatMap((edit) => this.#shapesOf(edit));
     if (this.isDrawing && kind === "keepout" && corners.length > 1)
       shapes.push(new Markers(corners.flatMap((v, i) => i % 2 ? [v, 0] : [v]), { color: new Color(COLORS.keepout), size_px: 9 }));
     view.draw("edits", shapes);
