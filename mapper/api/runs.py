@@ -2,11 +2,11 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from mapper.api.progress import AnyProgress, receiver_of
 from mapper.config.loading import Settings, overridden
 from mapper.core.trajectory import Trajectory
-from mapper.export.exporters import Frame
 from mapper.export.exporters import export as export_kind
 from mapper.export.report.data import chapter_of
 from mapper.export.report.map_page import write_map_page
@@ -26,24 +26,13 @@ def export(
     path: AnyPath | None,
     *,
     settings: Settings | None,
-    frame: Frame,
-    crop: Sequence[float] | None,
-    overwrite: bool,
     progress: AnyProgress,
+    **options: Any,
 ) -> Path:
     """Write a run for another program; see :meth:`mapper.run.folder.Run.export`."""
     config = overridden(run.config, settings=settings) if settings else None
     out = None if path is None else Path(path)
-    return export_kind(
-        run,
-        kind,
-        out,
-        config=config,
-        frame=frame,
-        box_m=crop,
-        overwrite=overwrite,
-        progress=receiver_of(progress),
-    )
+    return export_kind(run, kind, out, config=config, progress=receiver_of(progress), **options)
 
 
 def fuse(run: Run, *, settings: Settings | None, trajectory: Trajectory | None, progress: AnyProgress) -> Run:

@@ -13,16 +13,15 @@ from mapper.core.geometry import Array
 from mapper.core.trajectory import Trajectory
 from mapper.export.figures import (
     BACKDROP,
-    END,
     ESTIMATE,
     HEAD_IN,
     IMAGE_PX,
     LINE,
     MARGIN_M,
-    START,
     STRAY_PERCENT,
     WIDE_IN,
     hex_of,
+    mark_ends,
     new_figure,
     save,
     scale_bar,
@@ -146,16 +145,7 @@ def _draw_view(axes: "Axes", view: _View, colors: NDArray[np.uint8]) -> None:
     axes.imshow(image, origin="lower", interpolation="antialiased", extent=(low[0], high[0], low[1], high[1]))
     axes.plot(*path[:, :2].T, color="white", linewidth=2.4, alpha=0.75)
     axes.plot(*path[:, :2].T, color=hex_of(ESTIMATE), linewidth=1.3, label="path")
-    for place, color, marker, label in ((path[0], START, "o", "start"), (path[-1], END, "s", "end")):
-        axes.plot(
-            *place[:2],
-            marker,
-            color=hex_of(color),
-            markersize=7,
-            markeredgecolor="white",
-            label=label,
-            linestyle="none",
-        )
+    mark_ends(axes, path)
     scale_bar(axes, low, high, color="white")
     axes.set_axis_off()
 

@@ -161,6 +161,14 @@ def scale_bar(axes: "Axes", low: Array, high: Array, *, color: str) -> None:
     axes.annotate(f"{length_m:g} m", (x, y), (0, 5), textcoords="offset points", color=color, fontsize=9)
 
 
+def mark_ends(axes: "Axes", positions: Array, *, end: str = "end") -> None:
+    """Mark where a path begins and ends, (N, 2) or more metres."""
+    ends = (positions[0], START, "o", "start"), (positions[-1], END, "s", end)
+    for position, color, marker, label in ends:
+        (mark,) = axes.plot(*position[:2], marker, color=hex_of(color), markersize=8, label=label)
+        mark.set(markeredgecolor="white", markeredgewidth=1.4)
+
+
 def round_length(length_m: float) -> float:
     """Return the largest of 1, 2 or 5 times a power of ten that is not longer."""
     decade = 10.0 ** np.floor(np.log10(length_m))

@@ -46,27 +46,24 @@ def write_grid(folder: Path, stem: str, grid: OccupancyGrid) -> None:
     pixels[grid.cells == FREE] = FREE_PIXEL
     pixels[grid.cells == OCCUPIED] = OCCUPIED_PIXEL
     _write_picture(folder / f"{stem}.png", grid)
-    _write_image(folder, stem, pixels, grid, mode="trinary")
+    write_values(folder, stem, pixels, grid, mode="trinary")
 
 
-def write_values(folder: Path, stem: str, values: NDArray[np.uint8], geometry: OccupancyGrid) -> None:
-    """Write ``stem.pgm`` and ``stem.yaml`` in map_server's mode "raw", each atomically.
+def write_values(
+    folder: Path, stem: str, values: NDArray[np.uint8], geometry: OccupancyGrid, *, mode: str = "raw"
+) -> None:
+    """Write ``stem.pgm`` and ``stem.yaml`` for map_server, each atomically.
 
     Args:
         folder: Folder of the files; made if missing.
         stem: Name of the files without ending.
-        values: (H, W) what the cells are published as: 0 … 100, or 255 for unknown.
+        values: (H, W) what the cells are published as: 0 … 100, or 255 for unknown; pixels in mode "trinary".
         geometry: A grid of these cells.
+        mode: Mode of map_server.
     """
-    _write_image(folder, stem, values, geometry, mode="raw")
-
-
-def _write_image(
-    folder: Path, stem: str, pixels: NDArray[np.uint8], geometry: OccupancyGrid, *, mode: str
-) -> None:
-    height, width = pixels.shape
+    height, width = values.shape
     header = f"P5\n# CREATOR: mapper {geometry.resolution_m:.3f} m/pix\n{width} {height}\n255\n"
-    write_bytes(folder / f"{stem}.pgm", header.encode("ascii") + pixels[::-1].tobytes())
+    write_bytes(folder / f"{stem}.pgm", header.encode("ascii") + values[::-1].tobytes())
     x, y = (float(value) for value in geometry.origin_world_m)
     settings = {
         "image": f"{stem}.pgm",

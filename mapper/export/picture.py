@@ -1,6 +1,5 @@
 """Pictures over a grid, seen from above: trajectories, planned paths, runs of a merged map, voxels."""
 
-import base64
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from html import escape
@@ -18,7 +17,6 @@ from mapper.export.figures import (
     BAND_ALPHA,
     CELL_PX,
     DOUBTFUL,
-    END,
     ESTIMATE,
     FACTORS,
     FAINT,
@@ -27,7 +25,6 @@ from mapper.export.figures import (
     MOST_CELLS,
     PLAN,
     SIGMAS,
-    START,
     TEXT,
     TRUTH,
     UNKNOWN_CELL,
@@ -36,13 +33,14 @@ from mapper.export.figures import (
     color_of,
     fit_to_window,
     hex_of,
+    mark_ends,
     new_figure,
     quiet_frame,
     save,
     scale_bar,
 )
 from mapper.export.grid import grid_image
-from mapper.export.html import table as html_table
+from mapper.export.html import image, table
 from mapper.octree.grid import FREE, OCCUPIED, OccupancyGrid, shrunk
 from mapper.run import files
 from mapper.run.pose_covariances import UncertainPoses
@@ -107,7 +105,7 @@ def draw_summary(
             _draw_doubtful(axes, poses)
         _draw_loops(axes, loops_world)
         _draw_direction(axes, positions)
-        _mark_ends(axes, positions)
+        mark_ends(axes, positions)
 
 
 def _positions(*paths: Trajectory | None) -> list[Array]:
@@ -188,7 +186,7 @@ def write_localised(
         _draw_doubtful(axes, poses)
         label = f"recognised in {len(recognised_world)} keyframes"
         axes.plot(*recognised_world[:, :2].T, ".", color=hex_of(FACTORS["loop"]), markersize=3.0, label=label)
-        _mark_ends(axes, positions)
+        mark_ends(axes, positions)
 
 
 def write_path(
@@ -215,7 +213,7 @@ def write_path(
         _draw_over(axes, _swept(grid, ends, radius_m), grid)
         axes.plot(*ends.T, color=hex_of(PLAN), linewidth=1.6, label=f"path, {2 * radius_m:g} m wide")
         axes.plot(*ends[1:-1].T, ".", color=hex_of(PLAN), markersize=5)
-        _mark_ends(axes, ends, end="goal")
+        mark_ends(axes, ends, end="goal")
 
 
 def write_merged(
@@ -323,13 +321,6 @@ def _extent(grid: OccupancyGrid, paths_world: Sequence[Array]) -> tuple[Array, A
     return seen.min(axis=0) - MARGIN_M, seen.max(axis=0) + MARGIN_M
 
 
-def _mark_ends(axes: "Axes", positions: Array, *, end: str = "end") -> None:
-    ends = (positions[0], START, "o", "start"), (positions[-1], END, "s", end)
-    for position, color, marker, label in ends:
-        (mark,) = axes.plot(*position[:2], marker, color=hex_of(color), markersize=8, label=label)
-        mark.set(markeredgecolor="white", markeredgewidth=1.4)
-
-
 @contextmanager
 def _map_page(
     path: Path, grid: OccupancyGrid, paths_world: Sequence[Array], title: str, lines: Sequence[str]
@@ -398,8 +389,6 @@ def run_html(run: "Run") -> str:
         ("path", f"{run.trajectory.path_length_m:.2f} m"),
         ("octree", f"{counts.voxels_text} of {run.config.octree.resolution_m:g} m"),
     ]
-    picture = ""
-    if (run.path / files.SUMMARY).is_file():
-        data = base64.b64encode(run.file(files.SUMMARY).read_bytes()).decode("ascii")
-        picture = f'<img alt="path over the slice" style="max-width:100%" src="data:image/png;base64,{data}">'
-    return f"<b>{escape(str(run.path))}</b>{html_table(('', ''), rows)}{picture}"
+    path = run.path / files.SUMMARY
+    picture = image(run.file(files.SUMMARY).read_bytes(), "path over the slice") if path.is_file() else ""
+    return f"<b>{escape(str(run.path))}</b>{table(('', ''), rows)}{picture}"

@@ -228,7 +228,7 @@ class Run:
             path,
             settings=settings,
             frame=frame,
-            crop=crop,
+            box_m=crop,
             overwrite=overwrite,
             progress=progress,
         )

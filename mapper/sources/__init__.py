@@ -75,9 +75,8 @@ def open_source(path: Path, config: SourceConfig = _DEFAULTS) -> "Log":
 
     if not path.exists():
         if address := _ADDRESS.match(f"{path}"):  # of whose two slashes a path keeps one
-            raise SourceError(
-                f"{address[0]}/{f'{path}'[address.end() :]}: an address; download it, and open the file"
-            )
+            url = f"{address[0]}/{f'{path}'[address.end() :]}"
+            raise SourceError(f"{url}: an address; download it, or mount its store, and open the file")
         raise SourceError(f"{path}: no such file or folder")
     if not (path.is_dir() or path.is_file()):
         raise SourceError(f"{path}: a device or a pipe; want a file or a folder")
