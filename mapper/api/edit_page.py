@@ -86,11 +86,11 @@ class _Session:
     Attributes:
         run: The run as it is now.
         earlier: Copies of its folder before each solve, the last one last.
-        told: What is being done, for the page.
+        status: What is being done, for the page.
     """
 
     def __init__(self, source: Log, run: Run, progress: Progress) -> None:
-        self.run, self.earlier, self.told = run, list[Path](), ""
+        self.run, self.earlier, self.status = run, list[Path](), ""
         self._source, self._progress = source, progress
         self._jobs = Queue[tuple[Callable[[], None], Future[None]]](maxsize=1)
         self._busy, self._page = Lock(), ""
@@ -121,7 +121,7 @@ class _Session:
                 if not isinstance(error, MapperError):
                     raise
             finally:
-                self.told = ""
+                self.status = ""
 
     def ask(self, job: Callable[[], None]) -> None:
         """Have a job done, and wait for it; called by the threads of requests.
@@ -139,9 +139,11 @@ class _Session:
     def solve(self, text: str) -> None:
         """Make the edits of an edits file; what the run was like before is kept."""
         edits = parse_config(text, Path("edits"), EditsFile)
-        earlier = _copy_of(self.run.path)
+        earlier = _copy(self.run.path)
         try:
-            self.run = apply_edits(self._source, self.run, edits, progress=_Told(self, self._progress))
+            self.run = apply_edits(
+                self._source, self.run, edits, progress=_PageProgress(self, self._progress)
+            )
         except BaseException:
             shutil.rmtree(earlier)
             raise
@@ -206,8 +208,8 @@ class _Session:
                 self._left_at = time.monotonic()
 
 
-class _Told:
-    """Progress that tells the page of the stages, too."""
+class _PageProgress:
+    """Progress that the page shows, too."""
 
     def __init__(self, session: _Session, progress: Progress) -> None:
         self._session, self._progress = session, progress
@@ -217,19 +219,19 @@ class _Told:
         """Enter a stage."""
         with self._progress.stage(name) as report:
 
-            def told(done: int, total: int) -> None:
-                self._session.told = f"{name}: {done} of {total}"
+            def report_both(done: int, total: int) -> None:
+                self._session.status = f"{name}: {done} of {total}"
                 report(done, total)
 
-            self._session.told = name
-            yield told
+            self._session.status = name
+            yield report_both
 
     def note(self, message: str) -> None:
         """Pass a note on."""
         self._progress.note(message)
 
 
-def _copy_of(folder: Path) -> Path:
+def _copy(folder: Path) -> Path:
     """Return a hidden copy of a run beside it; its files are the same ones where the disk can do that."""
     copy = folder.resolve().with_name(f".{folder.resolve().name}.{token_hex(8)}.part")
 
@@ -260,18 +262,18 @@ class _Server(ThreadingHTTPServer):
 
 
 class _Handler(BaseHTTPRequestHandler):
-    """Door to a session: refuses what does not come from its page, and knows a handful of names."""
+    """Handler of requests: refuses those that are not from the page."""
 
     server: _Server
     timeout = _TIMEOUT_S
 
     def do_GET(self) -> None:
-        """Answer with the page, or tell it of the work while it is open."""
+        """Answer with the page, two scans, or the status for as long as the page is open."""
         name = self._name()
         if name == "":
             self._answer_with(self.server.session.page, "text/html")
         elif name == "open":
-            self._tell()
+            self._send_status()
         elif match := _SCANS.fullmatch(name or ""):
             self._answer_with(lambda: self.server.session.scans(*map(int, match.groups())))
         else:
@@ -303,12 +305,12 @@ class _Handler(BaseHTTPRequestHandler):
         token, slash, name = rest.partition("/")
         return name if slash and compare_digest(token.encode(), self.server.token.encode()) else None
 
-    def _tell(self) -> None:
+    def _send_status(self) -> None:
         """Send what is being done as server-sent events, until the tab is closed."""
         self._head(HTTPStatus.OK, "text/event-stream")
         with self.server.session.tab(), suppress(OSError):
             while True:
-                self.wfile.write(f"data: {self.server.session.told}\n\n".encode())
+                self.wfile.write(f"data: {self.server.session.status}\n\n".encode())
                 time.sleep(_TICK_S)
 
     def _refuse(self) -> None:

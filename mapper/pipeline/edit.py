@@ -118,7 +118,7 @@ def _solve_edited(
     """Solve with loops added, by how they were aligned by hand, and removed, and with nodes dropped."""
     if run.config.graph.solve == "none":
         raise ConfigError(f"{run.path}: built with graph.solve=none, so loops change nothing; build it again")
-    tracked = _without(load_tracking(run), drop)
+    tracked = _drop_nodes(load_tracking(run), drop)
     graph, loops = tracked.graph, list(tracked.loops)
     for pair in remove:
         place = _held(loops, pair)
@@ -145,7 +145,7 @@ def _solve_edited(
     return tracked.solved(solved.graph, solved.loops), solved.report
 
 
-def _without(tracked: StoredTracking, nodes: Sequence[int]) -> StoredTracking:
+def _drop_nodes(tracked: StoredTracking, nodes: Sequence[int]) -> StoredTracking:
     """Return the tracking with the frames of some nodes doubtful, so that no map has them."""
     for node in nodes:
         if node not in tracked.graph.T_world_node:

@@ -57,8 +57,8 @@ export class Aligning {
     this.isOn = isOn;
     this.button.setAttribute("aria-pressed", String(isOn));
     this.field.hidden = this.byEye.closest("label").hidden = !isOn;
-    this.view.navigation.isLeft = isOn;
-    this.view.update({ isAside: isOn });
+    this.view.navigation.isDragTaken = isOn;
+    this.view.update({ hidesMaps: isOn });
   }
 
   /** Pose of the second keyframe in the world, moved and turned about where it is. */

@@ -106,7 +106,7 @@ export class Editing {
     const { view } = this, kind = this.find("edit-kind"), field = this.find("edit-region"), draw = this.find("edit-draw");
     const press = (isOn) => {
       this.isDrawing = isOn;
-      view.navigation.isLeft = isOn;
+      view.navigation.isDragTaken = isOn;
       draw.setAttribute("aria-pressed", String(isOn));
       if (isOn) this.tell(kind.value === "erase" ? "drag over the floor" : "click on the corners");
     };

@@ -30,18 +30,18 @@ export class MapView {
     this.shading = new Shading();
     this.onRest = []; // called when all of it is drawn
     this.shown = layers.map(() => true);
-    this.state = { points: "cloud", coloring: "height", isBeside: false, cut_m: Infinity, kept_m: [-Infinity, Infinity], until: NEVER, size: 1, isShaded: true, hasGrid: true, isAside: false };
+    this.state = { points: "cloud", coloring: "height", isBeside: false, cut_m: Infinity, kept_m: [-Infinity, Infinity], until: NEVER, size: 1, isShaded: true, hasGrid: true, hidesMaps: false };
     this.hidden = new Set();
     this.budget = new Budget();
     for (const one of layers) this.scene.add(one.group);
-    this.isApart = layers.some(({ run }) => run.world !== layers[0].run.world); // then each is seen as if it lay where the first lies
+    this.hasOwnWorlds = layers.some(({ run }) => run.world !== layers[0].run.world); // then each is seen as if it lay where the first lies
     this.boxes = layers.map((one) => boxOf([one]));
-    this.box = this.isApart ? this.boxes[0] : boxOf(layers);
+    this.box = this.hasOwnWorlds ? this.boxes[0] : boxOf(layers);
     this.navigation = new Navigation(this.camera, canvas, () => this.#moved());
     new ResizeObserver(() => this.resize()).observe(canvas.parentElement);
     this.resize();
     this.navigation.lookAt(this.box);
-    if (this.isApart) this.boxes.forEach((box, run) => this.draw(`ground${run}`, groundLines(box), { isOver: false, isGround: true, run }));
+    if (this.hasOwnWorlds) this.boxes.forEach((box, run) => this.draw(`ground${run}`, groundLines(box), { isOver: false, isGround: true, run }));
     else this.draw("ground", groundLines(this.box), { isOver: false, isGround: true });
     this.update({});
     requestAnimationFrame((now) => this.#tick(now));
@@ -55,7 +55,7 @@ export class MapView {
     this.layers.forEach((one, run) => {
       one.group.visible = this.shown[run];
       for (const [id, set] of Object.entries(one.points)) {
-        set.object.visible = id === kind && !this.state.isAside;
+        set.object.visible = id === kind && !this.state.hidesMaps;
         set.hide(this.state);
         if (isRepainted && id === kind) set.paint(coloring, range, { ramp: this.ramp, runColor: one.runColor });
       }
@@ -146,9 +146,11 @@ export class MapView {
   #panes() {
     const { clientWidth: width, clientHeight: height } = this.canvas;
     const runs = this.layers.map((_, run) => run).filter((run) => this.shown[run]);
-    if (!this.state.isBeside || runs.length < 2) return [{ left: 0, width, height, runs, camera: this.isApart && runs.length === 1 ? this.#cameraAt(runs[0]) : this.camera }];
+    const cameraOf = (run) => this.hasOwnWorlds ? this.#cameraAt(run) : this.camera;
+    if (runs.length < 2) return [{ left: 0, width, height, runs, camera: runs.length ? cameraOf(runs[0]) : this.camera }];
+    if (!this.state.isBeside) return [{ left: 0, width, height, runs, camera: this.camera }];
     const each = width / runs.length;
-    return runs.map((run, i) => ({ left: i * each, width: each, height, runs: [run], camera: this.isApart ? this.#cameraAt(run) : this.camera }));
+    return runs.map((run, i) => ({ left: i * each, width: each, height, runs: [run], camera: cameraOf(run) }));
   }
 
   /** The camera as it sees a run of another world: at the same place relative to that run's box. */

@@ -61,9 +61,9 @@ export class Navigation {
   }
 
   /** Whether dragging with the left button or one finger is someone else's. */
-  set isLeft(isLeft) {
-    this.orbit.mouseButtons.LEFT = isLeft ? null : MOUSE.ROTATE;
-    this.orbit.touches.ONE = isLeft ? null : TOUCH.ROTATE;
+  set isDragTaken(isTaken) {
+    this.orbit.mouseButtons.LEFT = isTaken ? null : MOUSE.ROTATE;
+    this.orbit.touches.ONE = isTaken ? null : TOUCH.ROTATE;
   }
 
   set flying(isFlying) {

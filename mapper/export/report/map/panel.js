@@ -43,7 +43,7 @@ export class Panel {
       });
     const choose = (isBeside) => view.update({ isBeside });
     this.find("beside").addEventListener("change", ({ target }) => choose(target.value === "beside"));
-    if (!view.isApart) return;
+    if (!view.hasOwnWorlds) return;
     this.find("beside").querySelector("[value=beside]").checked = true; // over each other they would say nothing
     choose(true);
     view.resize();
@@ -171,7 +171,7 @@ export class Panel {
   /** Scale, north, and the address of the view. */
   #orient() {
     const { view } = this, { camera, navigation: { orbit } } = view;
-    this.find("scale").parentElement.hidden = view.isApart && view.shown.filter(Boolean).length > 1; // each has its own
+    this.find("scale").parentElement.hidden = view.hasOwnWorlds && view.shown.filter(Boolean).length > 1; // each has its own
     const length = roundLength(SCALE_PX * view.metresPerPixel);
     this.find("scale").style.width = `${length / view.metresPerPixel}px`;
     this.find("scale-text").textContent = length < 1 ? `${Math.round(100 * length)} cm` : length < 1000 ? `${length} m` : `${length / 1000} km`;
