@@ -6,8 +6,9 @@ import shutil
 import sys
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future
+from concurrent.futures import Future, wait
 from contextlib import contextmanager, suppress
+from functools import partial
 from hmac import compare_digest
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -123,18 +124,18 @@ class _Session:
             finally:
                 self.status = ""
 
-    def ask(self, job: Callable[[], None]) -> None:
-        """Have a job done, and wait for it; called by the threads of requests.
+    def ask(self, job: Callable[[], None]) -> Future[None]:
+        """Have a job done; called by the threads of requests.
 
         Raises:
-            MapperError: The job failed, or another one is being done.
+            ConfigError: Another one is waiting to be done.
         """
         done = Future[None]()
         try:
             self._jobs.put_nowait((job, done))
         except Full:
             raise ConfigError("another solve has not ended yet; wait for it") from None
-        done.result()
+        return done
 
     def solve(self, text: str) -> None:
         """Make the edits of an edits file; what the run was like before is kept."""
@@ -280,21 +281,27 @@ class _Handler(BaseHTTPRequestHandler):
             self._refuse()
 
     def do_POST(self) -> None:
-        """Solve with an edits file, or undo the last solve; answer with nothing, or what is wrong."""
+        """Solve with an edits file, or undo the last solve; answer "done", or what is wrong.
+
+        Spaces are sent meanwhile, as browsers give up answers that take minutes.
+        """
         name, length = self._name(), self.headers.get("Content-Length", "")
         if name not in ("solve", "undo") or "Origin" not in self.headers:
             self._refuse()
             return
-        session = self.server.session
-
-        def work() -> str:
-            if not (length.isascii() and length.isdigit() and int(length) <= _MOST_BYTES):
-                raise ConfigError(f"edits: {length or 'unknown'} bytes, at most {_MOST_BYTES} at once")
-            text = self.rfile.read(int(length)).decode("utf-8", "replace")
-            session.ask(session.undo if name == "undo" else lambda: session.solve(text))
-            return ""
-
-        self._answer_with(work)
+        if not (length.isascii() and length.isdigit() and int(length) <= _MOST_BYTES):
+            self._answer(HTTPStatus.OK, f"edits: {length or 'unknown'} bytes, at most {_MOST_BYTES} at once")
+            return
+        text, session = self.rfile.read(int(length)).decode("utf-8", "replace"), self.server.session
+        self._head(HTTPStatus.OK, "text/plain")
+        try:
+            done = session.ask(session.undo if name == "undo" else partial(session.solve, text))
+            while wait([done], timeout=_TICK_S).not_done:
+                self.wfile.write(b" ")
+            done.result()
+            self.wfile.write(b"done")
+        except MapperError as error:
+            self.wfile.write(str(error).encode("utf-8", "replace"))
 
     def _name(self) -> str | None:
         """Return what is asked for behind the token; None if the request is not the page's own."""

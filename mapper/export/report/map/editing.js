@@ -181,9 +181,9 @@ export class Editing {
     this.#show();
     this.tell("…");
     const answer = await fetch(what, { method: "POST", body, headers: { "Content-Type": "application/toml" } }).catch(() => null);
-    const line = answer && await answer.text();
+    const line = answer && (await answer.text().catch(() => "")).trim();
     this.isAsking = false;
-    if (answer?.ok) location.reload();
+    if (line === "done") location.reload();
     else { this.#show(); this.tell(line || "mapper edit does not answer"); }
   }
 
