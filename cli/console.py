@@ -69,6 +69,8 @@ class EscapingStream:
         return getattr(self.raw, name)
 
 
+_LOGGED = re.compile(rb"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d,\d{3} \S+: mapper\b|$")  # how a log begins
+_LOGGED_BYTES = 64
 LOG = logging.getLogger("mapper.log-file")
 """What ``--log-file`` keeps, with times: what was asked, and all that is printed, also with ``--quiet``."""
 
@@ -78,12 +80,14 @@ def log_kept(path: Path | None) -> Iterator[None]:
     """Append what is printed inside to a file, and what ends it.
 
     Raises:
-        ConfigError: The file cannot be written.
+        ConfigError: The file cannot be written, or is there and no log of ours.
     """
     if path is None:
         yield
         return
     try:
+        if path.exists() and not (path.is_file() and _LOGGED.match(path.open("rb").read(_LOGGED_BYTES))):
+            raise ConfigError(f"--log-file {path}: is there already, and is no log of mapper; name another")
         handler = logging.FileHandler(path, encoding="utf-8")
     except OSError as error:
         raise ConfigError(f"--log-file {path}: {error.strerror}") from None

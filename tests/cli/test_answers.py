@@ -134,6 +134,11 @@ def test_a_log_file_keeps_what_is_printed_with_times(desk_run, tmp_path):
     assert [line for line in lines if line in printed] == 2 * printed
     assert lines[-1] == f"SourceError: {tmp_path / 'none'}: no such file or folder"
     mapper("inspect", tmp_path, "--log-file", tmp_path / "none" / "a.log", status=1)
+    for name in ("graph.g2o", "cloud.ply"):
+        before = desk_run.file(name).read_bytes()
+        refused = mapper("loops", desk_run.path, "--log-file", desk_run.path / name, status=1)
+        assert "is no log of mapper" in refused.stderr
+        assert desk_run.file(name).read_bytes() == before
 
 
 def test_progress_is_in_the_log_file(desk_log, tmp_path):
