@@ -118,10 +118,16 @@ class Trajectory:
         return trajectory_from((int(stamp_ns), self.at(stamp_ns)) for stamp_ns in stamps_ns)
 
     def write(self, path: str | PathLike[str]) -> None:
-        """Write the trajectory, atomically: KITTI text if the name ends in ".kitti", else TUM text."""
+        """Write the trajectory, atomically: as TUM text (".tum", ".txt") or KITTI text (".kitti").
+
+        Raises:
+            DataError: Another ending.
+        """
         writers = import_module("mapper.sources.trajectory_files")  # which imports this module
-        is_kitti = Path(path).suffix.lower() == ".kitti"
-        (writers.write_kitti if is_kitti else writers.write_tum)(Path(path), self)
+        ending = Path(path).suffix.lower()
+        if ending not in (".tum", ".txt", ".kitti"):
+            raise DataError(f"{path}: want a name that ends in .tum, .txt or .kitti")
+        (writers.write_kitti if ending == ".kitti" else writers.write_tum)(Path(path), self)
 
     @property
     def stamps(self) -> Array:

@@ -236,6 +236,8 @@ def test_a_trajectory_is_asked_for_other_times_and_written(run, tmp_path):
     again = read_tum(tmp_path / "path.tum")
     np.testing.assert_array_equal(again.stamps_ns, path.stamps_ns)
     np.testing.assert_allclose(again.poses, path.poses, atol=1e-12)
+    with pytest.raises(mapper.MapperError, match=r"path\.csv: want a name that ends in \.tum"):
+        path.write(tmp_path / "path.csv")
     path.write(tmp_path / "path.kitti")
     assert len((tmp_path / "path.kitti").read_text().splitlines()) == 31
 
