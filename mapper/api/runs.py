@@ -2,16 +2,19 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from mapper.api.progress import AnyProgress, receiver_of
-from mapper.config.loading import Settings, overridden
+from mapper.config.loading import Settings, checked_config, overridden
+from mapper.core.errors import ConfigError
 from mapper.core.trajectory import Trajectory
 from mapper.export.exporters import export as export_kind
 from mapper.export.report.data import chapter_of
 from mapper.export.report.map_page import write_map_page
+from mapper.mapping.config import EditKind, Region
 from mapper.merging.map_page import write_merged_map_page
 from mapper.merging.merged_map import open_map
+from mapper.pipeline.edit import add_region, undo_region
 from mapper.pipeline.fuse import fuse as fuse_run
 from mapper.run.folder import Run, open_run
 from mapper.run.manifest import is_merged_map
@@ -39,6 +42,16 @@ def fuse(run: Run, *, settings: Settings | None, trajectory: Trajectory | None, 
     """Make a run's maps again; see :meth:`mapper.run.folder.Run.fuse`."""
     config = overridden(run.config, settings=settings)
     return fuse_run(run.open_log(), run, config, trajectory=trajectory, progress=receiver_of(progress))
+
+
+def edit(run: Run, kind: Any, region: dict[str, Any], *, progress: AnyProgress) -> Run:
+    """Edit a run's maps by hand; see :meth:`mapper.run.folder.Run.edit`."""
+    receiver = receiver_of(progress)
+    if kind == "undo" and not region:
+        return undo_region(run.open_log(), run, progress=receiver)
+    if kind not in get_args(EditKind):
+        raise ConfigError(f"edit {kind!r}: want {', '.join(get_args(EditKind))}, or undo without a region")
+    return add_region(run.open_log(), run, kind, checked_config(region, Region, "region"), progress=receiver)
 
 
 def write_page(runs: Sequence[AnyPath], path: AnyPath | None = None, *, overwrite: bool = False) -> Path:

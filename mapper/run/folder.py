@@ -257,6 +257,28 @@ class Run:
         )
         return fused
 
+    def edit(
+        self,
+        kind: Literal["erase", "keep", "keepout", "undo"],
+        *,
+        progress: "Progress | Callable[[str], object] | None" = None,
+        **region: Any,
+    ) -> "Run":
+        """Erase, keep or block a region of the maps, as ``mapper edit`` does, and return the new run.
+
+        Args:
+            kind: What to do in the region; "undo" takes the last edit back and has none.
+            progress: As for ``mapper.build``.
+            region: Conditions of ``edits.toml``: ``box_m``, ``height_m``, ``path_radius_m``, ``polygon_m``.
+
+        Raises:
+            ConfigError: No such kind or condition, or nothing to undo.
+            DataError: Nothing would be left of the map.
+            RunError: The log is no longer there, or is not what it was.
+        """
+        edited: Run = import_module("mapper.api.runs").edit(self, kind, region, progress=progress)
+        return edited
+
     def view(self, path: AnyPath | None = None, *, overwrite: bool = False) -> Path:
         """Write the map in 3D as a page for any browser, as ``mapper view --html`` does; return its path.
 
@@ -371,17 +393,7 @@ def moved_log(run: Run, *logs: Path) -> Run:
     Raises:
         RunError: It was made from another number of logs.
     """
-    known = run.manifest.input
-    if len(logs) != 1 + len(known.appended):
-        raise RunError(
-            f"{run.path}: made from {1 + len(known.appended)} logs, {known.title}; "
-            f"{len(logs)} given, want all of them in this order"
-        )
-    first, *others = (str(log.resolve()) for log in logs)
-    appended = tuple(
-        log.model_copy(update={"path": path}) for log, path in zip(known.appended, others, strict=True)
-    )
-    moved = known.model_copy(update={"path": first, "appended": appended})
+    moved = run.manifest.input.moved(logs, run=run.path)
     return replace(run, manifest=run.manifest.model_copy(update={"input": moved}))
 
 

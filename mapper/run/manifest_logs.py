@@ -1,5 +1,6 @@
 """Logs of a run as its manifest keeps them: where they are, what was noted, and where the sensors were."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Self
@@ -7,6 +8,7 @@ from typing import Self
 import numpy as np
 
 from mapper.core.config import Config
+from mapper.core.errors import RunError
 from mapper.core.geometry import Transform, inverse
 from mapper.core.rotations import pose_of_row, row_of_pose
 from mapper.core.trajectory import Trajectory
@@ -119,3 +121,20 @@ class Input(InputLog):
     def title(self) -> str:
         """The logs' names."""
         return " + ".join(Path(log.path).name for log in (self, *self.appended))
+
+    def moved(self, logs: Sequence[Path], *, run: Path) -> "Input":
+        """Return the same logs at other paths.
+
+        Raises:
+            RunError: There are more or fewer; the message names the run.
+        """
+        if len(logs) != 1 + len(self.appended):
+            raise RunError(
+                f"{run}: made from {1 + len(self.appended)} logs, {self.title}; "
+                f"{len(logs)} given, want all of them in this order"
+            )
+        first, *others = (str(log.resolve()) for log in logs)
+        appended = tuple(
+            log.model_copy(update={"path": path}) for log, path in zip(self.appended, others, strict=True)
+        )
+        return self.model_copy(update={"path": first, "appended": appended})

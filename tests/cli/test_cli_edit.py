@@ -5,6 +5,7 @@ import shutil
 import numpy as np
 import pytest
 
+from mapper.core.errors import ConfigError
 from mapper.octree.grid import FREE, OCCUPIED, read_grid
 from mapper.octree.map import read_octree
 from mapper.run.folder import open_run
@@ -27,6 +28,21 @@ def occupied(folder):
 
 def maps_of(folder):
     return {name: data for name, data in files_of(folder).items() if name not in TIMED}
+
+
+def test_a_run_is_edited_and_undone_from_python(run_folder):
+    mapper("fuse", run_folder, "--quiet")
+    before, points = maps_of(run_folder), occupied(run_folder)
+    box = np.quantile(points, [0.3, 0.8], axis=0)
+    inside = ((points >= box[0]) & (points <= box[1])).all(axis=1)
+    run = open_run(run_folder).edit("erase", box_m=box.tolist())
+    np.testing.assert_allclose(run.octree.occupied(), points[~inside])
+    run.edit("undo")
+    assert maps_of(run_folder) == before
+    wrong = {"erase": {}, "remove": {"height_m": (0, 1)}, "keep": {"box": 1}, "undo": {}}
+    for kind, region in wrong.items():
+        with pytest.raises(ConfigError):
+            run.edit(kind, **region)
 
 
 def test_an_edit_holds_until_it_is_undone_and_then_all_bytes_are_back(run_folder):
