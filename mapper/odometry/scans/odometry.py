@@ -72,6 +72,7 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
         self._keyframes: deque[ScanKeyframe] = deque(maxlen=_KEYFRAMES)  # the newest first
         self._doubtful: ScanKeyframe | None = None
         self._last: ScanKeyframe | None = None
+        self._is_last_sure = True
         self._first: ScanObservation | None = None
         self._lost_scans = 0
         self._next_node = 0
@@ -120,7 +121,7 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
 
     @property
     def _path(self) -> KnownPath:
-        return KnownPath(self._keyframes, self._doubtful, self._last, self._motion)
+        return KnownPath(self._keyframes, self._doubtful, self._last, self._is_last_sure, self._motion)
 
     def _noise_of(self, observation: ScanObservation, placed: PlacedScan) -> PoseNoise:
         """Return the noise of a scan's pose relative to the keyframe that it was compared with."""
@@ -161,7 +162,7 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
         motion: Motion = self._motion.twist if placed.sweep is None else placed.sweep
         T_world_body = found.T_world_middle @ motion.over(-observation.middle_s)
         T_key_body = inverse(found.keyframe.T_world_body) @ T_world_body
-        is_keyframe = is_far(T_key_body, self._config)
+        is_keyframe = found.fits_last or is_far(T_key_body, self._config)
         at_stamp = observation.middle_s**2 * placed.velocity_covariance
         scan = ScanKeyframe(self._next_node, deskewed, found.T_world_middle, T_world_body, at_stamp)
         if not is_doubtful:
@@ -179,7 +180,7 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
                 self._doubtful = scan
             else:
                 self._keyframes.appendleft(scan)
-        self._last = scan
+        self._last, self._is_last_sure = scan, not is_doubtful
         return FrameResult(
             stamp_ns=observation.scan.stamp_ns,
             node=node,

@@ -61,11 +61,11 @@ class PoseAssessment:
         return share < (self._config.lost_ratio if speaks_against else 0.5 * self._config.lost_ratio)
 
     def doubts(self, candidate: PoseCandidate) -> tuple[Doubt, ...]:
-        """Return what speaks against a pose; empty if it is believed.
+        """Return what speaks against a pose; empty if it is believed, as one that fits the last scan is.
 
         Little overlap alone is a new room, and a jump alone a sudden turn.
         """
-        if self._config.usual_ratio == 0.0:
+        if self._config.usual_ratio == 0.0 or candidate.fits_last:
             return ()
         log, shares = self.statistics, candidate.shares
         little = log.has_little_overlap(shares, usual_ratio=self._config.usual_ratio)

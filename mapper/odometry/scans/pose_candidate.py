@@ -87,6 +87,7 @@ class PoseCandidate:
         jump: Deviation from the predicted pose.
         open_m: (6,) errors of the motions that were predicted instead of measured.
         method: Step that found it.
+        fits_last: The scan fits this keyframe less than the log's scans do, and the last scan as they do.
     """
 
     keyframe: ScanKeyframe
@@ -96,6 +97,7 @@ class PoseCandidate:
     jump: Jump
     open_m: Array
     method: str
+    fits_last: bool = False
 
     @property
     def is_measured(self) -> bool:
