@@ -123,6 +123,7 @@ def map_of(chapter: Chapter, *, runs: int = 1, most_points: int = MOST_POINTS) -
     observed = observations_of(run, codes)
     snapshots = list(snapshots_of(run))
     images = _images(chapter, snapshots)
+    has_colors = bool(snapshots) or bool(run.manifest.input.images)
     shown: dict[str, Any] = {
         "voxels": _voxels(
             codes, octree.resolution_m, observed, trajectory.stamps_ns, most=most_points // runs // 2
@@ -135,10 +136,10 @@ def map_of(chapter: Chapter, *, runs: int = 1, most_points: int = MOST_POINTS) -
         "headroom_m": four_digits(float(trajectory.positions_world[:, 2].max()) + MARGIN_M),
     }
     most, room = most_points // runs - shown["voxels"]["count"], _MOST_BYTES // runs - len(json.dumps(shown))
-    cloud = _cloud(chapter, octree.resolution_m, observed, most=most, has_colors=bool(snapshots))
+    cloud = _cloud(chapter, octree.resolution_m, observed, most=most, has_colors=has_colors)
     while cloud["count"] and len(cloud["data"]) > room:
         most = int(_SPARE * cloud["count"] * max(room, 1) / len(cloud["data"]))
-        cloud = _cloud(chapter, octree.resolution_m, observed, most=most, has_colors=bool(snapshots))
+        cloud = _cloud(chapter, octree.resolution_m, observed, most=most, has_colors=has_colors)
     return {"cloud": cloud, **shown}
 
 

@@ -16,11 +16,6 @@ _MEMORY = 100
 """Undoubted frames over which medians are taken."""
 _FEWEST = 10
 """With fewer of them the medians are not known."""
-_LOOSE_M = 0.025
-"""A translation this uncertain is doubtful where the usual is far better: 1 % of a view 2 to 3 m deep."""
-_LOOSE_RATIO = 4.0
-_LOW_AGREEMENT = 0.5
-"""Share of the usual agreement below which a pose is doubtful, however many features agree."""
 _JUMP_RATIO = 8.0
 """Deviation from constant velocity, relative to the usual per second, that is a jump. The 99th percentile of
 right poses is 3 to 6."""
@@ -93,18 +88,6 @@ class FrameDoubts:
             return Assessment(tuple(doubts), sigma_rad, sigma_m) if doubts else UNDOUBTED
         usual_m, usual_agreement = self._median("sigma_m"), self._median("agreement")
         agreement = tracked_pose.agreement
-        if sigma_m > max(_LOOSE_M, _LOOSE_RATIO * usual_m):
-            doubts.append(
-                Doubt(
-                    "unobservable",
-                    f"{tracked_pose.inliers} features agree, which tell the translation to {sigma_m:.3f} m"
-                    + (f", {usual_m:.3f} m is usual" if usual_m else ""),
-                )
-            )
-        if agreement < _LOW_AGREEMENT * usual_agreement:
-            doubts.append(
-                Doubt("disagreement", f"{agreement:.0%} of the matches agree, {usual_agreement:.0%} is usual")
-            )
         few_move = len(tracked_pose.moving) <= FEW_MOVING * len(tracked_pose.observation)
         is_supported = (
             agreement >= _SUPPORT_AGREEMENT * usual_agreement
