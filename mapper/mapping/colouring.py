@@ -71,9 +71,8 @@ class ScanColouring:
         """Return T_world_body at an image's time; None where it is too far from a scan or from any pose."""
         stamps_ns = self._trajectory.stamps_ns
         after = int(np.searchsorted(stamps_ns, stamp_ns))
-        neighbours_ns = stamps_ns[max(after - 1, 0) : after + 1]
-        apart_ns = max(abs(stamp_ns - scan_ns), int(np.abs(neighbours_ns - stamp_ns).max(initial=0)))
-        if apart_ns > _MOST_APART_NS:
+        next_pose_ns = int(np.abs(stamps_ns[max(after - 1, 0) : after + 1] - stamp_ns).min())
+        if max(abs(stamp_ns - scan_ns), next_pose_ns) > _MOST_APART_NS:
             return None
         clipped_ns = int(np.clip(stamp_ns, stamps_ns[0], stamps_ns[-1]))
         return self._trajectory.at(clipped_ns)

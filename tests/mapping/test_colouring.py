@@ -80,6 +80,12 @@ def test_images_are_seen_from_the_pose_of_their_time():
     np.testing.assert_array_equal(half_way, there)
 
 
+def test_scans_a_second_apart_are_coloured():
+    slow = Trajectory(np.array([0, 1_000_000_000]), np.array([np.eye(4)] * 2))
+    _, is_seen = ScanColouring([images(20_000_000)], slow).colour(wall(4.0, 1.0), 0)
+    assert is_seen.all()
+
+
 @pytest.mark.parametrize("stamp_ns", [600_000_000, 5_000_000_000])
 def test_images_far_from_a_scan_or_from_the_path_colour_nothing(stamp_ns):
     _, is_seen = ScanColouring([images(stamp_ns)], STILL).colour(wall(4.0, 1.0), 0)
