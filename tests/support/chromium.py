@@ -176,5 +176,5 @@ class Page:
         is_complaint = method in ("Runtime.exceptionThrown", "Log.entryAdded", "Runtime.consoleAPICalled")
         if is_complaint and "ReadPixels" not in text:  # WebGL on a CPU is read back to be shown
             self.complaints.append(text)
-        if method == "Network.requestWillBeSent":
+        if method == "Network.requestWillBeSent" and not told["request"]["url"].startswith("data:"):
             self.asked_for.append(told["request"]["url"][:80])

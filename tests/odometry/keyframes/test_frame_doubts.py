@@ -74,8 +74,6 @@ def test_doubts_are_measured_against_what_is_usual(frames, odometry):
     jump = assess(31, moved_m=0.3, agreement=0.7)
     assert kinds(jump) == ["jump"]
     assert jump.sigma_m == pytest.approx(0.3, rel=0.01)
-    assert "unobservable" in kinds(assess(32, sigma_m=0.05))
-    assert "disagreement" in kinds(assess(33, agreement=0.4))
     displaced = assess(34, displaced=Displacement(0.6, 0.15, 0.4))
     assert kinds(displaced) == ["elsewhere"]
     assert displaced.sigma_m == pytest.approx(0.15)
