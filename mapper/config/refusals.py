@@ -29,7 +29,7 @@ _WANTED = {
 }
 """What a setting must be, by the type of pydantic's error."""
 _OTHER_UNITS = 100.0
-"""Lengths that are so many times their default are centimetres or millimetres."""
+"""Lengths from this multiple of their default on are centimetres or millimetres."""
 _SIZES = re.compile(
     r"(resolution|voxel|radius|height|step|keyframe_distance|pair_distance|footprint|tolerance)_m$"
 )

@@ -59,7 +59,7 @@ class Jump:
         """Both in words."""
         return (
             f"jump of {self.translation_m:.2f} m and {np.degrees(self.rotation_rad):.0f}° from the predicted "
-            f"pose, where {self.limit_m:.2f} m and {np.degrees(self.limit_rad):.0f}° would be much"
+            f"pose; the limits are {self.limit_m:.2f} m and {np.degrees(self.limit_rad):.0f}°"
         )
 
 
