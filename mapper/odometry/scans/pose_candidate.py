@@ -59,7 +59,7 @@ class Jump:
         """Both in words."""
         return (
             f"jump of {self.translation_m:.2f} m and {np.degrees(self.rotation_rad):.0f}° from the predicted "
-            f"pose; the limits are {self.limit_m:.2f} m and {np.degrees(self.limit_rad):.0f}°"
+            f"pose, the limits being {self.limit_m:.2f} m and {np.degrees(self.limit_rad):.0f}°"
         )
 
 
@@ -87,7 +87,7 @@ class PoseCandidate:
         jump: Deviation from the predicted pose.
         open_m: (6,) errors of the motions that were predicted instead of measured.
         method: Step that found it.
-        fits_last: The scan fits this keyframe less than the log's scans do, and the last scan as they do.
+        fits_last: It is doubtful or lost by this keyframe, and fits the last scan well.
     """
 
     keyframe: ScanKeyframe

@@ -93,33 +93,40 @@ class PoseSearch:
             T_world_guess: (4, 4) where the matcher begins; None is the predicted pose.
         """
         scan = _Scan(deskewed, path.motion.predicted(time_ns), path.motion.spread(time_ns))
-        found = self._track(scan, path, T_world_guess)
-        if found is not None and found.fits_last:
-            return found
+        tracked = found = self._track(scan, path.keyframes, T_world_guess)
         if found is None or (not self._believes_all and self._assessment.is_suspect(found)):
             found = self._search(scan, path, found)
-        return None if found is None or self._assessment.is_lost(found) else found
+        is_lost = found is None or self._assessment.is_lost(found)
+        if found is not None and not is_lost and not self._assessment.doubts(found):
+            return found
+        if tracked is not None and self._fits_last(scan, path, tracked):
+            return replace(tracked, fits_last=True)
+        return None if is_lost else found
 
-    def _track(self, scan: _Scan, path: KnownPath, T_world_guess: Transform | None) -> PoseCandidate | None:
-        """Match a scan near the prediction, and compare the pose with the keyframe that shows most of it.
+    def _fits_last(self, scan: _Scan, path: KnownPath, tracked: PoseCandidate) -> bool:
+        """Return whether a scan fits the last one as the log's scans fit keyframes.
 
-        A sensor that tilts soon sees another part of the scene than its keyframe, and then the last scan
-        decides whether the pose is believed.
+        A sensor that tilts soon sees another part of the scene than its keyframe.
         """
+        if path.last is None or not path.is_last_sure:
+            return False
+        beside = self._candidate(scan, _Hypothesis(tracked.T_world_middle, path.last, 0, tracked.method))
+        return beside is not None and beside.is_measured and not self._assessment.is_suspect(beside)
+
+    def _track(
+        self, scan: _Scan, keyframes: Sequence[ScanKeyframe], T_world_guess: Transform | None
+    ) -> PoseCandidate | None:
+        """Match a scan near the prediction, and compare the pose with the keyframe that shows most of it."""
         T_world_begin = scan.T_world_predicted if T_world_guess is None else T_world_guess
         T_world_near = self._matcher.match(scan.deskewed, T_world_begin, reach="near")
         best: PoseCandidate | None = None
-        for keyframe in path.keyframes:
+        for keyframe in keyframes:
             near = self._candidate(scan, _Hypothesis(T_world_near, keyframe, 0, "map"))
             if near is not None and self._believes_all:
                 return near
             if near is not None and near.is_measured and not self._assessment.is_suspect(near):
                 return near
             best = self._preferred(best, near)
-        if best is not None and path.last is not None and path.is_last_sure:
-            beside = self._candidate(scan, _Hypothesis(T_world_near, path.last, 0, "map"))
-            if beside is not None and beside.is_measured and not self._assessment.is_suspect(beside):
-                return replace(best, fits_last=True)
         return best
 
     def _search(self, scan: _Scan, path: KnownPath, tracked: PoseCandidate | None) -> PoseCandidate | None:
