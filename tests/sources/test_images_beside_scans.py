@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from mapper.core.errors import SourceError
+from mapper.core.errors import FrameError, SourceError
 from mapper.core.frames import PinholeCamera, Scan
 from mapper.core.geometry import exp, inverse
 from mapper.sources import open_source
@@ -76,6 +76,15 @@ def test_images_are_paired_by_name(tmp_path):
     (images,) = open_source(folder).images
     np.testing.assert_array_equal(images.stamps_ns, open_source(folder).stamps_ns[[0, 2, 3]])
     np.testing.assert_array_equal(images.image_at(1), picture(2))
+
+
+def test_a_damaged_first_image_costs_itself_alone(tmp_path):
+    folder = write_kitti(tmp_path / "drive")
+    (folder / "image_2/000000.png").write_bytes(b"no image")
+    (images,) = open_source(folder).images
+    np.testing.assert_array_equal(images.image_at(1), picture(1))
+    with pytest.raises(FrameError):
+        images.image_at(0)
 
 
 @pytest.mark.parametrize("missing", ["Tr", "P2"])

@@ -5,13 +5,14 @@ from pathlib import Path
 
 import numpy as np
 
-from mapper.core.errors import FrameError, SourceError
+from mapper.core.errors import SourceError
 from mapper.core.frames import Image
 from mapper.core.geometry import Array, Transform, inverse, transform
 from mapper.sources.base import CameraImages, Log
 from mapper.sources.calibration import Calibration
 from mapper.sources.image_files.image_sizes import recorded_camera
-from mapper.sources.image_files.reading import read_colour
+from mapper.sources.image_files.reading import read_colour, read_grey
+from mapper.sources.image_folders.rgbd import first_size
 from mapper.sources.kitti_calibration import read_matrix, rigid_motion
 from mapper.sources.listed_files import refuse_links_out
 from mapper.sources.scan_folders.scans import ScanEntry
@@ -40,14 +41,15 @@ def with_images(log: Log, sequence: Path) -> Log:
     stamps_ns, files = zip(*paired, strict=True)
     refuse_links_out(files, log=sequence)
     try:
-        first = read_colour(files[0])
+        size_px, reason = first_size(files, read_grey)
+        if size_px is None:
+            raise SourceError(f"none of {len(files)} images in {folder} can be read; the first: {reason}")
         projection, T_camera_lidar = _camera(sequence, is_raw=folder.name == "data")
         fx, fy, cx, cy = (projection[k] for k in ((0, 0), (1, 1), (0, 2), (1, 2)))
-        size_px = first.shape[1], first.shape[0]
         recorded = recorded_camera(
             Calibration(f"{folder}", fx, fy, cx, cy), colour_px=size_px, depth_px=size_px, where=f"{folder}"
         )
-    except (SourceError, FrameError) as error:
+    except SourceError as error:
         return replace(log, notes=[*log.notes, f"images that are not used: {error}"])
 
     def image_at(index: int) -> Image:
