@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from mapper.core.errors import FrameError
 from mapper.core.frames import Points32
 from mapper.core.geometry import Array, Transform, apply, inverse
-from mapper.core.timebase import NS_PER_S
+from mapper.core.timebase import NS_PER_S, nearest
 from mapper.core.trajectory import Trajectory
 from mapper.sources.base import CameraImages
 
@@ -48,9 +48,9 @@ class ScanColouring:
         colors = np.zeros(points_world.shape, np.uint8)
         is_seen = np.zeros(len(points_world), np.bool_)
         for images in self._images:
-            index = int(np.abs(images.stamps_ns - stamp_ns).argmin())
-            T_world_body = self._pose(int(images.stamps_ns[index]), stamp_ns)
-            if T_world_body is None:
+            (index,), (apart_ns,) = nearest(images.stamps_ns, np.array([stamp_ns]))
+            T_world_body = self._pose(int(images.stamps_ns[index]))
+            if T_world_body is None or abs(apart_ns) > _MOST_APART_NS:
                 continue
             T_camera_world = inverse(T_world_body @ images.T_body_camera)
             points, pixels = _visible(apply(T_camera_world, points_world.astype(np.float64)), images)
@@ -59,7 +59,7 @@ class ScanColouring:
             if len(points) == 0:
                 continue
             try:
-                image = images.image_at(index)
+                image = images.image_at(int(index))
             except FrameError:
                 continue
             seen = image[pixels[:, 1], pixels[:, 0]]
@@ -67,15 +67,13 @@ class ScanColouring:
             is_seen[points] = True
         return colors, is_seen
 
-    def _pose(self, stamp_ns: int, scan_ns: int) -> Transform | None:
-        """Return T_world_body at an image's time; None where it is too far from a scan or from any pose."""
+    def _pose(self, stamp_ns: int) -> Transform | None:
+        """Return T_world_body at an image's time; None where it is too far from any pose."""
         stamps_ns = self._trajectory.stamps_ns
-        after = int(np.searchsorted(stamps_ns, stamp_ns))
-        next_pose_ns = int(np.abs(stamps_ns[max(after - 1, 0) : after + 1] - stamp_ns).min())
-        if max(abs(stamp_ns - scan_ns), next_pose_ns) > _MOST_APART_NS:
+        _, (apart_ns,) = nearest(stamps_ns, np.array([stamp_ns]))
+        if abs(apart_ns) > _MOST_APART_NS:
             return None
-        clipped_ns = int(np.clip(stamp_ns, stamps_ns[0], stamps_ns[-1]))
-        return self._trajectory.at(clipped_ns)
+        return self._trajectory.at(int(np.clip(stamp_ns, stamps_ns[0], stamps_ns[-1])))
 
 
 def _visible(points_camera: Array, images: CameraImages) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
