@@ -50,7 +50,7 @@ class ScanColouring:
         for images in self._images:
             (index,), (apart_ns,) = nearest(images.stamps_ns, np.array([stamp_ns]))
             T_world_body = self._pose(int(images.stamps_ns[index]))
-            if T_world_body is None or abs(apart_ns) > _MOST_APART_NS:
+            if T_world_body is None or apart_ns > _MOST_APART_NS:
                 continue
             T_camera_world = inverse(T_world_body @ images.T_body_camera)
             points, pixels = _visible(apply(T_camera_world, points_world.astype(np.float64)), images)
@@ -71,7 +71,7 @@ class ScanColouring:
         """Return T_world_body at an image's time; None where it is too far from any pose."""
         stamps_ns = self._trajectory.stamps_ns
         _, (apart_ns,) = nearest(stamps_ns, np.array([stamp_ns]))
-        if abs(apart_ns) > _MOST_APART_NS:
+        if apart_ns > _MOST_APART_NS:
             return None
         return self._trajectory.at(int(np.clip(stamp_ns, stamps_ns[0], stamps_ns[-1])))
 
