@@ -24,6 +24,18 @@ def turned(A, v):
 
 
 @njit(cache=True, nogil=True)
+def gram(A, B):
+    """Return the (K, L) product AᵀB of (N, K) and (N, L), summed in the same order with any BLAS."""
+    rows, columns = A.shape[1], B.shape[1]
+    C = np.zeros((rows, columns))
+    for n in range(len(A)):
+        for i in range(rows):
+            for j in range(columns):
+                C[i, j] += A[n, i] * B[n, j]
+    return C
+
+
+@njit(cache=True, nogil=True)
 def solve_positive(A, b):
     """Return x with A x = b by Cholesky's factorisation; zeros where A (N, N) is not positive definite.
 

@@ -27,6 +27,24 @@ def thin(points: Points32, voxel_m: float) -> NDArray[np.intp]:
     return firsts
 
 
+def thin_in_range(
+    points: Points32, origin: Points32, min_range_m: float, max_range_m: float, voxel_m: float
+) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
+    """Return the (M,) indices of the first point in range in every voxel, ascending, and their ranges.
+
+    Args:
+        points: (N, 3) float32, finite, metres.
+        origin: (3,) float32, metres: where ranges begin.
+        min_range_m: Nearer points are left out.
+        max_range_m: Farther ones, too.
+        voxel_m: Edge of a voxel; 0 keeps all points in range.
+    """
+    index = voxel_index(len(points))
+    limits = np.float32(min_range_m), np.float32(max_range_m)
+    found: tuple[NDArray[np.intp], NDArray[np.float32]] = _in_range(points, origin, *limits, voxel_m, index)
+    return found
+
+
 def voxel_means(points: Points | Points32, voxel_m: float) -> Points:
     """Return (M, 3) float64 means of the points in every voxel, in the order of each voxel's first point.
 
@@ -52,6 +70,26 @@ def _voxels(points, voxels_per_m, index):  # type: ignore[no-untyped-def]
             count += 1
         voxel_of[i] = voxel
     return voxel_of, firsts[:count].copy()
+
+
+@njit(cache=True, nogil=True)
+def _in_range(points, origin, min_range, max_range, voxel, index):  # type: ignore[no-untyped-def]
+    kept, ranges = np.empty(len(points), np.int64), np.empty(len(points), np.float32)
+    voxels_per_m, count = 1.0 / voxel if voxel > 0.0 else 0.0, 0
+    for i in range(len(points)):
+        x, y, z = points[i, 0] - origin[0], points[i, 1] - origin[1], points[i, 2] - origin[2]
+        range_m = np.sqrt(x * x + y * y + z * z)
+        if not min_range <= range_m <= max_range:
+            continue
+        if voxel > 0.0:
+            key = cell_key(
+                points[i, 0] * voxels_per_m, points[i, 1] * voxels_per_m, points[i, 2] * voxels_per_m
+            )
+            if claim_row(index, key, count) < count:
+                continue
+        kept[count], ranges[count] = i, range_m
+        count += 1
+    return kept[:count].copy(), ranges[:count].copy()
 
 
 @njit(cache=True, nogil=True)

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.geometry import Array, Transform
+from mapper.core.linear import gram
 from mapper.registration.base import Alignment
 from mapper.registration.config import AcceptanceConfig
 from mapper.registration.degeneracy import degeneracy_of
@@ -51,10 +52,11 @@ def assess(
 
 def weakest_direction(normals: Array, agree: NDArray[np.bool_]) -> tuple[float, Array]:
     """Return the share that agrees in the direction where the least does, and that direction."""
-    squares = np.einsum("ni,nj->ij", normals, normals)
+    squares, agreeing = gram(normals, normals), normals[agree]
     facing, directions = np.linalg.eigh(squares / max(np.trace(squares), 1.0))
-    weights = np.einsum("ni,ik->nk", normals, directions) ** 2
-    shares = weights[agree].sum(axis=0) / np.maximum(weights.sum(axis=0), np.finfo(float).tiny)
+    weights = np.einsum("ik,ij,jk->k", directions, squares, directions)
+    shares = np.einsum("ik,ij,jk->k", directions, gram(agreeing, agreeing), directions)
+    shares /= np.maximum(weights, np.finfo(float).tiny)
     weakest = int(np.argmin(np.where(facing >= _FEW, shares, np.inf)))
     direction = directions[:, weakest]
     return float(shares[weakest]), direction * np.sign(direction[np.argmax(np.abs(direction))])

@@ -6,6 +6,7 @@ import numpy as np
 
 from mapper.core.errors import DataError
 from mapper.core.geometry import Array, Points, adjoint, transform
+from mapper.core.linear import gram
 
 _MIN_SHARE = 0.004
 _MIN_ARM_M = 1e-3  # a pole's turning about itself must stay a number
@@ -63,7 +64,7 @@ def degeneracy_of(information: Array, *, points: Points, min_share: float = _MIN
         raise DataError(f"degeneracy: information {total:g} from {len(points)} points; want some of both")
     centroid = points.mean(axis=0)
     centred = points - centroid
-    squares = np.einsum("ni,nj->ij", centred, centred) / len(points)
+    squares = gram(centred, centred) / len(points)
     arms, axes = np.linalg.eigh(np.trace(squares) * np.eye(3) - squares)
     metre = np.eye(6)  # motions about the centroid that displace the points by 1 m root mean square
     metre[:3, :3] = (axes / np.sqrt(np.maximum(arms, _MIN_ARM_M**2))) @ axes.T

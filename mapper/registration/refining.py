@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.geometry import Array, Points, Transform, apply, is_rigid
+from mapper.core.linear import gram
 from mapper.registration.base import Alignment, failed
 from mapper.registration.gauss_newton import GAUSSIAN, PLANE, POINT, descend_on_points
 from mapper.registration.surfaces import Prepared
@@ -158,7 +159,7 @@ def measured_agreement(
         inlier_ratio=pairs / len(near),
         inlier_rmse_m=float(np.sqrt((distances_m[near][agree] ** 2).sum() / max(pairs, 1))),
         pairs=pairs,
-        information=_gram(jacobian) / (target.neighbours * sigma_m**2),
+        information=gram(jacobian, jacobian) / (target.neighbours * sigma_m**2),
     )
     near[near] = agree
     return alignment, near
@@ -182,9 +183,3 @@ def plane_rows(
     normals_source = normals @ T_target_source[:3, :3]
     jacobian = np.hstack([np.cross(points_source, normals_source), normals_source])
     return jacobian, np.einsum("ni,ni->n", normals, differences)
-
-
-def _gram(rows: Array) -> Array:
-    """Return rowsᵀ·rows, summed in one order however many threads a BLAS would take."""
-    product: Array = np.einsum("ni,nj->ij", rows, rows)
-    return product

@@ -11,7 +11,7 @@ from mapper.core.frames import Points32
 from mapper.core.geometry import Array, Points
 from mapper.core.voxel_grid import voxel_means
 from mapper.core.voxel_index import HALF_SPAN
-from mapper.registration.kd_tree import KdTree, kd_tree, neighbours_of
+from mapper.registration.kd_tree import KdTree, kd_tree
 
 _NEIGHBOURS = 10
 _FEWEST_NEIGHBOURS = 5
@@ -28,22 +28,27 @@ class Prepared:
 
     Attributes:
         normals: (N, 3) unit normals towards the origin; zero where there are too few neighbours.
-        near_normals: (N, 3) the same fitted to the nearer half of the neighbours.
         voxel_m: Edge of the voxels, metres.
         neighbours: Number of points that each normal is fitted to.
         tree: Search tree of the points; None without points.
+        is_planar: All points have one z.
     """
 
     normals: Array
-    near_normals: Array
     voxel_m: float
     neighbours: int
     tree: KdTree | None
+    is_planar: bool = False
 
     @property
     def points(self) -> Points:
         """(N, 3) means of the points in each occupied voxel, metres."""
         return np.empty((0, 3)) if self.tree is None else self.tree.points
+
+    def near_normals(self) -> Array:
+        """Return the (N, 3) normals that fit the nearer half of the neighbours."""
+        nearer = max(_FEWEST_NEIGHBOURS, min(self.neighbours, len(self.points)) // 2)
+        return np.empty((0, 3)) if self.tree is None else _normals(self.tree, nearer, self.is_planar)
 
     def nearest(self, points: Points) -> tuple[NDArray[np.int64], Array]:
         """Return the indices of the prepared points nearest to (M, 3) points, and their distances, metres."""
@@ -68,7 +73,7 @@ def prepared(
         DataError: A point lies more than 2²⁰ voxels from the origin.
     """
     if len(points) == 0:
-        return Prepared(np.empty((0, 3)), np.empty((0, 3)), voxel_m, neighbours, None)
+        return Prepared(np.empty((0, 3)), voxel_m, neighbours, None)
     farthest_m, limit_m = float(np.abs(points).max()), HALF_SPAN * voxel_m
     if farthest_m >= limit_m:
         raise DataError(
@@ -79,17 +84,15 @@ def prepared(
     if is_planar:  # points of a line have two neighbours at each distance, those of a surface more
         neighbours = max(_FEWEST_NEIGHBOURS, neighbours // 2)
     normals = _normals(tree, min(neighbours, len(tree.points)), is_planar)
-    return Prepared(*normals, voxel_m, neighbours, tree)
+    return Prepared(normals, voxel_m, neighbours, tree, is_planar)
 
 
-def _normals(tree: KdTree, neighbours: int, is_planar: bool) -> tuple[Array, Array]:
-    normals, near_normals = np.zeros_like(tree.points), np.zeros_like(tree.points)
-    if neighbours >= _FEWEST_NEIGHBOURS:
-        about, _ = neighbours_of(tree.points, tree.axes, tree.cuts, tree.points, neighbours)
+def _normals(tree: KdTree, neighbours: int, is_planar: bool) -> Array:
+    normals = np.zeros_like(tree.points)
+    if _FEWEST_NEIGHBOURS <= neighbours <= len(tree.points):
+        about, _ = tree.nearest_few(tree.points, neighbours)
         _fit_normals(tree.points, about, normals, is_planar)
-        nearer = max(_FEWEST_NEIGHBOURS, neighbours // 2)
-        _fit_normals(tree.points, np.ascontiguousarray(about[:, :nearer]), near_normals, is_planar)
-    return normals, near_normals
+    return normals
 
 
 @njit(cache=True, nogil=True)

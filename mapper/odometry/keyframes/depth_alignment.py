@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.geometry import Array, Points, Transform, is_rigid
+from mapper.core.linear import gram
 from mapper.odometry.base import Diagnostics
 from mapper.odometry.camera.depth_surfaces import (
     DepthCells,
@@ -224,7 +225,7 @@ def observes_all(surface: DepthSurface) -> bool:
         return False
     points, normals = points[fitted], normals[fitted]
     rows = np.hstack([np.cross(points, normals), normals])
-    information = np.einsum("ni,nj->ij", rows, rows)
+    information = gram(rows, rows)
     return degeneracy_of(information, points=points, min_share=_min_share([surface])).unobservable_count == 0
 
 

@@ -8,6 +8,8 @@ from numpy.typing import NDArray
 
 from mapper.core.frames import Points32
 from mapper.core.geometry import Array, Transform, apply
+from mapper.core.linear import gram
+from mapper.odometry.scans.scan_fit_kernels import count_showing, pair_rows
 from mapper.odometry.scans.scan_matcher import DeskewedScan
 from mapper.registration.acceptance import weakest_direction
 from mapper.registration.degeneracy import Degeneracy, degeneracy_of, plane_rows
@@ -158,20 +160,25 @@ def fit_of(
     near = np.flatnonzero(distances_m <= reach_m)
     if len(near) < _MIN_PAIRS:
         return None
-    partners, points = indices[near], source.points[near]
-    normals_key = target.normals[partners]
-    residuals_m = np.einsum("ni,ni->n", normals_key, points_key[near] - target.points[partners])
-    normals = normals_key @ T_key_scan[:3, :3]
+    points = source.points[near]
     moved_voxels = float(np.linalg.norm(T_key_scan[:3, 3])) / source.voxel_m
     elsewhere = min(1.0, moved_voxels / _SAME_VOXELS)
-    own = elsewhere * _towards(source.normals[near], normals)
-    own += (1.0 - elsewhere) * _towards(source.near_normals[near], normals)
-    rows = np.hstack([np.cross(points, normals), normals])
-    own_rows = np.hstack([np.cross(points, own), own])
-    if np.einsum("ni,ni->", normals, own) <= 0.0:
+    rows, own_rows, residuals_m = pair_rows(
+        near,
+        indices,
+        source.points,
+        points_key,
+        source.normals,
+        source.normals if elsewhere == 1.0 else source.near_normals(),
+        elsewhere,
+        target.points,
+        target.normals,
+        T_key_scan[:3, :3],
+    )
+    if np.einsum("ni,ni->", rows[:, 3:], own_rows[:, 3:]) <= 0.0:
         return None
     agree = np.zeros(len(source.points), dtype=bool)
-    agree[near] = (np.abs(residuals_m) <= _SURFACE_VOXELS * source.voxel_m) & normals.any(axis=1)
+    agree[near] = (np.abs(residuals_m) <= _SURFACE_VOXELS * source.voxel_m) & rows[:, 3:].any(axis=1)
     counting, seen = source.normals, len(source.points)
     if is_planar:
         in_sight = _in_sight(keyframe.description, points_key) | agree
@@ -216,12 +223,6 @@ def _in_sight(keyframe: ScanDescription, points_key: Array) -> NDArray[np.bool_]
     return in_sight
 
 
-def _towards(normals: Array, others: Array) -> Array:
-    """Return normals with the signs that make them point as others do."""
-    towards: Array = normals * np.sign(np.einsum("ni,ni->n", normals, others))[:, None]
-    return towards
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class _Pairs:
     """Pairs of points: those of the scan, the rows of both scans' normals, and whether they agree."""
@@ -243,7 +244,7 @@ class _Pairs:
 
     def information(self) -> Array:
         """Return the (6, 6) information that is in the normals of both scans."""
-        shown = np.einsum("ni,nj->ij", self.rows, self.own_rows)
+        shown = gram(self.rows, self.own_rows)
         return np.asarray(0.5 * (shown + shown.T), np.float64)
 
 
@@ -254,13 +255,9 @@ def _observability(degeneracy: Degeneracy, pairs: _Pairs, *, chance_pairs: float
     little, as on slopes, the squared cosines summed. Shares alone do not tell: normals off by a few degrees,
     a thousand times, make as large a share as one tree.
     """
-    displacements = np.cross(degeneracy.motions[:, None, :3], pairs.points)
-    displacements += degeneracy.motions[:, None, 3:]
-    squares = np.maximum(np.einsum("kni,kni->kn", displacements, displacements), np.finfo(float).tiny)
-    along = (
-        pairs.agree * (degeneracy.motions @ pairs.rows.T) * (degeneracy.motions @ pairs.own_rows.T) / squares
+    showing = count_showing(
+        degeneracy.motions, pairs.points, pairs.rows, pairs.own_rows, pairs.agree, _FACING
     )
-    showing = np.maximum((along > _FACING).sum(axis=1), along.sum(axis=1))
     observability: Array = 1.0 - np.exp(-np.maximum(showing - chance_pairs, 0.0) / _CHANCE_PAIRS)
     return observability
 

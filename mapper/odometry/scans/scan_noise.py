@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from mapper.core.doubts import Doubt
 from mapper.core.geometry import Array, Transform, angle_between
+from mapper.core.linear import gram
 from mapper.graph.config import WheelNoiseConfig
 from mapper.odometry.scans.pose_candidate import Jump
 from mapper.odometry.scans.scan_fit import ScanFit
@@ -50,7 +51,7 @@ def surface_covariance(fit: ScanFit) -> Array:
     """
     measured = _IN_PLANE if fit.is_planar else slice(6)
     rows, residuals_m = fit.rows[:, measured], fit.residuals_m
-    hessian = np.einsum("ni,nj->ij", rows, rows)
+    hessian = gram(rows, rows)
     scale = np.sqrt(np.maximum(np.diag(hessian), np.finfo(float).tiny))
     known, motions = np.linalg.eigh(hessian / np.outer(scale, scale))
     sigmas = np.maximum(known, _LEAST_SHARE * known[-1]) ** -0.5
@@ -59,8 +60,8 @@ def surface_covariance(fit: ScanFit) -> Array:
     variance = float(np.mean(residuals_m**2)) * _design_effect(residuals_m, sectors, points)
     if variance == 0.0:
         return np.zeros((6, 6))
-    columns = (rows / scale) @ (motions * (sigmas / np.sqrt(variance)))
-    steps: Array = np.stack([np.bincount(sectors, column * residuals_m) for column in columns.T], axis=1)
+    gradients = np.stack([np.bincount(sectors, column * residuals_m) for column in rows.T], axis=1)
+    steps: Array = (gradients / scale) @ (motions * (sigmas / np.sqrt(variance)))
     used = int((points > 0).sum())
     freedom = rows.shape[1]
     scatter, axes = np.linalg.eigh(np.einsum("ci,cj->ij", steps, steps) * (used / max(used - freedom, 1)))

@@ -8,7 +8,7 @@ from mapper.core.deskew import STILL, Motion, deskewed
 from mapper.core.errors import FrameError
 from mapper.core.frames import Frame, Scan
 from mapper.core.timebase import NS_PER_S
-from mapper.core.voxel_grid import thin
+from mapper.core.voxel_grid import thin, thin_in_range
 from mapper.features.frame_view import ScanView
 from mapper.odometry.scans.config import ScanOdometryConfig
 from mapper.odometry.scans.scan_matcher import DeskewedScan
@@ -81,12 +81,15 @@ def observe_scan(frame: Frame, config: ScanOdometryConfig) -> ScanObservation:
     scan = frame.scan()
     if scan.is_planar:
         scan = _in_its_plane(scan)
-    range_m = np.linalg.norm(scan.points_body - scan.origin_body.astype(np.float32), axis=1)
     fewest = _MIN_PLANAR_POINTS if scan.is_planar else _MIN_POINTS
-    in_range = np.flatnonzero((range_m >= config.min_range_m) & (range_m <= config.max_range_m))
-    points_body = scan.points_body[in_range]
-    # A planar scan has few points, and the free-space check needs all of its rays.
-    kept = np.arange(len(points_body)) if scan.is_planar else thin(points_body, _FINER * config.voxel_m)
+    kept, ranges_m = thin_in_range(
+        scan.points_body,
+        scan.origin_body.astype(np.float32),
+        config.min_range_m,
+        config.max_range_m,
+        # A planar scan has few points, and the free-space check needs all of its rays.
+        0.0 if scan.is_planar else _FINER * config.voxel_m,
+    )
     if len(kept) < fewest:
         raise FrameError(
             f"scan {scan.stamp_ns}: {len(scan.points_body)} points, of which {len(kept)} are left between "
@@ -94,12 +97,12 @@ def observe_scan(frame: Frame, config: ScanOdometryConfig) -> ScanObservation:
             f"want {fewest} (odometry.min_range_m, max_range_m, voxel_m; source.cloud_scale where these "
             "are no metres)"
         )
-    thinned = replace(scan, points_body=points_body[kept], colors=None, times_s=None, intensities=None)
-    median_m = float(np.median(range_m[in_range][kept]))
+    thinned = replace(scan, points_body=scan.points_body[kept], colors=None, times_s=None, intensities=None)
+    median_m = float(np.median(ranges_m))
     if scan.times_s is None:
         whole = _prepared(thinned, config.voxel_m)
         return ScanObservation(thinned, 0.0, 0.0, median_m, whole, config.voxel_m)
-    times_s = scan.times_s[in_range][kept]
+    times_s = scan.times_s[kept]
     first_s, last_s = float(times_s.min()), float(times_s.max())
     middle_s, half_s = 0.5 * (first_s + last_s), 0.5 * (last_s - first_s)
     swept = replace(thinned, times_s=times_s)

@@ -8,6 +8,7 @@ import numpy as np
 from mapper.core.deskew import SampledMotion, Twist, deskewed
 from mapper.core.frames import Scan
 from mapper.core.geometry import Array, Transform, apply, exp, inverse
+from mapper.core.linear import gram
 from mapper.core.running_median import SIGMAS_PER_MAD
 from mapper.odometry.scans.config import ScanOdometryConfig
 from mapper.odometry.scans.pose_candidate import PoseCandidate
@@ -224,7 +225,7 @@ def fit_sweep_motion(
         scale_m = max(SIGMAS_PER_MAD * float(np.median(np.abs(residuals_m))), 0.02 * voxel_m)
         weights = 1.0 / (1.0 + (residuals_m / (_KERNEL * scale_m)) ** 2)
         weights /= _ALIKE * len(keyframes) * scale_m**2
-        information = np.einsum("ni,n,nj->ij", rows, weights, rows)
+        information = gram(rows, weights[:, None] * rows)
         gradient = rows.T @ (weights * residuals_m)
         information[6:, 6:] += prior_information
         gradient[6:] += prior_information @ (velocity - expected)
