@@ -9,6 +9,7 @@ from mapper.core.errors import ConfigError
 from mapper.core.frames import Sensor
 from mapper.evaluators.compare.config import CompareConfig
 from mapper.evaluators.compare.methods import AnyRegistration, Method, odometry_method, registration_method
+from mapper.evaluators.compare.rko_lio import RkoLioTracker
 from mapper.odometry.config import IsvdOdometryConfig, LocalMapConfig, PnpConfig
 from mapper.odometry.factory import build_frame_odometry
 from mapper.odometry.scans.config import KissOdometryConfig
@@ -18,12 +19,14 @@ from mapper.registration.hough.config import HoughConfig
 from mapper.runtime.extras import install_line, require
 from mapper.sources.base import Log
 
+RKO_LIO = "rko-lio"
 _LIBRARIES = {
     "rgbd": "open3d",
     "ndt": "open3d",
     "hough-ndt": "open3d",
     "kiss-matcher": "kiss_matcher",
     "kiss-icp": "kiss_icp",
+    RKO_LIO: "rko_lio",
 }
 """Optional libraries of methods, by the method's name."""
 
@@ -35,8 +38,10 @@ def methods_for(source: Log, config: CompareConfig) -> tuple[list[Method], list[
         ConfigError: No method of such a name, or none of them can use the log.
         DependencyError: The library of a method that is named is not installed.
     """
-    images, scans = _image_methods(config.rgbd.max_depth_m), _scan_methods(source.sensor)
+    images, scans = _image_methods(config.rgbd.max_depth_m), _scan_methods(source)
     names = [method.name for method in (*images, *scans)]
+    if RKO_LIO in config.methods and RKO_LIO not in names:
+        raise ConfigError(f"{source.path}: {RKO_LIO} needs scans, angular velocities and accelerations")
     for name in config.methods:
         if name not in names:
             raise ConfigError(f"no method {name!r}; want one of {', '.join(names)}")
@@ -76,8 +81,9 @@ def _image_methods(max_depth_m: float) -> list[Method]:
     ]
 
 
-def _scan_methods(sensor: Sensor) -> list[Method]:
-    """Return every registration of scans, those that need a guess first, and KISS-ICP."""
+def _scan_methods(source: Log) -> list[Method]:
+    """Return the registrations of scans, first those that need a guess, KISS-ICP, and with an IMU RKO-LIO."""
+    sensor = source.sensor
     registrations = [
         registration_method(
             one.kind, partial(build_registration, one), uses_guess=one.kind not in NEED_NO_GUESS
@@ -85,10 +91,23 @@ def _scan_methods(sensor: Sensor) -> list[Method]:
         for one in registrations_for(sensor)
     ]
     kiss = kiss_icp(sensor)
-    return [
+    methods = [
         *sorted(registrations, key=lambda method: not method.uses_guess),
         odometry_method(kiss.kind, partial(build_frame_odometry, kiss), sees_images=False),
     ]
+    if sensor == "lidar" and source.gyroscope is not None and source.accelerations is not None:
+        tracker = partial(RkoLioTracker, source)
+        methods.append(
+            Method(
+                RKO_LIO,
+                sees_images=False,
+                uses_guess=False,
+                tracker=tracker,
+                registration=None,
+                sees_times=True,
+            )
+        )
+    return methods
 
 
 _INDOORS = 0.1

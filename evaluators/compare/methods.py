@@ -125,18 +125,20 @@ class Method:
         sees_images: It gets the log's frames; otherwise the scans that are the same for all.
         uses_guess: Its registration begins at a guess.
         tracker: Makes one for a log.
-        registration: Makes one for pairs.
+        registration: Makes one for pairs; None if it only follows whole logs.
+        sees_times: It gets the log's scans with the times of their points.
     """
 
     name: str
     sees_images: bool
     uses_guess: bool
     tracker: Callable[[], Tracker]
-    registration: Callable[[], AnyRegistration]
+    registration: Callable[[], AnyRegistration] | None
+    sees_times: bool = False
 
     def view(self, frame: PreparedFrame) -> Frame:
         """Return what the method gets of a frame."""
-        return frame.frame if self.sees_images else frame.scan
+        return frame.frame if self.sees_images or self.sees_times else frame.scan
 
 
 def odometry_method(name: str, build: Callable[[], FrameOdometry[Any]], *, sees_images: bool) -> Method:

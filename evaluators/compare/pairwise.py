@@ -97,8 +97,11 @@ def trials_of(
         config: The kinds of guesses, and what counts as right.
 
     Returns:
-        A record for each registration: its errors are None without an answer, its times of the CPU.
+        A record for each registration, none of a method that only follows logs. Its errors are None without
+        an answer, its times of the CPU.
     """
+    if method.registration is None:
+        return []
     if not method.uses_guess:
         return [_trial(method, pair, frames, NO_GUESS, np.eye(4), config)]
     kinds = zip(config.guesses, guesses, strict=True)
@@ -113,6 +116,7 @@ def _trial(
     T_guess: Transform,
     config: TrialsConfig,
 ) -> Record:
+    assert method.registration is not None
     target, source = frames
     T_true = pair.T_target_source
     if not method.sees_images:

@@ -19,7 +19,7 @@ from mapper.evaluators.compare.files import compare_into, tables_of, tables_text
 from mapper.evaluators.compare.methods import registration_method
 from mapper.evaluators.compare.pairwise import registration_records
 from mapper.evaluators.metrics.odometry import PathErrors
-from mapper.simulation.config import STREET, LidarSensorConfig
+from mapper.simulation.config import STREET, LidarSensorConfig, SynthImuConfig
 from mapper.simulation.lidar import LidarSimulator
 from mapper.sources import open_source
 from mapper.sources.config import SourceConfig
@@ -91,6 +91,25 @@ def test_registration_is_right_from_good_guesses(on_desk, on_street):
     blind = comparison_rows(on_desk, "not used") | comparison_rows(on_street, "not used")
     assert set(blind) == {"pnp", "hough-gicp"}
     assert {name: row["right"] for name, row in blind.items()} == dict.fromkeys(blind, 3)
+
+
+def test_rko_lio_follows_scans_with_inertial_readings(street, tmp_path, capfd):
+    pytest.importorskip("rko_lio")
+    assert "rko-lio" not in {method.name for method in methods_for(street, CompareConfig())[0]}
+    with pytest.raises(ConfigError, match="accelerations"):
+        methods_for(street, CompareConfig(methods=("rko-lio",)))
+    readings = SynthImuConfig(mounting_rad=(0.0, 0.0, 0.0), offset_s=0.0)
+    slow = {"imu": readings, "speed_mps": 2.0, "duration_s": 2.0, "sensor": LidarSensorConfig(rings=32)}
+    log = LidarSimulator(STREET.model_copy(update=slow)).log()
+
+    comparison = compare(log, CompareConfig(methods=("rko-lio", "icp"), pairs=2), tmp_path)
+
+    ours, theirs = sorted(comparison.runs, key=lambda run: run.method)
+    assert (theirs.frames, theirs.failures, theirs.coverage, theirs.broke) == (21, 0, 1.0, "")
+    assert theirs.errors.ate_m < 0.6  # of 4 m: it slides along this street
+    assert theirs.errors.rpe_rad < 0.005
+    assert {trial["method"] for trial in comparison.trials} == {ours.method}
+    assert capfd.readouterr().out == ""
 
 
 def odometry_records(comparison):
