@@ -28,7 +28,7 @@ from mapper.pipeline.checkpoints import (
 )
 from mapper.pipeline.components import largest_component
 from mapper.pipeline.georeference import Georeferenced, georeference
-from mapper.pipeline.inertial_bridging import bridge
+from mapper.pipeline.inertial_bridging import bridge, check_accelerations
 from mapper.pipeline.joined_components import joined
 from mapper.pipeline.solve import solve
 from mapper.pipeline.track import first_session, noted_log_warnings, track_log
@@ -140,7 +140,11 @@ class _Steps:
                 observer=self.observer,
                 checkpoints=None if self.checkpoints is None else TrackingCheckpoints(self.checkpoints),
             )
-            tracking = bridge(self.source, tracking, progress=self.progress)
+            source, warnings = check_accelerations(self.source, tracking)
+            for warning in warnings:
+                self.progress.note(warning.text)
+            tracking = replace(tracking, warnings=(*tracking.warnings, *warnings))
+            tracking = bridge(source, tracking, progress=self.progress)
             tracking = joined(self.source, tracking, self.config, progress=self.progress)
             tracking = largest_component(tracking, progress=self.progress)
         if self.checkpoints is not None:
@@ -165,7 +169,8 @@ class _Steps:
         tracking = replace(tracking, graph=graph.graph, loops=graph.loops)
         tracking = largest_component(tracking, progress=self.progress)
         with self.writer.clock.stage("level"):
-            level = level_of(with_body_rates(self.source, tracking.gyroscope), tracking, self.config)
+            source, _ = check_accelerations(self.source, tracking)
+            level = level_of(with_body_rates(source, tracking.gyroscope), tracking, self.config)
             tracking = replace(tracking, graph=tracking.graph.moved(level.T_level_world))
             placed = georeference(tracking, self.source.gnss, self.config.graph)
         level = replace(level, T_level_world=placed.T_map_world @ level.T_level_world)

@@ -28,6 +28,10 @@ _TRUSTED_MPS = 0.1
 _CONTRADICTION = 25.0
 """Variance factor from which on residuals are not noise but wrong readings: 5 standard deviations."""
 METHOD = "inertial"
+_CERTAIN = 5.0  # standard deviations
+_OTHER_UNIT = 2.0
+"""Factor between lengths by accelerations and by frames from which on one has another unit; made logs with a
+known unit have 0.67 to 1.1, real units of length are 2.5 apart and more."""
 
 
 def bridge(source: Log, tracking: TrackingResult, *, progress: Progress) -> TrackingResult:
@@ -63,6 +67,45 @@ def bridge(source: Log, tracking: TrackingResult, *, progress: Progress) -> Trac
     for warning in tracking.warnings[before:]:
         progress.note(warning.sentence)
     return tracking
+
+
+def check_accelerations(source: Log, tracking: TrackingResult) -> tuple[Log, tuple[RunWarning, ...]]:
+    """Return the log with accelerations that point up at rest, and warnings of their sign and of lengths.
+
+    The path's changes of velocity tell the sign, which gravity alone does not, and whether the frames'
+    lengths are metres.
+
+    Args:
+        source: The log.
+        tracking: Its tracked frames; those that surfaces do not place are left out.
+    """
+    sure = [track for track in tracking.tracked if not track.diagnostics.unobservable]
+    felt = source.accelerations
+    if tracking.gyroscope is None or felt is None or not sure:
+        return source, ()
+    readings = body_readings(source, tracking.gyroscope)
+    trajectory = replace(tracking, tracks=tuple(sure)).tracked_trajectory()
+    found = readings and readings.path_scale(trajectory.stamps_ns, trajectory.T_world_body)
+    if not found:
+        return source, ()
+    scale, sigma = found
+    warnings = []
+    if scale < -_CERTAIN * sigma:
+        source = replace(source, accelerations=replace(felt, acceleration_mps2=-felt.acceleration_mps2))
+        sentence = "accelerations have the opposite sign, as changes of velocity show; they are used reversed"
+        warnings.append(RunWarning(kind="imu", sentence=sentence))
+    if abs(np.log(abs(scale))) > np.log(_OTHER_UNIT) and abs(scale) > _CERTAIN * sigma:
+        setting = "source.camera.depth_factor" if source.sensor == "rgbd" else "source.cloud_scale"
+        warnings.append(
+            RunWarning(
+                kind="imu",
+                sentence=f"by the accelerations the path is {1.0 / abs(scale):.2g} times as long as by the "
+                "frames: their lengths may not be metres",
+                suggestion=f"{setting}, by which lengths become metres",
+                weight="doubt",
+            )
+        )
+    return source, tuple(warnings)
 
 
 def _is_weak(track: FrameResult) -> bool:

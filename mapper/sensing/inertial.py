@@ -79,11 +79,30 @@ class InertialReadings:
             stamps_ns: (M,) increasing times.
             T_world_body: (M, 4, 4) poses then, in one world.
         """
-        lever = self._lever_turns()
-        place_m = self._lever_arm_m(stamps_ns, T_world_body, lever)
-        if not place_m.any():
+        triples = self._triples(stamps_ns, T_world_body)
+        if triples is None:
             return self
-        return replace(self, accelerations_mps2=self.accelerations_mps2 - lever @ place_m)
+        found, covariance = _fit(triples.columns, triples.moved_mps - triples.felt_mps)
+        place_m = found[-3:]
+        if place_m @ np.linalg.solve(covariance[-3:, -3:], place_m) <= _CERTAIN_CHI2:
+            return self
+        return replace(self, accelerations_mps2=self.accelerations_mps2 - self._lever_turns() @ place_m)
+
+    def path_scale(self, stamps_ns: Stamps, T_world_body: Array) -> tuple[float, float] | None:
+        """Return the ratio of a path's lengths to metres by accelerations, and its standard deviation.
+
+        It is negative where the accelerations point down at rest: gravity cannot be told from its opposite,
+        but changes of velocity can. None with too few poses.
+
+        Args:
+            stamps_ns: (M,) increasing times.
+            T_world_body: (M, 4, 4) poses then, in one world; what no surface shows must not be among them.
+        """
+        triples = self._triples(stamps_ns, T_world_body)
+        if triples is None:
+            return None
+        found, covariance = _fit(np.column_stack([triples.felt_mps, triples.columns]), triples.moved_mps)
+        return float(found[0]), float(np.sqrt(covariance[0, 0]))
 
     def _lever_turns(self) -> Array:
         """Return (N, 3, 3) what a lever arm is multiplied by: [α]× + [ω]×²."""
@@ -100,15 +119,17 @@ class InertialReadings:
     def _times_s(self) -> Array:
         return np.asarray((self.stamps_ns - self.stamps_ns[0]) / NS_PER_S, np.float64)
 
-    def _lever_arm_m(self, stamps_ns: Stamps, T_world_body: Array, lever: Array) -> Array:
+    def _triples(self, stamps_ns: Stamps, T_world_body: Array) -> "_Triples | None":
         times_s, poses_s = self._times_s, (stamps_ns - self.stamps_ns[0]) / NS_PER_S
+        if len(poses_s) < _FEWEST_TRIPLES:
+            return None
         after = np.clip(np.searchsorted(poses_s, times_s), 1, len(poses_s) - 1)
         nearest = np.where(poses_s[after] - times_s < times_s - poses_s[after - 1], after, after - 1)
         turned = self.rates_radps * (times_s - poses_s[nearest])[:, None]
         R_world_body = T_world_body[nearest, :3, :3] @ _rotations(turned)
         felt = np.einsum("nij,nj->ni", R_world_body, self.accelerations_mps2)
-        turns, positions = R_world_body @ lever, T_world_body[:, :3, 3]
-        rows, values = [], []
+        turns, positions = R_world_body @ self._lever_turns(), T_world_body[:, :3, 3]
+        columns, felts, moves = [], [], []
         for k in range(0, len(poses_s), max(1, len(poses_s) // _MOST_TRIPLES)):
             begin, end = np.searchsorted(poses_s, [poses_s[k] - _HALF_S, poses_s[k] + _HALF_S])
             if end >= len(poses_s):
@@ -120,27 +141,14 @@ class InertialReadings:
             rising, falling = (times_s[s] - poses_s[begin]) / before_s, (poses_s[end] - times_s[s]) / after_s
             weights = np.minimum(rising, falling) * np.gradient(times_s[s])
             weighted = [np.einsum("n,nij->ij", weights, one[s]) for one in (R_world_body, turns)]
-            rows.append(np.hstack([weights.sum() * np.eye(3), -weighted[0], -weighted[1]]))
-            moved = (positions[end] - positions[k]) / after_s - (positions[k] - positions[begin]) / before_s
-            values.append(moved - weights @ felt[s])
-        if len(rows) < _FEWEST_TRIPLES:
-            return np.zeros(3)
-        A, b = np.vstack(rows), np.concatenate(values)
-        prior, weight, sigma = (
-            np.diag(np.repeat([0.0, _BIAS_MPS2**-2.0, _PLACE_M**-2.0], 3)),
-            np.ones(len(b)),
-            1.0,
-        )
-        for _ in range(_ITERATIONS):
-            information = A.T @ (A * (weight / sigma**2)[:, None]) + prior
-            found = np.linalg.solve(information, A.T @ (b * weight) / sigma**2)
-            off = np.abs(b - A @ found)
-            sigma = max(SIGMAS_PER_MAD * float(np.median(off)), 1e-4)
-            weight = np.minimum(1.0, 2.0 * sigma / np.maximum(off, 1e-12))
-        place_m = np.asarray(found[6:], np.float64)
-        covariance = np.linalg.inv(information)[6:, 6:]
-        is_certain = place_m @ np.linalg.solve(covariance, place_m) > _CERTAIN_CHI2
-        return place_m if is_certain else np.zeros(3)
+            columns.append(np.hstack([weights.sum() * np.eye(3), -weighted[0], -weighted[1]]))
+            felts.append(weights @ felt[s])
+            moves.append(
+                (positions[end] - positions[k]) / after_s - (positions[k] - positions[begin]) / before_s
+            )
+        if len(columns) < _FEWEST_TRIPLES:
+            return None
+        return _Triples(np.vstack(columns), np.concatenate(felts), np.concatenate(moves))
 
     def _at(self, values: Array, stamp_ns: int) -> Array:
         after = min(max(int(np.searchsorted(self.stamps_ns, stamp_ns)), 1), len(values) - 1)
@@ -154,6 +162,35 @@ class InertialReadings:
         seconds = float(np.median(np.diff(self.stamps_ns))) / NS_PER_S
         sigma = SIGMAS_PER_MAD * float(np.median(np.abs(np.diff(values, n=2, axis=0)))) / np.sqrt(6.0)
         return float(sigma * np.sqrt(seconds))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Triples:
+    """Triples of poses: changes of the mean velocity before the middle one to that after it.
+
+    Attributes:
+        columns: (3 T, 9) what gravity, the accelerations' bias and the unit's place add to them.
+        felt_mps: (3 T,) by double integrals of the accelerations.
+        moved_mps: (3 T,) by the poses.
+    """
+
+    columns: Array
+    felt_mps: Array
+    moved_mps: Array
+
+
+def _fit(A: Array, b: Array) -> tuple[Array, Array]:
+    """Return x of A x = b by Huber's kernel and its covariance; the last six columns are bias and place."""
+    precisions = np.zeros(A.shape[1])
+    precisions[-6:] = np.repeat([_BIAS_MPS2**-2.0, _PLACE_M**-2.0], 3)
+    weight, sigma = np.ones(len(b)), 1.0
+    for _ in range(_ITERATIONS):
+        information = A.T @ (A * (weight / sigma**2)[:, None]) + np.diag(precisions)
+        found = np.linalg.solve(information, A.T @ (b * weight) / sigma**2)
+        off = np.abs(b - A @ found)
+        sigma = max(SIGMAS_PER_MAD * float(np.median(off)), 1e-4)
+        weight = np.minimum(1.0, 2.0 * sigma / np.maximum(off, 1e-12))
+    return np.asarray(found, np.float64), np.asarray(np.linalg.inv(information), np.float64)
 
 
 def _rotations(vectors: Array) -> Array:

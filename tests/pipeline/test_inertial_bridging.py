@@ -1,5 +1,6 @@
 """Bridging by inertial readings: lost frames, parts of a path, motions that surfaces leave open."""
 
+import re
 from dataclasses import replace
 from functools import cache
 
@@ -14,7 +15,7 @@ from mapper.graph.components import components
 from mapper.graph.model import BetweenFactor, PoseGraph
 from mapper.odometry.base import Diagnostics, FrameResult, lost_frame
 from mapper.odometry.gyroscope_calibration import GyroscopeCalibration
-from mapper.pipeline.inertial_bridging import bridge
+from mapper.pipeline.inertial_bridging import bridge, check_accelerations
 from mapper.pipeline.tracking_result import TrackingResult
 from mapper.runtime.progress import SILENT
 from mapper.simulation.config import SynthImuConfig
@@ -210,6 +211,46 @@ def test_accelerations_in_g_are_the_same():
     in_g = replace(log_.accelerations, acceleration_mps2=log_.accelerations.acceleration_mps2 / 9.80665)
     found = bridge(replace(log_, accelerations=in_g), tracking, progress=SILENT)
     assert np.linalg.norm(relative(found, truth, 69, 95)[3:]) < 0.04
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_accelerations_of_either_sign_point_up_at_rest(seed, sign):
+    log_, tracking, _ = made(seed)
+    felt = log_.accelerations
+    given = replace(log_, accelerations=replace(felt, acceleration_mps2=sign * felt.acceleration_mps2))
+    checked, warnings = check_accelerations(given, tracking)
+    assert np.array_equal(checked.accelerations.acceleration_mps2, felt.acceleration_mps2)
+    assert [(warning.kind, warning.weight) for warning in warnings] == [("imu", "note")] * (sign < 0.0)
+
+
+@pytest.mark.parametrize("unit", [0.3048, 1.0, 5.0])
+def test_lengths_that_are_no_metres_are_doubted(unit):
+    log_, tracking, _ = made(1)
+    graph = tracking.graph.with_poses(
+        {node: enlarged(T, 1.0 / unit) for node, T in tracking.graph.T_world_node.items()}
+    )
+    tracks = [replace(t, T_node_body=enlarged(t.T_node_body, 1.0 / unit)) for t in tracking.tracks]
+    _, warnings = check_accelerations(log_, replace(tracking, graph=graph, tracks=tuple(tracks)))
+    assert [warning.weight for warning in warnings] == ["doubt"] * (unit != 1.0)
+    if warnings:
+        times = float(re.search(r"is ([\d.]+) times", warnings[0].sentence)[1])
+        assert times == pytest.approx(unit, rel=0.05)
+
+
+def enlarged(T, scale):
+    larger = T.copy()
+    larger[:3, 3] *= scale
+    return larger
+
+
+def test_frames_that_surfaces_do_not_place_tell_nothing_of_accelerations():
+    log_, tracking, _ = made(1)
+    unseen = Diagnostics(unobservable="translation along x")
+    tracks = tuple(replace(track, diagnostics=unseen) for track in tracking.tracks)
+    negated = replace(log_.accelerations, acceleration_mps2=-log_.accelerations.acceleration_mps2)
+    given = replace(log_, accelerations=negated)
+    assert check_accelerations(given, replace(tracking, tracks=tracks)) == (given, ())
 
 
 def test_a_gap_of_the_readings_is_not_bridged():
