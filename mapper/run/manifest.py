@@ -3,6 +3,7 @@
 import platform
 import sys
 from datetime import UTC, datetime
+from functools import cache
 from importlib import metadata
 from pathlib import Path
 from typing import Literal, TypeVar
@@ -313,6 +314,7 @@ def library_versions() -> dict[str, str]:
     return {name: _version(name) for name in _LIBRARIES}
 
 
+@cache
 def _version(name: str) -> str:
     try:
         return metadata.version(name)
