@@ -61,7 +61,6 @@ BUILD = """
 from mapper.pipeline.warm_up import _build_lidar
 
 _build_lidar(pathlib.Path(sys.argv[1]) / "log")
-_build_lidar(pathlib.Path(sys.argv[1]) / "again")
 """
 
 
