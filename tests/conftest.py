@@ -9,7 +9,6 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -64,6 +63,40 @@ def shared_folder(factory: pytest.TempPathFactory, name: str, fill: Callable[[Pa
     assert digest_of(folder) == filled.read_text(), f"a test has changed {folder}, which others read"
 
 
+@contextmanager
+def pictures_drawn(*, drawn: bool) -> Iterator[None]:
+    """Let builds draw the pictures of their runs, or write a black pixel instead."""
+    import cv2
+    import numpy as np
+
+    from mapper.export.cloud_picture import write_cloud_views
+    from mapper.export.picture import write_summary
+
+    pixel = cv2.imencode(".png", np.zeros((1, 1, 3), np.uint8))[1].tobytes()
+    with pytest.MonkeyPatch.context() as patch:
+        for draw in (write_summary, write_cloud_views):
+            instead = draw if drawn else lambda path, *_, **__: path.write_bytes(pixel)
+            patch.setattr(f"mapper.pipeline.fuse.{draw.__name__}", instead)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def undrawn() -> Iterator[None]:
+    """Spare builds their pictures, a third of a small one's time; tests of small things load no builds."""
+    if "mapper.pipeline.fuse" not in sys.modules:
+        yield
+        return
+    with pictures_drawn(drawn=False):
+        yield
+
+
+@pytest.fixture
+def drawn() -> Iterator[None]:
+    """Let builds of a test draw their pictures."""
+    with pictures_drawn(drawn=True):
+        yield
+
+
 @pytest.fixture
 def tiny_tum_log(tmp_path: Path) -> Callable[..., Path]:
     """Make a TUM folder of ``n`` 64×48 frames with truth along x at 0.3 m/s."""
@@ -89,7 +122,11 @@ def desk_run(desk_log: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterat
     from mapper.run.folder import open_run
     from tests.support.desk import build_desk_run
 
-    with shared_folder(tmp_path_factory, "runs/desk", partial(build_desk_run, desk_log)) as run:
+    def fill(folder: Path) -> None:
+        with pictures_drawn(drawn=True):
+            build_desk_run(desk_log, folder)
+
+    with shared_folder(tmp_path_factory, "runs/desk", fill) as run:
         yield open_run(run)
 
 
