@@ -23,8 +23,8 @@ def room_log(folder: Path) -> Path:
 
 
 def street_log(folder: Path) -> Path:
-    """Write three seconds of a LiDAR on a car in a street, as a KITTI folder."""
+    """Write two seconds of a LiDAR on a car in a street, as a KITTI folder."""
     log = folder / "street"
     sensor = LidarSensorConfig(rings=32, azimuth_steps=720)
-    write_lidar_log(log, STREET.model_copy(update={"duration_s": 3.0, "sensor": sensor}))
+    write_lidar_log(log, STREET.model_copy(update={"duration_s": 2.0, "sensor": sensor}))
     return log

@@ -54,7 +54,7 @@ ANSWERS = {
     "inspect": (["LOG"], "path topics log problem build"),
     "convert": (["LOG", "--as", "mbag", "--out", "TMP/log"], "path format frames skipped"),
     "synth": (
-        ["TMP/new", "--seconds", "0.1", "--set", "width_px=64", "--set", "height_px=48"],
+        ["TMP/new", "--seconds", "0.1", "--set", "width_px=64", "--set", "texture_px_per_m=8"],
         "path format",
     ),
     "config": ([], "loops octree odometry"),

@@ -259,7 +259,7 @@ def test_eval_judges_a_run_without_a_truth(run_folder, desk_log, tmp_path):
     bare, other = tmp_path / "bare", tmp_path / "other"
     shutil.copytree(desk_log, bare)
     (bare / "groundtruth.txt").unlink()
-    mapper("build", bare, "--out", other, "--set", "odometry.kind=isvd", "--quiet")
+    mapper("build", bare, "--out", other, "--set", "odometry.kind=pnp", "--quiet")
     told = json.loads(mapper("eval", other, "--json").stdout)["metrics"]
     values = {metric["name"]: metric["value"] for metric in told}
     assert "ATE RMSE, SE(3)-aligned" not in values
@@ -267,9 +267,9 @@ def test_eval_judges_a_run_without_a_truth(run_folder, desk_log, tmp_path):
     shutil.rmtree(bare)
     assert "not measured" in mapper("eval", other).stdout
 
-    compared = json.loads(mapper("eval", run_folder, "--against", other, "--json").stdout)["metrics"]
-    assert {metric["name"]: metric["value"] for metric in compared}["views compared in both runs"] > 50
-    assert "whose files are not those of" in mapper("eval", run_folder, "--against", other).stdout
+    compared = mapper("eval", run_folder, "--against", other).stdout
+    assert int(re.search(r"views compared in both runs +(\d+)", compared)[1]) > 50
+    assert "whose files are not those of" in compared
     assert "whose files" not in mapper("eval", run_folder, "--against", run_folder).stdout
     mapper("eval", run_folder, "--gate", "ATE RMSE=1", "--quiet")
     assert "more than 0.0001" in mapper("eval", run_folder, "--gate", "ATE RMSE=0.0001", status=1).stderr

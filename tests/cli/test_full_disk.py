@@ -27,7 +27,7 @@ WRITERS = {
     "convert to tum": ["convert", "LOG", "--out", "OUT/log", "--as", "tum"],
     "convert to mcap": ["convert", "LOG", "--out", "OUT/log.mcap", "--as", "mcap"],
     "convert to bag": ["convert", "LOG", "--out", "OUT/log.bag", "--as", "bag"],
-    "synth": ["synth", "OUT/log", "--seconds", "0.2", "--quiet"],
+    "synth": ["synth", "OUT/log", "--seconds", "0.2", "--set", "texture_px_per_m=8", "--quiet"],
     "synth lidar": ["synth", "OUT/log", "--sensor", "lidar", "--scene", "street", "--seconds", "0.2"],
 }
 

@@ -36,9 +36,9 @@ def logs(desk_log, tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def built():
-    """The runs that pages have built, by their commands: pages build the same ones."""
-    return {}
+def built(tmp_path_factory):
+    """The runs that pages have built, and what was printed, by their commands: pages build the same ones."""
+    return tmp_path_factory.mktemp("built"), {}
 
 
 @pytest.fixture
@@ -79,25 +79,23 @@ def test_blocks_run_and_print_the_rows_that_the_page_shows(page, place, built, c
 
 
 def run(command, built):
-    """Run a command and return what it prints; a build with a printed output is not copied."""
+    """Run a command and return what it prints."""
     program, verb, *words = command.words
     assert program == "mapper"
-    if verb == "build" and not command.shown:
-        return copied_or_built(words, built)
-    if verb == "build" and not built:
-        return in_a_process_of_its_own(verb, *words)
+    if verb == "build":
+        return built_or_copied(words, *built)
     return mapper(verb, *words, *QUICKER.get(verb, ())).stdout
 
 
-def copied_or_built(words, built):
-    """Build, or copy the run that another page has built with the same words."""
-    out, key = Path(words[words.index("--out") + 1]), tuple(words)
-    if key not in built:
-        assert not mapper("build", *words).stdout.strip()
-        built[key] = out.resolve()
+def built_or_copied(words, folder, runs):
+    """Build, the first time as a user does, or copy the run that a page has built with the same words."""
+    out, key = Path(words[words.index("--out") + 1]), tuple(word for word in words if word != "--quiet")
+    if key not in runs:
+        printed = mapper("build", *key).stdout if runs else in_a_process_of_its_own("build", *key)
+        runs[key] = shutil.copytree(out, folder / str(len(runs))), printed
     else:
-        shutil.copytree(built[key], out)
-    return ""
+        shutil.copytree(runs[key][0], out)
+    return "" if "--quiet" in words else runs[key][1]
 
 
 def in_a_process_of_its_own(*arguments):

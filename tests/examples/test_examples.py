@@ -2,9 +2,8 @@
 
 import importlib.util
 import json
-import os
 import re
-import subprocess
+import runpy
 import sys
 
 import pytest
@@ -17,12 +16,17 @@ SCRIPTS = ("map_and_query", "own_odometry", "compare_registrations")
 NOTEBOOK = json.loads((EXAMPLES / "first_map.ipynb").read_text(encoding="utf-8"))
 
 
-def run_example(name, *arguments):
-    settings = os.environ | {"PYTHONPATH": str(ROOT), "MPLBACKEND": "Agg"}
-    command = [sys.executable, EXAMPLES / f"{name}.py", *arguments]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, env=settings)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
+@pytest.fixture
+def told_by(monkeypatch, capsys):
+    """What an example prints, run as a script."""
+
+    def run(name, *arguments):
+        monkeypatch.syspath_prepend(EXAMPLES)
+        monkeypatch.setattr(sys, "argv", [name, *map(str, arguments)])
+        runpy.run_path(str(EXAMPLES / f"{name}.py"), run_name="__main__")
+        return capsys.readouterr().out
+
+    return run
 
 
 def test_every_example_is_run_here():
@@ -32,8 +36,8 @@ def test_every_example_is_run_here():
 
 
 @pytest.mark.slow
-def test_a_log_of_one_s_own_is_mapped_and_queried(desk_log, tmp_path):
-    told = run_example("map_and_query", desk_log, tmp_path / "run")
+def test_a_log_of_one_s_own_is_mapped_and_queried(told_by, desk_log, tmp_path):
+    told = told_by("map_and_query", desk_log, tmp_path / "run")
     assert "verdict: trusted" in told
     run = mapper.open_run(tmp_path / "run")
     assert f"octree: {len(run.octree.occupied())} occupied voxels" in told
@@ -41,16 +45,16 @@ def test_a_log_of_one_s_own_is_mapped_and_queried(desk_log, tmp_path):
 
 
 @pytest.mark.slow
-def test_an_own_odometry_maps_a_simulated_street():
-    told = run_example("own_odometry")
+def test_an_own_odometry_maps_a_simulated_street(told_by):
+    told = told_by("own_odometry")
     errors = dict(re.findall(r"^(.*): \d+ poses, .* m, ATE (\S+) m$", told, re.MULTILINE))
     assert errors.keys() == {"own odometry", "toolkit"}
     assert all(float(error) < 0.5 for error in errors.values())
 
 
 @pytest.mark.slow
-def test_registrations_of_a_simulated_street_are_compared():
-    told = run_example("compare_registrations")
+def test_registrations_of_a_simulated_street_are_compared(told_by):
+    told = told_by("compare_registrations")
     rows = [line.split() for line in told.splitlines()[1:]]
     trusted = {row[0]: float(row[2]) for row in rows if row[1] == "yes"}
     assert {"icp", "plane-icp", "gicp"} <= trusted.keys()

@@ -222,13 +222,20 @@ def test_inspect_refuses_what_a_build_must_refuse(tmp_path, name):
         build_case(name, tmp_path / "run")
 
 
+@pytest.fixture(scope="module")
+def corridor(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("corridor")
+    subprocess.run([sys.executable, case("23_bare_corridor") / "make.py"], cwd=folder, check=True)
+    return folder / "corridor"
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("voxel_m", [0.1, 0.15, 0.4, 0.8])
-def test_a_corridor_that_shows_no_motion_along_it_is_not_trusted_at_any_voxel_size(tmp_path, voxel_m):
-    script = case("23_bare_corridor") / "make.py"
-    subprocess.run([sys.executable, script], cwd=tmp_path, check=True)
+def test_a_corridor_that_shows_no_motion_along_it_is_not_trusted_at_any_voxel_size(
+    corridor, tmp_path, voxel_m
+):
     with suppress(MapperError):  # too few frames are tracked
-        log = open_source(tmp_path / "corridor", SourceConfig())
+        log = open_source(corridor, SourceConfig())
         indoor = load_config(CONFIGS / "lidar_indoor.toml", [f"odometry.voxel_m={voxel_m}"], sensor="lidar")
         build(log, indoor, tmp_path / "run")
     (manifest,) = tmp_path.glob("run*/manifest.json")

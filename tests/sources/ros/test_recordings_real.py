@@ -36,7 +36,7 @@ def test_fr1_xyz_gives_the_identical_trajectory(tmp_path, kind):
 
 @pytest.mark.slow
 def test_fr1_xyz_seen_by_a_depth_camera_beside_colour_s_gives_the_path_and_the_map(tmp_path):
-    registered = open_source(log_or_skip("tum_fr1_xyz"), SourceConfig(last_frame=60, stride=3))
+    registered = open_source(log_or_skip("tum_fr1_xyz"), SourceConfig(last_frame=60, stride=5))
     write_unregistered(tmp_path / "bag", registered)
     config = load_config()
     wanted, found = (
