@@ -68,7 +68,8 @@ class TopicsConfig(Config):
     gyroscope: str | None = None
     """Inertial readings whose angular velocities are used; None is the same topic, or one that has them."""
     gnss: str | None = None
-    """Fixes of a GNSS receiver (NavSatFix); None is guessed: a receiver's rather than a filter's."""
+    """Fixes of a GNSS receiver (NavSatFix, GPSFix, or sentences of NMEA); None is guessed: a receiver's
+    rather than a filter's."""
     truth: str | None = None
     """True poses (Odometry, PoseStamped, TransformStamped); None is /ground_truth, if there is one."""
     wheels: str | None = None

@@ -1,4 +1,4 @@
-"""GNSS fixes beside a log: ``gnss.txt``, or the ``oxts`` folder of KITTI's raw drives."""
+"""GNSS fixes beside a log: ``gnss.txt``, sentences of NMEA 0183, or ``oxts`` of KITTI's raw drives."""
 
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -11,6 +11,7 @@ from mapper.core.timebase import seconds_text_from_ns
 from mapper.runtime.atomic import write_text
 from mapper.sensing.gnss import NO_FIX, GnssFixes
 from mapper.sources.listed_files import refuse_links_out
+from mapper.sources.nmea import fixes_from_sentences
 from mapper.sources.text import parse_date, parse_numbers, parse_stamp, read_lines, rows, time_order
 
 FIXES, OXTS = "gnss.txt", "oxts"
@@ -31,8 +32,8 @@ def read_gnss(folder: Path) -> tuple[GnssFixes | None, list[str]]:
     Args:
         folder: Folder that may hold ``gnss.txt``, lines of ``stamp latitude_deg longitude_deg height_m
             status``, to which the upper triangle of the covariance of east, north and up (m²) may be added,
-            after an optional line ``antenna x y z`` (metres, body frame); or ``oxts/data/*.txt`` with
-            ``oxts/timestamps.txt`` (Geiger et al. 2013).
+            after an optional line ``antenna x y z`` (metres, body frame); ``oxts/data/*.txt`` with
+            ``oxts/timestamps.txt`` (Geiger et al. 2013); or a file ``.nmea`` of a receiver's sentences.
 
     Raises:
         SourceError: A file is malformed.
@@ -41,6 +42,10 @@ def read_gnss(folder: Path) -> tuple[GnssFixes | None, list[str]]:
         return _read_table(folder / FIXES)
     if (folder / OXTS / "timestamps.txt").is_file():
         return _read_oxts(folder / OXTS)
+    for path in sorted(folder.glob("*.nmea"))[:1]:
+        fixes, notes = fixes_from_sentences(path.name, ((None, line) for line in read_lines(path)))
+        kept, more = (None, []) if fixes is None else in_order(fixes)
+        return kept, [*notes, *more]
     return None, []
 
 

@@ -1,19 +1,24 @@
 """GNSS fixes go over with a log into other formats, and come back; inspection tells of them."""
 
 import json
+from datetime import UTC, datetime
+from functools import reduce
+from operator import xor
 
 import numpy as np
 import pytest
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from mapper.core.geodesy import GeodeticOrigin
 from mapper.core.geometry import exp
 from mapper.core.rotations import rotation_from_euler
+from mapper.core.timebase import NS_PER_S
 from mapper.simulation.config import STREET
 from mapper.simulation.gnss_config import SynthGnssConfig
 from mapper.simulation.lidar import LidarSimulator, write_lidar_log
 from mapper.sources import open_source
 from mapper.sources.config import SourceConfig, TopicsConfig
-from mapper.sources.ros.encode_ros import fix_message
+from mapper.sources.ros.encode_ros import SerializedMessage, fix_message
 from mapper.sources.writers import left_out, write_log
 from tests.support.command_line import invoke
 from tests.support.recordings import shots, transforms, write
@@ -101,3 +106,147 @@ def test_a_receivers_topic_goes_before_a_filters_and_another_can_be_chosen(tmp_p
     assert any(note.endswith(": /a/filtered") for note in log.notes)
     chosen = open_source(tmp_path / "a.mcap", SourceConfig(topics=TopicsConfig(gnss="/a/filtered")))
     assert chosen.gnss.name == "/a/filtered"
+
+
+GPS_STATUS = """std_msgs/Header header
+uint16 satellites_used
+int32[] satellite_used_prn
+uint16 satellites_visible
+int32[] satellite_visible_prn
+int32[] satellite_visible_z
+int32[] satellite_visible_azimuth
+int32[] satellite_visible_snr
+int16 STATUS_DGPS_FIX=18
+int16 status
+uint16 motion_source
+uint16 orientation_source
+uint16 position_source
+"""
+GPS_FIX = """std_msgs/Header header
+GPSStatus status
+float64 latitude
+float64 longitude
+float64 altitude
+float64 track
+float64 speed
+float64 climb
+float64 pitch
+float64 roll
+float64 dip
+float64 time
+float64 gdop
+float64 pdop
+float64 hdop
+float64 vdop
+float64 tdop
+float64 err
+float64 err_horz
+float64 err_vert
+float64 err_track
+float64 err_speed
+float64 err_climb
+float64 err_time
+float64 err_pitch
+float64 err_roll
+float64 err_dip
+float64[9] position_covariance
+uint8 COVARIANCE_TYPE_KNOWN=3
+uint8 position_covariance_type
+"""
+"""As gps_umd defines them."""
+
+
+def receivers_store():
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    store.register(get_types_from_msg(GPS_STATUS, "gps_msgs/msg/GPSStatus"))
+    store.register(get_types_from_msg(GPS_FIX, "gps_msgs/msg/GPSFix"))
+    store.register(get_types_from_msg("std_msgs/Header header\nstring sentence", "nmea_msgs/msg/Sentence"))
+    return store
+
+
+def message_of(store, type_, stamp_ns, topic, **fields):
+    sec, nanosec = divmod(stamp_ns, NS_PER_S)
+    stamp = store.types["builtin_interfaces/msg/Time"](sec=sec, nanosec=nanosec)
+    header = store.types["std_msgs/msg/Header"](stamp=stamp, frame_id="antenna")
+    message = store.types[type_](header=header, **fields)
+    return SerializedMessage(stamp_ns, topic, type_, bytes(store.serialize_cdr(message, type_)))
+
+
+def test_gps_fixes_are_fixes_with_their_own_numbers_of_status(tmp_path):
+    store, none = receivers_store(), np.zeros(0, np.int32)
+    messages = [*shots(3)]
+    for k, shot in enumerate(shots(3)[::3]):
+        status = store.types["gps_msgs/msg/GPSStatus"](
+            **{name: none for name in GPS_STATUS.split() if name.startswith("satellite_")},
+            header=store.types["std_msgs/msg/Header"](
+                stamp=store.types["builtin_interfaces/msg/Time"](sec=0, nanosec=0), frame_id=""
+            ),
+            satellites_used=7, satellites_visible=9, status=18,
+            motion_source=0, orientation_source=0, position_source=1,
+        )  # fmt: skip
+        others = [line.split()[1] for line in GPS_FIX.splitlines() if line.startswith("float64 ")]
+        place = dict.fromkeys(others, 0.0) | {"latitude": 47.0, "longitude": 19.0, "altitude": 100.0 + k}
+        covariance = {"position_covariance": np.eye(3).ravel() * 0.25, "position_covariance_type": 3}
+        stamp_ns = shot.stamp_ns
+        messages.append(
+            message_of(store, "gps_msgs/msg/GPSFix", stamp_ns, "/gps", status=status, **place, **covariance)
+        )
+    write(tmp_path / "a.mcap", messages)
+    fixes = open_source(tmp_path / "a.mcap").gnss
+    assert fixes.geodetic.tolist() == [[47.0, 19.0, 100.0 + k] for k in range(3)]
+    assert fixes.status.tolist() == [2, 2, 2]
+    assert fixes.covariances_enu[2].tolist() == (0.25 * np.eye(3)).tolist()
+
+
+def sentence(body):
+    return f"${body}*{reduce(xor, body.encode()):02X}"
+
+
+SENTENCES = [
+    sentence("GPRMC,235959.50,A,4730.000,N,01902.000,E,0.1,0.0,311226,,,A"),
+    sentence("GPGGA,235959.50,4730.000,N,01902.000,E,4,12,0.8,100.0,M,43.5,M,1.0,0001"),
+    sentence("GPGST,235959.50,,,,,0.02,0.03,0.05"),
+    sentence("GPGGA,000000.50,4730.600,S,01902.000,W,1,8,1.2,101.0,M,43.5,M,,"),
+    "$GPGGA,000001.50,4730.600,S,01902.000,W,1,8,1.2,101.0,M,43.5,M,,*00",
+    sentence("GPGGA,000002.50,,,,,0,,,,,,,,"),
+]
+"""Over midnight, an accuracy for the first, one damaged, one without a fix."""
+
+
+def test_sentences_beside_a_log_are_fixes_with_times_of_utc(tmp_path):
+    write_lidar_log(tmp_path / "log", SHORT.model_copy(update={"gnss": None}))
+    (tmp_path / "log" / "receiver.nmea").write_text("\r\n".join(SENTENCES) + "\r\n")
+    log = open_source(tmp_path / "log")
+    midnight_s = datetime(2027, 1, 1, tzinfo=UTC).timestamp()
+    assert (log.gnss.stamps_ns / NS_PER_S).tolist() == [midnight_s - 0.5, midnight_s + 0.5]
+    np.testing.assert_allclose(
+        log.gnss.geodetic, [[47.5, 19 + 2 / 60, 143.5], [-47.51, -19 - 2 / 60, 144.5]], atol=1e-9
+    )
+    assert log.gnss.status.tolist() == [2, 0]
+    np.testing.assert_allclose(np.sqrt(log.gnss.covariances_enu[0].diagonal()), [0.03, 0.02, 0.05])
+    assert np.isnan(log.gnss.covariances_enu[1]).all()
+    assert sum("1 damaged" in note for note in log.notes) == 1
+    (tmp_path / "log" / "receiver.nmea").write_text("\n".join(SENTENCES[1:]))
+    undated = open_source(tmp_path / "log")
+    assert undated.gnss is None
+    assert sum("date" in note for note in undated.notes) == 1
+
+
+def test_sentences_of_a_recording_have_its_stamps_and_come_after_fixes(tmp_path):
+    store, topic, type_ = receivers_store(), "/nmea_sentence", "nmea_msgs/msg/Sentence"
+    messages = [
+        *shots(3),
+        *(
+            message_of(store, type_, shot.stamp_ns, topic, sentence=text)
+            for shot in shots(3)[::3]
+            for text in SENTENCES[1:3]
+        ),
+    ]
+    write(tmp_path / "a.mcap", messages)
+    log = open_source(tmp_path / "a.mcap")
+    assert log.gnss.stamps_ns.tolist() == [shot.stamp_ns for shot in shots(3)[::3]]
+    np.testing.assert_allclose(log.gnss.sigmas_m, np.sqrt((0.02**2 + 0.03**2) / 2.0))
+    place = {"geodetic": np.array([47.0, 19.0, 1.0]), "covariance_enu": np.eye(3), "status": 0}
+    fix = fix_message(shots(1)[0].stamp_ns, "/fix", **place, frame="antenna")
+    write(tmp_path / "b.mcap", [*messages, fix])
+    assert open_source(tmp_path / "b.mcap").gnss.name == "/fix"

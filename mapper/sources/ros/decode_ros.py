@@ -16,6 +16,7 @@ from mapper.sources.ros.driver_messages import decode_driver_message
 from mapper.sources.ros.messages import (
     DRIVER_CLOUDS,
     EXTRINSICS,
+    GPS_FIXES,
     CameraMessage,
     CloudMessage,
     FileMessage,
@@ -24,6 +25,7 @@ from mapper.sources.ros.messages import (
     Message,
     PixelsMessage,
     PoseMessage,
+    SentenceMessage,
     Window,
 )
 from mapper.sources.ros.recording import Topic
@@ -32,6 +34,8 @@ from mapper.sources.ros.typestore import typestore
 POINT_FIELD_TYPES = dict(enumerate(("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8"), start=1))
 """Numpy's names of PointField's constants."""
 _EXTRINSICS_NUMBERS = 12
+_GPS_STATUS = {18: 2, 19: 2, 20: 2, 33: 1}
+"""GPSStatus's own numbers of differential, RTK, RTK with floating ambiguities and WAAS, as NavSatStatus's."""
 
 
 def decode_ros(topic: Topic, data: memoryview) -> Message:
@@ -125,7 +129,12 @@ def _fix(m: Any) -> FixMessage:
     if m.position_covariance_type == m.COVARIANCE_TYPE_UNKNOWN:
         covariance = np.full((3, 3), np.nan)
     place = np.array([m.latitude, m.longitude, m.altitude])
-    return FixMessage(_ns(m.header.stamp), m.header.frame_id, m.status.status, place, covariance)
+    status = _GPS_STATUS.get(m.status.status, m.status.status)
+    return FixMessage(_ns(m.header.stamp), m.header.frame_id, status, place, covariance)
+
+
+def _sentence(m: Any) -> SentenceMessage:
+    return SentenceMessage(_ns(m.header.stamp), m.header.frame_id, m.sentence)
 
 
 def _pose_stamped(m: Any) -> list[PoseMessage]:
@@ -170,6 +179,8 @@ _READERS: Mapping[str, Callable[[Any], Message]] = {
     "sensor_msgs/msg/LaserScan": _laser,
     "sensor_msgs/msg/Imu": _imu,
     "sensor_msgs/msg/NavSatFix": _fix,
+    **dict.fromkeys(GPS_FIXES, _fix),
+    "nmea_msgs/msg/Sentence": _sentence,
     "geometry_msgs/msg/PoseStamped": _pose_stamped,
     "geometry_msgs/msg/PoseWithCovarianceStamped": _pose_stamped,
     "nav_msgs/msg/Odometry": _pose_stamped,

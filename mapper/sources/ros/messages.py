@@ -153,7 +153,7 @@ class ImuMessage:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FixMessage:
-    """A fix of a GNSS receiver (sensor_msgs/NavSatFix).
+    """A fix of a GNSS receiver (sensor_msgs/NavSatFix, gps_common/GPSFix).
 
     Attributes:
         stamp_ns: Time of the fix.
@@ -170,8 +170,25 @@ class FixMessage:
     covariance_enu: Array
 
 
+@dataclass(frozen=True, slots=True)
+class SentenceMessage:
+    """A sentence of a GNSS receiver (nmea_msgs/Sentence), and when it was received."""
+
+    stamp_ns: int
+    frame: str
+    sentence: str
+
+
 ImageMessage = PixelsMessage | FileMessage
-Message = ImageMessage | CameraMessage | CloudMessage | ImuMessage | FixMessage | list[PoseMessage]
+Message = (
+    ImageMessage
+    | CameraMessage
+    | CloudMessage
+    | ImuMessage
+    | FixMessage
+    | SentenceMessage
+    | list[PoseMessage]
+)
 
 
 def frame_of(message: Message | None) -> str:
@@ -191,7 +208,9 @@ DRIVER_CLOUDS = LIVOX | VELODYNE
 LASERS = frozenset({"sensor_msgs/msg/LaserScan", "foxglove.LaserScan"})
 CLOUDS = frozenset({"sensor_msgs/msg/PointCloud2", "foxglove.PointCloud"}) | DRIVER_CLOUDS | LASERS
 IMUS = frozenset({"sensor_msgs/msg/Imu"})
-FIXES = frozenset({"sensor_msgs/msg/NavSatFix"})
+SENTENCES = frozenset({"nmea_msgs/msg/Sentence"})
+GPS_FIXES = frozenset({"gps_common/msg/GPSFix", "gps_msgs/msg/GPSFix"})
+FIXES = frozenset({"sensor_msgs/msg/NavSatFix"}) | GPS_FIXES | SENTENCES
 ODOMETRY = frozenset({"nav_msgs/msg/Odometry"})
 POSES = ODOMETRY | frozenset(
     {

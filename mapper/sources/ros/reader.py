@@ -19,20 +19,23 @@ from mapper.sensing.gnss import GnssFixes
 from mapper.sensing.gyroscope import Gyroscope
 from mapper.sources.base import Accelerations
 from mapper.sources.config import WheelsConfig
+from mapper.sources.nmea import fixes_from_sentences
 from mapper.sources.ros.decode import decode
 from mapper.sources.ros.entries import Located
 from mapper.sources.ros.frame_tree import FrameTree
 from mapper.sources.ros.index import Series, first_messages, index_of
 from mapper.sources.ros.message_order import ordered
 from mapper.sources.ros.messages import (
+    SENTENCES,
     TRANSFORMS,
     FixMessage,
     Message,
     PoseMessage,
+    SentenceMessage,
     frame_of,
 )
 from mapper.sources.ros.recording import Recording
-from mapper.sources.text import ROUNDING
+from mapper.sources.text import ROUNDING, time_order
 from mapper.sources.wheel_files import mounting
 
 _MAX_READINGS = 20_000  # levelling asks for fewer
@@ -163,21 +166,37 @@ class RecordingReader:
         """Return the fixes of a topic, with the antenna's place if tf has one that stays, and notes."""
         if series is None:
             return None, []
-        order, notes = ordered(series)
-        found = [(ns, fix) for ns, fix in self._messages(series, order) if isinstance(fix, FixMessage)]
-        frame = next((fix.frame.lstrip("/") for _, fix in found), "")
+        frame = frame_of(self.firsts.get(series.topic.name))
         tree = self.tree_of(body, frame)
         T_body_antenna = None if tree.moves(body, frame) else tree.find(body, frame)
+        fixes, notes = self._sentences(series) if series.topic.type in SENTENCES else self._fixes(series)
+        if fixes is None:
+            return None, notes
+        antenna = None if T_body_antenna is None else T_body_antenna[:3, 3]
+        kept, more = replace(fixes, antenna_body=antenna).without_invalid()
+        return kept, [*notes, *more]
+
+    def _fixes(self, series: Series) -> tuple[GnssFixes, list[str]]:
+        order, notes = ordered(series)
+        found = [(ns, fix) for ns, fix in self._messages(series, order) if isinstance(fix, FixMessage)]
         fixes = GnssFixes(
             series.topic.name,
             np.array([ns for ns, _ in found], np.int64),
             np.array([fix.geodetic for _, fix in found]).reshape(-1, 3),
             np.array([fix.covariance_enu for _, fix in found]).reshape(-1, 3, 3),
             np.array([fix.status for _, fix in found], np.int8),
-            None if T_body_antenna is None else T_body_antenna[:3, 3],
         )
-        kept, more = fixes.without_invalid()
-        return kept, [*notes, *more]
+        return fixes, notes
+
+    def _sentences(self, series: Series) -> tuple[GnssFixes | None, list[str]]:
+        """Return the fixes of sentences, those of one moment with one stamp."""
+        order = np.argsort(series.stamps_ns, kind="stable")
+        found = [(ns, one) for ns, one in self._messages(series, order) if isinstance(one, SentenceMessage)]
+        fixes, notes = fixes_from_sentences(series.topic.name, ((ns, one.sentence) for ns, one in found))
+        if fixes is None:
+            return None, notes
+        kept, more = time_order(fixes.stamps_ns, what=series.topic.name)
+        return fixes.of(kept), [*notes, *more]
 
     def base_of(self, frame: str) -> str | None:
         """Return the frame of the robot that carries a frame; None where tf names none."""

@@ -16,16 +16,19 @@ from mapper.sources.ros.messages import (
     CAMERAS,
     CLOUDS,
     FIXES,
+    GPS_FIXES,
     IMAGES,
     IMUS,
     LASERS,
     ODOMETRY,
     POSES,
     READ,
+    SENTENCES,
     ImageMessage,
     Message,
     frame_of,
 )
+from mapper.sources.ros.recording import Topic
 from mapper.sources.ros.unused_topics import feels_gravity, unused_notes, usual_acceleration, what_there_is
 
 TRUTH, WHEELS = "/ground_truth", "/wheel_odometry"
@@ -148,7 +151,9 @@ def choose(
         gyroscope = pick.one(
             "gyroscope", config.gyroscope, IMUS, _plain_rank, where=lambda name: _turns(series[name])
         )
-    gnss = pick.one("gnss", config.gnss, FIXES, _fix_rank, where=lambda _name: True)
+    gnss = pick.one(
+        "gnss", config.gnss, FIXES, lambda name: _fix_rank(series[name].topic), where=lambda _name: True
+    )
     truth = pick.one("truth", config.truth, POSES, _plain_rank, where=lambda name: name == TRUTH)
     wheels = pick.one("wheels", config.wheels, POSES, _plain_rank, where=lambda name: name == WHEELS)
     if wheels is None and points is not None and points.topic.type in LASERS:
@@ -340,9 +345,10 @@ def _plain_rank(name: str) -> tuple[int, ...]:
     return (name.count("/"),)
 
 
-def _fix_rank(name: str) -> tuple[int, ...]:
-    """Rank a receiver's fixes before those that a filter made of them and of other sensors."""
-    return int(any(word in name.lower() for word in ("filter", "fused", "odom"))), name.count("/")
+def _fix_rank(topic: Topic) -> tuple[int, ...]:
+    """Rank fixes before sentences, and a receiver's before those that a filter made of several sensors."""
+    is_filtered = any(word in topic.name.lower() for word in ("filter", "fused", "odom"))
+    return is_filtered, topic.type in SENTENCES, topic.type in GPS_FIXES, topic.name.count("/")
 
 
 def _is_packed(name: str) -> bool:

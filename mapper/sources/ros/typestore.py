@@ -9,6 +9,35 @@ from mapper.core.geometry import Transform
 from mapper.core.rotations import quaternion_from_rotation
 from mapper.core.timebase import NS_PER_S
 
+_GPS_STATUS = """\
+std_msgs/Header header
+uint16 satellites_used
+int32[] satellite_used_prn
+uint16 satellites_visible
+int32[] satellite_visible_prn
+int32[] satellite_visible_z
+int32[] satellite_visible_azimuth
+int32[] satellite_visible_snr
+int16 status
+uint16 motion_source
+uint16 orientation_source
+uint16 position_source
+"""
+_GPS_NUMBERS = (
+    *("latitude", "longitude", "altitude", "track", "speed", "climb", "pitch", "roll", "dip", "time"),
+    *("gdop", "pdop", "hdop", "vdop", "tdop", "err", "err_horz", "err_vert", "err_track", "err_speed"),
+    *("err_climb", "err_time", "err_pitch", "err_roll", "err_dip"),
+)
+_GPS_FIX = "\n".join(
+    [
+        "std_msgs/Header header",
+        "GPSStatus status",
+        *(f"float64 {name}" for name in _GPS_NUMBERS),
+        "float64[9] position_covariance",
+        "uint8 COVARIANCE_TYPE_UNKNOWN=0",
+        "uint8 position_covariance_type",
+    ]
+)
 _OCTOMAP = """\
 std_msgs/Header header
 bool binary
@@ -27,11 +56,21 @@ def typestore(encoding: str) -> Any:
     if encoding != "ros1":
         store = get_typestore(Stores.ROS2_HUMBLE)
         store.register(get_types_from_msg(_OCTOMAP, "octomap_msgs/msg/Octomap"))
+        _add_receivers(store)
         return store
     store = get_typestore(Stores.ROS1_NOETIC)
+    _add_receivers(store)
     for name in ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage"):  # rosbags leaves them out of Noetic's
         store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", name))
     return store
+
+
+def _add_receivers(store: Any) -> None:
+    """Add the messages of GNSS receivers' drivers (gps_umd, nmea_navsat_driver)."""
+    for package in ("gps_common", "gps_msgs"):
+        store.register(get_types_from_msg(_GPS_STATUS, f"{package}/msg/GPSStatus"))
+        store.register(get_types_from_msg(_GPS_FIX, f"{package}/msg/GPSFix"))
+    store.register(get_types_from_msg("std_msgs/Header header\nstring sentence\n", "nmea_msgs/msg/Sentence"))
 
 
 @cache
