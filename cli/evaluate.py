@@ -127,7 +127,7 @@ def evaluate(
     mapper eval runs/flat --map logs/flat --sharpness
     """
     from mapper.evaluators.metrics.evaluate import estimate_and_truth
-    from mapper.evaluators.metrics.loops import loop_metrics_of_run
+    from mapper.evaluators.metrics.loops import agreement_of_loops, loop_metrics_of_run
     from mapper.run.manifest import is_merged_map
 
     of_log = {"--sharpness": sharpness, "--agreement": agreement, "--against": against}
@@ -162,8 +162,9 @@ def evaluate(
         names=(str(estimate), str(truth) if truth else "its truth"),
     )
     metrics = list(found.metrics)
-    if run is not None and known is not None:
-        metrics += loop_metrics_of_run(run, known)
+    if run is not None:
+        metrics += [] if known is None else loop_metrics_of_run(run, known)
+        metrics += agreement_of_loops(run.graph)
     if run is None:
         refuse_with(f"{estimate}, a trajectory alone", of_log, remedy="give the folder of its run")
     if map_ is None:

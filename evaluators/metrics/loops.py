@@ -1,14 +1,16 @@
-"""Loop metrics: how many closures are right, and how many true revisits they found."""
+"""Loop metrics: how many closures are right, how many true revisits they found, how they agree."""
 
 from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.core.geometry import Array, distances_along
+from mapper.core.geometry import Array, distances_along, inverse, log
 from mapper.core.timebase import MAX_TRUTH_GAP_NS, NS_PER_S, Stamps, nearest
 from mapper.core.trajectory import Trajectory
 from mapper.evaluators.metrics.metric import Metric
+from mapper.graph.marginals import marginals_of
+from mapper.graph.model import PoseGraph
 from mapper.loops.closure import LoopClosure, accepted_loops, discrepancy
 from mapper.loops.config import ScanLoopsConfig
 from mapper.run.folder import Run
@@ -17,6 +19,8 @@ MAX_ERROR_M, MAX_ERROR_RAD = 0.2, 0.1
 """A loop that is farther from the truth is wrong."""
 REVISIT_M, REVISIT_RAD, REVISIT_S = 0.5, np.deg2rad(20.0), 5.0
 """A keyframe revisits a place if an earlier one was within this distance and turn, and before this time."""
+_CERTAIN_CHI2 = 22.46
+"""99.9 % of χ² with six degrees of freedom."""
 
 
 def loop_metrics_of_run(run: Run, truth: Trajectory) -> list[Metric]:
@@ -48,6 +52,44 @@ def loop_metrics(
         Metric("loops wrongly accepted", sum(wrong_loops(accepted, truth)), "loops"),
         Metric("true revisits", int(revisits.sum()), "keyframes"),
         Metric("true revisits with a loop", int((found & revisits).sum()), "keyframes"),
+    ]
+
+
+def agreement_of_loops(graph: PoseGraph) -> list[Metric]:
+    """Return how far each loop is from the pose that all others and the odometry give; nothing without loops.
+
+    Each loop is left out in turn. It need not be solved for: the covariance P of its two nodes relative to
+    each other is that of two independent estimates, the loop's and all others', so the others' has the
+    covariance (P⁻¹ − Ω)⁻¹, and the residual without the loop is larger by the factor by which that exceeds P
+    (Cook 1977). The squared residual by its covariance has six degrees of freedom; a loop beyond their 99.9 %
+    contradicts the others. Loops that alone tie their nodes are not compared.
+
+    Args:
+        graph: Solved, with the loops that hold.
+    """
+    relative = marginals_of(graph).relative if graph.loops else {}
+    distances_m, angles_rad, squares = [], [], []
+    for loop in graph.loops:
+        try:
+            others = np.linalg.inv(np.linalg.inv(relative[loop.i, loop.j]) - loop.information)
+            covariance = others + np.linalg.inv(loop.information)
+            np.linalg.cholesky(others)
+        except np.linalg.LinAlgError:
+            continue
+        T_i_j = inverse(graph.T_world_node[loop.i]) @ graph.T_world_node[loop.j]
+        left_out = covariance @ loop.information @ np.concatenate(log(inverse(T_i_j) @ loop.T_i_j))
+        angles_rad.append(float(np.linalg.norm(left_out[:3])))
+        distances_m.append(float(np.linalg.norm(left_out[3:])))
+        squares.append(float(left_out @ np.linalg.solve(covariance, left_out)))
+    if not squares:
+        return []
+    contradicting = sum(square > _CERTAIN_CHI2 for square in squares)
+    return [
+        Metric("loops compared with all others", len(squares), "loops"),
+        Metric("loops off the others, median", float(np.median(distances_m)), "m"),
+        Metric("loops off the others, largest", max(distances_m), "m"),
+        Metric("loops off the others, median angle", float(np.median(angles_rad)), "rad"),
+        Metric("loops that contradict the others", contradicting, "loops"),
     ]
 
 

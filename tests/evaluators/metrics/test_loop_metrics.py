@@ -5,9 +5,18 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from mapper.core.geometry import exp, inverse, log
 from mapper.core.timebase import NS_PER_S
 from mapper.core.trajectory import Trajectory
-from mapper.evaluators.metrics.loops import loop_metrics, loop_metrics_of_run, revisits_of
+from mapper.evaluators.metrics.loops import (
+    agreement_of_loops,
+    loop_metrics,
+    loop_metrics_of_run,
+    revisits_of,
+)
+from mapper.graph.config import GraphConfig
+from mapper.graph.model import BetweenFactor, PoseGraph, PoseSigmas
+from mapper.graph.optimize import optimize
 from mapper.loops.closure import LoopClosure
 from mapper.loops.config import PlaceLoopsConfig, ScanLoopsConfig
 from tests.support.planar import at
@@ -88,3 +97,53 @@ def test_where_looks_are_rare_a_loop_counts_for_the_keyframes_around(truth):
 def test_scans_are_searched_for_loops_once_in_some_metres(truth, loops, found):
     run = SimpleNamespace(config=SimpleNamespace(loops=loops), loops=[closure(2, 18, 0.0)], keyframes=truth)
     assert values(loop_metrics_of_run(run, truth))["true revisits with a loop"] == found
+
+
+def ring(*, false_m=0.0, seed=0):
+    """Return a solved ring of 40 nodes walked twice, with ten loops, the last of which errs by a distance."""
+    rng = np.random.default_rng(seed)
+    sigmas = PoseSigmas(rotation_rad=0.002, translation_m=0.005)
+    noise = np.repeat([sigmas.rotation_rad, sigmas.translation_m], 3)
+    turn = exp(np.array([0.0, 0.0, 2.0 * np.pi / 40.0]), np.array([0.3, 0.0, 0.0]))
+    true = [np.linalg.matrix_power(turn, k) for k in range(80)]
+
+    def measured(i, j, origin, off_m=0.0):
+        error = rng.normal(0.0, noise)
+        T = inverse(true[i]) @ true[j] @ exp(error[:3], error[3:] + off_m * np.eye(3)[0])
+        return BetweenFactor(i, j, T, sigmas.information, origin)
+
+    factors = [measured(k - 1, k, "odometry") for k in range(1, 80)]
+    loops = [measured(k, k + 40, "loop", false_m * (k == 36)) for k in range(0, 40, 4)]
+    graph = PoseGraph(dict(enumerate(true)), {k: k * NS_PER_S for k in range(80)}, [*factors, *loops])
+    return solved(graph)
+
+
+def solved(graph):
+    return graph.with_poses(optimize(graph, GraphConfig(robust="none")).T_world_node)
+
+
+def test_a_loop_is_as_far_from_the_others_as_a_solve_without_it_says():
+    graph = ring()
+    distances_m = []
+    for loop in graph.loops:
+        without = solved(graph.with_factors(factor for factor in graph.factors if factor is not loop))
+        T_i_j = inverse(without.T_world_node[loop.i]) @ without.T_world_node[loop.j]
+        distances_m.append(np.linalg.norm(log(inverse(T_i_j) @ loop.T_i_j)[1]))
+    told = values(agreement_of_loops(graph))
+    assert told["loops compared with all others"] == 10
+    assert told["loops off the others, median"] == pytest.approx(np.median(distances_m), rel=0.03)
+    assert told["loops off the others, largest"] == pytest.approx(max(distances_m), rel=0.03)
+    assert told["loops that contradict the others"] == 0
+
+
+def test_a_false_loop_contradicts_the_others():
+    told = values(agreement_of_loops(ring(false_m=0.2)))
+    assert told["loops that contradict the others"] >= 1
+    assert told["loops off the others, largest"] == pytest.approx(0.2, rel=0.2)
+
+
+def test_what_nothing_else_ties_is_not_compared():
+    graph = ring()
+    chain = graph.with_factors([*graph.without_loops().factors[:-1], graph.loops[0]])
+    assert agreement_of_loops(chain.without_loops()) == []
+    assert values(agreement_of_loops(chain))["loops compared with all others"] == 1
