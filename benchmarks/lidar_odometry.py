@@ -1,75 +1,102 @@
-"""Odometry for scans on LiDAR logs with truth, compared with KISS-ICP's own pipeline in the same run.
+"""Odometry for scans on LiDAR logs with truth, compared with that of other projects in the same run.
 
     python benchmarks/lidar_odometry.py LOG… [--kinds gicp icp kiss-icp hough-ndt]
 
-Times are CPU milliseconds per scan in one thread, without reading; `ratio` is the peer's time over ours.
+Peers are KISS-ICP, GenZ-ICP and, on logs with angular velocities and accelerations, RKO-LIO, each as its
+authors' library runs it, on one thread; one that is not installed is left out. Times are CPU milliseconds per
+scan, without reading; `ratio` is KISS-ICP's over the method's.
 """
 
 import argparse
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from mapper.config.loading import load_config
 from mapper.core.frames import Scan
-from mapper.core.geometry import Transform
-from mapper.core.trajectory import Trajectory
+from mapper.core.trajectory import Trajectory, trajectory_from
+from mapper.evaluators.compare.methods import OdometryTracker, Tracker
+from mapper.evaluators.compare.rko_lio import RkoLioTracker
 from mapper.evaluators.metrics.trajectory import ate_rmse_m
 from mapper.odometry.factory import build_frame_odometry
 from mapper.sources import open_source
+from mapper.sources.base import Log
 
-Follow = Callable[[Scan], Transform | None]
+_VOXEL_M = 1.0  # as both peers have for outdoor LiDARs
 
 
-def ours(kind: str) -> Follow:
+class PipelineTracker:
+    """Tracker by a pipeline with ``register_frame`` and ``last_pose``."""
+
+    def __init__(self, pipeline: Any) -> None:
+        self._pipeline = pipeline
+        self._poses: list[tuple[int, Any]] = []
+
+    def add(self, scan: Scan) -> bool:
+        """Register the next scan with the times of its points, if it has any."""
+        times_s = np.empty(0) if scan.times_s is None else scan.times_s.astype(np.float64)
+        self._pipeline.register_frame(scan.points_body.astype(np.float64), times_s)
+        self._poses.append((scan.stamp_ns, np.array(self._pipeline.last_pose)))
+        return True
+
+    def trajectory(self) -> Trajectory:
+        """Return a pose for each scan."""
+        return trajectory_from(self._poses)
+
+
+def ours(kind: str) -> Tracker:
     """Return one of our odometries, without loops."""
-    odometry = build_frame_odometry(load_config(None, [f"odometry.kind={kind}"], sensor="lidar").odometry)
-
-    def follow(scan: Scan) -> Transform | None:
-        track = odometry.track(odometry.observe(scan))
-        return None if track.node is None else track.T_world_body
-
-    return follow
+    config = load_config(None, [f"odometry.kind={kind}"], sensor="lidar")
+    return OdometryTracker(build_frame_odometry(config.odometry))
 
 
-def peer() -> Follow:
-    """Return KISS-ICP as its authors' pipeline runs it, on one thread."""
+def kiss_icp() -> Tracker:
+    """Return KISS-ICP as its authors' pipeline runs it."""
     from kiss_icp.config import KISSConfig
     from kiss_icp.kiss_icp import KissICP
 
     settings = KISSConfig()
-    settings.mapping.voxel_size = 1.0
+    settings.mapping.voxel_size = _VOXEL_M
     settings.registration.max_num_threads = 1
-    pipeline = KissICP(settings)
-
-    def follow(scan: Scan) -> Transform | None:
-        times_s = np.empty(0) if scan.times_s is None else scan.times_s.astype(np.float64)
-        pipeline.register_frame(scan.points_body.astype(np.float64), times_s)
-        pose: Transform = pipeline.last_pose
-        return pose
-
-    return follow
+    return PipelineTracker(KissICP(settings))
 
 
-def measured(log: Path, follow: Follow) -> tuple[float, float, int, int]:
+def genz_icp() -> Tracker:
+    """Return GenZ-ICP (Lee et al. 2025) as its authors' pipeline runs it."""
+    from genz_icp.config import GenZConfig
+    from genz_icp.genz_icp import GenZICP
+
+    settings = GenZConfig()
+    settings.mapping.voxel_size = _VOXEL_M
+    return PipelineTracker(GenZICP(settings))
+
+
+def peers_for(log: Log) -> Iterator[tuple[str, Callable[[], Tracker]]]:
+    """Yield the installed peers that can use a log."""
+    yield "KISS-ICP itself", kiss_icp
+    if find_spec("genz_icp") is not None:
+        yield "GenZ-ICP itself", genz_icp
+    if find_spec("rko_lio") is not None and log.gyroscope is not None and log.accelerations is not None:
+        yield "RKO-LIO itself", lambda: RkoLioTracker(log)
+
+
+def measured(log: Log, tracker: Tracker) -> tuple[float, float, int, int]:
     """Return ATE in metres, CPU milliseconds a scan, scans placed and scans read."""
-    source = open_source(log)
-    stamps_ns, poses, seconds, scans = [], [], 0.0, 0
-    for entry in source.entries():
+    if log.truth is None:
+        raise SystemExit(f"{log.path}: has no truth to measure against")
+    seconds, scans = 0.0, 0
+    for entry in log.entries():
         scan = entry.scan()
         began = time.process_time()
-        T_world_body = follow(scan)
+        tracker.add(scan)
         seconds += time.process_time() - began
         scans += 1
-        if T_world_body is not None:
-            stamps_ns.append(entry.stamp_ns)
-            poses.append(T_world_body)
-    if source.truth is None:
-        raise SystemExit(f"{log}: has no truth to measure against")
-    error_m = ate_rmse_m(Trajectory(np.array(stamps_ns), np.array(poses)), source.truth)
-    return error_m, 1e3 * seconds / scans, len(poses), scans
+    trajectory = tracker.trajectory()
+    return ate_rmse_m(trajectory, log.truth), 1e3 * seconds / scans, len(trajectory), scans
 
 
 def main() -> None:
@@ -81,13 +108,14 @@ def main() -> None:
     parser.add_argument("--kinds", nargs="+", default=["gicp", "icp", "kiss-icp", "hough-ndt"])
     arguments = parser.parse_args()
     print(f"{'log':<20} {'method':<16} {'ATE m':>8} {'placed':>10} {'ms':>7} {'ratio':>6}")
-    for log in arguments.logs:
+    for path in arguments.logs:
+        log = open_source(path)
         measured(log, ours("gicp"))  # compiles the kernels
-        rows = [("KISS-ICP itself", *measured(log, peer()))]
+        rows = [(name, *measured(log, build())) for name, build in peers_for(log)]
         rows += [(kind, *measured(log, ours(kind))) for kind in arguments.kinds]
         for name, error_m, ms, placed, scans in rows:
             share = f"{placed}/{scans}"
-            print(f"{log.name:<20} {name:<16} {error_m:8.4f} {share:>10} {ms:7.1f} {rows[0][2] / ms:6.2f}")
+            print(f"{path.name:<20} {name:<16} {error_m:8.4f} {share:>10} {ms:7.1f} {rows[0][2] / ms:6.2f}")
 
 
 if __name__ == "__main__":
