@@ -25,6 +25,8 @@ class WheelNode:
     T_odom_body: Transform
 
 
+OTHER_UNIT = 2.0
+"""Ratio of lengths by frames and by other sensors from which on they have different units: feet have 3.3."""
 _SLACK_M, _SLACK_RAD = 0.2, 0.1
 """Difference to the wheels' motion that is possible without noise: by clocks, mountings, uneven floors."""
 
@@ -81,19 +83,26 @@ def wheel_conflict(graph: PoseGraph, driven: Sequence[BetweenFactor]) -> str:
     """
     part_of = component_numbers(graph.with_factors(f for f in graph.factors if f.origin == "odometry"))
     both = [factor for factor in driven if part_of[factor.i] == part_of[factor.j]]
-    comparisons = [
-        _compared(inverse(graph.T_world_node[factor.i]) @ graph.T_world_node[factor.j], factor)
-        for factor in both
-    ]
+    steps = [inverse(graph.T_world_node[factor.i]) @ graph.T_world_node[factor.j] for factor in both]
+    comparisons = [_compared(T_i_j, factor) for T_i_j, factor in zip(steps, both, strict=True)]
     wrong = [comparison for comparison in comparisons if not comparison.is_possible]
     if not wrong:
         return ""
     miss_m = median(comparison.translation_m for comparison in wrong)
     miss_rad = median(comparison.rotation_rad for comparison in wrong)
+    moved_m, driven_m = (
+        np.array([np.linalg.norm(T_i_j[:3, 3]) for T_i_j in all_steps])
+        for all_steps in (steps, [factor.T_i_j for factor in both])
+    )
+    ratio = float(np.median(driven_m / np.maximum(moved_m, _SLACK_M / 10.0)))
+    question = "did they slip, is their mounting or clock wrong, or did the odometry jump?"
+    if not 1.0 / OTHER_UNIT < ratio < OTHER_UNIT and np.median(driven_m) > _SLACK_M:
+        question = (
+            f"by them steps are {ratio:.2g} times as long as by the frames, whose lengths may not be metres"
+        )
     return (
         f"the wheels contradict the odometry in {len(wrong)} of {len(both)} steps between keyframes, by "
-        f"{miss_m:.2f} m and {miss_rad:.2f} rad (median): did they slip, is their mounting or clock wrong, "
-        "or did the odometry jump?"
+        f"{miss_m:.2f} m and {miss_rad:.2f} rad (median): {question}"
     )
 
 

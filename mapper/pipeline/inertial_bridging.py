@@ -15,6 +15,7 @@ from mapper.graph.components import component_numbers
 from mapper.graph.inertial import SmoothedPath, smooth_path
 from mapper.graph.model import BetweenFactor, PoseGraph
 from mapper.graph.uncertainty import information_of
+from mapper.graph.wheel_factors import OTHER_UNIT
 from mapper.odometry.base import FrameResult
 from mapper.odometry.gyroscope_calibration import body_readings
 from mapper.pipeline.tracking_result import TrackingResult
@@ -29,9 +30,6 @@ _CONTRADICTION = 25.0
 """Variance factor from which on residuals are not noise but wrong readings: 5 standard deviations."""
 METHOD = "inertial"
 _CERTAIN = 5.0  # standard deviations
-_OTHER_UNIT = 2.0
-"""Factor between lengths by accelerations and by frames from which on one has another unit; made logs with a
-known unit have 0.67 to 1.1, real units of length are 2.5 apart and more."""
 
 
 def bridge(source: Log, tracking: TrackingResult, *, progress: Progress) -> TrackingResult:
@@ -94,7 +92,7 @@ def check_accelerations(source: Log, tracking: TrackingResult) -> tuple[Log, tup
         source = replace(source, accelerations=replace(felt, acceleration_mps2=-felt.acceleration_mps2))
         sentence = "accelerations have the opposite sign, as changes of velocity show; they are used reversed"
         warnings.append(RunWarning(kind="imu", sentence=sentence))
-    if abs(np.log(abs(scale))) > np.log(_OTHER_UNIT) and abs(scale) > _CERTAIN * sigma:
+    if abs(np.log(abs(scale))) > np.log(OTHER_UNIT) and abs(scale) > _CERTAIN * sigma:
         setting = "source.camera.depth_factor" if source.sensor == "rgbd" else "source.cloud_scale"
         warnings.append(
             RunWarning(

@@ -89,8 +89,8 @@ def open_source(path: Path, config: SourceConfig = _DEFAULTS) -> "Log":
         with reads() as read:
             log: Log = import_module(f"mapper.sources.{name}").read_log(path, config)
             if log.wheels is None and path.is_dir():
-                wheels, notes = read_wheels(path, config.wheels, sensor=log.sensor)
-                log = replace(log, wheels=wheels, notes=[*log.notes, *notes])
+                wheels, used, notes = read_wheels(path, config.wheels, sensor=log.sensor)
+                log = replace(log, wheels=wheels, choices=[*log.choices, *used], notes=[*log.notes, *notes])
             if log.gyroscope is None and path.is_dir():
                 gyroscope, accelerations, notes = read_imu(path)
                 log = replace(log, gyroscope=gyroscope, notes=[*log.notes, *notes])

@@ -40,8 +40,10 @@ def mounting(config: WheelsConfig, sensor: Sensor) -> Transform:
     return T_base_body
 
 
-def read_wheels(folder: Path, config: WheelsConfig, *, sensor: Sensor) -> tuple[Trajectory | None, list[str]]:
-    """Return T_odom_body of a log's wheels, if its folder has a file of them, and notes.
+def read_wheels(
+    folder: Path, config: WheelsConfig, *, sensor: Sensor
+) -> tuple[Trajectory | None, list[str], list[str]]:
+    """Return T_odom_body of a log's wheels, if its folder has a file of them, a sentence on it, and notes.
 
     Args:
         folder: Folder that may hold ``wheels.txt`` (``stamp tx ty tz qx qy qz qw`` of the base) or
@@ -53,7 +55,10 @@ def read_wheels(folder: Path, config: WheelsConfig, *, sensor: Sensor) -> tuple[
         SourceError: A file is malformed, or there are readings but no wheelbase.
     """
     path = next((folder / name for name in (POSES, READINGS) if (folder / name).is_file()), None)
-    return (None, []) if path is None else read_wheels_file(path, config, sensor=sensor)
+    if path is None:
+        return None, [], []
+    wheels, notes = read_wheels_file(path, config, sensor=sensor)
+    return wheels, [f"{path.name}: wheel odometry, {len(wheels)} poses"], notes
 
 
 def read_wheels_file(
@@ -83,7 +88,7 @@ def read_wheels_file(
     else:
         T_odom_base, notes = _integrated(path, config.wheelbase_m, wheelbase_by)
     wheels = replace(T_odom_base, T_world_body=T_odom_base.T_world_body @ mounting(config, sensor))
-    return wheels, [*notes, f"{path.name}: wheel odometry, {len(wheels)} poses"]
+    return wheels, notes
 
 
 def write_wheels(folder: Path, wheels: Trajectory, *, sensor: Sensor) -> None:

@@ -1,5 +1,6 @@
 """Wheel factors: their order and noise, motions that wheels rule out, wheels that slip."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -65,6 +66,17 @@ def test_wheels_that_slip_are_told():
     assert said.startswith("the wheels contradict the odometry in 1 of 4 steps between keyframes, by 2.00 m")
     assert wheel_conflict(broken, driven) == ""  # the odometry measured nothing there
     assert wheel_conflict(connected, []) == ""
+
+
+@pytest.mark.parametrize("times", [0.3048, 5.0])
+def test_lengths_of_another_unit_are_named(times):
+    stamps_ns = {k: k * S // 2 for k in range(5)}
+    graph = PoseGraph()
+    for k, stamp_ns in stamps_ns.items():
+        graph.add_node(k, stamp_ns, at(2.5 * k / times, 0.0, 0.0))
+    graph.add_factors(BetweenFactor(k, k + 1, np.eye(4), np.eye(6)) for k in range(4))
+    said = wheel_conflict(graph, wheel_factors(stamps_ns, arc(21), WheelFactorsConfig()))
+    assert float(re.search(r"are ([\d.]+) times", said)[1]) == pytest.approx(times, rel=0.02)
 
 
 def test_without_wheels_or_when_switched_off_there_are_no_factors():

@@ -19,7 +19,7 @@ def test_poses_beside_a_log_are_led_to_a_camera_that_looks_forward(tiny_tum_log)
     base = arc(4, turn_rad=0.2)
     write_tum(log / "wheels.txt", base)
     source = open_source(log)
-    assert source.notes == ["wheels.txt: wheel odometry, 4 poses"]
+    assert (source.choices[-1], source.notes) == ("wheels.txt: wheel odometry, 4 poses", [])
     expected = base.T_world_body @ transform(R_BASE_OPTICAL, np.zeros(3))
     np.testing.assert_allclose(source.wheels.T_world_body, expected, atol=1e-12)
     assert len(open_source(log, SourceConfig(first_frame=1)).wheels) == 4
