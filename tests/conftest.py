@@ -81,7 +81,7 @@ def pictures_drawn(*, drawn: bool) -> Iterator[None]:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def undrawn() -> Iterator[None]:
+def undrawn_builds() -> Iterator[None]:
     """Spare builds their pictures, a third of a small one's time; tests of small things load no builds."""
     if "mapper.pipeline.fuse" not in sys.modules:
         yield
@@ -91,7 +91,7 @@ def undrawn() -> Iterator[None]:
 
 
 @pytest.fixture
-def drawn() -> Iterator[None]:
+def drawn_builds() -> Iterator[None]:
     """Let builds of a test draw their pictures."""
     with pictures_drawn(drawn=True):
         yield

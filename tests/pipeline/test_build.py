@@ -154,7 +154,7 @@ def test_the_log_holds_the_whole_story(run):
     assert summary.statistics.message_end_time == stamps[-1]
 
 
-@pytest.mark.usefixtures("drawn")
+@pytest.mark.usefixtures("drawn_builds")
 @pytest.mark.parametrize("workers", [0, 1])
 def test_the_same_log_gives_the_same_bytes(run, desk_log, tmp_path, workers):
     again = build_run(desk_log, tmp_path / "again", REPEATABLE, f"workers={workers}")
