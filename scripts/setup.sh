@@ -152,11 +152,13 @@ if [ "$(cat "$stamp" 2>/dev/null)" != "$want" ]; then
   if [ -n "$(find "$venv" -name 'mapper-0.1.0.dist-info' -print -quit)" ]; then # its name until 0.2
     "$venv/bin/python" -m pip uninstall --quiet --yes mapper >&2
   fi
+  rm -f "$venv/.libraries" # tells scripts/test.sh that all are there, while the kernels are compiled
   say "installing the project"
   install --editable .
   compile_kernels &
   say "installing its extras [$extra]"
   install "octree-mapper[$extra]"
+  touch "$venv/.libraries"
   [ "$extra" != dev ] || install_axe
   wait
   printf '%s\n' "$want" >"$stamp"

@@ -5,16 +5,21 @@
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
+types=$(mktemp)
+check_types() { # while kernels are compiled, the last of them by one process
+  until [ -e .venv/.libraries ]; do sleep 1; done
+  .venv/bin/mypy
+}
+check_types >"$types" 2>&1 &
+checking=$!
+trap 'kill "$checking" 2>/dev/null || true; rm -f "$types"' EXIT
 bash scripts/setup.sh --dev
 .venv/bin/ruff check .
 .venv/bin/ruff format --check .
 
-types=$(mktemp)
-trap 'rm -f "$types"' EXIT
-.venv/bin/mypy >"$types" 2>&1 & # beside the tests, which leave a processor idle now and then
 status=0
 .venv/bin/pytest -n auto --dist loadfile --no-loadscope-reorder "$@" || status=$? # a file's fixtures are made once
-wait $! || {
+wait "$checking" || {
   cat "$types" >&2
   status=1
 }

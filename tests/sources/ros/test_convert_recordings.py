@@ -3,13 +3,9 @@
 import numpy as np
 import pytest
 
-from mapper.config.loading import load_config
 from mapper.core.errors import SourceError
 from mapper.core.frames import Scan
-from mapper.pipeline.track import track_log
-from mapper.runtime.progress import SILENT
 from mapper.sources import open_source
-from mapper.sources.config import SourceConfig
 from mapper.sources.ros.encode_ros import cloud_message
 from mapper.sources.writers import write_log
 from tests.support.tum_logs import CALIBRATION, FIRST_NS
@@ -80,18 +76,6 @@ def test_the_same_log_gives_the_same_bytes(tiny_tum_log, tmp_path, kind):
     for name in ("a", "b"):
         write_log(source, tmp_path / f"{name}.{kind}", kind=kind)
     assert (tmp_path / f"a.{kind}").read_bytes() == (tmp_path / f"b.{kind}").read_bytes()
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_tracking_a_recording_gives_the_trajectory_of_the_folder(desk_log, tmp_path, kind):
-    config = load_config(None, ["loops.kind=none", "workers=0"])
-    source = open_source(desk_log, SourceConfig(last_frame=14))
-    write_log(source, tmp_path / f"desk.{kind}", kind=kind)
-    expected = track_log(source, config, progress=SILENT).trajectory()
-    found = track_log(open_source(tmp_path / f"desk.{kind}"), config, progress=SILENT).trajectory()
-    assert len(expected) == 15
-    np.testing.assert_array_equal(found.stamps_ns, expected.stamps_ns)
-    np.testing.assert_array_equal(found.T_world_body, expected.T_world_body)
 
 
 def kitti_log(folder, n=3):
