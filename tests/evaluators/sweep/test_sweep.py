@@ -293,7 +293,7 @@ def test_builds_in_other_processes_come_to_the_same(interrupted, resumable_folde
     )
     assert theirs == ours
     assert not (plan.out / "scratch").exists()
-    for name in ("trajectory.tum", "summary.png"):
+    for name in ("trajectory.tum", "truth.tum"):
         assert (plan.out / ours[0]["run"] / name).read_bytes() == (out / ours[0]["run"] / name).read_bytes()
 
 
