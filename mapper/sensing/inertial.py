@@ -19,6 +19,9 @@ _PLACE_M, _BIAS_MPS2 = 0.1, 0.3
 _CERTAIN_CHI2 = 16.3
 """99.9 % of χ² with three degrees of freedom."""
 _ITERATIONS = 5
+_UNEXPLAINED = 0.5
+"""Median of what accelerations leave of the path's changes of velocity, relative to theirs, that is too much:
+of a sensor that hardly moves, errors of the poses would be taken for the motion."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,7 +95,8 @@ class InertialReadings:
         """Return the ratio of a path's lengths to metres by accelerations, and its standard deviation.
 
         It is negative where the accelerations point down at rest: gravity cannot be told from its opposite,
-        but changes of velocity can. None with too few poses.
+        but changes of velocity can. None with too few poses, or where accelerations explain less than half of
+        these changes.
 
         Args:
             stamps_ns: (M,) increasing times.
@@ -102,6 +106,9 @@ class InertialReadings:
         if triples is None:
             return None
         found, covariance = _fit(np.column_stack([triples.felt_mps, triples.columns]), triples.moved_mps)
+        left_mps = triples.moved_mps - triples.felt_mps * found[0] - triples.columns @ found[1:]
+        if np.median(np.abs(left_mps)) > _UNEXPLAINED * np.median(np.abs(triples.moved_mps)):
+            return None
         return float(found[0]), float(np.sqrt(covariance[0, 0]))
 
     def _lever_turns(self) -> Array:

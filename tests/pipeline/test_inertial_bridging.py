@@ -253,6 +253,23 @@ def test_frames_that_surfaces_do_not_place_tell_nothing_of_accelerations():
     assert check_accelerations(given, replace(tracking, tracks=tracks)) == (given, ())
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_a_sensor_that_stands_tells_nothing_of_accelerations(seed):
+    rng = np.random.default_rng(seed)
+    log_, tracking, _ = made(seed)
+    still = np.tile(np.array([0.1, 0.2, 9.8]), (len(log_.accelerations.stamps_ns), 1))
+    felt = still + rng.normal(0.0, 0.05, still.shape)
+    standing = PoseGraph({0: np.eye(4)}, {0: tracking.tracks[0].stamp_ns})
+    tracks = [
+        replace(track, node=0, T_node_body=exp(*(SIGMAS * rng.standard_normal(6)).reshape(2, 3)))
+        for track in tracking.tracks
+    ]
+    rates = replace(log_.gyroscope, rates_radps=rng.normal(0.0, 1e-3, log_.gyroscope.rates_radps.shape))
+    given = replace(log_, gyroscope=rates, accelerations=replace(log_.accelerations, acceleration_mps2=-felt))
+    checked, warnings = check_accelerations(given, replace(tracking, tracks=tuple(tracks), graph=standing))
+    assert (checked, warnings) == (given, ())
+
+
 def test_a_gap_of_the_readings_is_not_bridged():
     log_, tracking, _ = made(7, lost=range(70, 90))
     begin_ns = tracking.tracks[75].stamp_ns
