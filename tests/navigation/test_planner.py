@@ -129,14 +129,8 @@ def test_a_narrow_gap_lets_a_small_robot_through_only():
     [
         ((0.025, 2.0), r"the start \(0\.025, 2\.000\) lies in an obstacle; the nearest free point is \("),
         ((-0.05, 2.0), r"is 0\.050 m from what is blocked, too close for a radius of 0\.2 m; the nearest"),
-        (
-            (-9.0, 2.0),
-            r"lies outside the map, which spans \(-2\.000, 1\.000\) to \(2\.000, 4\.000\) m; the near",
-        ),
-        (
-            (-1.0, 3.9),
-            r"lies in unknown space; the nearest free point is .* or let unknown space count as free",
-        ),
+        ((-9.0, 2.0), r"lies outside the map, which spans \(-2\.000, 1\.000\) to \(2\.000, 4\.000\) m"),
+        ((-1.0, 3.9), r"lies in unknown space; the nearest free point is .* or let unknown"),
         ((np.nan, 0.0), r"the start \[nan, 0\.0, 0\.0\] is no point"),
     ],
 )

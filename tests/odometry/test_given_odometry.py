@@ -143,20 +143,14 @@ def test_a_path_starts_here_or_in_the_log_s_folder(flat, tmp_path, monkeypatch):
 
 
 def test_mistakes_are_named_with_the_remedy(flat, tmp_path):
-    with pytest.raises(
-        ConfigError, match=r"neither truth nor device poses; name a file .*--set odometry\.path=poses\.tum"
-    ):
+    with pytest.raises(ConfigError, match=r"neither truth nor device poses; .*odometry\.path=poses\.tum"):
         track_log(replace(flat, truth=None), given(), progress=SILENT)
-    with pytest.raises(
-        ConfigError, match=r"loops\.kind=thesis looks from frames .*odometry\.kind=given counts none"
-    ):
+    with pytest.raises(ConfigError, match=r"loops\.kind=thesis looks .*odometry\.kind=given counts none"):
         track_log(flat, given("loops.kind=thesis"), progress=SILENT)
     path = tmp_path / "poses.tum"
     late = Trajectory(flat.truth.stamps_ns + 100 * NS_PER_S, flat.truth.T_world_body)
     write_tum(path, late)
-    with pytest.raises(
-        ConfigError, match=r"poses\.tum: poses from 17\d+\.\d+ to .* s, but the log's frames are from"
-    ):
+    with pytest.raises(ConfigError, match=r"poses\.tum: poses from 17\d+\.\d+ to .* s, but the log's"):
         track_log(flat, given(f"odometry.path={path}"), progress=SILENT)
     path.write_text("1 2 3\n")
     with pytest.raises(DataError, match=r"poses\.tum:1: 3 columns, want 8"):
@@ -164,9 +158,7 @@ def test_mistakes_are_named_with_the_remedy(flat, tmp_path):
     write_tum(path, poses_at(flat.truth, lambda s: s < 0.5))
     config = given("loops.kind=none", f"odometry.path={path}")
     tracking = track_log(flat, config, progress=SILENT)
-    with pytest.raises(
-        TrackingError, match="do the given poses cover the frames' times, without gaps beyond"
-    ):
+    with pytest.raises(TrackingError, match="do the given poses cover the frames' times"):
         refuse_a_fragment(tracking, config, sensor="rgbd")
     known = [RunWarning(kind="depth", sentence="depth: 5 times too small", weight="doubt")]
     with pytest.raises(TrackingError, match="; depth: 5 times too small"):

@@ -169,18 +169,12 @@ def with_header(data, old, new):
         (lambda data: b"PK" + data, "is not a vocabulary; make one with mapper vocabulary train"),
         (lambda data: data[:0], "is not a vocabulary"),
         (lambda data: data[:15] + b"\x07" + data[16:], "is of version 7, only 1 can be read; train it again"),
-        (
-            lambda data: with_header(data, b'"orb"', b'"akaze"'),
-            "has words of akaze descriptors of 32 bytes; only orb's of 32 can be used",
-        ),
+        (lambda data: with_header(data, b'"orb"', b'"akaze"'), "has words of akaze descriptors of 32 bytes"),
         (lambda data: with_header(data, b'bytes":32', b'bytes":61'), "descriptors of 61 bytes"),
         (lambda data: with_header(data, b'"words"', b'"wards"'), "does not describe a vocabulary"),
         (lambda data: with_header(data, b'"words":', b'"words":1'), "body does not hold"),
         (lambda data: with_header(data, b'"words":', b'"words":-'), "does not describe a vocabulary"),
-        (
-            lambda data: with_header(data, b'"nodes":', b'"nodes":"x","was":'),
-            "does not describe a vocabulary",
-        ),
+        (lambda data: with_header(data, b'"nodes":', b'"nodes":"x","was":'), "does not describe"),
     ],
 )
 def test_files_that_cannot_be_used_are_refused_in_one_line(saved, edit, message):

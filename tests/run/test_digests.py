@@ -156,9 +156,7 @@ def test_a_map_that_was_edited_is_kept_once_accepted(run):
     path = run.path / "slice.pgm"
     original = path.read_bytes()
     path.write_bytes(original[:-40] + bytes(40))
-    with pytest.raises(
-        RunError, match=r"mapper fuse .*; if you edited it, mapper doctor .* --accept slice.pgm"
-    ):
+    with pytest.raises(RunError, match=r"mapper fuse .*; .* mapper doctor .* --accept slice.pgm"):
         export(run, "costmap")
     assert "no map that can be edited" in mapper("doctor", run.path, "--accept", "map.bt", status=1).output
     path.write_bytes(b"P5 no image")

@@ -247,16 +247,8 @@ def test_a_cloud_that_is_a_circle_of_links_is_refused_in_one_line(tmp_path):
 @pytest.mark.parametrize(
     ("old", "new", "complaint"),
     [
-        (
-            np.float32(2.5).tobytes(),
-            np.float32(np.nan).tobytes(),
-            r"point 1 is at \[nan +4\. +5\. *\], want finite",
-        ),
-        (
-            np.float32(2.5).tobytes(),
-            np.float32(3e38).tobytes(),
-            r"point 1 is at \[3\.e\+38 .*\], want finite",
-        ),
+        (np.float32(2.5).tobytes(), np.float32(np.nan).tobytes(), r"point 1 is at \[nan +4\. +5\. *\]"),
+        (np.float32(2.5).tobytes(), np.float32(3e38).tobytes(), r"point 1 is at \[3\.e\+38 .*\]"),
         (b"float y", b"float w", "no property y of float32"),
         (b"float y", b"int y", "no property y of float32"),
         (b"uchar green", b"char green", "no property green of uint8"),

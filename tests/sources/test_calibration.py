@@ -113,11 +113,7 @@ def test_what_is_written_reads_back_exactly(tmp_path):
         ("a.toml", OURS + "depht_factor = 5000\n", "depht_factor: unknown key; known are"),
         ("a.toml", OURS + "depth_factor = 0\n", r"depth_factor 0, want 0\.001 to 1e\+07 units"),
         ("a.toml", OURS.replace("1.16]", "1.16, 0.0, 3.0]"), "7 distortion coefficients"),
-        (
-            "a.yaml",
-            ROS.replace("plumb_bob", "equidistant"),
-            "5 distortion coefficients; want .*4 of an equid",
-        ),
+        ("a.yaml", ROS.replace("plumb_bob", "equidistant"), "5 distortion coefficients; want .*4 of"),
         ("a.yaml", "name: kinect\n", "no number fx_px"),
         ("a.toml", OURS.replace("width_px = 640", "width_px = 1e400"), "width: inf is not finite"),
         ("a.toml", OURS.replace("= 517.3", "= 1" + 400 * "0"), "int too large to convert to float"),
@@ -168,9 +164,7 @@ def test_a_distortion_without_an_inverse_is_refused(tmp_path, number):
     path = tmp_path / "calibration.toml"
     path.write_text(OURS.replace("[0.26, -0.95, -0.005, 0.0026, 1.16]", f"[0.0, 0.0, 0.0, {number}, 0.0]"))
     calibration = read_calibration(path)
-    with pytest.raises(
-        SourceError, match=r"calibration\.toml: distortion 0, 0, 0, .*, 0 cannot be taken out"
-    ):
+    with pytest.raises(SourceError, match=r"calibration\.toml: distortion 0, 0, 0, .*, 0 cannot"):
         calibration.camera(width_px=640, height_px=480)
 
 

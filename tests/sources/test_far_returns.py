@@ -66,9 +66,7 @@ def test_times_and_colours_stay_with_their_points(tmp_path):
 
 def test_a_cloud_of_nothing_else_is_refused(tmp_path):
     np.save(tmp_path / "1.npy", sweep(100) * 1000.0 + 1e4)
-    with pytest.raises(
-        FrameError, match=r"1\.npy: 100 of 100 points are farther than 5000 m, which no sensor r"
-    ):
+    with pytest.raises(FrameError, match=r"1\.npy: 100 of 100 points are farther than 5000 m"):
         ScanEntry(0, tmp_path / "1.npy", scale=1.0).load()
 
 

@@ -120,16 +120,8 @@ def test_associations_by_stamp_are_not_taken_for_frame_numbers(tiny_tum_log):
         ("livingRoom1.gt.freiburg", "1 2 3\n", r"freiburg:1: 3 columns, want 8: number tx ty tz qx qy qz qw"),
         ("livingRoom1.gt.freiburg", "1.5 0 0 0 0 0 0 1\n", r"freiburg:1: '1\.5' is no number of a frame"),
         ("associations.txt", "0 depth/0.png 0 rgb/0.png\n1 rgb/1.png\n", r"associations\.txt:2: 2 columns"),
-        (
-            "associations.txt",
-            "0 depth/0.png 0 rgb/0.png\na d b c\n",
-            r"associations\.txt:2: 'a' is no number of a frame",
-        ),
-        (
-            "associations.txt",
-            "7 depth/7.png 7 rgb/7.png\n",
-            r"associations\.txt: none of its 1 pairs of images",
-        ),
+        ("associations.txt", "0 depth/0.png 0 rgb/0.png\na d b c\n", r"associations\.txt:2: 'a' is no"),
+        ("associations.txt", "7 depth/7.png 7 rgb/7.png\n", r"associations\.txt: none of its 1 pairs"),
         ("associations.txt", "# none\n", r"associations\.txt: empty list; want lines of number depth/number"),
         (
             "associations.txt",

@@ -37,9 +37,7 @@ def renamed(log, name, number=1):
 def test_names_that_lead_out_of_a_log_are_refused(tiny_tum_log, name):
     log = tiny_tum_log(3)
     renamed(log, name)
-    with pytest.raises(
-        SourceError, match=r"rgb\.txt:2: '.*' leads out of the log's folder; want the name of"
-    ):
+    with pytest.raises(SourceError, match=r"rgb\.txt:2: '.*' leads out of the log's folder"):
         open_source(log)
 
 
@@ -60,9 +58,7 @@ def test_an_image_that_is_a_link_out_of_the_log_is_refused(tiny_tum_log, tmp_pat
     for image in (renamed(log, "rgb/link.png").with_name("link.png"), folder / "depth/000001.png"):
         image.unlink(missing_ok=True)
         image.symlink_to("/etc/passwd")
-        with pytest.raises(
-            SourceError, match=rf"{image.name}: a link to /etc/passwd, out of the log; copy the f"
-        ):
+        with pytest.raises(SourceError, match=rf"{image.name}: a link to /etc/passwd, out of the log"):
             open_source(log if image.name == "link.png" else folder)
 
 

@@ -133,9 +133,7 @@ def test_a_folder_of_labels_is_refused_with_the_reason(tmp_path, text, reason, p
     for i in range(20):
         (folder / f"{i:06d}.txt").write_text("" if i == 0 else text)
     for opened in (folder, tmp_path):
-        with pytest.raises(
-            SourceError, match=rf"label_2: 20 \.txt files are no clouds: 0000\d\d\.txt: {reason}"
-        ):
+        with pytest.raises(SourceError, match=rf"label_2: 20 \.txt files .*: 0000\d\d\.txt: {reason}"):
             open_source(opened, SourceConfig(pattern=pattern))
 
 
@@ -207,9 +205,7 @@ def test_the_list_that_the_user_names_goes_before_names(tmp_path):
     (tmp_path / "clock.txt").write_text("3\n4\n")
     source = open_source(folder, SourceConfig(stamps_file="../clock.txt"))
     assert stamps_of(source) == [3 * NS_PER_S, 4 * NS_PER_S]
-    with pytest.raises(
-        SourceError, match=r"clock.txt: no such file; source.stamps_file and truth_file start"
-    ):
+    with pytest.raises(SourceError, match=r"clock.txt: no such file; source.stamps_file"):
         open_source(folder, SourceConfig(stamps_file="clock.txt"))
 
 

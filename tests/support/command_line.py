@@ -5,22 +5,8 @@ from typer.testing import CliRunner, Result
 from mapper.cli.main import app
 
 HEAVY = {
-    "cv2",
-    "numba",
-    "gtsam",
-    "matplotlib",
-    "foxglove",
-    "mcap",
-    "pydantic",
-    "numpy",
-    "rich",
-    "open3d",
-    "kiss_icp",
-    "kiss_matcher",
-    "rerun",
-    "distributed",
-    "rosbags",
-    "laspy",
+    *("cv2", "numba", "gtsam", "matplotlib", "foxglove", "mcap", "pydantic", "numpy", "rich", "open3d"),
+    *("kiss_icp", "kiss_matcher", "rerun", "distributed", "rosbags", "laspy"),
 }
 """Packages that take long to import: help and completion do without."""
 

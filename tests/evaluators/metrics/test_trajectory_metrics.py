@@ -286,7 +286,5 @@ def test_what_only_begins_as_euroc_s_is_refused(tmp_path):
 def test_mulran_s_poses_in_disorder_are_refused(tmp_path):
     lines = mulran_text(walk(5, seed=6)).splitlines()
     (tmp_path / "poses.csv").write_text("\n".join([lines[1], lines[0]]) + "\n")
-    with pytest.raises(
-        DataError, match=r"poses\.csv:2: stamp \d+ comes before the line above; sort the file"
-    ):
+    with pytest.raises(DataError, match=r"poses\.csv:2: stamp \d+ comes before the line above"):
         evaluate(walk(5, seed=6), tmp_path / "poses.csv")

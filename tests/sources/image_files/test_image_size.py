@@ -74,9 +74,7 @@ HUGE = {
 @pytest.mark.parametrize("data", HUGE.values(), ids=HUGE.keys())
 @pytest.mark.parametrize("decode", DECODERS.values(), ids=DECODERS.keys())
 def test_an_image_without_measure_is_not_decoded(decode, data):
-    with pytest.raises(
-        Exception, match=rf"x: an image of \d+×\d+ px; more than {MOST_MEGAPIXELS} megapixels"
-    ):
+    with pytest.raises(Exception, match=rf"x: .* \d+×\d+ px; more than {MOST_MEGAPIXELS} megapixels"):
         decode(data)
 
 

@@ -120,9 +120,7 @@ def test_a_rotation_that_is_none_is_a_damaged_message():
 
 def test_depth_without_a_pose_or_intrinsics_is_refused_with_the_setting(tmp_path):
     path = write(tmp_path / "a.mcap", unregistered(T=None))
-    with pytest.raises(
-        SourceError, match=r"\(106×60 px, focal length 53\.0 px\) .*source\.camera\.depth_in_col"
-    ):
+    with pytest.raises(SourceError, match=r"\(106×60 px, focal length 53\.0 px\) .*\.depth_in_color"):
         open_source(path)
     beside = CameraConfig(depth_in_color=tuple(row_of_pose(BESIDE).tolist()))
     (note,) = (one for one in open_source(path, SourceConfig(camera=beside)).notes if "registered" in one)

@@ -104,9 +104,7 @@ def test_a_topic_that_stops_is_told():
 
 
 def test_nothing_that_pairs_is_an_error():
-    with pytest.raises(
-        SourceError, match=r"log: no image of /a .* within 20 ms; the closest are 0.05 s apart"
-    ):
+    with pytest.raises(SourceError, match=r"no image of /a .* within 20 ms; the closest are 0.05 s"):
         pairs([0, 100], [50, 150])
 
 

@@ -192,10 +192,7 @@ def test_rows_that_follow_each_other_are_read_whatever_step_says():
         (file(encoded(BGR, ".jpg")[:-50], "jpeg"), "truncated JPEG"),
         (file(b"", "jpeg"), "empty file"),
         (PixelsMessage(0, "", "rgb8", 64, 48, 192, False, memoryview(bytes(100))), "but 100 bytes are there"),
-        (
-            PixelsMessage(0, "", "rgb8", 900, 7000, 1, False, memoryview(bytes(9999))),
-            "in rows of 1 bytes, but 9999",
-        ),
+        (PixelsMessage(0, "", "rgb8", 900, 7000, 1, False, memoryview(bytes(9999))), "in rows of 1 bytes"),
     ],
 )
 def test_what_is_no_image_is_refused(message, why):

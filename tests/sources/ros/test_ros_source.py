@@ -149,10 +149,7 @@ def test_the_likeliest_of_several_topics_is_taken_and_another_can_be_chosen(tmp_
     ("topics", "why"),
     [
         ({"color": "/nowhere"}, r"a.mcap: source.topics.color=/nowhere is not there; topics for that: /cam"),
-        (
-            {"imu": COLOR},
-            r"source.topics.imu=/cam/color/image_raw is of type sensor_msgs/msg/Image; .*: none",
-        ),
+        ({"imu": COLOR}, r"source.topics.imu=/cam/color/image_raw is of type sensor_msgs/msg/Image"),
     ],
 )
 def test_a_choice_that_cannot_be_is_refused(tmp_path, topics, why):
@@ -163,10 +160,7 @@ def test_a_choice_that_cannot_be_is_refused(tmp_path, topics, why):
 @pytest.mark.parametrize(
     ("kept", "why"),
     [
-        (
-            COLOR,
-            "nothing to map: colour images /cam/color/image_raw, but neither depth images nor point clouds",
-        ),
+        (COLOR, "nothing to map: colour images /cam/color/image_raw, but neither depth images"),
         (DEPTH, "nothing to map: depth images /cam/aligned_depth/image_raw, but neither colour images"),
         (
             "/cam/color/camera_info",
@@ -286,9 +280,7 @@ def test_truth_is_led_to_the_sensor_by_tf(tmp_path, name):
     own, moved = (next(log.entries()).load() for log in (source, based))
     expected = own.points_body @ T_BASE_LIDAR[:3, :3].T + T_BASE_LIDAR[:3, 3]
     np.testing.assert_allclose(moved.points_body, expected, atol=1e-5)
-    with pytest.raises(
-        SourceError, match=r"body_frame=wheel: tf does not connect .* frames: base_link, lidar, odom"
-    ):
+    with pytest.raises(SourceError, match=r"body_frame=wheel: .* frames: base_link, lidar, odom"):
         open_source(tmp_path / name, SourceConfig(body_frame="wheel"))
 
 
@@ -387,9 +379,7 @@ def test_a_damaged_first_image_file_does_not_hide_the_log(tiny_tum_log, tmp_path
 @pytest.mark.parametrize("name", ["log.mcap", "log.bag"])
 def test_another_body_is_refused_where_the_camera_is_the_body(tmp_path, name):
     log = write(tmp_path / name, shots(3))
-    with pytest.raises(
-        SourceError, match=r"body_frame=base_link: the body of RGB-D frames is the camera; leave"
-    ):
+    with pytest.raises(SourceError, match=r"body_frame=base_link: .* is the camera"):
         open_source(log, SourceConfig(body_frame="base_link"))
 
 
@@ -399,7 +389,5 @@ def test_another_body_is_refused_where_there_is_no_tf(tiny_tum_log, tmp_path):
     for i in range(2):
         np.save(scans / f"{i}.npy", np.random.default_rng(i).normal(0.0, 9.0, (20, 3)))
     for log in (tiny_tum_log(2), scans):
-        with pytest.raises(
-            SourceError, match=r"body_frame=base_link: only a recording's tf has such a frame"
-        ):
+        with pytest.raises(SourceError, match=r"body_frame=base_link: only a recording's tf"):
             open_source(log, SourceConfig(body_frame="base_link"))
