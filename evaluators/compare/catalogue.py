@@ -47,7 +47,8 @@ def methods_for(source: Log, config: CompareConfig) -> tuple[list[Method], list[
             raise ConfigError(f"no method {name!r}; want one of {', '.join(names)}")
         if name in _LIBRARIES:
             require(_LIBRARIES[name], "peers", f"--method {name}")
-    absent = {} if config.methods else {n: lib for n, lib in _LIBRARIES.items() if find_spec(lib) is None}
+    known = {} if config.methods else {n: lib for n, lib in _LIBRARIES.items() if n in names}
+    absent = {name: library for name, library in known.items() if find_spec(library) is None}
     chosen = config.methods or [name for name in names if name not in absent]
     unusable = [m.name for m in images if m.name in chosen and source.sensor != "rgbd"]
     methods = [m for m in (*images, *scans) if m.name in chosen and m.name not in unusable]
