@@ -23,8 +23,7 @@ def thin(points: Points32, voxel_m: float) -> NDArray[np.intp]:
         points: (N, 3) finite, metres.
         voxel_m: Edge of a voxel.
     """
-    firsts: NDArray[np.intp] = _voxels(points, 1.0 / voxel_m, voxel_index(len(points)))[1]
-    return firsts
+    return voxel_numbers(points, voxel_m)[1]
 
 
 def thin_in_range(
@@ -52,14 +51,19 @@ def voxel_means(points: Points | Points32, voxel_m: float) -> Points:
         points: (N, 3) finite, metres.
         voxel_m: Edge of a voxel.
     """
-    voxel_of, firsts = _voxels(points, 1.0 / voxel_m, voxel_index(len(points)))
+    voxel_of, firsts = voxel_numbers(points, voxel_m)
     means: Points = _means(points, voxel_of, len(firsts))
     return means
 
 
+def voxel_numbers(points: Points | Points32, voxel_m: float) -> tuple[NDArray[np.int64], NDArray[np.intp]]:
+    """Return (N,) each point's voxel, numbered in order of first points, and (M,) those first points."""
+    voxel_of, firsts = _voxels(points, 1.0 / voxel_m, voxel_index(len(points)))
+    return voxel_of, firsts
+
+
 @njit(cache=True, nogil=True)
 def _voxels(points, voxels_per_m, index):  # type: ignore[no-untyped-def]
-    """Return (N,) each point's voxel, numbered in order of first points, and (M,) those first points."""
     voxel_of, firsts = np.empty(len(points), np.int64), np.empty(len(points), np.int64)
     count = 0
     for i in range(len(points)):

@@ -58,6 +58,9 @@ class GraphConfig(Config):
     initial: Literal["auto", "given", "chordal"] = "auto"
     """Initial poses of the batch solve: the "given" estimates, a "chordal" relaxation that needs none, or
     "auto": the relaxation if the estimates fit badly, no loops are outliers, and its cost is lower."""
+    planes: Literal["auto", "off"] = "auto"
+    """Adjustment of the poses of 3D scans, after the solve, to the surfaces that they share (Liu, Liu & Zhang
+    2023): "auto" keeps it if surfaces of points that took no part become thinner, "off" saves its time."""
     wheels: WheelFactorsConfig = WheelFactorsConfig()
     gnss: GnssFactorsConfig = GnssFactorsConfig()
     max_iterations: PositiveInt = 100

@@ -13,6 +13,7 @@ from mapper.loops.factory import build_keyframe_loop_detector
 from mapper.odometry.base import FrameResult
 from mapper.odometry.gyroscope_calibration import with_body_rates
 from mapper.odometry.node_offset import NodeOffset
+from mapper.pipeline.adjusted_planes import adjust_stored
 from mapper.pipeline.components import component_of
 from mapper.pipeline.fuse import carry_times, fuse_into
 from mapper.pipeline.inertial_bridging import bridge
@@ -97,9 +98,13 @@ def append(
             solved = solve(tracking.graph, tracking.loops, config.graph)
         _refuse_unconnected(second, run, solved.loops, known)
         later = from_tracking(replace(tracking, graph=solved.graph, loops=solved.loops), None)
+        both = before.solved(solved.graph, solved.loops).then(later, truth=source.truth)
+        rotating = writer.manifest.with_body_rates(source)
+        with writer.clock.stage("solve"):
+            both, report = adjust_stored(rotating, both, solved.report, config, progress=progress)
         save_places(writer, tracking)
-        save_solved(writer, before.solved(solved.graph, solved.loops).then(later, truth=source.truth))
-        writer.update(solve=solved.report)
+        save_solved(writer, both)
+        writer.update(solve=report)
         write_edits(writer.folder, edits)
         fuse_into(writer, source, whole, progress, observer=observer, cached=run.scan_updates(), edits=wanted)
     return open_run(out)

@@ -17,6 +17,7 @@ from mapper.loops.factory import build_verifier, keyframe_loops
 from mapper.loops.image_verification import verify_aligned
 from mapper.loops.scan_verification import ScanVerifier
 from mapper.mapping.config import EditKind, Region
+from mapper.pipeline.adjusted_planes import adjust_stored
 from mapper.pipeline.fuse import fuse_changed
 from mapper.pipeline.reobserve import reobserve
 from mapper.pipeline.solve import solve
@@ -76,7 +77,7 @@ def edit_loops(
         LoopError: A node is unknown, a loop is there already or is not, two frames do not show one place, or
             the solver rejects a loop that was added.
     """
-    changed, report = _solve_edited(source, run, dict.fromkeys(add, _Alignment()), remove)
+    changed, report = _solve_edited(source, run, dict.fromkeys(add, _Alignment()), remove, progress=progress)
     return fuse_changed(source, run, changed, solve=report, progress=progress)
 
 
@@ -103,7 +104,7 @@ def apply_edits(source: Log, run: Run, edits: EditsFile, *, progress: Progress =
         if len(aligned) < len(edits.accept):
             raise ConfigError("edits: accept: the same nodes twice")
         rejected = [loop.nodes for loop in edits.reject]
-        changed, report = _solve_edited(source, run, aligned, rejected, edits.drop)
+        changed, report = _solve_edited(source, run, aligned, rejected, edits.drop, progress=progress)
     regions = text if len(edits) else None
     return fuse_changed(source, run, changed, solve=report, edits=regions, progress=progress)
 
@@ -114,6 +115,8 @@ def _solve_edited(
     add: Mapping[Pair, _Alignment],
     remove: Sequence[Pair],
     drop: Sequence[int] = (),
+    *,
+    progress: Progress,
 ) -> tuple[StoredTracking, Solve]:
     """Solve with loops added, by how they were aligned by hand, and removed, and with nodes dropped."""
     if run.config.graph.solve == "none":
@@ -142,7 +145,9 @@ def _solve_edited(
         _refuse_rejected(loop)
     if len(components(solved.graph)) > len(components(graph)):
         raise LoopError(f"{run.path}: without these loops the graph falls apart; nothing removed")
-    return tracked.solved(solved.graph, solved.loops), solved.report
+    tracked = tracked.solved(solved.graph, solved.loops)
+    rotating = run.manifest.with_body_rates(source)
+    return adjust_stored(rotating, tracked, solved.report, run.config, progress=progress)
 
 
 def _drop_nodes(tracked: StoredTracking, nodes: Sequence[int]) -> StoredTracking:

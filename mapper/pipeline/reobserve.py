@@ -1,6 +1,6 @@
 """Views of a finished run's frames, observed again from the log, since a run does not keep them."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 
 from mapper.config.build import BuildConfig
 from mapper.core.deskew import twist_at
@@ -22,7 +22,19 @@ def reobserve(
     *,
     progress: Progress = SILENT,
 ) -> dict[int, FrameView]:
-    """Return the views of some frames of a log, by stamp, as a configuration's odometry makes them.
+    """Return what ``reobserve_each`` yields, by stamp."""
+    return dict(reobserve_each(source, trajectory, stamps_ns, config, progress=progress))
+
+
+def reobserve_each(
+    source: Log,
+    trajectory: Trajectory,
+    stamps_ns: Collection[int],
+    config: BuildConfig,
+    *,
+    progress: Progress = SILENT,
+) -> Iterator[tuple[int, FrameView]]:
+    """Yield the stamps and views of some frames of a log, as a configuration's odometry makes them.
 
     Args:
         source: The log.
@@ -46,9 +58,7 @@ def reobserve(
         return entry.stamp_ns, odometry.view(observation, motion)
 
     entries = list(source.entries_of(stamps_ns))
-    views = {}
     with progress.stage("observe") as report:
-        for stamp_ns, seen in ordered_map(view, entries, workers=config.workers):
-            views[stamp_ns] = seen
-            report(len(views), len(entries))
-    return views
+        for done, seen in enumerate(ordered_map(view, entries, workers=config.workers), start=1):
+            yield seen
+            report(done, len(entries))

