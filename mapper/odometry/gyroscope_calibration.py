@@ -95,7 +95,8 @@ def body_readings(log: Log, calibration: GyroscopeCalibration) -> InertialReadin
     """Return a log's angular velocities and accelerations of the body; None where they cannot be told.
 
     Accelerations have to be as long as gravity in m/s² or g, and a mounting is one of both readings only if
-    it is certain and right-handed. They are interpolated at the times of the angular velocities.
+    it is certain and right-handed. They are interpolated at the times of the angular velocities, and moved to
+    the body's origin where the log states the unit's place.
     """
     gyroscope, felt = log.gyroscope, log.accelerations
     mounting_rad = float(np.sqrt(np.diag(calibration.covariance)[:3].max()))
@@ -113,7 +114,8 @@ def body_readings(log: Log, calibration: GyroscopeCalibration) -> InertialReadin
     at_ns = turned.stamps_ns[inside]
     felt_body = unit * felt.acceleration_mps2 @ R_body_felt.T
     accelerations = np.column_stack([np.interp(at_ns, stamps_ns, column) for column in felt_body.T])
-    return InertialReadings(at_ns, turned.rates_radps[inside], accelerations, turned.gap_ns)
+    readings = InertialReadings(at_ns, turned.rates_radps[inside], accelerations, turned.gap_ns)
+    return readings if felt.place_body is None else readings.moved_from(felt.place_body)
 
 
 def uncalibrated(gyroscope: Gyroscope) -> GyroscopeCalibration:

@@ -18,6 +18,7 @@ _PLACE_M, _BIAS_MPS2 = 0.1, 0.3
 """Prior standard deviations of a unit's distance from the body's origin, and of its bias."""
 _CERTAIN_CHI2 = 16.3
 """99.9 % of χ² with three degrees of freedom."""
+_TURN_S = 0.02  # on either side: of single readings the angular acceleration would be noise
 _ITERATIONS = 5
 _UNEXPLAINED = 0.5
 """Median of what accelerations leave of the path's changes of velocity, relative to theirs, that is too much:
@@ -89,6 +90,10 @@ class InertialReadings:
         place_m = found[-3:]
         if place_m @ np.linalg.solve(covariance[-3:, -3:], place_m) <= _CERTAIN_CHI2:
             return self
+        return self.moved_from(place_m)
+
+    def moved_from(self, place_m: Array) -> "InertialReadings":
+        """Return the readings of a unit at (3,) a place in the body, metres, as of one at its origin."""
         return replace(self, accelerations_mps2=self.accelerations_mps2 - self._lever_turns() @ place_m)
 
     def path_scale(self, stamps_ns: Stamps, T_world_body: Array) -> tuple[float, float] | None:
@@ -114,7 +119,11 @@ class InertialReadings:
     def _lever_turns(self) -> Array:
         """Return (N, 3, 3) what a lever arm is multiplied by: [α]× + [ω]×²."""
         x, y, z = self.rates_radps.T
-        ax, ay, az = np.gradient(self.rates_radps, self._times_s, axis=0).T
+        times_s = self._times_s
+        first = np.searchsorted(times_s, times_s - _TURN_S)
+        last = np.searchsorted(times_s, times_s + _TURN_S, side="right") - 1
+        turned = self.rates_radps[last] - self.rates_radps[first]
+        ax, ay, az = (turned / np.maximum(times_s[last] - times_s[first], _TURN_S)[:, None]).T
         rows = [
             [-y * y - z * z, x * y - az, x * z + ay],
             [x * y + az, -x * x - z * z, y * z - ax],

@@ -14,7 +14,7 @@ from mapper.core.timebase import NS_PER_S
 from mapper.graph.components import components
 from mapper.graph.model import BetweenFactor, PoseGraph
 from mapper.odometry.base import Diagnostics, FrameResult, lost_frame
-from mapper.odometry.gyroscope_calibration import GyroscopeCalibration
+from mapper.odometry.gyroscope_calibration import GyroscopeCalibration, body_readings
 from mapper.pipeline.inertial_bridging import bridge, check_accelerations
 from mapper.pipeline.tracking_result import TrackingResult
 from mapper.runtime.progress import SILENT
@@ -187,6 +187,24 @@ def test_a_unit_beside_the_body_bridges_as_well(seed):
     assert len(components(found.graph)) == 1
     assert np.linalg.norm(relative(found, truth, 69, 95)[3:]) < 0.1
     assert all(f in tracking.graph.factors for f in found.graph.factors[:-1])
+
+
+def test_readings_of_a_unit_whose_place_is_stated_are_those_at_the_origin():
+    place_m, exact = np.array([0.8, -0.4, 0.3]), IMU.model_copy(update={"accelerometer_noise_mps2": 0.0})
+    aside = exp(np.zeros(3), place_m)
+
+    def felt_by(place, stated):
+        rng = np.random.default_rng(0)
+        poses = walk(2)
+        gyroscope, felt = measure_imu(exact, lambda times_s: poses(times_s) @ place, duration_s=9.0, rng=rng)
+        log_ = log_in_memory([], gyroscope=gyroscope, accelerations=replace(felt, place_body=stated))
+        readings = body_readings(log_, CALIBRATION)
+        return np.cumsum(readings.accelerations_mps2, axis=0)[::40] / IMU.rate_hz  # velocities, 5 a second
+
+    at_origin = np.diff(felt_by(np.eye(4), None), axis=0)
+    unstated, stated = (np.diff(felt_by(aside, place), axis=0) - at_origin for place in (None, place_m))
+    assert np.median(np.linalg.norm(stated, axis=1)) < 0.01
+    assert np.median(np.linalg.norm(unstated, axis=1)) > 0.03
 
 
 def flipped(log_):

@@ -18,7 +18,7 @@ from mapper.core.frames import Image
 from mapper.core.geometry import Array, Transform, inverse, transform
 from mapper.core.trajectory import Trajectory
 from mapper.runtime.regular_files import read_text
-from mapper.sources.base import ImageFile, Log
+from mapper.sources.base import Accelerations, ImageFile, Log
 from mapper.sources.calibration import Calibration
 from mapper.sources.calibration_file import read_yaml
 from mapper.sources.config import SourceConfig
@@ -125,12 +125,13 @@ def _euroc_log(path: Path, folder: Path, config: SourceConfig) -> Log:
     if not readings.is_file():
         return log
     gyroscope, accelerations, imu_notes = read_euroc_imu(readings)
-    R_body_imu = T_imu_body[:3, :3].T
+    T_body_imu = inverse(T_imu_body)
+    R_body_imu = T_body_imu[:3, :3]
     if gyroscope is not None:
         gyroscope = replace(gyroscope, R_body_imu=R_body_imu)
     if accelerations is not None:
         turned_mps2 = accelerations.acceleration_mps2 @ R_body_imu.T
-        accelerations = replace(accelerations, acceleration_mps2=turned_mps2, are_axes_stated=True)
+        accelerations = Accelerations(accelerations.stamps_ns, turned_mps2, True, T_body_imu[:3, 3])
     return replace(log, gyroscope=gyroscope, accelerations=accelerations, notes=[*log.notes, *imu_notes])
 
 

@@ -200,6 +200,10 @@ def _imu(source: Log) -> Iterator[SerializedMessage]:
     stamps_ns = np.empty(0, np.int64) if felt is None else felt.stamps_ns
     is_one = turned is not None and turned.R_body_imu is None and np.array_equal(stamps_ns, turned.stamps_ns)
     if felt is not None:
+        if felt.place_body is not None and (stamps_ns >= 0).any():
+            T_body_imu = transform(np.eye(3), felt.place_body)
+            first_ns = int(stamps_ns[stamps_ns >= 0][0])
+            yield transforms_message(first_ns, "/tf_static", [(body, _IMU_FRAME, T_body_imu)])
         for k in np.flatnonzero(stamps_ns >= 0).tolist():
             rates = turned.rates_radps[k] if turned is not None and is_one else None
             yield imu_message(

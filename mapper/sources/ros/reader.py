@@ -38,7 +38,6 @@ from mapper.sources.ros.recording import Recording
 from mapper.sources.text import ROUNDING, time_order
 from mapper.sources.wheel_files import mounting
 
-_MAX_READINGS = 20_000  # levelling asks for fewer
 _MAX_TRANSFORMS = 1_000
 _BASES = ("base_link", "base_footprint")
 """Frames of a robot's base (REP 105, REP 120)."""
@@ -128,7 +127,6 @@ class RecordingReader:
         if series is None:
             return None, []
         order, notes = ordered(series)
-        order = _spread(order, most=_MAX_READINGS)
         order = order[np.isfinite(series.imu[order, 3:]).all(axis=1)]
         if not len(order):
             return None, [*notes, f"{series.topic.name}: no readings"]
@@ -138,11 +136,13 @@ class RecordingReader:
             acceleration_imu *= unit
             notes.append(f"{series.topic.name}: accelerations are as long as 1 at rest: taken as g")
         imu = frame_of(self.firsts.get(series.topic.name))
-        known, T_body_imu = self.tree_of(body, imu).find_each(body, imu, stamps_ns)
+        tree = self.tree_of(body, imu)
+        known, T_body_imu = tree.find_each(body, imu, stamps_ns)
         if not known.any():
             return Accelerations(stamps_ns, acceleration_imu), notes
         acceleration_body = np.einsum("nij,nj->ni", T_body_imu[:, :3, :3], acceleration_imu[known])
-        return Accelerations(stamps_ns[known], acceleration_body, are_axes_stated=True), notes
+        place_body = None if tree.moves(body, imu) else T_body_imu[0, :3, 3]
+        return Accelerations(stamps_ns[known], acceleration_body, True, place_body), notes
 
     def gyroscope(self, series: Series | None, *, body: str) -> tuple[Gyroscope | None, list[str]]:
         """Return the angular velocities of a topic, with the mounting if tf has one that stays, and notes."""

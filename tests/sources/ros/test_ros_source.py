@@ -5,7 +5,7 @@ import pytest
 
 from mapper.core.errors import FrameError, SourceError
 from mapper.core.frames import PinholeCamera, Scan
-from mapper.core.geometry import exp
+from mapper.core.geometry import exp, inverse
 from mapper.sources import open_source
 from mapper.sources.config import CameraConfig, SourceConfig, TopicsConfig
 from mapper.sources.image_files.reading import decode_depth_units
@@ -310,9 +310,22 @@ def test_accelerations_are_told_in_the_body_where_tf_ties_the_two(tmp_path):
     told = opened(tmp_path / "a.mcap", messages).accelerations
     assert told.stamps_ns.tolist() == stamps(3)
     np.testing.assert_allclose(told.acceleration_mps2, np.tile([0.1, 0.2, 9.8] @ R, (3, 1)), atol=1e-12)
+    place_body = inverse(T_BASE_LIDAR)[:3, 3]
+    np.testing.assert_allclose(told.place_body, place_body, atol=1e-12)
+    assert write_log(open_source(tmp_path / "a.mcap"), tmp_path / "again.mcap", kind="mcap") == []
+    again = open_source(tmp_path / "again.mcap").accelerations
+    assert again.are_axes_stated
+    np.testing.assert_allclose(again.acceleration_mps2, told.acceleration_mps2, atol=1e-12)
+    np.testing.assert_allclose(again.place_body, place_body, atol=1e-12)
     without = [message for message in messages if "tf" not in message.topic]
     told = opened(tmp_path / "b.mcap", without).accelerations
     np.testing.assert_array_equal(told.acceleration_mps2, np.tile([0.1, 0.2, 9.8], (3, 1)))
+
+
+def test_no_acceleration_of_a_long_recording_is_left_out(tmp_path):
+    times_ns = range(FIRST_NS, FIRST_NS + 25_000 * 1_000_000, 1_000_000)
+    messages = [*(cloud(t) for t in stamps(3)), *(imu(t, [0.0, 0.0, 9.8]) for t in times_ns)]
+    assert len(opened(tmp_path / "a.mcap", messages).accelerations.stamps_ns) == 25_000
 
 
 def test_angular_velocities_come_from_the_topic_that_has_them(tmp_path):
