@@ -41,6 +41,7 @@ from mapper.evaluators.metrics.loops import wrong_loops
 from mapper.evaluators.metrics.silent_failures import check_doubts
 from mapper.evaluators.metrics.trajectory import align, associate, ate_rmse_m
 from mapper.loops.closure import accepted_loops
+from mapper.pipeline.adjusted_planes import adjust_tracking
 from mapper.pipeline.build import level_of
 from mapper.pipeline.components import largest_component
 from mapper.pipeline.joined_components import joined
@@ -201,7 +202,7 @@ def solved(log: Log, config: BuildConfig) -> TrackingResult:
         refuse_a_fragment(tracking, config, sensor=log.sensor)
     graph = solve(tracking.graph, tracking.loops, config.graph)
     tracking = replace(tracking, graph=graph.graph, loops=graph.loops)
-    return largest_component(tracking, progress=SILENT)
+    return adjust_tracking(log, largest_component(tracking, progress=SILENT), config)[0]
 
 
 def compared(row: Row, log: Log, config: BuildConfig, tracking: TrackingResult, truth: Trajectory) -> Row:

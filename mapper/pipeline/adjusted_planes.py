@@ -1,7 +1,7 @@
 """Plane adjustment of a solved log, kept where surfaces of points that took no part are thinner, too."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -12,9 +12,11 @@ from mapper.core.trajectory import Trajectory
 from mapper.features.frame_view import ScanView
 from mapper.graph.model import PoseGraph
 from mapper.graph.plane_adjustment import NodeClouds, adjust_planes, compare_thickness
+from mapper.odometry.gyroscope_calibration import with_body_rates
 from mapper.odometry.scans.config import AnyScanOdometryConfig
 from mapper.odometry.scans.surroundings import adapted_to
 from mapper.pipeline.reobserve import reobserve_each
+from mapper.pipeline.tracking_result import TrackingResult
 from mapper.run.doubtful_frames import without_doubtful
 from mapper.run.manifest import PlaneAdjustment, Solve
 from mapper.run.stored_tracking import StoredTracking
@@ -95,6 +97,21 @@ def adjust_to_planes(
     )
     progress.note(found.sentence)
     return AdjustedPlanes(adjusted if found.is_kept else graph, found)
+
+
+def adjust_tracking(
+    source: Log, tracking: TrackingResult, config: BuildConfig, *, progress: Progress = SILENT
+) -> tuple[TrackingResult, PlaneAdjustment | None]:
+    """Return a tracked log that was just solved, adjusted as ``adjust_to_planes`` does, and the record."""
+    adjusted = adjust_to_planes(
+        with_body_rates(source, tracking.gyroscope),
+        tracking.graph,
+        tracking.tracked_trajectory(),
+        {track.stamp_ns: track.node for track in tracking.tracked if track.node is not None},
+        config,
+        progress=progress,
+    )
+    return replace(tracking, graph=adjusted.graph), adjusted.report
 
 
 def adjust_stored(

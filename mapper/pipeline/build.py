@@ -18,7 +18,7 @@ from mapper.mapping.levelling import Level, axes_of, find_level, level_in_plane
 from mapper.navigation.floor import MAX_SENSOR_HEIGHT_M
 from mapper.odometry.base import Odometry
 from mapper.odometry.gyroscope_calibration import with_body_rates
-from mapper.pipeline.adjusted_planes import AdjustedPlanes, adjust_to_planes
+from mapper.pipeline.adjusted_planes import adjust_tracking
 from mapper.pipeline.checkpoint_identity import identity_of, kept_from_before
 from mapper.pipeline.checkpoints import (
     EVERY_S,
@@ -169,8 +169,8 @@ class _Steps:
             graph = solve(tracking.graph, tracking.loops, self.config.graph)
         tracking = replace(tracking, graph=graph.graph, loops=graph.loops)
         tracking = largest_component(tracking, progress=self.progress)
-        adjusted = self._adjust(tracking)
-        tracking = replace(tracking, graph=adjusted.graph)
+        with self.writer.clock.stage("solve"):
+            tracking, planes = adjust_tracking(self.source, tracking, self.config, progress=self.progress)
         with self.writer.clock.stage("level"):
             source, _ = check_accelerations(self.source, tracking)
             level = level_of(with_body_rates(source, tracking.gyroscope), tracking, self.config)
@@ -178,25 +178,16 @@ class _Steps:
             placed = georeference(tracking, self.source.gnss, self.config.graph)
         level = replace(level, T_level_world=placed.T_map_world @ level.T_level_world)
         if placed.report is not None and placed.report.is_corrected:  # by a solve of the graph alone
-            adjusted = self._adjust(placed.tracking)
-            placed = replace(placed, tracking=replace(placed.tracking, graph=adjusted.graph))
-        report = graph.report.model_copy(update={"planes": adjusted.report})
+            with self.writer.clock.stage("solve"):
+                after, planes = adjust_tracking(
+                    self.source, placed.tracking, self.config, progress=self.progress
+                )
+            placed = replace(placed, tracking=after)
+        report = graph.report.model_copy(update={"planes": planes})
         solved = _Solved(placed.tracking, report, level, placed)
         if self.checkpoints is not None:
             self.checkpoints.store("solved", solved)
         return solved
-
-    def _adjust(self, tracking: TrackingResult) -> AdjustedPlanes:
-        """Adjust the poses of 3D scans to the surfaces that they share."""
-        with self.writer.clock.stage("solve"):
-            return adjust_to_planes(
-                with_body_rates(self.source, tracking.gyroscope),
-                tracking.graph,
-                tracking.tracked_trajectory(),
-                {track.stamp_ns: track.node for track in tracking.tracked if track.node is not None},
-                self.config,
-                progress=self.progress,
-            )
 
     def save(self, solved: _Solved, poses: Trajectory | None) -> None:
         """Write the solved poses, the graph, the places, and the poses that were given."""

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from mapper.core.geometry import apply, exp, inverse, log
-from mapper.graph.model import BetweenFactor, PoseGraph, PoseSigmas
+from mapper.graph.model import BetweenFactor, PoseGraph, PoseSigmas, PositionFactor
 from mapper.graph.plane_adjustment import NodeClouds, adjust_planes, compare_thickness, find_surfaces
 from mapper.graph.plane_kernels import Surfaces, linearise, times_eliminated
 
@@ -75,6 +75,18 @@ def test_what_no_surface_shows_stays_where_the_graph_has_it():
     drift = errors(graph.poses, truth)
     np.testing.assert_allclose(found[:, 2:5], drift[:, 2:5], atol=4e-3)
     assert np.abs(found[:, [0, 1, 5]]).max() < 0.3 * np.abs(drift[:, [0, 1, 5]]).max()
+
+
+def test_measured_positions_hold_the_whole():
+    rng = np.random.default_rng(0)
+    clouds, truth = room(rng)
+    graph = drifted(truth, rng)
+    graph.fixes = tuple(
+        PositionFactor(k, np.zeros(3), T[:3, 3], np.eye(3) * 1e6) for k, T in enumerate(truth)
+    )
+    after = np.abs(errors(adjust_planes(graph, clouds, voxel_m=VOXEL_M).poses, truth)).max(axis=0)
+    assert after[:3].max() < 2e-3
+    assert after[3:].max() < 2e-3
 
 
 def test_a_judge_of_other_points_tells_a_gain_from_none():
