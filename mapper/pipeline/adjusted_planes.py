@@ -25,6 +25,9 @@ from mapper.sources.base import Log
 
 _MOST_POINTS = 10_000_000
 """Of all scans, which 1.5 GB hold; scans of longer logs are thinned further."""
+_FEWEST_NODES = 30
+"""Standard errors of clusters need some thirty of them (Cameron & Miller 2015, §VI), and a node shows one
+place or less: of shorter logs the judge would know little."""
 _SURE_SIGMAS = 2.0
 """Three real logs, whose adjusted poses differ by less than the truth's error, have −2.6 to 2.0 by how their
 cells lie; synthetic ones, whose ATE halves, 2.5 to 18."""
@@ -55,8 +58,8 @@ def adjust_to_planes(
     """Return a solved graph at poses at which the surfaces of its scans are thinner, if there are such.
 
     Half of the points adjust the poses, the others judge: the adjustment is kept if their surfaces, too,
-    become thinner by more than two standard errors. Only poses of 3D scans that an odometry of
-    scans has found, and a batch solve has solved, are adjusted.
+    become thinner by more than two standard errors. Only poses of 30 nodes or more are adjusted, of 3D scans
+    that an odometry of scans has found and a batch solve has solved.
 
     Args:
         source: The log, with the body's rates if it has a gyroscope.
@@ -70,6 +73,7 @@ def adjust_to_planes(
         config.graph.planes == "off"
         or config.graph.solve != "batch"
         or source.sensor != "lidar"
+        or len(graph.T_world_node) < _FEWEST_NODES
         or not isinstance(config.odometry, AnyScanOdometryConfig)
     ):
         return AdjustedPlanes(graph)
