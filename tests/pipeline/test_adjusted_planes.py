@@ -24,7 +24,7 @@ def both(log, folder):
 
 
 def test_rooms_are_more_accurate_and_the_manifest_says_so(tmp_path):
-    flat = LIDAR_SCENES["flat"].model_copy(update={"duration_s": 12.0, "seed": 1})
+    flat = LIDAR_SCENES["flat"].model_copy(update={"duration_s": 20.0, "seed": 1})
     write_lidar_log(tmp_path / "log", flat)
 
     off_m, auto_m, run = both(tmp_path / "log", tmp_path)
