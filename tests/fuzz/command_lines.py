@@ -135,7 +135,7 @@ def _words(draw: st.DrawFn, verb: Verb) -> tuple[str, ...]:
 
 def _values(parameter: Any) -> st.SearchStrategy[list[str]]:
     """Return the strategy of the words that follow an option, or stand for an argument."""
-    kind = parameter.type_descriptor.annotation
+    kind = _kind_of(parameter)
     if getattr(parameter, "is_flag", False):
         return st.just([])
     if get_origin(kind) is Literal:
@@ -153,6 +153,15 @@ def _values(parameter: Any) -> st.SearchStrategy[list[str]]:
     else:
         word = st.sampled_from((*_TEXTS, *_INPUTS) if kind is str else _NUMBERS)
     return st.lists(word, min_size=max(parameter.nargs, 1), max_size=max(parameter.nargs, 1))
+
+
+def _kind_of(parameter: Any) -> Any:
+    """Return a parameter's annotation, by typer 0.28 and later or by those before, which rko-lio asks for."""
+    if hasattr(parameter, "type_descriptor"):
+        return parameter.type_descriptor.annotation
+    if choices := getattr(parameter.type, "choices", None):
+        return Literal[tuple(choices)]
+    return {"path": Path, "str": str}.get(parameter.type.name, float)
 
 
 class Sandbox:
