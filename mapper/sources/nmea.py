@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable
 from datetime import date, time
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -26,56 +26,89 @@ def fixes_from_sentences(
     """
     import pynmea2
 
-    places: list[tuple[int | None, Any]] = []
+    places: list[_Place] = []
     sigmas: dict[time, tuple[float, float, float]] = {}
     day: date | None = None
     damaged = 0
     for stamp_ns, sentence in sentences:
         try:
             message = pynmea2.parse(sentence[max(sentence.find("$"), 0) :].strip(), check=True)
-        except pynmea2.ParseError:
+            match getattr(message, "sentence_type", ""):
+                case "GGA" if message.timestamp is not None:
+                    places.append(_place(stamp_ns, message))
+                case "GST" if message.timestamp is not None:
+                    three = (message.std_dev_longitude, message.std_dev_latitude, message.std_dev_altitude)
+                    sigmas[_clock(message)] = (_number(three[0]), _number(three[1]), _number(three[2]))
+                case "RMC" | "ZDA":
+                    day = day or _day(message)
+        except (ValueError, OverflowError):
             damaged += bool(sentence.strip()) and not sentence.startswith("#")
-            continue
-        match getattr(message, "sentence_type", ""):
-            case "GGA" if message.timestamp is not None:
-                places.append((stamp_ns, message))
-            case "GST" if message.timestamp is not None:
-                three = (message.std_dev_longitude, message.std_dev_latitude, message.std_dev_altitude)
-                sigmas[message.timestamp] = (_number(three[0]), _number(three[1]), _number(three[2]))
-            case "RMC":
-                day = day or message.datestamp
-            case "ZDA" if message.day and message.month and message.year:
-                day = day or date(int(message.year), int(message.month), int(message.day))
     notes = [f"{name}: {damaged} damaged sentences are left out"] * (damaged > 0)
     if not places:
         return None, notes
-    stamps_ns = [stamp_ns for stamp_ns, _ in places if stamp_ns is not None]
+    stamps_ns = [place.stamp_ns for place in places if place.stamp_ns is not None]
     if not stamps_ns and day is None:
         return None, [*notes, f"{name}: GNSS fixes are not used, as no RMC or ZDA sentence has their date"]
     if not stamps_ns and day is not None:
-        stamps_ns = _utc_ns(day, [message.timestamp for _, message in places])
-    if any(not _is_stated(message.geo_sep) for _, message in places):
+        stamps_ns = _utc_ns(day, [place.clock for place in places])
+    if not all(place.has_geoid for place in places):
         notes.append(f"{name}: heights are above sea level, as the receiver states no height of the geoid")
-    variances = np.square([sigmas.get(message.timestamp, (np.nan,) * 3) for _, message in places])
+    variances = np.square([sigmas.get(place.clock, (np.nan,) * 3) for place in places])
     fixes = GnssFixes(
         name,
         np.array(stamps_ns, np.int64),
-        np.array([_geodetic(message) for _, message in places]),
+        np.array([place.geodetic for place in places]),
         variances[:, :, None] * np.eye(3),
-        np.array([_status(message) for _, message in places], np.int8),
+        np.array([place.status for place in places], np.int8),
     )
     return fixes, notes
 
 
-def _geodetic(message: Any) -> tuple[float, float, float]:
-    height_m = _number(message.altitude) + (_number(message.geo_sep) if _is_stated(message.geo_sep) else 0.0)
+class _Place(NamedTuple):
+    """What a GGA sentence says, and when it was received."""
+
+    stamp_ns: int | None
+    clock: time
+    geodetic: tuple[float, float, float]
+    status: int
+    has_geoid: bool
+
+
+def _place(stamp_ns: int | None, message: Any) -> _Place:
+    """Return the place of a GGA sentence; without coordinates it is no fix.
+
+    Raises:
+        ValueError: A field is malformed.
+    """
+    clock, geoid_m = _clock(message), _number(message.geo_sep)
+    has_geoid = bool(np.isfinite(geoid_m))
     if not (message.lat and message.lon):
-        return np.nan, np.nan, np.nan
-    return message.latitude, message.longitude, height_m
+        return _Place(stamp_ns, clock, (np.nan, np.nan, np.nan), NO_FIX, has_geoid)
+    if message.lat_dir not in ("N", "S") or message.lon_dir not in ("E", "W"):  # the library says 0°
+        raise ValueError(f"{message.lat_dir!r}, {message.lon_dir!r} are no directions")
+    height_m = _number(message.altitude) + (geoid_m if has_geoid else 0.0)
+    status = _STATUS.get(int(message.gps_qual or 0), NO_FIX)
+    return _Place(stamp_ns, clock, (message.latitude, message.longitude, height_m), status, has_geoid)
 
 
-def _status(message: Any) -> int:
-    return _STATUS.get(int(message.gps_qual or 0), NO_FIX) if message.lat and message.lon else NO_FIX
+def _clock(message: Any) -> time:
+    if not isinstance(message.timestamp, time):  # the library leaves what it cannot convert as it was
+        raise ValueError(f"{message.timestamp!r} is no time")
+    return message.timestamp
+
+
+def _day(message: Any) -> date | None:
+    """Return the date of an RMC or ZDA sentence; None if it has none yet.
+
+    Raises:
+        ValueError: It is malformed.
+    """
+    if message.sentence_type == "ZDA":
+        fields = message.day, message.month, message.year
+        return date(int(fields[2]), int(fields[1]), int(fields[0])) if all(fields) else None
+    if not isinstance(message.datestamp, date | None):
+        raise ValueError(f"{message.datestamp!r} is no date")
+    return message.datestamp
 
 
 def _utc_ns(day: date, times: list[time]) -> list[int]:
@@ -95,7 +128,3 @@ def _number(value: Any) -> float:
         return float(value)
     except (TypeError, ValueError):
         return np.nan
-
-
-def _is_stated(value: Any) -> bool:
-    return bool(np.isfinite(_number(value)))

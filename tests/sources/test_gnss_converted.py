@@ -18,6 +18,7 @@ from mapper.simulation.gnss_config import SynthGnssConfig
 from mapper.simulation.lidar import LidarSimulator, write_lidar_log
 from mapper.sources import open_source
 from mapper.sources.config import SourceConfig, TopicsConfig
+from mapper.sources.nmea import fixes_from_sentences
 from mapper.sources.ros.encode_ros import SerializedMessage, fix_message
 from mapper.sources.writers import left_out, write_log
 from tests.support.command_line import invoke
@@ -230,6 +231,32 @@ def test_sentences_beside_a_log_are_fixes_with_times_of_utc(tmp_path):
     undated = open_source(tmp_path / "log")
     assert undated.gnss is None
     assert sum("date" in note for note in undated.notes) == 1
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        "GPRMC,xx,A,zz,N,yy,E,0,0,ab,,,A",
+        "GPRMC,235959.50,A,4730.000,N,01902.000,E,0.1,0.0,999999,,,A",
+        "GPZDA,201530.00,99,99,2002,00,00",
+        "GPZDA,201530.00,1,1,99999999999,00,00",
+        "GPZDA,201530.00,a,b,c,00,00",
+        "GPGGA,235959.50,zz,N,yy,E,4,12,0.8,100.0,M,43.5,M,,",
+        "GPGGA,235959.50,nan,N,inf,E,4,12,0.8,100.0,M,43.5,M,,",
+        "GPGGA,235959.50,4730.0,N,01902.0,E,x,12,0.8,100.0,M,43.5,M,,",
+        "GPGGA,235959.50,4730.0,Q,01902.0,E,1,12,0.8,100.0,M,43.5,M,,",
+        "GPGGA,256199,4730.0,N,01902.0,E,1,12,0.8,100.0,M,43.5,M,,",
+        "GPGGA,1,2",
+        "GPGST,zz,,,,,1,1,1",
+    ],
+)
+def test_a_malformed_field_costs_its_sentence(body):
+    whole, _ = fixes_from_sentences("x", [(None, text) for text in SENTENCES[:3]])
+    fixes, notes = fixes_from_sentences("x", [(None, text) for text in (sentence(body), *SENTENCES[:3])])
+    assert fixes.stamps_ns.tolist() == whole.stamps_ns.tolist()
+    np.testing.assert_array_equal(fixes.geodetic, whole.geodetic)
+    np.testing.assert_array_equal(fixes.covariances_enu, whole.covariances_enu)
+    assert sum("1 damaged" in note for note in notes) == 1
 
 
 def test_sentences_of_a_recording_have_its_stamps_and_come_after_fixes(tmp_path):
