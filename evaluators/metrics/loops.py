@@ -9,8 +9,10 @@ from mapper.core.geometry import Array, distances_along, inverse, log
 from mapper.core.timebase import MAX_TRUTH_GAP_NS, NS_PER_S, Stamps, nearest
 from mapper.core.trajectory import Trajectory
 from mapper.evaluators.metrics.metric import Metric
+from mapper.graph.config import GraphConfig
 from mapper.graph.marginals import marginals_of
 from mapper.graph.model import PoseGraph
+from mapper.graph.optimize import optimize
 from mapper.loops.closure import LoopClosure, accepted_loops, discrepancy
 from mapper.loops.config import ScanLoopsConfig
 from mapper.run.folder import Run
@@ -65,9 +67,13 @@ def agreement_of_loops(graph: PoseGraph) -> list[Metric]:
     contradicts the others. Loops that alone tie their nodes are not compared.
 
     Args:
-        graph: Solved, with the loops that hold.
+        graph: With the loops that hold. It is solved first: poses that were adjusted to planes or by hand are
+            not its own.
     """
-    relative = marginals_of(graph).relative if graph.loops else {}
+    if not graph.loops:
+        return []
+    graph = graph.with_poses(optimize(graph, GraphConfig(robust="none")).T_world_node)
+    relative = marginals_of(graph).relative
     distances_m, angles_rad, squares = [], [], []
     for loop in graph.loops:
         try:

@@ -136,6 +136,13 @@ def test_a_loop_is_as_far_from_the_others_as_a_solve_without_it_says():
     assert told["loops that contradict the others"] == 0
 
 
+def test_loops_agree_alike_at_poses_that_something_else_moved():
+    graph, rng = ring(), np.random.default_rng(1)
+    moved = {node: T @ exp(*rng.normal(0.0, 0.003, (2, 3))) for node, T in graph.T_world_node.items()}
+    told, expected = (values(agreement_of_loops(one)) for one in (graph.with_poses(moved), graph))
+    assert told == pytest.approx(expected, rel=1e-3)
+
+
 def test_a_false_loop_contradicts_the_others():
     told = values(agreement_of_loops(ring(false_m=0.2)))
     assert told["loops that contradict the others"] >= 1
