@@ -141,11 +141,7 @@ class _Steps:
                 observer=self.observer,
                 checkpoints=None if self.checkpoints is None else TrackingCheckpoints(self.checkpoints),
             )
-            source, warnings = check_accelerations(self.source, tracking)
-            for warning in warnings:
-                self.progress.note(warning.text)
-            tracking = replace(tracking, warnings=(*tracking.warnings, *warnings))
-            tracking = bridge(source, tracking, progress=self.progress)
+            tracking = bridge(self.source, tracking, progress=self.progress)
             tracking = joined(self.source, tracking, self.config, progress=self.progress)
             tracking = largest_component(tracking, progress=self.progress)
         if self.checkpoints is not None:

@@ -18,9 +18,10 @@ from mapper.graph.uncertainty import information_of
 from mapper.graph.wheel_factors import OTHER_UNIT
 from mapper.odometry.base import FrameResult
 from mapper.odometry.gyroscope_calibration import body_readings
+from mapper.pipeline.components import largest_component
 from mapper.pipeline.tracking_result import TrackingResult
 from mapper.run.manifest import RunWarning
-from mapper.runtime.progress import Progress
+from mapper.runtime.progress import SILENT, Progress
 from mapper.sensing.inertial import InertialReadings
 from mapper.sources.base import Log
 
@@ -47,9 +48,13 @@ def bridge(source: Log, tracking: TrackingResult, *, progress: Progress) -> Trac
     """
     before = len(tracking.warnings)
     tracks = tracking.tracks
-    if tracking.gyroscope is None or source.accelerations is None:
+    calibration = tracking.gyroscope
+    if calibration is None or source.accelerations is None:
         return tracking
-    readings = body_readings(source, tracking.gyroscope)
+    source, warnings = check_accelerations(source, tracking)
+    if warnings:
+        tracking = replace(tracking, warnings=(*tracking.warnings, *warnings))
+    readings = body_readings(source, calibration)
     if readings is None:
         sentence = "accelerations are not used: their unit, or their mounting on the body, is not known"
         progress.note(sentence)
@@ -63,7 +68,7 @@ def bridge(source: Log, tracking: TrackingResult, *, progress: Progress) -> Trac
         if len(known) > 1:
             tracking = _bridge_window(tracking, readings, known[0], end - 1)
     for warning in tracking.warnings[before:]:
-        progress.note(warning.sentence)
+        progress.note(warning.text)
     return tracking
 
 
@@ -75,14 +80,15 @@ def check_accelerations(source: Log, tracking: TrackingResult) -> tuple[Log, tup
 
     Args:
         source: The log.
-        tracking: Its tracked frames; those that surfaces do not place are left out.
+        tracking: Its tracked frames, of which those of the largest part are used that surfaces place.
     """
-    sure = [track for track in tracking.tracked if not track.diagnostics.unobservable]
+    whole = largest_component(tracking, progress=SILENT)
+    sure = tuple(track for track in whole.tracked if not track.diagnostics.unobservable)
     felt = source.accelerations
     if tracking.gyroscope is None or felt is None or not sure:
         return source, ()
     readings = body_readings(source, tracking.gyroscope)
-    trajectory = replace(tracking, tracks=tuple(sure)).tracked_trajectory()
+    trajectory = replace(whole, tracks=sure).tracked_trajectory()
     found = readings and readings.path_scale(trajectory.stamps_ns, trajectory.T_world_body)
     if not found:
         return source, ()

@@ -112,8 +112,8 @@ class InertialReadings:
             return None
         found, covariance = _fit(np.column_stack([triples.felt_mps, triples.columns]), triples.moved_mps)
         left_mps = triples.moved_mps - triples.felt_mps * found[0] - triples.columns @ found[1:]
-        if np.median(np.abs(left_mps)) > _UNEXPLAINED * np.median(np.abs(triples.moved_mps)):
-            return None
+        if np.median(np.abs(left_mps)) >= _UNEXPLAINED * np.median(np.abs(triples.moved_mps)):
+            return None  # nothing is explained where nothing moved, either
         return float(found[0]), float(np.sqrt(covariance[0, 0]))
 
     def _lever_turns(self) -> Array:

@@ -18,6 +18,7 @@ from mapper.odometry.gyroscope_calibration import GyroscopeCalibration, body_rea
 from mapper.pipeline.inertial_bridging import bridge, check_accelerations
 from mapper.pipeline.tracking_result import TrackingResult
 from mapper.runtime.progress import SILENT
+from mapper.sensing.inertial import InertialReadings
 from mapper.simulation.config import SynthImuConfig
 from mapper.simulation.path import START_NS
 from mapper.simulation.readings import measure_imu
@@ -240,6 +241,26 @@ def test_accelerations_of_either_sign_point_up_at_rest(seed, sign):
     checked, warnings = check_accelerations(given, tracking)
     assert np.array_equal(checked.accelerations.acceleration_mps2, felt.acceleration_mps2)
     assert [(warning.kind, warning.weight) for warning in warnings] == [("imu", "note")] * (sign < 0.0)
+
+
+def test_a_later_session_bridges_by_reversed_accelerations_as_the_first_does():
+    log_, tracking, truth = made(5, lost=range(70, 90))
+    felt = log_.accelerations
+    given = replace(log_, accelerations=replace(felt, acceleration_mps2=-felt.acceleration_mps2))
+    found = bridge(given, tracking, progress=SILENT)
+    assert len(components(found.graph)) == 1
+    assert np.linalg.norm(relative(found, truth, 69, 95)[3:]) < 0.06
+    assert sum("opposite sign" in warning.sentence for warning in found.warnings) == 1
+
+
+@pytest.mark.parametrize("is_exact", [True, False])
+def test_no_scale_is_found_where_nothing_moved(is_exact):
+    stamps_ns = 5_000_000 * np.arange(4000)
+    felt = np.tile([0.0, 0.0, 9.81], (4000, 1))
+    if not is_exact:
+        felt += np.random.default_rng(0).normal(0.0, 0.05, felt.shape)
+    readings = InertialReadings(stamps_ns, np.zeros_like(felt), felt, 20_000_000)
+    assert readings.path_scale(100_000_000 * np.arange(1, 180), np.tile(np.eye(4), (179, 1, 1))) is None
 
 
 @pytest.mark.parametrize("unit", [0.3048, 1.0, 5.0])
