@@ -7,6 +7,9 @@ MIB = 1 << 20
 GRAVITY_MPS2 = 9.80665
 """Standard gravity: the unit g of accelerations."""
 
+OTHER_UNIT = 2.0
+"""Ratio of lengths by frames and by other sensors from which on they have different units: feet have 3.3."""
+
 
 def unit_of_gravity(length: float) -> float | None:
     """Return the unit in which the length of an acceleration is gravity's: 1 m/s² or g; None if in neither.

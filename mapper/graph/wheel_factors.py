@@ -9,6 +9,7 @@ import numpy as np
 from mapper.core.geometry import Transform, inverse
 from mapper.core.timebase import NS_PER_S
 from mapper.core.trajectory import Trajectory
+from mapper.core.units import OTHER_UNIT
 from mapper.graph.components import component_numbers
 from mapper.graph.config import WheelFactorsConfig, WheelNoiseConfig
 from mapper.graph.model import BetweenFactor, Origin, PoseGraph, PoseSigmas
@@ -25,8 +26,6 @@ class WheelNode:
     T_odom_body: Transform
 
 
-OTHER_UNIT = 2.0
-"""Ratio of lengths by frames and by other sensors from which on they have different units: feet have 3.3."""
 _SLACK_M, _SLACK_RAD = 0.2, 0.1
 """Difference to the wheels' motion that is possible without noise: by clocks, mountings, uneven floors."""
 
@@ -90,10 +89,8 @@ def wheel_conflict(graph: PoseGraph, driven: Sequence[BetweenFactor]) -> str:
         return ""
     miss_m = median(comparison.translation_m for comparison in wrong)
     miss_rad = median(comparison.rotation_rad for comparison in wrong)
-    moved_m, driven_m = (
-        np.array([np.linalg.norm(T_i_j[:3, 3]) for T_i_j in all_steps])
-        for all_steps in (steps, [factor.T_i_j for factor in both])
-    )
+    moved_m = np.linalg.norm([T_i_j[:3, 3] for T_i_j in steps], axis=1)
+    driven_m = np.linalg.norm([factor.T_i_j[:3, 3] for factor in both], axis=1)
     ratio = float(np.median(driven_m / np.maximum(moved_m, _SLACK_M / 10.0)))
     question = "did they slip, is their mounting or clock wrong, or did the odometry jump?"
     if not 1.0 / OTHER_UNIT < ratio < OTHER_UNIT and np.median(driven_m) > _SLACK_M:

@@ -18,7 +18,7 @@ from mapper.odometry.scans.surroundings import adapted_to
 from mapper.pipeline.reobserve import reobserve_each
 from mapper.pipeline.tracking_result import TrackingResult
 from mapper.run.doubtful_frames import without_doubtful
-from mapper.run.manifest import PlaneAdjustment, Solve
+from mapper.run.manifest import SURE_SIGMAS, PlaneAdjustment, Solve
 from mapper.run.stored_tracking import StoredTracking
 from mapper.runtime.progress import SILENT, Progress
 from mapper.sources.base import Log
@@ -28,9 +28,6 @@ _MOST_POINTS = 10_000_000
 _FEWEST_NODES = 30
 """Standard errors of clusters need some thirty of them (Cameron & Miller 2015, §VI), and a node shows one
 place or less: of shorter logs the judge would know little."""
-_SURE_SIGMAS = 2.0
-"""Three real logs, whose adjusted poses differ by less than the truth's error, have −2.6 to 2.0 by how their
-cells lie; synthetic ones, whose ATE halves, 2.5 to 18."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,7 +89,7 @@ def adjust_to_planes(
         return AdjustedPlanes(graph)
     moved_m = np.linalg.norm(adjusted.positions - graph.positions, axis=1)
     found = PlaneAdjustment(
-        is_kept=judged.thinner_sigmas > _SURE_SIGMAS,
+        is_kept=judged.thinner_sigmas > SURE_SIGMAS,
         surfaces=judged.surfaces,
         thinner_sigmas=judged.thinner_sigmas,
         thickness_before_m=judged.before_m,

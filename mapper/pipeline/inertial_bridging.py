@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from mapper.core.doubts import Doubt
 from mapper.core.errors import GraphError
 from mapper.core.geometry import Array, Transform, adjoint, inverse
+from mapper.core.units import OTHER_UNIT
 from mapper.graph.components import component_numbers
 from mapper.graph.inertial import SmoothedPath, smooth_path
 from mapper.graph.model import BetweenFactor, PoseGraph
 from mapper.graph.uncertainty import information_of
-from mapper.graph.wheel_factors import OTHER_UNIT
 from mapper.odometry.base import FrameResult
 from mapper.odometry.gyroscope_calibration import body_readings
 from mapper.pipeline.components import largest_component
