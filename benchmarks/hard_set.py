@@ -39,12 +39,12 @@ from mapper.core.errors import MapperError
 from mapper.core.trajectory import Trajectory
 from mapper.evaluators.metrics.loops import wrong_loops
 from mapper.evaluators.metrics.silent_failures import check_doubts
-from mapper.evaluators.metrics.trajectory import align, associate, ate_rmse_m
+from mapper.evaluators.metrics.trajectory_errors import align, associate, ate_rmse_m
 from mapper.loops.closure import accepted_loops
-from mapper.pipeline.adjusted_planes import adjust_tracking
 from mapper.pipeline.build import level_of
-from mapper.pipeline.components import largest_component
-from mapper.pipeline.joined_components import joined
+from mapper.pipeline.component_loops import joined
+from mapper.pipeline.disconnected_components import largest_component
+from mapper.pipeline.lidar_adjustment import adjust_tracking
 from mapper.pipeline.solve import solve
 from mapper.pipeline.track import noted_log_warnings, track_log
 from mapper.pipeline.tracking_result import TrackingResult, from_tracking, refuse_a_fragment

@@ -36,8 +36,8 @@ from mapper.simulation.config import LIDAR_SCENES, SynthConfig
 from mapper.simulation.lidar import write_lidar_log
 from mapper.sources import open_source
 from mapper.sources.base import Log
-from mapper.sources.chained import chained
 from mapper.sources.config import SourceConfig
+from mapper.sources.multi_session_log import chained
 
 _WRONG_M = {"rgbd": 0.3, "lidar": 1.0}
 _HEAD = (

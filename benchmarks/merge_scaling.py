@@ -28,7 +28,7 @@ from mapper.core.deskew import deskewed, twist_at
 from mapper.core.timebase import nearest
 from mapper.core.trajectory import Trajectory
 from mapper.merging.merge import merge
-from mapper.merging.placing import Placing, as_built
+from mapper.merging.world_poses import Placing, as_built
 from mapper.octree.map import OctreeMap, read_octree
 from mapper.octree.map_file import write_map
 from mapper.run.folder import Run, open_run

@@ -25,11 +25,11 @@ import numpy as np
 from mapper.core.deskew import deskewed, twist_at
 from mapper.core.frames import Scan
 from mapper.core.geometry import exp
-from mapper.mapping.measured_noise import measure_noise
-from mapper.octree.casting import Caster
+from mapper.mapping.depth_noise_estimation import measure_noise
 from mapper.octree.config import OctreeConfig
 from mapper.octree.map import OctreeMap
 from mapper.octree.moving_objects import remove_moving_objects
+from mapper.octree.ray_casting import Caster
 from mapper.octree.scan_updates import pack
 from mapper.sensing.depth import DepthLimit
 from mapper.simulation.config import COURTYARD, STREET, LidarSynthConfig, SynthConfig

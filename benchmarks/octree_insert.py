@@ -22,7 +22,7 @@ import pyoctomap
 from mapper.core.frames import Scan
 from mapper.core.geometry import Transform, apply, inverse
 from mapper.core.timebase import nearest
-from mapper.octree import casting_kernels as kernels
+from mapper.octree import ray_casting_kernels as kernels
 from mapper.octree.config import OctreeConfig
 from mapper.octree.map import OctreeMap, read_octree
 from mapper.octree.octomap_file import write_bt, write_ot

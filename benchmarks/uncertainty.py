@@ -15,8 +15,8 @@ from pathlib import Path
 from mapper.config.loading import load_config, load_source_config
 from mapper.core.timebase import NS_PER_S
 from mapper.evaluators.metrics.consistency import Nees, factor_nees, window_nees
-from mapper.evaluators.metrics.trajectory import ate_rmse_m
-from mapper.pipeline.components import largest_component
+from mapper.evaluators.metrics.trajectory_errors import ate_rmse_m
+from mapper.pipeline.disconnected_components import largest_component
 from mapper.pipeline.solve import solve
 from mapper.pipeline.track import track_log
 from mapper.run.frame_outcomes import records_of

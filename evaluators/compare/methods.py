@@ -14,7 +14,7 @@ from mapper.core.trajectory import Trajectory, trajectory_from
 from mapper.evaluators.compare.config import RgbdCompareConfig
 from mapper.graph.model import PoseGraph
 from mapper.odometry.base import FrameOdometry, FrameResult
-from mapper.pipeline.components import largest_component
+from mapper.pipeline.disconnected_components import largest_component
 from mapper.pipeline.tracking_result import TrackingResult
 from mapper.registration.base import Alignment, failed
 from mapper.runtime.progress import SILENT

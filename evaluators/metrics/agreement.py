@@ -25,7 +25,7 @@ from mapper.loops.image_verification import ImageVerifier
 from mapper.mapping.placed_frames import PlacedFrame, placed_frames
 from mapper.odometry.config import LocalMapConfig
 from mapper.odometry.factory import build_frame_odometry
-from mapper.registration.refining import plane_rows
+from mapper.registration.pair_refinement import plane_rows
 from mapper.registration.surfaces import Prepared, prepared
 from mapper.runtime.ordered_map import ordered_map
 from mapper.runtime.progress import SILENT, Progress

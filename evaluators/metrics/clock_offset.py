@@ -7,7 +7,7 @@ import numpy as np
 from mapper.core.geometry import Array
 from mapper.core.timebase import NS_PER_S
 from mapper.core.trajectory import Trajectory
-from mapper.evaluators.metrics.trajectory import AlignmentKind, Matched, align, ate
+from mapper.evaluators.metrics.trajectory_errors import AlignmentKind, Matched, align, ate
 
 _MAX_OFFSET_S = 2.0
 _MAX_SHARE = 0.1

@@ -15,7 +15,7 @@ from mapper.evaluators.metrics.clock_offset import clock_offset
 from mapper.evaluators.metrics.coverage import frame_coverage, time_coverage
 from mapper.evaluators.metrics.metric import Metric, shown, text_table
 from mapper.evaluators.metrics.segments import LengthErrors, lengths_for, segment_errors, segment_metrics
-from mapper.evaluators.metrics.trajectory import (
+from mapper.evaluators.metrics.trajectory_errors import (
     AlignmentKind,
     Matched,
     Similarity,

@@ -11,9 +11,9 @@ from mapper.core.geometry import Transform, apply, inverse, mean_rotation, trans
 from mapper.evaluators.metrics.map_reference import Reference, check_occupancy
 from mapper.evaluators.metrics.metric import Metric
 from mapper.evaluators.metrics.occupancy import OccupancyCheck, check_metrics
-from mapper.evaluators.metrics.trajectory import associate
+from mapper.evaluators.metrics.trajectory_errors import associate
 from mapper.registration.kd_tree import kd_tree
-from mapper.registration.refining import refined_motion
+from mapper.registration.pair_refinement import refined_motion
 from mapper.registration.surfaces import prepared
 from mapper.run import files
 from mapper.run.folder import Run

@@ -10,7 +10,7 @@ from mapper.evaluators.metrics.evaluate import ALIGNED, ATE_RMSE
 from mapper.evaluators.metrics.map_reference import Reference, check_occupancy
 from mapper.evaluators.metrics.metric import Metric
 from mapper.evaluators.metrics.occupancy import check_metrics
-from mapper.evaluators.metrics.trajectory import AlignmentKind, Matched, align, associate, ate
+from mapper.evaluators.metrics.trajectory_errors import AlignmentKind, Matched, align, associate, ate
 from mapper.merging.merged_map import MergedMap, RunInMap
 from mapper.run.folder import open_run
 

@@ -8,7 +8,7 @@ from mapper.core.errors import DataError
 from mapper.core.geometry import Array, path_length
 from mapper.core.timebase import MAX_TRUTH_GAP_NS, NS_PER_S, Stamps, nearest
 from mapper.core.trajectory import Trajectory
-from mapper.evaluators.metrics.trajectory import DeltaUnit, Matched, align, associate, ate, step_errors
+from mapper.evaluators.metrics.trajectory_errors import DeltaUnit, Matched, align, associate, ate, step_errors
 
 _STRETCHES = (0.1, 0.2, 0.3, 0.4, 0.5)  # of the true path's length
 _MIN_POSES = 3  # to lay one path over another

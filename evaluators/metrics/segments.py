@@ -8,7 +8,7 @@ import numpy as np
 from mapper.core.errors import DataError
 from mapper.core.geometry import Array
 from mapper.evaluators.metrics.metric import Metric
-from mapper.evaluators.metrics.trajectory import Matched, motion_errors, progress_of, statistics
+from mapper.evaluators.metrics.trajectory_errors import Matched, motion_errors, progress_of, statistics
 from mapper.evaluators.study.table import Column, Record, degrees, percent
 
 KITTI_LENGTHS_M = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)

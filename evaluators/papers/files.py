@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mapper.core.geometry import Array
-from mapper.evaluators.metrics.trajectory import associate
+from mapper.evaluators.metrics.trajectory_errors import associate
 from mapper.evaluators.papers.model import (
     RULE,
     PaperCell,

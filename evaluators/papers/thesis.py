@@ -9,7 +9,7 @@ from mapper.config.build import BuildConfig
 from mapper.core.errors import ConfigError, DataError, FrameError, MapperError
 from mapper.core.frames import Frame, Image
 from mapper.core.trajectory import Trajectory
-from mapper.evaluators.metrics.trajectory import align, associate, ate
+from mapper.evaluators.metrics.trajectory_errors import align, associate, ate
 from mapper.evaluators.papers.model import PaperPath, PaperTable
 from mapper.evaluators.papers.paper import (
     Cut,
@@ -36,13 +36,13 @@ from mapper.loops.closure import accepted_loops
 from mapper.loops.factory import build_loop_detector
 from mapper.odometry.base import FrameResult
 from mapper.odometry.config import IsvdOdometryConfig, MatchConfig
-from mapper.odometry.isvd.odometry import IsvdOdometry
-from mapper.odometry.isvd.registration import (
+from mapper.odometry.isvd.frame_pairs import (
     IsvdObservation,
     PairRegistration,
     RegisterPair,
     matched_pairs,
 )
+from mapper.odometry.isvd.odometry import IsvdOdometry
 from mapper.pipeline.solve import solve
 from mapper.pipeline.tracking_result import TrackingResult, refuse_a_fragment
 from mapper.registration.base import Alignment

@@ -12,7 +12,7 @@ from mapper.config.loading import load_config
 from mapper.core.geometry import inverse, rotation_log
 from mapper.core.trajectory import Trajectory
 from mapper.core.units import MM_PER_M
-from mapper.evaluators.metrics.trajectory import associate, ate_rmse_m, rpe
+from mapper.evaluators.metrics.trajectory_errors import associate, ate_rmse_m, rpe
 from mapper.evaluators.papers.model import PaperCell, PaperTable
 from mapper.evaluators.papers.paper import CONFIGS, Figures, figures, published
 

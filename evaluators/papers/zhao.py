@@ -10,7 +10,7 @@ from tempfile import TemporaryDirectory
 from mapper.config.build import BuildConfig
 from mapper.config.loading import load_config
 from mapper.core.units import MB
-from mapper.evaluators.metrics.trajectory import ate_rmse_m
+from mapper.evaluators.metrics.trajectory_errors import ate_rmse_m
 from mapper.evaluators.papers.model import PaperCell, PaperTable
 from mapper.evaluators.papers.paper import (
     CONFIGS,

@@ -11,7 +11,7 @@ from mapper.core.geometry import Array
 from mapper.core.timebase import NS_PER_S
 from mapper.evaluators.metrics.evaluate import Assessment, have_clock
 from mapper.evaluators.metrics.occupancy import OccupancyCheck
-from mapper.evaluators.metrics.trajectory import Matched
+from mapper.evaluators.metrics.trajectory_errors import Matched
 from mapper.export.figures import (
     END,
     ESTIMATE,

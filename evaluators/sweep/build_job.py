@@ -14,7 +14,7 @@ from mapper.core.errors import DataError, MapperError
 from mapper.core.trajectory import Trajectory
 from mapper.evaluators.metrics.odometry import ONE_SECOND, PathErrors, path_errors
 from mapper.evaluators.metrics.segments import lengths_for, segment_errors
-from mapper.evaluators.metrics.trajectory import Matched, align, associate, start_end_offset
+from mapper.evaluators.metrics.trajectory_errors import Matched, align, associate, start_end_offset
 from mapper.evaluators.study.table import Record, Value
 from mapper.pipeline.build import build
 from mapper.run.files import CONFIG, MANIFEST, OCTREE_MAP, SUMMARY, TRAJECTORY, TRUTH

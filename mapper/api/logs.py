@@ -71,8 +71,8 @@ def inspect(
         if log.sensor == "rgbd":
             return None
         from mapper.odometry.scans import scan_observation
+        from mapper.odometry.scans.adapted_lengths import adapted_to
         from mapper.odometry.scans.config import AnyScanOdometryConfig
-        from mapper.odometry.scans.surroundings import adapted_to
 
         odometry = load_config(None, overrides, settings=settings, sensor=log.sensor).odometry
         odometry = adapted_to(odometry, log)

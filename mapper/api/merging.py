@@ -10,8 +10,8 @@ from mapper.merging.differences import Differences, differences_of, write_differ
 from mapper.merging.merge import DEFAULT_TILE_M, Merged
 from mapper.merging.merge import merge as merge_runs
 from mapper.merging.merged_map import MergedMap, open_map
-from mapper.merging.placing import Placing, as_built, by_poses, by_truth
 from mapper.merging.runs_in_map import runs_of
+from mapper.merging.world_poses import Placing, as_built, by_poses, by_truth
 from mapper.run.folder import Run, open_run
 from mapper.run.manifest import is_merged_map
 from mapper.runtime.executor import IN_PROCESS, Workers
@@ -140,7 +140,7 @@ def _placing(
         case "truth":
             return Placing(by_truth(runs))
         case "auto":
-            from mapper.pipeline.join_runs import place_by_shared_places, place_jointly  # loads GTSAM
+            from mapper.pipeline.session_alignment import place_by_shared_places, place_jointly  # loads GTSAM
 
             if not jointly:
                 return place_by_shared_places(runs, workers=workers, progress=progress)

@@ -13,7 +13,7 @@ from mapper.export.mesh_files import write_cloud
 from mapper.export.part_of_run import in_map
 from mapper.octree.attributes import NEVER_SEEN
 from mapper.run.folder import Run
-from mapper.run.georeference import Georeference
+from mapper.run.georeference_record import Georeference
 from mapper.runtime.atomic import write_text
 from mapper.runtime.progress import Progress
 from mapper.sources.cloud_files.las import write_las

@@ -2,7 +2,7 @@
 
 from mapper.core.geodesy import FLATTENING, SEMI_MAJOR_M
 from mapper.run.folder import Run
-from mapper.run.georeference import Georeference
+from mapper.run.georeference_record import Georeference
 from mapper.run.map_folder import MapFolder
 
 _MEAN_RADIUS_M = 6_371_008.8  # of the ellipsoid (IUGG)

@@ -32,8 +32,8 @@ from mapper.export.part_of_run import in_map, placed
 from mapper.mapping.cloud import Colors
 from mapper.mapping.config import edits_of
 from mapper.mapping.edits import MapEditor
-from mapper.octree.blocks import check_memory
 from mapper.octree.map import OctreeMap
+from mapper.octree.sparse_grid import check_memory
 from mapper.run.folder import Run
 from mapper.runtime.extras import extra
 from mapper.runtime.ordered_map import ordered_map

@@ -14,7 +14,7 @@ from mapper.export.grid import write_grid, write_values
 from mapper.navigation.config import CostmapConfig
 from mapper.navigation.distance import plane_distances
 from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, overlap_of, with_obstacles
-from mapper.run.georeference import Georeference
+from mapper.run.georeference_record import Georeference
 from mapper.run.map_folder import MapFolder
 from mapper.runtime.atomic import write_bytes, write_text
 from mapper.runtime.progress import Progress

@@ -12,8 +12,8 @@ from mapper.export.run_mcap import BODY, CAMERA
 from mapper.mapping.config import edits_of
 from mapper.mapping.edits import MapEditor
 from mapper.mapping.fusion import Maps, Snapshot
-from mapper.navigation.floor import reachable_floor
-from mapper.navigation.traversable import TraversableFloor, traversable
+from mapper.navigation.reachable_floor import reachable_floor
+from mapper.navigation.traversable_grid import TraversableFloor, traversable
 from mapper.octree.grid import OccupancyGrid, stored_grid_if_any
 from mapper.run import files
 from mapper.run.cloud import read_cloud

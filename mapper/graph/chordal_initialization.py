@@ -8,9 +8,9 @@ import numpy as np
 
 from mapper.core.errors import GraphError
 from mapper.core.geometry import Array, nearest_rotation
-from mapper.graph.batch import Part, problem_of
 from mapper.graph.config import GraphConfig
-from mapper.graph.terms import between, solver_errors
+from mapper.graph.gtsam_factors import between, solver_errors
+from mapper.graph.least_squares import Part, problem_of
 
 if TYPE_CHECKING:
     import gtsam

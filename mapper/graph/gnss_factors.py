@@ -9,11 +9,8 @@ from numpy.typing import NDArray
 from mapper.core.errors import GraphError
 from mapper.core.geometry import Array, Transform, distances_along, transform
 from mapper.core.rotations import rotation_from_euler
-from mapper.graph.batch import Effort, solve
 from mapper.graph.config import GraphConfig
-from mapper.graph.model import PoseGraph, PositionFactor
-from mapper.graph.robust import ROUND, Graduated, truncate
-from mapper.graph.terms import (
+from mapper.graph.gtsam_factors import (
     LEVEL_SIGMA_RAD,
     Kernel,
     between,
@@ -22,6 +19,9 @@ from mapper.graph.terms import (
     upright,
     values_of,
 )
+from mapper.graph.least_squares import Effort, solve
+from mapper.graph.model import PoseGraph, PositionFactor
+from mapper.graph.robust import ROUND, Graduated, truncate
 
 _MEDIAN_CHI2, _LIMIT_CHI2 = 2.366, 11.345
 """Median and 99 % of χ² with three degrees of freedom."""

@@ -9,8 +9,8 @@ import numpy as np
 from mapper.core.errors import GraphError
 from mapper.core.geometry import Transform, inverse
 from mapper.graph.config import GraphConfig
+from mapper.graph.gtsam_factors import Kernel, anchor, between, poses_of, values_of
 from mapper.graph.model import BetweenFactor, refuse_factor, refuse_node
-from mapper.graph.terms import Kernel, anchor, between, poses_of, values_of
 
 _HUBER = Kernel("huber", GraphConfig().robust_width)
 _LARGEST_RATIO = 1e16

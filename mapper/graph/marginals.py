@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.geometry import Array, adjoint, inverse
-from mapper.graph.batch import problem_of
 from mapper.graph.components import components_with_factors
+from mapper.graph.gtsam_factors import anchor, between, position, solver_errors, values_of
+from mapper.graph.least_squares import problem_of
 from mapper.graph.model import PoseGraph, PoseSigmas
-from mapper.graph.terms import anchor, between, position, solver_errors, values_of
 
 if TYPE_CHECKING:
     import gtsam

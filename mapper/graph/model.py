@@ -148,8 +148,8 @@ class PoseGraph:
         Every factor is a ``BetweenFactorPose3`` with Gaussian noise; its tangent is ordered (rotation,
         translation), as here.
         """
-        from mapper.graph.batch import problem_of
-        from mapper.graph.terms import anchor, between, values_of
+        from mapper.graph.gtsam_factors import anchor, between, values_of
+        from mapper.graph.least_squares import problem_of
 
         first = next(iter((*self.fixed, *self.T_world_node)), None)
         priors = [] if first is None else [anchor(first, self.T_world_node[first])]

@@ -8,14 +8,14 @@ import numpy as np
 
 from mapper.core.errors import GraphError
 from mapper.core.geometry import is_rigid
-from mapper.graph.batch import Part, PartSolution
 from mapper.graph.chordal_initialization import start_of
 from mapper.graph.components import components_with_factors
 from mapper.graph.config import GraphConfig
+from mapper.graph.gtsam_factors import between, gauge, poses_of, values_of
+from mapper.graph.least_squares import Part, PartSolution
 from mapper.graph.model import PoseGraph, Solution
 from mapper.graph.proportional_correction import distribute
 from mapper.graph.robust import solve_part
-from mapper.graph.terms import between, gauge, poses_of, values_of
 from mapper.runtime.progress import SILENT, Progress
 
 if TYPE_CHECKING:

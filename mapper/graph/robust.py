@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 
 from mapper.core.clusters import cluster_numbers
 from mapper.core.geometry import Array
-from mapper.graph.batch import Effort, Part, PartSolution, solve
 from mapper.graph.config import GraphConfig
 from mapper.graph.drift import MOST_TRIED, innovations
+from mapper.graph.gtsam_factors import Kernel, between
+from mapper.graph.least_squares import Effort, Part, PartSolution, solve
+from mapper.graph.measurement_covariance import MEDIAN_CHI2
 from mapper.graph.model import BetweenFactor
-from mapper.graph.terms import Kernel, between
-from mapper.graph.uncertainty import MEDIAN_CHI2
 from mapper.runtime.progress import Report
 
 if TYPE_CHECKING:

@@ -12,8 +12,8 @@ from mapper.core.trajectory import Trajectory
 from mapper.core.units import OTHER_UNIT
 from mapper.graph.components import component_numbers
 from mapper.graph.config import WheelFactorsConfig, WheelNoiseConfig
+from mapper.graph.measurement_covariance import Comparison, compare
 from mapper.graph.model import BetweenFactor, Origin, PoseGraph, PoseSigmas
-from mapper.graph.uncertainty import Comparison, compare
 from mapper.sensing.wheel_kinematics import Odometer, pose_at
 
 

@@ -16,9 +16,9 @@ from mapper.core.timebase import NS_PER_S, Stamps, seconds_text_from_ns
 from mapper.core.trajectory import Trajectory, trajectory_from
 from mapper.line_laser.config import LineLaserCalibration, LineLaserConfig, LineLaserMapConfig
 from mapper.line_laser.ranging import LineScan, scan_image
-from mapper.octree.blocks import log_odds
 from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from mapper.octree.slice import SEEN_FREE, SEEN_OCCUPIED
+from mapper.octree.sparse_grid import log_odds
 from mapper.runtime.ordered_map import ordered_map
 from mapper.runtime.progress import SILENT, Progress
 from mapper.sensing.wheel_kinematics import pose_at

@@ -7,7 +7,7 @@ import numpy as np
 from mapper.core.geometry import inverse
 from mapper.loops.closure import LoopClosure, discrepancy, exceeds
 from mapper.loops.config import GateConfig
-from mapper.loops.odometry_chain import NodePath, OdometryChain, allowed
+from mapper.loops.odometry_drift import NodePath, OdometryChain, allowed
 from mapper.loops.online_pose_estimator import OnlinePoseEstimator
 
 

@@ -18,10 +18,10 @@ from mapper.loops.closure import MIN_CONFLICTS, Discrepancy, LoopClosure, discre
 from mapper.loops.config import KeyframeLoopsConfig
 from mapper.loops.consistency_check import ConsistencyCheck
 from mapper.loops.drift_gate import DriftGate
-from mapper.loops.odometry_chain import OdometryChain
+from mapper.loops.nearby_proposer import PoseProposer
+from mapper.loops.odometry_drift import OdometryChain
 from mapper.loops.online_pose_estimator import OnlinePoseEstimator
 from mapper.loops.place_file import AnyPlace
-from mapper.loops.proposers import PoseProposer
 from mapper.odometry.base import FrameResult
 from mapper.runtime.archived import Archived, ArchivedMapping, archived
 

@@ -5,11 +5,11 @@ from statistics import median
 import numpy as np
 
 from mapper.core.geometry import inverse
-from mapper.graph.uncertainty import Comparison, compare
+from mapper.graph.measurement_covariance import Comparison, compare
 from mapper.loops.closure import LoopClosure
 from mapper.loops.config import GateConfig
 from mapper.loops.consistency_check import ConsistencyCheck
-from mapper.loops.odometry_chain import OdometryChain, allowed
+from mapper.loops.odometry_drift import OdometryChain, allowed
 from mapper.loops.online_pose_estimator import OnlinePoseEstimator
 
 

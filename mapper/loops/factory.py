@@ -21,7 +21,7 @@ from mapper.loops.config import (
     ThesisLoopsConfig,
 )
 from mapper.loops.detector import KeyframeLoopDetector, LoopDetector, NoLoopDetector
-from mapper.loops.odometry_chain import OdometryChain
+from mapper.loops.odometry_drift import OdometryChain
 from mapper.loops.online_pose_estimator import Correction, build_pose_estimator
 from mapper.loops.place_file import AnyPlace
 

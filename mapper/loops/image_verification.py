@@ -17,14 +17,14 @@ from mapper.core.geometry import Array, Points, Transform, adjoint, apply, inver
 from mapper.features.frame_view import FrameView, ImageView
 from mapper.features.hamming import match_mutual_bits
 from mapper.features.matching import Pairs, homography_inliers, match_mutual
-from mapper.graph.uncertainty import MODEL_SHARE, inflated, with_model_error
+from mapper.graph.measurement_covariance import MODEL_SHARE, inflated, with_model_error
 from mapper.loops.base import Verification
 from mapper.loops.config import ImageVerificationConfig
 from mapper.registration.base import Alignment
 from mapper.registration.degeneracy import degeneracy_of
 from mapper.registration.image_agreement import ImageAgreement, image_agreement
 from mapper.registration.isvd import Isvd
-from mapper.registration.refining import refine
+from mapper.registration.pair_refinement import refine
 from mapper.registration.reprojection import (
     disparity_sigmas_px,
     image_measurements,

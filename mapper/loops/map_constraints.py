@@ -16,9 +16,9 @@ from mapper.loops.config import PlaceLoopsConfig, ScanLoopsConfig
 from mapper.loops.consistency_check import ConsistencyCheck
 from mapper.loops.detector import UNCONFIRMED, LoopDetector, ViewOf
 from mapper.loops.factory import build_similarity_proposer, build_verifier
-from mapper.loops.odometry_chain import OdometryChain
+from mapper.loops.nearby_proposer import NodePoses, PoseProposer
+from mapper.loops.odometry_drift import OdometryChain
 from mapper.loops.online_pose_estimator import IncrementalPoseEstimator, OnlinePoseEstimator
-from mapper.loops.proposers import NodePoses, PoseProposer
 from mapper.loops.scan_context_proposer import MAX_SIMILAR
 from mapper.odometry.base import FrameResult
 

@@ -9,7 +9,7 @@ from mapper.graph.incremental import IncrementalSolver
 from mapper.graph.model import PoseGraph
 from mapper.graph.proportional_correction import spread
 from mapper.loops.closure import Discrepancy, LoopClosure, discrepancy, exceeds
-from mapper.loops.proposers import NodePoses
+from mapper.loops.nearby_proposer import NodePoses
 from mapper.odometry.base import FrameResult
 
 Correction = Literal["batch", "proportional", "none"]

@@ -11,9 +11,9 @@ from mapper.core.frames import Points32
 from mapper.core.geometry import Transform, apply
 from mapper.loops.base import Proposal, Proposer
 from mapper.loops.config import ScanLoopsConfig
-from mapper.loops.odometry_chain import OdometryChain
+from mapper.loops.nearby_proposer import CombinedProposer, NodePoses, PoseProposer
+from mapper.loops.odometry_drift import OdometryChain
 from mapper.loops.online_pose_estimator import OnlinePoseEstimator
-from mapper.loops.proposers import CombinedProposer, NodePoses, PoseProposer
 from mapper.places.config import ScanContextConfig
 from mapper.places.scan_context import ScanContext, ScanContexts, scan_context
 from mapper.runtime.archived import Archivable

@@ -9,7 +9,7 @@ import numpy as np
 from mapper.core.errors import ConfigError
 from mapper.core.geometry import Array, Transform, apply, inverse, transform
 from mapper.features.frame_view import FrameView, ScanView
-from mapper.graph.uncertainty import inflated
+from mapper.graph.measurement_covariance import inflated
 from mapper.loops.base import Verification
 from mapper.loops.closure import Discrepancy, discrepancy, exceeds
 from mapper.loops.config import ScanVerificationConfig
@@ -22,7 +22,7 @@ from mapper.registration.hough.description import centres_of
 from mapper.registration.hough.ground import find_ground, find_obstacles, level
 from mapper.registration.hough.ground_kernels import thin
 from mapper.registration.hough.voting import vote
-from mapper.registration.refining import refine
+from mapper.registration.pair_refinement import refine
 from mapper.registration.surfaces import Prepared, prepared
 
 DIRECTION_RAD = 0.035

@@ -12,8 +12,8 @@ from mapper.loops.base import Verifier, verify_proposal
 from mapper.loops.closure import LoopClosure
 from mapper.loops.config import ThesisLoopsConfig
 from mapper.loops.detector import LoopDetector, ViewOf
+from mapper.loops.nearby_proposer import PoseProposer
 from mapper.loops.online_pose_estimator import OnlinePoseEstimator
-from mapper.loops.proposers import PoseProposer
 from mapper.odometry.base import FrameResult
 from mapper.odometry.sharpest_keyframe import SharpestKeyframes
 from mapper.runtime.archived import Archived, ArchivedMapping, archived

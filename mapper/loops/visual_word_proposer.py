@@ -5,8 +5,8 @@ from functools import lru_cache
 from mapper.features.frame_view import ImageView
 from mapper.loops.base import Proposal, Proposer
 from mapper.loops.config import PlaceLoopsConfig
+from mapper.loops.nearby_proposer import CombinedProposer, NodePoses, PoseProposer
 from mapper.loops.online_pose_estimator import OnlinePoseEstimator
-from mapper.loops.proposers import CombinedProposer, NodePoses, PoseProposer
 from mapper.places.config import PlacesConfig
 from mapper.places.index import PlaceIndex
 from mapper.places.vocabulary import WordVector, load_vocabulary

@@ -12,7 +12,7 @@ from mapper.core.errors import DataError
 from mapper.core.frames import Cloud
 from mapper.core.geometry import stride_for
 from mapper.core.voxel_index import HALF_SPAN, cell_key, cell_of, claim_row, voxel_index
-from mapper.octree.blocks import GROWTH
+from mapper.octree.sparse_grid import GROWTH
 
 Real = TypeVar("Real", bound="np.floating[Any]")
 

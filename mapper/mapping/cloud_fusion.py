@@ -11,8 +11,8 @@ from mapper.mapping.cloud import CloudBuilder, height_colors
 from mapper.mapping.colouring import ScanColouring
 from mapper.mapping.config import FuseSettings
 from mapper.mapping.placed_frames import PlacedFrame, placed_frames, within_reach
-from mapper.octree.casting import depth_limit_of
 from mapper.octree.moving_objects import MovingObjects
+from mapper.octree.ray_casting import depth_limit_of
 from mapper.runtime.ordered_map import ordered_map
 from mapper.runtime.progress import Progress
 from mapper.sources.base import Log

@@ -10,9 +10,7 @@ from mapper.core.errors import DataError
 from mapper.core.frames import Points32
 from mapper.core.geometry import Array, Points, Transform, apply
 from mapper.mapping.config import AppliedEdit, Edits, Region
-from mapper.navigation.traversable import Storey, TraversableFloor, trim
-from mapper.octree.blocks import BLOCKS_AT_ONCE
-from mapper.octree.columns import NOWHERE, Columns, DrivenGround, nearest_heights
+from mapper.navigation.traversable_grid import Storey, TraversableFloor, trim
 from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from mapper.octree.keys import (
     BLOCK_EDGE,
@@ -24,6 +22,8 @@ from mapper.octree.keys import (
     gather,
 )
 from mapper.octree.map import OctreeMap
+from mapper.octree.occupied_columns import NOWHERE, Columns, DrivenGround, nearest_heights
+from mapper.octree.sparse_grid import BLOCKS_AT_ONCE
 
 Mask = NDArray[np.bool_]
 

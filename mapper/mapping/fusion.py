@@ -16,13 +16,13 @@ from mapper.mapping.config import AppliedEdit, Edits, FuseSettings, McapConfig
 from mapper.mapping.edits import MapEditor
 from mapper.mapping.placed_frames import PlacedFrame, placed_frames, within_reach
 from mapper.mapping.thumbnails import encode_jpeg, shrunk_camera
-from mapper.navigation.floor import driven_ground, reachable_floor
-from mapper.navigation.traversable import traversable
-from mapper.octree.casting import Caster, reach_m
+from mapper.navigation.reachable_floor import driven_ground, reachable_floor
+from mapper.navigation.traversable_grid import traversable
 from mapper.octree.config import OctreeConfig
 from mapper.octree.grid import OccupancyGrid
 from mapper.octree.map import OctreeMap
 from mapper.octree.moving_objects import MovingObjects, remove_moving_objects
+from mapper.octree.ray_casting import Caster, reach_m
 from mapper.octree.scan_updates import (
     CachedUpdate,
     ScanUpdate,

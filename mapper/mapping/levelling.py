@@ -12,8 +12,8 @@ from mapper.core.geometry import Array, Points, Transform, exp, stride_for, tran
 from mapper.core.timebase import nearest
 from mapper.core.trajectory import Trajectory
 from mapper.mapping.config import LevelConfig
-from mapper.mapping.floor import floor_below, floor_of, heights_of
-from mapper.mapping.heading import WallHeading, wall_heading
+from mapper.mapping.floor_height import floor_below, floor_of, heights_of
+from mapper.mapping.wall_direction import WallHeading, wall_heading
 from mapper.registration.planes import (
     MAX_TILT_RAD,
     MIN_PATCHES,

@@ -9,8 +9,8 @@ from mapper.core.deskew import deskewed
 from mapper.core.frames import Frame, Scan
 from mapper.core.geometry import Transform
 from mapper.core.trajectory import Trajectory
-from mapper.octree.casting import reach_m
 from mapper.octree.config import OctreeConfig
+from mapper.octree.ray_casting import reach_m
 from mapper.sensing.gyroscope import Gyroscope
 from mapper.sensing.sweep_motion import motion_during
 from mapper.sources.base import FrameRef, Log

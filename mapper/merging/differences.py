@@ -18,9 +18,9 @@ from mapper.core.geometry import Array, Points, Transform, apply, inverse
 from mapper.export.figures import APPEARED, NOT_SEEN_AGAIN, VANISHED, Rgb
 from mapper.export.mesh_files import write_ply
 from mapper.export.picture import write_layers
-from mapper.merging.placing import Placed
-from mapper.octree.blocks import log_odds
+from mapper.merging.world_poses import Placed
 from mapper.octree.map import OctreeMap
+from mapper.octree.sparse_grid import log_odds
 from mapper.run.folder import Run
 from mapper.runtime.atomic import MANIFEST_NAME, FolderKind, atomic_folder, write_json
 

@@ -24,12 +24,11 @@ from mapper.mapping.config import edits_of
 from mapper.mapping.fusion import fuse_octree
 from mapper.merging.merged_map import TILES, Tiling
 from mapper.octree.attributes import UNSET
-from mapper.octree.blocks import Overlap
 from mapper.octree.color_tree import COLOR_NODE, color_nodes, parent_color
-from mapper.octree.columns import block_extent, lowest_occupied, occupied_voxels
 from mapper.octree.config import OctreeConfig
 from mapper.octree.map import OctreeMap, read_octree
 from mapper.octree.map_file import write_map
+from mapper.octree.occupied_columns import block_extent, lowest_occupied, occupied_voxels
 from mapper.octree.octomap_file import LEAF_ROOT, write_tree
 from mapper.octree.octomap_tree import (
     NODE,
@@ -44,6 +43,7 @@ from mapper.octree.octomap_tree import (
 from mapper.octree.resampling import blocks_reached, resample
 from mapper.octree.scan_updates import ScanUpdateWriter, open_scan_updates
 from mapper.octree.slice import Band
+from mapper.octree.sparse_grid import Overlap
 from mapper.run.folder import open_run
 from mapper.runtime.atomic import atomic_file, write_bytes
 from mapper.runtime.progress import SILENT

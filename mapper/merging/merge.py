@@ -35,7 +35,6 @@ from mapper.merging.merged_map import (
     open_map,
     tiling_for,
 )
-from mapper.merging.placing import Placed, Placing, warnings_about
 from mapper.merging.runs_in_map import (
     KnownTile,
     KnownTiles,
@@ -49,6 +48,7 @@ from mapper.merging.runs_in_map import (
     write_poses,
 )
 from mapper.merging.slicing import Sliced, slice_map
+from mapper.merging.world_poses import Placed, Placing, warnings_about
 from mapper.octree.config import OctreeConfig
 from mapper.octree.grid import OccupancyGrid
 from mapper.run import files

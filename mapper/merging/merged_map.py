@@ -21,7 +21,7 @@ from mapper.core.trajectory import Trajectory
 from mapper.graph.g2o import read_g2o
 from mapper.graph.model import PoseGraph
 from mapper.mapping.config import Region
-from mapper.merging.joint_graph import Tie
+from mapper.merging.multi_session_graph import Tie
 from mapper.navigation.config import CostmapConfig, TraversableConfig
 from mapper.octree.config import OctreeConfig, SliceConfig
 from mapper.octree.grid import OccupancyGrid, stored_grid, stored_grid_if_any

@@ -16,9 +16,9 @@ from mapper.loops.closure import write_closures
 from mapper.mapping.config import edits_of
 from mapper.merging.jobs import FusedRun, SplitRun, Workspace, fuse_run, stays_within_m
 from mapper.merging.merged_map import FUSED, RUNS, MapManifest, MergedMap, RunInMap, Tile, Tiling
-from mapper.merging.placing import InMap, Placed, Placing, farthest_m
-from mapper.octree.blocks import Overlap
+from mapper.merging.world_poses import InMap, Placed, Placing, farthest_m
 from mapper.octree.config import OctreeConfig
+from mapper.octree.sparse_grid import Overlap
 from mapper.run import files
 from mapper.run.doubtful_frames import without_doubtful
 from mapper.run.folder import Run, open_run

@@ -26,11 +26,13 @@ from mapper.merging.jobs import (
     slice_column,
 )
 from mapper.merging.merged_map import MapManifest, MergedMap
-from mapper.merging.placing import Placed
+from mapper.merging.world_poses import Placed
 from mapper.navigation.config import TraversableConfig
-from mapper.navigation.floor import Floor, driven_ground, floor_of, margin_for
-from mapper.navigation.traversable import TraversableFloor, traversable
-from mapper.octree.columns import (
+from mapper.navigation.reachable_floor import Floor, driven_ground, floor_of, margin_for
+from mapper.navigation.traversable_grid import TraversableFloor, traversable
+from mapper.octree.grid import OccupancyGrid, overlap_of, with_obstacles
+from mapper.octree.map import read_octree
+from mapper.octree.occupied_columns import (
     NOTHING,
     DrivenGround,
     block_extent,
@@ -41,8 +43,6 @@ from mapper.octree.columns import (
     occupied_voxels,
     snap_to_floor,
 )
-from mapper.octree.grid import OccupancyGrid, overlap_of, with_obstacles
-from mapper.octree.map import read_octree
 from mapper.octree.slice import Band
 from mapper.run.folder import Run
 from mapper.runtime.resumable_jobs import Stages

@@ -7,7 +7,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from mapper.navigation.config import TraversableConfig
-from mapper.octree.columns import NOWHERE
+from mapper.octree.occupied_columns import NOWHERE
 
 ALLOWANCE = 1e-6  # of a voxel: 0.1 m is two voxels of 5 cm, whatever the rounding of the division
 OFF_PLANE = 0.75

@@ -14,10 +14,10 @@ from mapper.navigation.config import PlanConfig
 from mapper.navigation.distance import DistanceField, VoxelGrid, dense_voxels, distance_field, layer
 from mapper.navigation.floor_kernels import ALLOWANCE
 from mapper.navigation.path_search import Cell, clearance_of, in_sight, shorten, shortest_path
-from mapper.navigation.traversable import Storey, TraversableFloor
-from mapper.octree.columns import NOWHERE, nearest_heights
+from mapper.navigation.traversable_grid import Storey, TraversableFloor
 from mapper.octree.grid import OCCUPIED, UNKNOWN, OccupancyGrid
 from mapper.octree.map import OctreeMap
+from mapper.octree.occupied_columns import NOWHERE, nearest_heights
 
 _BYTES_PER_VOXEL = 30  # a distance field's 14, the mask of free voxels, and the search's costs and steps
 
@@ -267,7 +267,7 @@ def plan_storeys(
     with floor there.
 
     Args:
-        floor: Floor from :func:`mapper.navigation.traversable.traversable`, with links.
+        floor: Floor from :func:`mapper.navigation.traversable_grid.traversable`, with links.
         start_world: (2,) or (3,) metres.
         goal_world: (2,) or (3,) metres.
         config: Radius, and whether unknown cells are blocked.

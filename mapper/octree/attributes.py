@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 
 from mapper.core.frames import Points32
 from mapper.core.geometry import Array, Points, Transform
-from mapper.octree.blocks import FIRST_BLOCKS, GROWTH, BlockStore, check_memory, find_slots, slot_of
-from mapper.octree.casting_kernels import OCCUPIED
 from mapper.octree.config import OctreeConfig
 from mapper.octree.keys import (
     BLOCK_BITS,
@@ -28,6 +26,8 @@ from mapper.octree.keys import (
     key_of,
     morton,
 )
+from mapper.octree.ray_casting_kernels import OCCUPIED
+from mapper.octree.sparse_grid import FIRST_BLOCKS, GROWTH, BlockStore, check_memory, find_slots, slot_of
 
 NEVER_SEEN = int(np.iinfo(np.int64).min)
 """``last_seen_ns`` of a voxel where no stamped ray has ended."""

@@ -6,9 +6,9 @@ from numpy import int64, uint8
 from numpy.typing import NDArray
 
 from mapper.octree.attributes import UNSET, AttributeLayer
-from mapper.octree.blocks import BlockStore
 from mapper.octree.keys import BLOCK_BITS, BLOCK_VOXELS, KEY_BITS
 from mapper.octree.octomap_tree import enter_next_child
+from mapper.octree.sparse_grid import BlockStore
 
 COLOR_NODE = np.dtype([("value", "<f4"), ("rgb", "u1", 3), ("mask", "u1")])
 """A node as a ColorOcTree's ``.ot`` file lists it: log-odds, RGB, and a bit for each child that exists."""

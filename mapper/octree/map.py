@@ -9,15 +9,15 @@ from pydantic import ValidationError
 from mapper.core.errors import DataError, MapFileError, MapSizeError
 from mapper.core.frames import Points32, Scan
 from mapper.core.geometry import Array, Transform, apply
-from mapper.octree import casting_kernels, map_file, octomap_file
+from mapper.octree import map_file, octomap_file, ray_casting_kernels
 from mapper.octree.attributes import NEVER_SEEN, UNSET, AttributeLayer, ended_blocks
-from mapper.octree.blocks import BlockStore, Overlap, SensorModel, add_blocks, check_memory, sensor_model
-from mapper.octree.casting import Caster, depth_limit_of
 from mapper.octree.config import OctreeConfig, Parent
 from mapper.octree.keys import KEY_BITS, codes_of
 from mapper.octree.octomap_file import TreeLeaves, fill
 from mapper.octree.queries import MapView
+from mapper.octree.ray_casting import Caster, depth_limit_of
 from mapper.octree.scan_updates import ScanUpdate
+from mapper.octree.sparse_grid import BlockStore, Overlap, SensorModel, add_blocks, check_memory, sensor_model
 from mapper.runtime.regular_files import AnyPath, read_regular
 
 
@@ -97,7 +97,9 @@ class OctreeMap(MapView):
         except MapSizeError:
             self._caster.reset()
             raise
-        casting_kernels.merge(cast.window.cells, cast.positions, slots, self.blocks.table.values, self.sensor)
+        ray_casting_kernels.merge(
+            cast.window.cells, cast.positions, slots, self.blocks.table.values, self.sensor
+        )
         if self.attributes is not None:
             if (limit := depth_limit_of(self.config)) is not None:
                 scan, _ = limit.split(scan)
@@ -132,7 +134,7 @@ class OctreeMap(MapView):
         """
         slots = self.blocks.claim(update.codes)
         positions = np.arange(len(update))
-        casting_kernels.merge(update.cells(), positions, slots, self.blocks.table.values, self.sensor)
+        ray_casting_kernels.merge(update.cells(), positions, slots, self.blocks.table.values, self.sensor)
 
     def add(self, other: "OctreeMap", *, slots: NDArray[np.int64] | None = None) -> Overlap:
         """Add the log-odds of an independent map voxel by voxel: Bayes' rule with a prior of 0.5.

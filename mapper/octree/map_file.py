@@ -22,9 +22,9 @@ from pydantic import ValidationError
 from mapper.core.config import drop_unknown
 from mapper.core.errors import MapFileError
 from mapper.octree.attributes import AttributeLayer
-from mapper.octree.blocks import BLOCK_BYTES, BLOCKS_AT_ONCE, BlockStore, check_memory, find_slots
 from mapper.octree.config import OctreeConfig
 from mapper.octree.keys import BLOCK_VOXELS, PACKED_BYTES
+from mapper.octree.sparse_grid import BLOCK_BYTES, BLOCKS_AT_ONCE, BlockStore, check_memory, find_slots
 from mapper.runtime.atomic import writing
 from mapper.runtime.checked_file import CheckedFormat
 

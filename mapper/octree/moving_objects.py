@@ -54,8 +54,6 @@ from mapper.octree.bit_planes import (
     neighbours_of,
     words_of,
 )
-from mapper.octree.blocks import BlockStore, find_slots
-from mapper.octree.casting import depth_limit_of
 from mapper.octree.config import OctreeConfig
 from mapper.octree.keys import (
     BLOCK_BITS,
@@ -68,7 +66,9 @@ from mapper.octree.keys import (
     keys_of,
 )
 from mapper.octree.map import OctreeMap
+from mapper.octree.ray_casting import depth_limit_of
 from mapper.octree.scan_updates import ScanUpdate
+from mapper.octree.sparse_grid import BlockStore, find_slots
 from mapper.sensing.config import DepthNoiseConfig
 from mapper.sensing.depth import depth_sigma_m
 

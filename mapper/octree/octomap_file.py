@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from mapper.core.errors import MapFileError
 from mapper.octree.attributes import UNSET
-from mapper.octree.blocks import BLOCK_BYTES, BlockStore, SensorModel, check_memory
 from mapper.octree.color_tree import COLOR_NODE, color_nodes
 from mapper.octree.keys import BLOCK_BITS, BLOCK_DEPTH, BLOCK_VOXELS, KEY_BITS
 from mapper.octree.octomap_tree import (
@@ -23,6 +22,7 @@ from mapper.octree.octomap_tree import (
     preorder_of,
     words_in_preorder,
 )
+from mapper.octree.sparse_grid import BLOCK_BYTES, BlockStore, SensorModel, check_memory
 from mapper.runtime import atomic
 
 if TYPE_CHECKING:

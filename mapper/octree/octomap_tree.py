@@ -14,8 +14,8 @@ from numba import njit
 from numpy import float32, int64, uint8, uint16
 from numpy.typing import NDArray
 
-from mapper.octree.blocks import BLOCKS_AT_ONCE, BlockStore
 from mapper.octree.keys import BLOCK_DEPTH, BLOCK_EDGE, BLOCK_VOXELS
+from mapper.octree.sparse_grid import BLOCKS_AT_ONCE, BlockStore
 
 NODE = np.dtype([("value", "<f4"), ("mask", "u1")])
 """A node as in an ``.ot`` file: log-odds, and a bit for each child that exists."""

@@ -10,11 +10,11 @@ from mapper.core.errors import DataError, expect_shape
 from mapper.core.frames import Points32
 from mapper.core.geometry import Array, Points, point_rows
 from mapper.octree import query_kernels as kernels
-from mapper.octree.blocks import BLOCKS_AT_ONCE, BlockStore, count_known, log_odds
-from mapper.octree.casting import origin_key
 from mapper.octree.config import OctreeConfig, Parent
 from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from mapper.octree.keys import BLOCK_BITS, BLOCK_DEPTH, KEY_BITS, KEY_ZERO, codes_of, keys_of
+from mapper.octree.ray_casting import origin_key
+from mapper.octree.sparse_grid import BLOCKS_AT_ONCE, BlockStore, count_known, log_odds
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -8,8 +8,6 @@ from numpy import float32, float64, int16, int64
 from numpy.typing import NDArray
 
 from mapper.core.voxel_index import VACANT
-from mapper.octree.blocks import slot_of
-from mapper.octree.casting_kernels import CHUNK, NEVER
 from mapper.octree.keys import (
     BLOCK_BITS,
     BLOCK_EDGE,
@@ -23,6 +21,8 @@ from mapper.octree.keys import (
     keys_of,
     morton,
 )
+from mapper.octree.ray_casting_kernels import CHUNK, NEVER
+from mapper.octree.sparse_grid import slot_of
 
 _OFFSETS: NDArray[np.int64] = keys_of(np.arange(BLOCK_VOXELS))
 """(512, 3) keys of a block's voxels relative to its first, in Morton order."""

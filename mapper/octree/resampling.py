@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from mapper.core.errors import MapSizeError
 from mapper.core.geometry import Transform
 from mapper.octree.attributes import AttributeLayer, LayerArrays
-from mapper.octree.blocks import slot_of
 from mapper.octree.config import OctreeConfig
 from mapper.octree.keys import (
     BLOCK_BITS,
@@ -30,6 +29,7 @@ from mapper.octree.keys import (
     morton,
 )
 from mapper.octree.map import OctreeMap
+from mapper.octree.sparse_grid import slot_of
 
 
 def blocks_reached(octree: OctreeMap, T_map_world: Transform) -> NDArray[np.int64]:

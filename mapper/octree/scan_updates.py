@@ -23,10 +23,10 @@ from numpy.typing import NDArray
 from mapper.core.errors import DataError, MapFileError
 from mapper.core.geometry import Array, Transform, angle_between
 from mapper.core.units import MIB
-from mapper.octree.casting import Cast, depth_limit_of
-from mapper.octree.casting_kernels import FREE, OCCUPIED, UNTOUCHED
 from mapper.octree.config import OctreeConfig
 from mapper.octree.keys import BLOCK_VOXELS, PACKED_BYTES
+from mapper.octree.ray_casting import Cast, depth_limit_of
+from mapper.octree.ray_casting_kernels import FREE, OCCUPIED, UNTOUCHED
 from mapper.runtime.atomic import writing
 from mapper.runtime.ordered_map import ordered_map
 

@@ -9,10 +9,16 @@ from numpy.typing import NDArray
 
 from mapper.core.errors import DataError
 from mapper.core.geometry import Array
-from mapper.octree.columns import DrivenGround, block_extent, ground_heights, known_floor, nearest_heights
 from mapper.octree.config import SliceConfig
 from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from mapper.octree.keys import BLOCK_EDGE, KEY_ZERO, block_keys
+from mapper.octree.occupied_columns import (
+    DrivenGround,
+    block_extent,
+    ground_heights,
+    known_floor,
+    nearest_heights,
+)
 
 if TYPE_CHECKING:
     from mapper.octree.queries import MapView

@@ -40,7 +40,7 @@ def odometry_for(
         DataError: The file of known poses is malformed.
     """
     from mapper.odometry.given_poses import poses_for
-    from mapper.odometry.scans.surroundings import adapted_to
+    from mapper.odometry.scans.adapted_lengths import adapted_to
 
     if isinstance(config, IsvdOdometryConfig | LocalMapConfig | PnpConfig) and config.depth_noise is None:
         config = config.model_copy(update={"depth_noise": log.depth_noise})
@@ -110,7 +110,7 @@ def build_frame_odometry(
 
             return IsvdOdometry(config, motion_check=motion_check, gyroscope=gyroscope)
         case LocalMapConfig():
-            from mapper.odometry.keyframes.motion_tracker import MotionPoseTracker
+            from mapper.odometry.keyframes.motion_model_tracker import MotionPoseTracker
             from mapper.odometry.keyframes.odometry import KeyframeOdometry
 
             return KeyframeOdometry(config, partial(MotionPoseTracker, config), motion_check, gyroscope)
@@ -131,15 +131,15 @@ def _build_matcher(config: AnyScanOdometryConfig) -> "ScanMatcher":
     """Return the scan matcher that the settings choose, before its first scan."""
     match config:
         case GicpOdometryConfig():
-            from mapper.odometry.scans.gicp import GicpMatcher
+            from mapper.odometry.scans.gicp_matcher import GicpMatcher
 
             return GicpMatcher(config)
         case IcpOdometryConfig():
-            from mapper.odometry.scans.icp import IcpMatcher
+            from mapper.odometry.scans.icp_matcher import IcpMatcher
 
             return IcpMatcher(config)
         case KissOdometryConfig():
-            from mapper.odometry.scans.kiss_icp import KissMatcher
+            from mapper.odometry.scans.kiss_icp_matcher import KissMatcher
 
             return KissMatcher(config)
         case HoughOdometryConfig():

@@ -12,12 +12,12 @@ from mapper.loops.config import KeyframeLoopsConfig
 from mapper.loops.factory import build_keyframe_loop_detector
 from mapper.odometry.base import FrameResult
 from mapper.odometry.gyroscope_calibration import with_body_rates
-from mapper.odometry.node_offset import NodeOffset
-from mapper.pipeline.adjusted_planes import adjust_stored
-from mapper.pipeline.components import component_of
+from mapper.odometry.renumbered_nodes import NodeOffset
+from mapper.pipeline.component_loops import joined
+from mapper.pipeline.disconnected_components import component_of
 from mapper.pipeline.fuse import carry_times, fuse_into
 from mapper.pipeline.inertial_bridging import bridge
-from mapper.pipeline.joined_components import joined
+from mapper.pipeline.lidar_adjustment import adjust_stored
 from mapper.pipeline.reobserve import reobserve
 from mapper.pipeline.solve import solve
 from mapper.pipeline.track import Start, noted_log_warnings, session_odometry, track_log
@@ -31,8 +31,8 @@ from mapper.run.verdict import INPUT_KINDS
 from mapper.run.writer import appended_log, write_run
 from mapper.runtime.progress import SILENT, Progress
 from mapper.sources.base import Log
-from mapper.sources.chained import chained
 from mapper.sources.config import SourceConfig
+from mapper.sources.multi_session_log import chained
 
 _FIXED_BY_FIRST_SESSION = ("odometry", "level")
 

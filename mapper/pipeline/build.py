@@ -15,10 +15,9 @@ from mapper.core.frames import Scan
 from mapper.core.timebase import check_stamps
 from mapper.core.trajectory import Trajectory
 from mapper.mapping.levelling import Level, axes_of, find_level, level_in_plane
-from mapper.navigation.floor import MAX_SENSOR_HEIGHT_M
+from mapper.navigation.reachable_floor import MAX_SENSOR_HEIGHT_M
 from mapper.odometry.base import Odometry
 from mapper.odometry.gyroscope_calibration import with_body_rates
-from mapper.pipeline.adjusted_planes import adjust_tracking
 from mapper.pipeline.checkpoint_identity import identity_of, kept_from_before
 from mapper.pipeline.checkpoints import (
     EVERY_S,
@@ -27,10 +26,11 @@ from mapper.pipeline.checkpoints import (
     open_checkpoints,
     remove_checkpoints,
 )
-from mapper.pipeline.components import largest_component
+from mapper.pipeline.component_loops import joined
+from mapper.pipeline.disconnected_components import largest_component
 from mapper.pipeline.georeference import Georeferenced, georeference
 from mapper.pipeline.inertial_bridging import bridge, check_accelerations
-from mapper.pipeline.joined_components import joined
+from mapper.pipeline.lidar_adjustment import adjust_tracking
 from mapper.pipeline.solve import solve
 from mapper.pipeline.track import first_session, noted_log_warnings, track_log
 from mapper.pipeline.tracking_checkpoints import TrackingCheckpoints

@@ -17,8 +17,8 @@ from mapper.loops.factory import build_verifier, keyframe_loops
 from mapper.loops.image_verification import verify_aligned
 from mapper.loops.scan_verification import ScanVerifier
 from mapper.mapping.config import EditKind, Region
-from mapper.pipeline.adjusted_planes import adjust_stored
 from mapper.pipeline.fuse import fuse_changed
+from mapper.pipeline.lidar_adjustment import adjust_stored
 from mapper.pipeline.reobserve import reobserve
 from mapper.pipeline.solve import solve
 from mapper.run.edits_file import EditsFile, edits_text, with_region, without_last

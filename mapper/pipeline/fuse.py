@@ -20,8 +20,8 @@ from mapper.export.mesh_files import write_cloud
 from mapper.export.picture import write_summary
 from mapper.export.run_mcap import log_maps, log_results, log_snapshot
 from mapper.mapping.config import Edits
+from mapper.mapping.depth_noise_estimation import measure_noise
 from mapper.mapping.fusion import Maps, fuse_log
-from mapper.mapping.measured_noise import measure_noise
 from mapper.octree.map_file import write_map
 from mapper.octree.octomap_file import write_bt, write_ot
 from mapper.octree.scan_updates import ScanUpdateWriter, open_scan_updates

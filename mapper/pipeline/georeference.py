@@ -14,7 +14,7 @@ from mapper.graph.config import GraphConfig
 from mapper.graph.gnss_factors import TooShortError, align, check, correct, point_at
 from mapper.graph.model import PositionFactor
 from mapper.pipeline.tracking_result import TrackingResult
-from mapper.run.georeference import Georeference
+from mapper.run.georeference_record import Georeference
 from mapper.run.manifest import RunWarning, Weight
 from mapper.sensing.gnss import GnssFixes
 from mapper.sensing.wheel_kinematics import pose_at

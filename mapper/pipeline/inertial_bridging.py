@@ -13,12 +13,12 @@ from mapper.core.errors import GraphError
 from mapper.core.geometry import Array, Transform, adjoint, inverse
 from mapper.core.units import OTHER_UNIT
 from mapper.graph.components import component_numbers
-from mapper.graph.inertial import SmoothedPath, smooth_path
+from mapper.graph.inertial_smoothing import SmoothedPath, smooth_path
+from mapper.graph.measurement_covariance import information_of
 from mapper.graph.model import BetweenFactor, PoseGraph
-from mapper.graph.uncertainty import information_of
 from mapper.odometry.base import FrameResult
 from mapper.odometry.gyroscope_calibration import body_readings
-from mapper.pipeline.components import largest_component
+from mapper.pipeline.disconnected_components import largest_component
 from mapper.pipeline.tracking_result import TrackingResult
 from mapper.run.manifest import RunWarning
 from mapper.runtime.progress import SILENT, Progress

@@ -16,9 +16,9 @@ from mapper.core.timebase import NS_PER_S
 from mapper.export.picture import write_localised
 from mapper.graph.components import component_numbers, components
 from mapper.graph.config import GraphConfig
+from mapper.graph.measurement_covariance import MEDIAN_CHI2
 from mapper.graph.model import PoseGraph
 from mapper.graph.optimize import optimize
-from mapper.graph.uncertainty import MEDIAN_CHI2
 from mapper.loops.closure import (
     LEAST_AGREEING,
     SOLVER,
@@ -30,9 +30,9 @@ from mapper.loops.closure import (
 )
 from mapper.loops.config import GateConfig, PlaceLoopsConfig, ScanLoopsConfig
 from mapper.loops.map_constraints import build_map_constraint_detector
-from mapper.loops.odometry_chain import NodePath, allowed
-from mapper.odometry.node_offset import NodeOffset
-from mapper.pipeline.components import component_of, disconnected
+from mapper.loops.odometry_drift import NodePath, allowed
+from mapper.odometry.renumbered_nodes import NodeOffset
+from mapper.pipeline.disconnected_components import component_of, disconnected
 from mapper.pipeline.known_map import KnownMap, detector_of, loops_between_days
 from mapper.pipeline.solve import solve
 from mapper.pipeline.track import Start, noted_log_warnings, session_odometry, track_log

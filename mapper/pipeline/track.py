@@ -19,10 +19,10 @@ from mapper.loops.factory import build_loop_detector, build_verifier
 from mapper.loops.verification_log import VerificationLog
 from mapper.odometry.base import FrameResult, GyroscopeUser, Odometry, SensorCheck
 from mapper.odometry.factory import build_odometry, odometry_for
-from mapper.pipeline.components import without_doubtful_ends
-from mapper.pipeline.spikes import with_doubtful_spikes
+from mapper.pipeline.disconnected_components import without_doubtful_ends
 from mapper.pipeline.tracking_checkpoints import FrameCheckpoint, TrackingCheckpoints
 from mapper.pipeline.tracking_result import BY_POSES, TrackingResult
+from mapper.pipeline.trajectory_spikes import with_doubtful_spikes
 from mapper.run.manifest import RunWarning
 from mapper.run.observers import NULL_OBSERVER, Observer, Step
 from mapper.runtime.ordered_map import ordered_map

@@ -10,7 +10,7 @@ from mapper.core.linear import gram
 from mapper.registration.base import Alignment
 from mapper.registration.config import AcceptanceConfig
 from mapper.registration.degeneracy import degeneracy_of
-from mapper.registration.refining import measured_agreement
+from mapper.registration.pair_refinement import measured_agreement
 from mapper.registration.surfaces import Prepared
 
 _FEW = 0.01  # of all surface; a direction that fewer face is left to the degeneracy check

@@ -5,7 +5,7 @@ from mapper.core.geometry import Transform
 from mapper.registration.acceptance import assess
 from mapper.registration.base import Alignment
 from mapper.registration.config import GicpConfig, IcpConfig, PlaneIcpConfig, RefinedConfig
-from mapper.registration.refining import Refiner, refine
+from mapper.registration.pair_refinement import Refiner, refine
 from mapper.registration.surfaces import Prepared, prepared
 
 AnyIcp = IcpConfig | PlaneIcpConfig | GicpConfig

@@ -13,7 +13,7 @@ from mapper.core.geometry import Transform, is_rigid, transform
 from mapper.registration.base import Alignment, failed
 from mapper.registration.config import KissMatcherConfig
 from mapper.registration.icp import cloud_of, refined
-from mapper.registration.refining import MIN_PAIRS
+from mapper.registration.pair_refinement import MIN_PAIRS
 from mapper.registration.surfaces import Prepared, prepared
 from mapper.runtime.extras import extra
 

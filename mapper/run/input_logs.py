@@ -12,8 +12,8 @@ from mapper.run.manifest import Manifest
 from mapper.run.manifest_logs import Input, InputLog
 from mapper.sources import open_source
 from mapper.sources.base import Log
-from mapper.sources.chained import chained, sessions_of
 from mapper.sources.config import SourceConfig
+from mapper.sources.multi_session_log import chained, sessions_of
 
 _TEXT_SUFFIXES = frozenset({".txt", ".csv", ".json", ".toml", ".yaml", ".yml", ".tum", ".log"})
 

@@ -15,7 +15,7 @@ import mapper
 from mapper.core.config import Config, drop_unknown
 from mapper.core.errors import DataError, RunError
 from mapper.mapping.config import AppliedEdit
-from mapper.run.georeference import Georeference
+from mapper.run.georeference_record import Georeference
 from mapper.run.manifest_logs import GyroscopeFit, Input
 from mapper.runtime.atomic import MANIFEST_NAME, write_text
 from mapper.runtime.regular_files import MOST_BYTES, read_regular, read_text

@@ -18,7 +18,7 @@ from mapper.sources.depth_scale import LOOKED_AT, depth_warnings
 from mapper.sources.image_order import time_warnings
 from mapper.sources.reading_checks import ReadingChecks
 from mapper.sources.ros import files as recordings
-from mapper.sources.ros.index import Series
+from mapper.sources.ros.message_index import Series
 from mapper.sources.ros.reader import RecordingReader
 from mapper.sources.ros.source import recording_log
 from mapper.sources.scan_frame import scan_frame_warnings

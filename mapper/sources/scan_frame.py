@@ -99,7 +99,7 @@ def _middle_way(one: Scan, other: Scan) -> Array:
 
 def _surfaces_way_m(one: Scan, other: Scan) -> float:
     """Return how far surfaces have moved from one scan to another; infinity where that is not found."""
-    from mapper.registration.refining import refine
+    from mapper.registration.pair_refinement import refine
     from mapper.registration.surfaces import prepared
 
     target, source = (prepared(scan.points_body, voxel_m=_VOXEL_M) for scan in (one, other))

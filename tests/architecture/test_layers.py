@@ -85,7 +85,7 @@ HOMES = {
     "rich": ("cli/",),
     "open3d": ("mapper/export/mesh.py", "mapper/registration/ndt.py", "mapper/registration/rgbd.py"),
     "small_gicp": (),
-    "kiss_icp": ("mapper/odometry/scans/kiss_icp.py",),
+    "kiss_icp": ("mapper/odometry/scans/kiss_icp_matcher.py",),
     "kiss_matcher": ("mapper/registration/kiss_matcher.py",),
     "pyoctomap": (),
     "evo": (),

@@ -5,7 +5,7 @@ import shutil
 import numpy as np
 import pytest
 
-from mapper.merging.placing import as_built
+from mapper.merging.world_poses import as_built
 from mapper.navigation.distance import distance_field, layer
 from mapper.octree.grid import read_grid
 from mapper.run.folder import open_run

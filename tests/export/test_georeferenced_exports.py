@@ -12,7 +12,7 @@ import yaml
 from mapper.core.geodesy import FLATTENING, SEMI_MAJOR_M
 from mapper.export.crs import wkt_of
 from mapper.export.exporters import export
-from mapper.run.georeference import Georeference
+from mapper.run.georeference_record import Georeference
 
 PLACE = Georeference(
     latitude_deg=47.4979,

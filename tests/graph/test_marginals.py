@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from mapper.core.geometry import Transform, adjoint, exp, inverse, log
+from mapper.graph.gtsam_factors import between, values_of
 from mapper.graph.marginals import marginals_of
 from mapper.graph.model import BetweenFactor, PoseGraph, PoseSigmas
-from mapper.graph.terms import between, values_of
 from tests.support.noisy_graphs import noisy_measure, odometry_chain
 
 SIGMAS = PoseSigmas(rotation_rad=0.01, translation_m=0.03)

@@ -6,7 +6,7 @@ import pytest
 from mapper.graph.model import BetweenFactor
 from mapper.loops.config import GateConfig
 from mapper.loops.consistency_check import ConsistencyCheck
-from mapper.loops.odometry_chain import OdometryChain
+from mapper.loops.odometry_drift import OdometryChain
 from tests.support.loop_closures import SURE, loop
 from tests.support.planar import at
 

@@ -14,7 +14,7 @@ from mapper.loops.closure import LoopClosure
 from mapper.loops.config import PlaceLoopsConfig
 from mapper.loops.detector import KeyframeLoopDetector
 from mapper.loops.factory import build_keyframe_loop_detector
-from mapper.loops.odometry_chain import OdometryChain
+from mapper.loops.odometry_drift import OdometryChain
 from tests.support.feature_room import LAP, LINK, NODES, PLACES, Room, track, walked
 
 SURE = PoseSigmas(rotation_rad=0.001, translation_m=0.002).information

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mapper.core.geometry import transform
-from mapper.loops.proposers import PoseProposer
+from mapper.loops.nearby_proposer import PoseProposer
 
 SEEN = SimpleNamespace(stamp_ns=0)
 

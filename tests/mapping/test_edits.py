@@ -9,8 +9,8 @@ from mapper.core.errors import DataError
 from mapper.mapping.config import Edits, Region
 from mapper.mapping.edits import MapEditor, covered
 from mapper.navigation.config import TraversableConfig
-from mapper.navigation.floor import driven_ground, reachable_floor
-from mapper.navigation.traversable import traversable
+from mapper.navigation.reachable_floor import driven_ground, reachable_floor
+from mapper.navigation.traversable_grid import traversable
 from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN
 from tests.support.floor_scenes import two_storeys
 from tests.support.octree_maps import as_dict, mapped

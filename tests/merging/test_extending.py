@@ -11,8 +11,8 @@ from mapper.core.geometry import exp
 from mapper.merging import jobs as merging_jobs
 from mapper.merging import merge as merging
 from mapper.merging.merged_map import open_map
-from mapper.merging.placing import Placed, as_built
 from mapper.merging.runs_in_map import runs_of
+from mapper.merging.world_poses import Placed, as_built
 from mapper.octree.map import OctreeMap
 from tests.support.merged_runs import make_run, merged_map_of
 from tests.support.octree_maps import CONFIG, mapped

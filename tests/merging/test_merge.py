@@ -13,7 +13,7 @@ from mapper.core.geometry import exp, inverse
 from mapper.core.trajectory import Trajectory
 from mapper.merging import jobs as merging_jobs
 from mapper.merging.merged_map import open_map
-from mapper.merging.placing import Placed, as_built, by_poses, by_truth, warnings_about
+from mapper.merging.world_poses import Placed, as_built, by_poses, by_truth, warnings_about
 from mapper.octree.map import OctreeMap
 from mapper.octree.octomap_file import write_bt, write_ot
 from mapper.octree.resampling import blocks_reached, resample

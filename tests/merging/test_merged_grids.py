@@ -10,15 +10,15 @@ from mapper.cli.main import app
 from mapper.core.errors import RunError
 from mapper.core.geometry import apply, exp
 from mapper.mapping.config import AppliedEdit, Region
-from mapper.merging.placing import Placed, as_built
 from mapper.merging.slicing import floor_of_map
+from mapper.merging.world_poses import Placed, as_built
 from mapper.navigation.config import TraversableConfig
-from mapper.navigation.floor import driven_ground, floor_of, margin_for
-from mapper.navigation.traversable import traversable
-from mapper.octree.columns import occupied_columns
+from mapper.navigation.reachable_floor import driven_ground, floor_of, margin_for
+from mapper.navigation.traversable_grid import traversable
 from mapper.octree.config import SliceConfig
 from mapper.octree.grid import FREE, OCCUPIED, read_grid
 from mapper.octree.map import OctreeMap, read_octree
+from mapper.octree.occupied_columns import occupied_columns
 from mapper.octree.slice import cut_slice
 from tests.support.command_line import mapper
 from tests.support.floor_scenes import two_storeys

@@ -11,7 +11,7 @@ from mapper.graph.g2o import write_g2o
 from mapper.graph.model import PoseGraph
 from mapper.loops.closure import LoopClosure, write_closures
 from mapper.merging.map_page import write_merged_map_page
-from mapper.merging.placing import Placed
+from mapper.merging.world_poses import Placed
 from mapper.run import files
 from tests.support.chromium import CHROMIUM, MISSING
 from tests.support.map_page import MapPage

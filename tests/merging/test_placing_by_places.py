@@ -6,8 +6,8 @@ import pytest
 from mapper.core.geometry import exp, inverse, length_and_angle
 from mapper.loops.closure import LoopClosure
 from mapper.loops.config import GateConfig
-from mapper.loops.shared_places import SharedPlace
-from mapper.merging.joint_graph import solve_worlds
+from mapper.loops.inter_session_loops import SharedPlace
+from mapper.merging.multi_session_graph import solve_worlds
 
 GATE = GateConfig()
 WORLDS = [

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from mapper.navigation.config import TraversableConfig
-from mapper.navigation.floor import driven_ground, reachable_floor
-from mapper.navigation.traversable import traversable
+from mapper.navigation.reachable_floor import driven_ground, reachable_floor
+from mapper.navigation.traversable_grid import traversable
 from mapper.octree.config import SliceConfig
 from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN
 from mapper.octree.slice import cut_slice

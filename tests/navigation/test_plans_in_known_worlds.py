@@ -8,9 +8,9 @@ import pytest
 from mapper.export.grid import write_grid
 from mapper.navigation.config import PlanConfig, TraversableConfig
 from mapper.navigation.distance import dense_voxels, distance_field
-from mapper.navigation.floor import reachable_floor
 from mapper.navigation.planner import plan_2d, plan_3d
-from mapper.navigation.traversable import traversable
+from mapper.navigation.reachable_floor import reachable_floor
+from mapper.navigation.traversable_grid import traversable
 from mapper.octree.config import OctreeConfig, SliceConfig
 from mapper.octree.grid import FREE, OCCUPIED, read_grid
 from mapper.octree.map import OctreeMap

@@ -5,9 +5,9 @@ import pytest
 
 from mapper.core.errors import PlanError
 from mapper.navigation.config import PlanConfig, TraversableConfig
-from mapper.navigation.floor import reachable_floor
 from mapper.navigation.planner import plan_storeys
-from mapper.navigation.traversable import traversable
+from mapper.navigation.reachable_floor import reachable_floor
+from mapper.navigation.traversable_grid import traversable
 from tests.support.floor_scenes import bridge, two_storeys
 from tests.support.floor_worlds import Block, Slab, World
 

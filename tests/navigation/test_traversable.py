@@ -3,13 +3,13 @@ import pytest
 
 from mapper.core.errors import DataError, MapSizeError
 from mapper.navigation.config import TraversableConfig
-from mapper.navigation.floor import driven_ground, floor_of, margin_for, reachable_floor
-from mapper.navigation.traversable import traversable
-from mapper.octree import blocks
-from mapper.octree.columns import occupied_columns
+from mapper.navigation.reachable_floor import driven_ground, floor_of, margin_for, reachable_floor
+from mapper.navigation.traversable_grid import traversable
+from mapper.octree import sparse_grid
 from mapper.octree.config import OctreeConfig, SliceConfig
 from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN
 from mapper.octree.map import OctreeMap, read_octree
+from mapper.octree.occupied_columns import occupied_columns
 from mapper.octree.octomap_file import write_ot
 from mapper.octree.slice import cut_slice
 
@@ -202,7 +202,9 @@ def test_a_floor_too_wide_for_memory_is_refused_before_it_is_made(monkeypatch):
     octree = OctreeMap(OctreeConfig(resolution_m=0.05))
     for corner_m in (-1200.0, 1200.0):
         octree.insert_points(np.full((1, 3), corner_m, np.float32), np.full(3, corner_m))
-    monkeypatch.setattr(blocks.os, "sysconf", lambda name: {"SC_PAGE_SIZE": 1, "SC_PHYS_PAGES": 2**35}[name])
+    monkeypatch.setattr(
+        sparse_grid.os, "sysconf", lambda name: {"SC_PAGE_SIZE": 1, "SC_PHYS_PAGES": 2**35}[name]
+    )
     wanted = (
         r"a floor of 240\d × 240\d m in cells of 0\.05 m needs 10\d\.\d GiB and this machine has 32\.0; raise"
     )

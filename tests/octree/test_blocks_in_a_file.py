@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from mapper.core.errors import WriteError
-from mapper.octree.blocks import FileArray
 from mapper.octree.config import OctreeConfig
 from mapper.octree.map import OctreeMap
 from mapper.octree.octomap_file import write_ot
+from mapper.octree.sparse_grid import FileArray
 from tests.support.paths import ROOT
 
 FILL = """

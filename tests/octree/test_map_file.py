@@ -7,7 +7,7 @@ import pytest
 
 from mapper.core.errors import MapFileError, MapSizeError, WriteError
 from mapper.core.frames import Scan
-from mapper.octree import blocks
+from mapper.octree import sparse_grid
 from mapper.octree.config import OctreeConfig
 from mapper.octree.map import OctreeMap, read_octree
 from mapper.octree.map_file import MAGIC, write_map
@@ -149,7 +149,7 @@ def test_everything_that_a_header_announces_has_to_fit_into_memory(path, monkeyp
         header.update(blocks=1 << 20, voxels=1 << 29, attribute_blocks=0, attribute_voxels=0)
 
     path.write_bytes(resealed(path.read_bytes(), announce))
-    monkeypatch.setattr(blocks.os, "sysconf", lambda _name: 1 << 16)  # of 4 GiB; the blocks alone take 2
+    monkeypatch.setattr(sparse_grid.os, "sysconf", lambda _name: 1 << 16)  # of 4 GiB; the blocks alone take 2
     with pytest.raises(MapSizeError, match=r"map\.octree needs 4\.1 GiB and this machine has 4\.0"):
         read_octree(path)
 

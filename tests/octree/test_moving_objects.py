@@ -5,11 +5,11 @@ import pytest
 
 from mapper.core.frames import Scan
 from mapper.octree.bit_planes import ALL_SET, NONE_SET, dilate, neighbours_of, words_of
-from mapper.octree.casting import Caster
 from mapper.octree.config import OctreeConfig
 from mapper.octree.keys import codes_of_keys, keys_of
 from mapper.octree.map import OctreeMap
 from mapper.octree.moving_objects import remove_moving_objects
+from mapper.octree.ray_casting import Caster
 from mapper.octree.scan_updates import pack
 from mapper.sensing.config import DepthNoiseConfig
 

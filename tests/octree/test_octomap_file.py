@@ -5,12 +5,12 @@ import pyoctomap
 import pytest
 
 from mapper.core.errors import MapFileError, MapSizeError
-from mapper.octree import blocks
-from mapper.octree.blocks import log_odds
+from mapper.octree import sparse_grid
 from mapper.octree.config import OctreeConfig
 from mapper.octree.keys import KEY_BITS
 from mapper.octree.map import OctreeMap, read_octree
 from mapper.octree.octomap_file import TreeLeaves, write_bt, write_ot
+from mapper.octree.sparse_grid import log_odds
 from tests.support.octomap_oracle import fr1_xyz_scans, fuse
 from tests.support.octree_maps import octree_of
 from tests.support.paths import DATA, FR1_XYZ
@@ -232,7 +232,7 @@ def test_truncated_files_are_refused(write, octree, share, tmp_path):
 def test_no_damage_goes_unnoticed_as_anything_but_a_map_or_an_error(write, octree, tmp_path, monkeypatch):
     # A flipped bit can turn a small leaf into a huge one: the machine pretends to have 64 MiB.
     monkeypatch.setattr(
-        blocks.os, "sysconf", lambda name: {"SC_PAGE_SIZE": 4096, "SC_PHYS_PAGES": 2**14}[name]
+        sparse_grid.os, "sysconf", lambda name: {"SC_PAGE_SIZE": 4096, "SC_PHYS_PAGES": 2**14}[name]
     )
     write(tmp_path / "map", octree)
     data = (tmp_path / "map").read_bytes()

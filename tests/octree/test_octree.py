@@ -7,8 +7,8 @@ import pytest
 from mapper.core.errors import DataError, MapSizeError
 from mapper.core.frames import Scan
 from mapper.core.geometry import exp
-from mapper.octree import blocks
-from mapper.octree import casting_kernels as kernels
+from mapper.octree import ray_casting_kernels as kernels
+from mapper.octree import sparse_grid
 from mapper.octree.config import OctreeConfig
 from mapper.octree.map import OctreeMap
 from mapper.octree.octomap_file import write_ot
@@ -215,7 +215,9 @@ def test_working_space_is_only_as_large_as_what_rays_cross():
 def test_a_map_too_large_for_memory_is_refused_and_stays_as_it_was(monkeypatch):
     octree = octree_of(random_scans(7)[:1])
     before = as_dict(octree)
-    monkeypatch.setattr(blocks.os, "sysconf", lambda name: {"SC_PAGE_SIZE": 4096, "SC_PHYS_PAGES": 1}[name])
+    monkeypatch.setattr(
+        sparse_grid.os, "sysconf", lambda name: {"SC_PAGE_SIZE": 4096, "SC_PHYS_PAGES": 1}[name]
+    )
     with pytest.raises(MapSizeError, match=r"blocks of 8³ voxels needs .* GiB"):
         octree.insert_points(random_scans(8, points=300)[0][0], random_scans(8)[0][1])
     monkeypatch.undo()

@@ -13,9 +13,9 @@ from mapper.core.geometry import exp
 from mapper.core.trajectory import Trajectory
 from mapper.mapping.config import Edits
 from mapper.mapping.fusion import fuse_log
-from mapper.octree.casting import Caster
 from mapper.octree.config import OctreeConfig
 from mapper.octree.map import OctreeMap
+from mapper.octree.ray_casting import Caster
 from mapper.octree.scan_updates import ScanUpdateWriter, decompress, displacement_m, open_scan_updates, pack
 from mapper.runtime.progress import SILENT
 from mapper.simulation import CameraSimulator

@@ -5,11 +5,11 @@ import pytest
 
 from mapper.core.errors import DataError
 from mapper.core.frames import Scan
-from mapper.octree.columns import NOWHERE, DrivenGround, block_extent, ground_heights
 from mapper.octree.config import OctreeConfig, SliceConfig
 from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, overlap_of, shrunk
 from mapper.octree.keys import KEY_ZERO
 from mapper.octree.map import OctreeMap
+from mapper.octree.occupied_columns import NOWHERE, DrivenGround, block_extent, ground_heights
 from mapper.octree.slice import Band, cut_slice
 from tests.support.grids import state_at
 

@@ -5,9 +5,9 @@ import pyoctomap
 import pytest
 
 from mapper.octree.attributes import NEVER_SEEN
-from mapper.octree.blocks import Overlap
 from mapper.octree.map import read_octree
 from mapper.octree.map_file import write_map
+from mapper.octree.sparse_grid import Overlap
 from tests.support.octomap_oracle import voxels
 from tests.support.octree_maps import COLORED, CONFIG, as_dict, mapped, total
 

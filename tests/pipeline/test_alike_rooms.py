@@ -9,8 +9,8 @@ from mapper.config.loading import load_config
 from mapper.core.frames import RgbdFrame
 from mapper.core.timebase import NS_PER_S
 from mapper.core.trajectory import Trajectory
-from mapper.evaluators.metrics.trajectory import ate_rmse_m
-from mapper.pipeline.components import largest_component
+from mapper.evaluators.metrics.trajectory_errors import ate_rmse_m
+from mapper.pipeline.disconnected_components import largest_component
 from mapper.pipeline.solve import solve
 from mapper.pipeline.track import track_log
 from mapper.runtime.progress import SILENT

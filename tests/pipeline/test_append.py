@@ -9,7 +9,7 @@ import pytest
 from mapper.cli.summary import summary_text
 from mapper.config.loading import overridden
 from mapper.core.errors import ConfigError, RunError
-from mapper.evaluators.metrics.trajectory import align, associate, ate, ate_rmse_m
+from mapper.evaluators.metrics.trajectory_errors import align, associate, ate, ate_rmse_m
 from mapper.loops.config import NoLoopsConfig
 from mapper.octree.map import read_octree
 from mapper.pipeline.append import append
@@ -17,8 +17,8 @@ from mapper.pipeline.fuse import fuse
 from mapper.run.folder import moved_log, open_run
 from mapper.run.observers import Observers
 from mapper.sources import open_source
-from mapper.sources.chained import sessions_of
 from mapper.sources.config import SourceConfig
+from mapper.sources.multi_session_log import sessions_of
 from tests.support.command_line import mapper
 from tests.support.files import files_of
 

@@ -9,7 +9,7 @@ from mcap.reader import make_reader
 
 from mapper.config.loading import load_config, overridden
 from mapper.core.errors import ConfigError, RunError, TrackingError
-from mapper.evaluators.metrics.trajectory import ate_rmse_m
+from mapper.evaluators.metrics.trajectory_errors import ate_rmse_m
 from mapper.export.run_maps import maps_of
 from mapper.octree.grid import read_grid
 from mapper.octree.map import read_octree

@@ -11,7 +11,7 @@ from mapper.config.loading import load_config
 from mapper.core.geometry import angle_between, exp, inverse
 from mapper.core.trajectory import Trajectory
 from mapper.graph.config import WheelFactorsConfig
-from mapper.pipeline.components import largest_component
+from mapper.pipeline.disconnected_components import largest_component
 from mapper.pipeline.solve import solve
 from mapper.pipeline.track import track_log
 from mapper.runtime.progress import SILENT

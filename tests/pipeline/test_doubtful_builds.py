@@ -9,7 +9,7 @@ import pytest
 from mapper.config.loading import load_config, overridden
 from mapper.core.errors import TrackingError
 from mapper.core.geometry import exp
-from mapper.evaluators.metrics.trajectory import align, associate, ate
+from mapper.evaluators.metrics.trajectory_errors import align, associate, ate
 from mapper.export.mesh import mesh_views
 from mapper.octree.map import read_octree
 from mapper.octree.scan_updates import open_scan_updates

@@ -21,8 +21,8 @@ from mapper.run.pose_covariances import read_poses
 from mapper.simulation.config import STREET, LidarSensorConfig
 from mapper.simulation.lidar import write_lidar_log
 from mapper.sources import open_source
-from mapper.sources.chained import chained
 from mapper.sources.config import SourceConfig
+from mapper.sources.multi_session_log import chained
 from mapper.sources.trajectory_files import read_tum
 from tests.support.command_line import mapper
 from tests.support.files import files_of

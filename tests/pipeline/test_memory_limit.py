@@ -2,8 +2,8 @@
 
 import pytest
 
-from mapper.octree import blocks
-from mapper.octree.blocks import FileArray
+from mapper.octree import sparse_grid
+from mapper.octree.sparse_grid import FileArray
 from mapper.pipeline.fuse import fuse
 from mapper.run.folder import open_run
 from mapper.sources import open_source
@@ -21,7 +21,7 @@ def grown(monkeypatch):
             rows.append(count)
             return super().grown(count)
 
-    monkeypatch.setattr(blocks, "FileArray", Watched)
+    monkeypatch.setattr(sparse_grid, "FileArray", Watched)
     return rows
 
 
@@ -40,7 +40,7 @@ def test_a_build_that_was_stopped_while_fusing_makes_the_same_map(
     stopped(desk_log, tmp_path / "run", limit, progress=Stage("fuse", 20))
     run = start(desk_log, tmp_path / "run", limit)
 
-    assert max(grown) * blocks.BLOCK_BYTES > 1e6 * limit_mb
+    assert max(grown) * sparse_grid.BLOCK_BYTES > 1e6 * limit_mb
     assert [step for step, _ in resumed(run)] == ["fuse"]
     assert_same_map(run, desk_run)
 

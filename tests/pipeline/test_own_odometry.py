@@ -8,7 +8,7 @@ import pytest
 from mapper.config.loading import load_config
 from mapper.core.errors import ConfigError
 from mapper.core.trajectory import Trajectory
-from mapper.evaluators.metrics.trajectory import ate_rmse_m
+from mapper.evaluators.metrics.trajectory_errors import ate_rmse_m
 from mapper.odometry.base import Odometry
 from mapper.odometry.config import LocalMapConfig
 from mapper.odometry.factory import build_frame_odometry

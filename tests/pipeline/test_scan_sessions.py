@@ -7,7 +7,7 @@ import pytest
 
 from mapper.config.loading import load_config, overridden
 from mapper.core.errors import ConfigError, LoopError
-from mapper.evaluators.metrics.trajectory import ate_rmse_m
+from mapper.evaluators.metrics.trajectory_errors import ate_rmse_m
 from mapper.loops.closure import discrepancy
 from mapper.pipeline.append import append
 from mapper.pipeline.build import build

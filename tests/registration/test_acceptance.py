@@ -9,7 +9,7 @@ from mapper.registration.acceptance import assess
 from mapper.registration.config import AcceptanceConfig, KissMatcherConfig, NdtConfig
 from mapper.registration.kiss_matcher import KissMatcher
 from mapper.registration.ndt import Ndt, refine_by_cells
-from mapper.registration.refining import measured
+from mapper.registration.pair_refinement import measured
 from mapper.registration.surfaces import prepared
 
 VOXEL_M = 0.3

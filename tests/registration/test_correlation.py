@@ -5,7 +5,7 @@ import pytest
 
 from mapper.core.geometry import apply, inverse, planar_motion
 from mapper.registration.correlation import LikelihoodField, correlate
-from mapper.registration.refining import refine
+from mapper.registration.pair_refinement import refine
 from mapper.registration.surfaces import prepared
 
 CORNERS = np.array([[-4.0, -3.0], [5.0, -3.0], [5.0, 1.0], [2.0, 1.0], [2.0, 4.0], [-4.0, 4.0]])

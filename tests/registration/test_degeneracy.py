@@ -6,7 +6,7 @@ import pytest
 from mapper.core.errors import DataError
 from mapper.core.geometry import apply, exp, transform
 from mapper.registration.degeneracy import degeneracy_of, projected
-from mapper.registration.refining import measured
+from mapper.registration.pair_refinement import measured
 from mapper.registration.surfaces import prepared
 
 N = 20_000

@@ -50,7 +50,7 @@ def view():
 
 
 def kiss_icp():
-    from mapper.odometry.scans.kiss_icp import KissMatcher
+    from mapper.odometry.scans.kiss_icp_matcher import KissMatcher
 
     KissMatcher(KissOdometryConfig())
 

@@ -8,8 +8,8 @@ import sys
 import numpy as np
 import pytest
 
-from mapper.octree.blocks import FileArray
-from mapper.octree.casting import sparse_zeros
+from mapper.octree.ray_casting import sparse_zeros
+from mapper.octree.sparse_grid import FileArray
 from mapper.runtime import atomic
 from mapper.runtime.atomic import FolderKind, atomic_folder, flush_to_disk
 from mapper.runtime.doctor import processors

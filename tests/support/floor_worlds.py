@@ -6,13 +6,13 @@ from itertools import pairwise, product
 
 import numpy as np
 
-from mapper.navigation.floor import reachable_floor
-from mapper.navigation.traversable import traversable
-from mapper.octree.columns import NOWHERE
+from mapper.navigation.reachable_floor import reachable_floor
+from mapper.navigation.traversable_grid import traversable
 from mapper.octree.config import OctreeConfig
 from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN
 from mapper.octree.keys import BLOCK_BITS, BLOCK_VOXELS, KEY_ZERO, codes_of_keys
 from mapper.octree.map import OctreeMap
+from mapper.octree.occupied_columns import NOWHERE
 
 THICK_M = 0.2
 PITCH_M = 0.1

@@ -6,7 +6,7 @@ from mapper.config.build import BuildConfig
 from mapper.core.geometry import exp
 from mapper.core.trajectory import Trajectory
 from mapper.merging.merge import merge
-from mapper.merging.placing import Placing
+from mapper.merging.world_poses import Placing
 from mapper.navigation.config import TraversableConfig
 from mapper.octree.config import SliceConfig
 from mapper.octree.map_file import write_map

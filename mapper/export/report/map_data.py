@@ -18,10 +18,10 @@ from mapper.export.report.packing import Plane, pack_layers, pack_points
 from mapper.export.run_maps import snapshots_of
 from mapper.mapping.fusion import Snapshot
 from mapper.mapping.thumbnails import encode_jpeg
-from mapper.octree.casting_kernels import FREE, OCCUPIED
 from mapper.octree.keys import BLOCK_BITS, BLOCK_VOXELS, KEY_BITS, codes_of, codes_of_keys, keys_of
 from mapper.octree.map import OctreeMap
 from mapper.octree.queries import Leaves
+from mapper.octree.ray_casting_kernels import FREE, OCCUPIED
 from mapper.octree.scan_updates import open_scan_updates
 from mapper.run.folder import Run
 from mapper.run.frame_outcomes import stamps_of

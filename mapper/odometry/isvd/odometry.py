@@ -26,8 +26,8 @@ from mapper.core.geometry import (
 from mapper.features.base import Detector
 from mapper.features.factory import build_detector
 from mapper.features.frame_view import ImageView
+from mapper.graph.measurement_covariance import with_model_error
 from mapper.graph.model import BetweenFactor
-from mapper.graph.uncertainty import with_model_error
 from mapper.odometry.base import (
     Diagnostics,
     FeatureMatches,
@@ -39,7 +39,7 @@ from mapper.odometry.base import (
 )
 from mapper.odometry.config import IsvdOdometryConfig, MatchConfig
 from mapper.odometry.gyroscope_calibration import GyroscopeCalibration
-from mapper.odometry.isvd.registration import IsvdObservation, PairRegistration, RegisterPair, matched_pairs
+from mapper.odometry.isvd.frame_pairs import IsvdObservation, PairRegistration, RegisterPair, matched_pairs
 from mapper.odometry.motion_prior import MotionPrior
 from mapper.odometry.sharpest_keyframe import SharpestKeyframes
 from mapper.registration.base import Alignment

@@ -17,7 +17,7 @@ from mapper.odometry.keyframes.depth_alignment import (
     align_depth,
     observes_all,
 )
-from mapper.odometry.keyframes.earlier_depth import EarlierDepth
+from mapper.odometry.keyframes.depth_comparison import EarlierDepth
 from mapper.odometry.keyframes.landmarks import LandmarkMap
 from mapper.odometry.keyframes.local_search import LocalSearch
 from mapper.odometry.keyframes.pose_tracker import TrackedPose, project, unmatched

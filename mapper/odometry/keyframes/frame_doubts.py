@@ -9,7 +9,7 @@ from mapper.core.doubts import Doubt
 from mapper.core.geometry import Array, Transform, inverse, log
 from mapper.core.running_median import RunningMedian
 from mapper.odometry.camera.image_observation import FEW_MOVING
-from mapper.odometry.keyframes.earlier_depth import Displacement
+from mapper.odometry.keyframes.depth_comparison import Displacement
 from mapper.odometry.keyframes.pose_tracker import TrackedPose
 
 _MEMORY = 100

@@ -8,8 +8,8 @@ import numpy as np
 
 from mapper.core.geometry import Array, Transform, inverse
 from mapper.core.running_median import RunningMedian
+from mapper.graph.measurement_covariance import inflated, with_model_error
 from mapper.graph.model import BetweenFactor
-from mapper.graph.uncertainty import inflated, with_model_error
 from mapper.odometry.config import KeyframeOdometryConfig
 from mapper.odometry.keyframes.focal_length import WINDOW_KEYFRAMES, FocalLengthCheck
 from mapper.odometry.keyframes.frame_doubts import UNDOUBTED, Assessment

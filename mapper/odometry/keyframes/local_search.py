@@ -10,10 +10,10 @@ from mapper.features.hamming import Bits
 from mapper.features.window_matching import GridFeatures, SearchWindows, match_windows
 from mapper.odometry.camera.image_observation import ImageObservation
 from mapper.odometry.config import KeyframeOdometryConfig
-from mapper.odometry.keyframes.camera_motion import refined_by_established
-from mapper.odometry.keyframes.earlier_depth import EarlierDepth
+from mapper.odometry.keyframes.depth_comparison import EarlierDepth
 from mapper.odometry.keyframes.landmark_kernels import project_visible
 from mapper.odometry.keyframes.landmarks import Ids, LandmarkMap
+from mapper.odometry.keyframes.motion_segmentation import refined_by_established
 from mapper.odometry.keyframes.pose_tracker import MAX_HAMMING, TrackedPose, rms_px
 
 _MAX_RATIO = 0.8

@@ -10,8 +10,8 @@ from mapper.core.frames import Frame
 from mapper.core.geometry import Array, Transform, inverse
 from mapper.features.factory import build_detector
 from mapper.features.frame_view import ImageView
+from mapper.graph.measurement_covariance import inflated
 from mapper.graph.model import BetweenFactor
-from mapper.graph.uncertainty import inflated
 from mapper.odometry.base import (
     Diagnostics,
     FeatureMatches,
@@ -25,7 +25,7 @@ from mapper.odometry.camera.image_observation import ImageObservation, observe_i
 from mapper.odometry.camera.readout_time import ReadoutTime
 from mapper.odometry.config import KeyframeOdometryConfig
 from mapper.odometry.gyroscope_calibration import GyroscopeCalibration
-from mapper.odometry.keyframes.earlier_depth import EarlierDepth
+from mapper.odometry.keyframes.depth_comparison import EarlierDepth
 from mapper.odometry.keyframes.frame_doubts import UNDOUBTED, Assessment, FrameDoubts
 from mapper.odometry.keyframes.keyframe_decision import KeyframeDecision
 from mapper.odometry.keyframes.landmarks import LandmarkMap

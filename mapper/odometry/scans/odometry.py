@@ -12,8 +12,8 @@ from mapper.core.frames import Frame
 from mapper.core.geometry import Array, Transform, adjoint, inverse
 from mapper.core.trajectory import Trajectory
 from mapper.features.frame_view import ScanView
+from mapper.graph.measurement_covariance import information_of
 from mapper.graph.model import BetweenFactor
-from mapper.graph.uncertainty import information_of
 from mapper.odometry.base import Diagnostics, FrameOdometry, FrameResult, lost_frame
 from mapper.odometry.gyroscope_calibration import GyroscopeCalibration
 from mapper.odometry.keyframe_distance import is_far

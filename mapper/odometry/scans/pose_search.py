@@ -15,7 +15,7 @@ from mapper.odometry.scans.scan_matcher import DeskewedScan, ScanMatcher
 from mapper.registration.base import Aligner
 from mapper.registration.factory import build_registration
 from mapper.registration.free_space import ScanDescription
-from mapper.registration.refining import refined_motion
+from mapper.registration.pair_refinement import refined_motion
 
 _TURNS_RAD = (0.3, -0.3, 0.6, -0.6, 1.0, -1.0)  # about the vertical, from the predicted pose
 _PAIR_DISTANCES = (4.0, 2.0, 1.0)  # of a scan to the last keyframe or scan, in largest pair distances

@@ -23,7 +23,7 @@ _WIDE_ROUNDS, _WIDE = 4, 3.0  # the first rounds take pairs this multiple of the
 _FEWEST_PAIRS = 60
 _KERNEL = 3.0  # Cauchy's, in median distances from the surfaces
 _ALIKE = 10.0  # points whose distances err alike: neighbours to which a normal is fitted
-_RANGE_VOXELS = 16.0  # median distance of points, as chosen in surroundings.py
+_RANGE_VOXELS = 16.0  # median distance of points, as chosen in adapted_lengths.py
 _FITTED = 0.02  # of a voxel: displacement of the sweep's first points by the last step
 
 

@@ -21,7 +21,7 @@ from mapper.registration.hough.refinement import (
     refinement_cloud,
 )
 from mapper.registration.hough.voting import Peak, distinct, vote
-from mapper.registration.refining import measured
+from mapper.registration.pair_refinement import measured
 from mapper.runtime.progress import Stopwatch
 
 MIN_CENTRES = 5

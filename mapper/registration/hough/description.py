@@ -14,7 +14,7 @@ from mapper.core.geometry import Array, Points, Transform, apply, stride_for
 from mapper.registration.free_space import ScanDescription, range_image
 from mapper.registration.hough.config import CellsConfig, HoughConfig, ObjectsConfig
 from mapper.registration.hough.ground import Ground, surroundings
-from mapper.registration.hough.search_kernels import draw_volume
+from mapper.registration.hough.voting_kernels import draw_volume
 
 
 def centres_of(obstacles: Points32, config: CellsConfig | ObjectsConfig) -> Array:

@@ -12,9 +12,9 @@ from mapper.core.geometry import Points, Transform, apply, planar_motion, rotati
 from mapper.registration.hough.config import HoughConfig, NdtStagesConfig
 from mapper.registration.hough.description import DIRECTION_RAD, HoughDescription
 from mapper.registration.hough.ground import FITS, Ground
-from mapper.registration.hough.search_kernels import FULL_OVERLAP, hill_climb
+from mapper.registration.hough.voting_kernels import FULL_OVERLAP, hill_climb
 from mapper.registration.ndt import refine_by_cells
-from mapper.registration.refining import refined_motion
+from mapper.registration.pair_refinement import refined_motion
 from mapper.registration.surfaces import Prepared, prepared
 
 _HALVINGS = 2

@@ -6,7 +6,7 @@ import numpy as np
 
 from mapper.core.geometry import Array, Transform, planar_motion
 from mapper.registration.hough.config import VotingConfig
-from mapper.registration.hough.search_kernels import vote_slices
+from mapper.registration.hough.voting_kernels import vote_slices
 
 _PER_ANGLE = 8
 

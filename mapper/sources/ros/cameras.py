@@ -20,7 +20,7 @@ from mapper.sources.config import CameraConfig
 from mapper.sources.image_files.image_sizes import Size, is_same_view, recorded_camera
 from mapper.sources.lens import FISHEYE_MODELS, POLYNOMIAL_MODELS, Lens, lens_model
 from mapper.sources.ros.image_messages import image_of, size_of
-from mapper.sources.ros.index import Series
+from mapper.sources.ros.message_index import Series
 from mapper.sources.ros.message_order import ordered
 from mapper.sources.ros.messages import CAMERAS, EXTRINSICS, CameraMessage, ImageMessage, Window, frame_of
 from mapper.sources.ros.reader import RecordingReader

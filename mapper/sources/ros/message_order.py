@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from mapper.core.errors import SourceError
 from mapper.core.timebase import NS_PER_S, Stamps, nearest
 from mapper.sources.image_folders.rgbd import unpaired_note
-from mapper.sources.ros.index import Series
+from mapper.sources.ros.message_index import Series
 from mapper.sources.text import time_order
 
 _Indices = NDArray[np.intp]

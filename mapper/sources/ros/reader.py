@@ -23,7 +23,7 @@ from mapper.sources.nmea import fixes_from_sentences
 from mapper.sources.ros.decode import decode
 from mapper.sources.ros.entries import Located
 from mapper.sources.ros.frame_tree import FrameTree
-from mapper.sources.ros.index import Series, first_messages, index_of
+from mapper.sources.ros.message_index import Series, first_messages, index_of
 from mapper.sources.ros.message_order import ordered
 from mapper.sources.ros.messages import (
     SENTENCES,

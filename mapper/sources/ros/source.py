@@ -21,7 +21,7 @@ from mapper.sources.ros.cameras import calibrate, images_beside
 from mapper.sources.ros.entries import CloudEntry, rgbd_entry, stereo_entry
 from mapper.sources.ros.frame_tree import is_fixed
 from mapper.sources.ros.image_messages import has_float_depth, size_of
-from mapper.sources.ros.index import Series, why_unread
+from mapper.sources.ros.message_index import Series, why_unread
 from mapper.sources.ros.message_order import ordered, paired
 from mapper.sources.ros.messages import (
     LASERS,

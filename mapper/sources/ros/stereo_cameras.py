@@ -6,7 +6,7 @@ from mapper.core.errors import SourceError
 from mapper.core.geometry import Array, nearest_rotation, transform
 from mapper.sources.image_files.image_sizes import Size
 from mapper.sources.ros.cameras import calibration_of
-from mapper.sources.ros.index import Series
+from mapper.sources.ros.message_index import Series
 from mapper.sources.ros.messages import CameraMessage, frame_of
 from mapper.sources.ros.reader import RecordingReader
 from mapper.sources.ros.topics import StereoTopics

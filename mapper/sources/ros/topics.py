@@ -11,7 +11,7 @@ import numpy as np
 from mapper.core.errors import SourceError
 from mapper.sources.config import TopicsConfig
 from mapper.sources.ros.image_messages import is_depth
-from mapper.sources.ros.index import Series
+from mapper.sources.ros.message_index import Series
 from mapper.sources.ros.messages import (
     CAMERAS,
     CLOUDS,

@@ -7,7 +7,7 @@ import numpy as np
 
 from mapper.core.errors import listed
 from mapper.core.units import unit_of_gravity
-from mapper.sources.ros.index import Series
+from mapper.sources.ros.message_index import Series
 from mapper.sources.ros.messages import CLOUDS, FIXES, IMAGES, IMUS, POSES, READ, Message
 
 _BOOKKEEPING = re.compile(

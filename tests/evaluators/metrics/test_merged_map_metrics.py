@@ -8,7 +8,7 @@ from mapper.core.errors import DataError
 from mapper.core.geometry import exp
 from mapper.evaluators.metrics.map_reference import Reference
 from mapper.evaluators.metrics.merged_map import merged_map_metrics, merged_map_quality
-from mapper.merging.placing import as_built, by_truth
+from mapper.merging.world_poses import as_built, by_truth
 from tests.support.merged_runs import make_run, merged_map_of
 from tests.support.octree_maps import mapped
 

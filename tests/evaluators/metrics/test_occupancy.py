@@ -7,10 +7,10 @@ import pytest
 
 from mapper.core.errors import DataError
 from mapper.evaluators.metrics.occupancy import assess_by_distance, check_metrics
-from mapper.octree.casting import Caster
 from mapper.octree.config import OctreeConfig
 from mapper.octree.map import OctreeMap
 from mapper.octree.moving_objects import remove_moving_objects
+from mapper.octree.ray_casting import Caster
 from mapper.octree.scan_updates import pack
 from mapper.simulation import Boxes, CameraSimulator, read_scene, write_tum_log
 from mapper.simulation.config import SynthConfig

@@ -16,7 +16,7 @@ from mapper.evaluators.metrics.segments import (
     segment_errors,
     segment_metrics,
 )
-from mapper.evaluators.metrics.trajectory import Matched, associate
+from mapper.evaluators.metrics.trajectory_errors import Matched, associate
 from mapper.sources.trajectory_files import read_kitti
 from tests.support.paths import DATA
 

@@ -9,7 +9,7 @@ from mapper.core.errors import DataError
 from mapper.core.geometry import exp, inverse, rotation_exp, transform
 from mapper.core.trajectory import Trajectory
 from mapper.evaluators.metrics.evaluate import evaluate
-from mapper.evaluators.metrics.trajectory import Matched, align, associate, ate, rpe, start_end_offset
+from mapper.evaluators.metrics.trajectory_errors import Matched, align, associate, ate, rpe, start_end_offset
 from mapper.sources.trajectory_files import read_kitti, read_tum, write_kitti, write_tum
 from tests.support.paths import SHARED
 

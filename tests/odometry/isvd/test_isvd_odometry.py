@@ -9,8 +9,8 @@ from mapper.core.geometry import apply, exp, inverse, log, mean_rotation, rotati
 from mapper.features.base import Features
 from mapper.features.config import OrbConfig
 from mapper.odometry.config import IsvdOdometryConfig
+from mapper.odometry.isvd.frame_pairs import IsvdObservation
 from mapper.odometry.isvd.odometry import IsvdOdometry
-from mapper.odometry.isvd.registration import IsvdObservation
 from mapper.sensing.gyroscope import Gyroscope
 
 CAMERA = PinholeCamera(640, 480, 500.0, 500.0, 320.0, 240.0)

@@ -7,7 +7,7 @@ from mapper.core.frames import PinholeCamera
 from mapper.core.geometry import apply, exp, inverse, log
 from mapper.features.base import Features
 from mapper.odometry.config import MatchConfig
-from mapper.odometry.isvd.registration import IsvdObservation, PairRegistration
+from mapper.odometry.isvd.frame_pairs import IsvdObservation, PairRegistration
 from mapper.registration.config import IsvdConfig
 
 CAMERA = PinholeCamera(640, 480, 500.0, 500.0, 320.0, 240.0)

@@ -7,7 +7,7 @@ import pytest
 
 from mapper.core.geometry import exp, inverse
 from mapper.core.trajectory import Trajectory, trajectory_from
-from mapper.evaluators.metrics.trajectory import ate_rmse_m
+from mapper.evaluators.metrics.trajectory_errors import ate_rmse_m
 from mapper.odometry.config import LocalMapConfig
 from mapper.odometry.factory import build_frame_odometry
 from tests.support.depth_rooms import CORNER, white_frame

@@ -9,7 +9,7 @@ from mapper.core.frames import RgbdFrame
 from mapper.core.geometry import exp
 from mapper.odometry.config import LocalMapConfig
 from mapper.odometry.factory import build_frame_odometry
-from mapper.odometry.keyframes.earlier_depth import Displacement
+from mapper.odometry.keyframes.depth_comparison import Displacement
 from mapper.odometry.keyframes.frame_doubts import FrameDoubts
 
 NOT_DISPLACED = Displacement()

@@ -7,7 +7,7 @@ from mapper.core.errors import FrameError
 from mapper.core.frames import PinholeCamera, RgbdFrame, Scan
 from mapper.core.geometry import exp, inverse
 from mapper.core.trajectory import Trajectory, trajectory_from
-from mapper.evaluators.metrics.trajectory import ate_rmse_m
+from mapper.evaluators.metrics.trajectory_errors import ate_rmse_m
 from mapper.features.config import OrbConfig
 from mapper.graph.config import GraphConfig
 from mapper.graph.model import PoseGraph

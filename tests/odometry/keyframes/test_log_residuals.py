@@ -3,7 +3,7 @@
 import numpy as np
 
 from mapper.core.geometry import transform
-from mapper.graph.uncertainty import with_model_error
+from mapper.graph.measurement_covariance import with_model_error
 from mapper.odometry.keyframes.local_mapping import LogResiduals
 from mapper.registration.reprojection import ResidualStatistics
 

@@ -6,7 +6,7 @@ import pytest
 from mapper.features.config import OrbConfig
 from mapper.odometry.config import IsvdOdometryConfig, LocalMapConfig, WheelsOdometryConfig
 from mapper.odometry.factory import build_frame_odometry, build_odometry
-from mapper.odometry.node_offset import NodeOffset
+from mapper.odometry.renumbered_nodes import NodeOffset
 from mapper.sources import open_source
 
 CONFIGS = {"local-map": LocalMapConfig(), "isvd": IsvdOdometryConfig(detector=OrbConfig())}

@@ -9,7 +9,7 @@ from mapper.core.frames import RgbdFrame
 from mapper.core.geometry import exp
 from mapper.odometry.config import LocalMapConfig
 from mapper.odometry.factory import build_frame_odometry
-from mapper.odometry.keyframes.earlier_depth import EarlierDepth
+from mapper.odometry.keyframes.depth_comparison import EarlierDepth
 
 NOW = 40
 """Frame that is looked at: 1.3 s after the first."""

@@ -6,7 +6,7 @@ import pytest
 from mapper.config.loading import load_config
 from mapper.core.geometry import angle_between, apply, exp, inverse
 from mapper.core.trajectory import trajectory_from
-from mapper.evaluators.metrics.trajectory import ate_rmse_m
+from mapper.evaluators.metrics.trajectory_errors import ate_rmse_m
 from mapper.odometry.config import PnpConfig
 from mapper.odometry.factory import build_frame_odometry
 from mapper.registration.reprojection import ransac_p3p

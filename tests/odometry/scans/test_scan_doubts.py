@@ -9,7 +9,7 @@ from mapper.core.frames import Scan
 from mapper.core.geometry import angle_between, apply, exp, inverse, log
 from mapper.odometry.motion_prior import MotionPrior
 from mapper.odometry.scans.config import GicpOdometryConfig
-from mapper.odometry.scans.gicp import GicpMatcher
+from mapper.odometry.scans.gicp_matcher import GicpMatcher
 from mapper.odometry.scans.motion_model import MotionModel, Spread
 from mapper.odometry.scans.odometry import ScanOdometry
 from mapper.odometry.scans.pose_assessment import FitStatistics
@@ -18,7 +18,7 @@ from mapper.odometry.scans.pose_search import Answers
 from mapper.odometry.scans.scan_fit import ScanKeyframe, contradiction, described, fit_of
 from mapper.odometry.scans.scan_matcher import DeskewedScan
 from mapper.odometry.scans.scan_noise import ScanNoise, surface_covariance
-from mapper.registration.refining import refine
+from mapper.registration.pair_refinement import refine
 from mapper.registration.surfaces import prepared
 
 ROOM = np.array([[-4.0, 4.0], [-3.0, 3.0], [-1.2, 1.6]])

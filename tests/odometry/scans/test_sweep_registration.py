@@ -9,7 +9,7 @@ from mapper.core.frames import Scan
 from mapper.core.geometry import angle_between, apply, exp, inverse
 from mapper.odometry.motion_prior import MotionPrior
 from mapper.odometry.scans.config import GicpOdometryConfig
-from mapper.odometry.scans.gicp import GicpMatcher
+from mapper.odometry.scans.gicp_matcher import GicpMatcher
 from mapper.odometry.scans.motion_model import MotionModel
 from mapper.odometry.scans.odometry import ScanOdometry
 from mapper.odometry.scans.scan_fit import ScanKeyframe

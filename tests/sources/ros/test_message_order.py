@@ -3,7 +3,7 @@ import pytest
 
 from mapper.core.errors import SourceError
 from mapper.core.timebase import NS_PER_S
-from mapper.sources.ros.index import Series
+from mapper.sources.ros.message_index import Series
 from mapper.sources.ros.message_order import ordered, paired
 from mapper.sources.ros.recording import Topic
 

@@ -5,7 +5,7 @@ import pytest
 from kiss_icp.datasets.rosbag import RosbagDataset
 
 from mapper.config.loading import load_config
-from mapper.evaluators.metrics.trajectory import align, associate, ate
+from mapper.evaluators.metrics.trajectory_errors import align, associate, ate
 from mapper.pipeline.build import build
 from mapper.pipeline.track import track_log
 from mapper.runtime.progress import SILENT

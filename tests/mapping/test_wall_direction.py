@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from mapper.core.geometry import rotation_exp
-from mapper.mapping.heading import wall_heading
+from mapper.mapping.wall_direction import wall_heading
 from mapper.registration.planes import Patches
 
 UP = np.array([0.0, 0.0, 1.0])

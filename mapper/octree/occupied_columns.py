@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.geometry import Array
-from mapper.octree.blocks import check_memory
 from mapper.octree.keys import BLOCK_BITS, KEY_COUNT, KEY_MASK, KEY_ZERO, block_keys
+from mapper.octree.sparse_grid import check_memory
 
 if TYPE_CHECKING:
     from mapper.octree.queries import MapView

@@ -10,11 +10,11 @@ from mapper.core.errors import FrameError
 from mapper.core.geometry import Array, apply, inverse, stride_for
 from mapper.core.trajectory import Trajectory
 from mapper.features.frame_view import ScanView
+from mapper.graph.lidar_bundle_adjustment import NodeClouds, adjust_planes, compare_thickness
 from mapper.graph.model import PoseGraph
-from mapper.graph.plane_adjustment import NodeClouds, adjust_planes, compare_thickness
 from mapper.odometry.gyroscope_calibration import with_body_rates
+from mapper.odometry.scans.adapted_lengths import adapted_to
 from mapper.odometry.scans.config import AnyScanOdometryConfig
-from mapper.odometry.scans.surroundings import adapted_to
 from mapper.pipeline.reobserve import reobserve_each
 from mapper.pipeline.tracking_result import TrackingResult
 from mapper.run.doubtful_frames import without_doubtful

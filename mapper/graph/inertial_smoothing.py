@@ -14,9 +14,9 @@ from mapper.core.errors import GraphError
 from mapper.core.geometry import Array, Transform, adjoint, inverse, length_and_angle, log, transform
 from mapper.core.timebase import NS_PER_S, Stamps
 from mapper.core.units import GRAVITY_MPS2
-from mapper.graph.batch import Effort, problem_of, solve
+from mapper.graph.gtsam_factors import Kernel, anchor, between, pose3
+from mapper.graph.least_squares import Effort, problem_of, solve
 from mapper.graph.model import BetweenFactor
-from mapper.graph.terms import Kernel, anchor, between, pose3
 from mapper.sensing.inertial import InertialReadings
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mapper.core.errors import GraphError
-from mapper.graph.terms import solver_errors
+from mapper.graph.gtsam_factors import solver_errors
 from mapper.runtime.progress import Report
 
 if TYPE_CHECKING:

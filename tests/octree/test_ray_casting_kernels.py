@@ -5,13 +5,13 @@ import pytest
 
 from mapper.core.frames import Scan
 from mapper.core.geometry import exp
-from mapper.octree import casting_kernels as kernels
-from mapper.octree.blocks import sensor_model
-from mapper.octree.casting import Caster
+from mapper.octree import ray_casting_kernels as kernels
 from mapper.octree.config import OctreeConfig
 from mapper.octree.keys import KEY_ZERO, keys_of
 from mapper.octree.map import OctreeMap
+from mapper.octree.ray_casting import Caster
 from mapper.octree.scan_updates import pack
+from mapper.octree.sparse_grid import sensor_model
 from tests.support.octree_maps import as_dict
 
 

@@ -9,8 +9,8 @@ from mapper.core.timebase import NS_PER_S
 from mapper.sensing.gnss import GnssFixes
 from mapper.sensing.gyroscope import Gyroscope
 from mapper.sources import open_source
-from mapper.sources.chained import chained, sessions_of
 from mapper.sources.config import SourceConfig
+from mapper.sources.multi_session_log import chained, sessions_of
 from tests.support.tum_logs import FIRST_NS, PERIOD_NS
 
 

@@ -29,8 +29,8 @@ from mapper.loops.closure import (
     exceeds,
 )
 from mapper.loops.config import GateConfig
-from mapper.loops.odometry_chain import NodePath, allowed
-from mapper.loops.shared_places import SharedPlace
+from mapper.loops.inter_session_loops import SharedPlace
+from mapper.loops.odometry_drift import NodePath, allowed
 
 _LEAST_LEAD = 2.0
 """Least ratio of the places that agree with the best pose to those that agree with any other: where rooms

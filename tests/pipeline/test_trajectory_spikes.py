@@ -5,7 +5,7 @@ import pytest
 
 from mapper.core.geometry import exp
 from mapper.odometry.base import Diagnostics, FrameResult
-from mapper.pipeline.spikes import with_doubtful_spikes
+from mapper.pipeline.trajectory_spikes import with_doubtful_spikes
 
 HOW = Diagnostics(100, 50, 40, 0.5, "px", "map")
 STEP_NS = 66_666_667

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from mapper.navigation.config import TraversableConfig
 from mapper.navigation.distance import NONE, squares_to_boxes
-from mapper.navigation.floor import Floor
 from mapper.navigation.floor_kernels import ALLOWANCE, Indices, Limits, Mask, around
-from mapper.octree.columns import NEAR_FLOOR_M, NOWHERE, Columns, nearest_heights, starts_of
+from mapper.navigation.reachable_floor import Floor
 from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from mapper.octree.keys import KEY_ZERO
+from mapper.octree.occupied_columns import NEAR_FLOOR_M, NOWHERE, Columns, nearest_heights, starts_of
 
 Heights = NDArray[np.int32]
 

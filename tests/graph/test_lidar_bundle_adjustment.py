@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from mapper.core.geometry import apply, exp, inverse, log
+from mapper.graph.lidar_bundle_adjustment import NodeClouds, adjust_planes, compare_thickness, find_surfaces
 from mapper.graph.model import BetweenFactor, PoseGraph, PoseSigmas, PositionFactor
-from mapper.graph.plane_adjustment import NodeClouds, adjust_planes, compare_thickness, find_surfaces
 from mapper.graph.plane_kernels import Surfaces, linearise, times_eliminated
 
 VOXEL_M = 0.2

@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 
 from mapper.core.geometry import Array, Points, Transform, exp, mean_rotation, transform
 from mapper.core.voxel_grid import voxel_numbers
-from mapper.graph.batch import problem_of
 from mapper.graph.components import components
+from mapper.graph.gtsam_factors import between, gauge, values_of
+from mapper.graph.least_squares import problem_of
 from mapper.graph.model import PoseGraph
 from mapper.graph.plane_kernels import (
     Linearised,
@@ -30,7 +31,6 @@ from mapper.graph.plane_kernels import (
     points_in_world,
     times_eliminated,
 )
-from mapper.graph.terms import between, gauge, values_of
 from mapper.runtime.progress import Report
 
 EDGES = (5.0, 2.5, 1.25)

@@ -8,8 +8,8 @@ import pytest
 from mapper.config.loading import load_config
 from mapper.core.frames import Scan
 from mapper.odometry.config import LocalMapConfig
+from mapper.odometry.scans.adapted_lengths import adapted_to, spaciousness_m
 from mapper.odometry.scans.config import GicpOdometryConfig, IcpOdometryConfig
-from mapper.odometry.scans.surroundings import adapted_to, spaciousness_m
 from mapper.sources.base import Log
 from tests.support.paths import ROOT
 

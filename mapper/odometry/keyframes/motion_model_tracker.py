@@ -9,10 +9,10 @@ from mapper.core.doubts import Doubt
 from mapper.core.geometry import Points, Transform, apply, inverse
 from mapper.odometry.camera.image_observation import ImageObservation
 from mapper.odometry.config import LocalMapConfig
-from mapper.odometry.keyframes.camera_motion import agreeing, camera_motion
-from mapper.odometry.keyframes.earlier_depth import EarlierDepth
+from mapper.odometry.keyframes.depth_comparison import EarlierDepth
 from mapper.odometry.keyframes.landmarks import Ids, LandmarkMap
 from mapper.odometry.keyframes.local_search import LocalSearch
+from mapper.odometry.keyframes.motion_segmentation import agreeing, camera_motion
 from mapper.odometry.keyframes.pose_tracker import TrackedPose, project, unmatched
 from mapper.odometry.keyframes.relocalizer import Relocalizer
 

@@ -9,7 +9,7 @@ from mapper.core.geometry import Points, Transform, apply
 from mapper.odometry.scans.config import IcpOdometryConfig
 from mapper.odometry.scans.scan_matcher import DeskewedScan, Reach
 from mapper.registration.correlation import LikelihoodField
-from mapper.registration.refining import Refiner, refine
+from mapper.registration.pair_refinement import Refiner, refine
 from mapper.registration.surfaces import Prepared, prepared
 
 _MAP_KEYFRAMES = 10

@@ -10,8 +10,8 @@ from mapper.core.geometry import inverse
 from mapper.graph.components import components
 from mapper.graph.model import BetweenFactor, PoseGraph, PoseSigmas
 from mapper.loops.config import NoLoopsConfig
-from mapper.pipeline.components import largest_component
-from mapper.pipeline.joined_components import joined
+from mapper.pipeline.component_loops import joined
+from mapper.pipeline.disconnected_components import largest_component
 from mapper.pipeline.solve import solve
 from mapper.pipeline.tracking_result import TrackingResult
 from mapper.runtime.progress import SILENT

@@ -10,7 +10,7 @@ from mapper.graph.config import GraphConfig
 from mapper.graph.model import BetweenFactor, PoseGraph, PoseSigmas
 from mapper.loops.closure import LoopClosure
 from mapper.odometry.base import Diagnostics, FrameResult
-from mapper.pipeline.components import DISCONNECTED, largest_component, without_doubtful_ends
+from mapper.pipeline.disconnected_components import DISCONNECTED, largest_component, without_doubtful_ends
 from mapper.pipeline.solve import solve
 from mapper.pipeline.tracking_result import TrackingResult
 from mapper.runtime.progress import SILENT

@@ -7,8 +7,8 @@ from mapper.core.geometry import exp, inverse
 from mapper.graph.config import GraphConfig
 from mapper.graph.model import BetweenFactor, PoseGraph, PoseSigmas
 from mapper.loops.closure import LoopClosure
-from mapper.loops.shared_places import shared_place
-from mapper.merging.joint_graph import solve_jointly
+from mapper.loops.inter_session_loops import shared_place
+from mapper.merging.multi_session_graph import solve_jointly
 
 CONFIG = GraphConfig()
 NODES = 21

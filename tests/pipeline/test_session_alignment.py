@@ -13,20 +13,20 @@ from mapper.core.errors import RunError
 from mapper.core.geometry import angle_between, apply, exp, fit_rigid, inverse
 from mapper.core.timebase import nearest
 from mapper.core.trajectory import Trajectory
-from mapper.loops import shared_places
+from mapper.loops import inter_session_loops
 from mapper.loops.base import verify_proposal
 from mapper.loops.closure import read_closures
 from mapper.loops.map_constraints import KnownPlaces
 from mapper.loops.scan_context_proposer import ScanPlace
 from mapper.merging.merge import merge
 from mapper.merging.merged_map import open_map
-from mapper.merging.placing import Placed, Placing, by_truth
+from mapper.merging.world_poses import Placed, Placing, by_truth
 from mapper.octree.map import read_octree
-from mapper.pipeline import join_runs
+from mapper.pipeline import session_alignment
 from mapper.pipeline.build import build
 from mapper.pipeline.fuse import fuse
-from mapper.pipeline.join_runs import place_by_shared_places, place_jointly
 from mapper.pipeline.known_map import run_places
+from mapper.pipeline.session_alignment import place_by_shared_places, place_jointly
 from mapper.run.folder import moved_log, open_run
 from mapper.sources import open_source
 from tests.support.command_line import mapper
@@ -146,7 +146,7 @@ def test_a_run_is_added_to_a_map_in_place(halves, elsewhere, desk_log, tmp_path,
         compared.append(places[1].stamp_ns)
         return verify_proposal(proposal, node, *places)
 
-    monkeypatch.setattr(shared_places, "verify_proposal", verify)
+    monkeypatch.setattr(inter_session_loops, "verify_proposal", verify)
     result = mapper("merge", out, elsewhere.path, middle.path)
     assert f"mapper: {elsewhere.path}: left out, " in result.stderr
 
@@ -200,7 +200,7 @@ def test_a_run_whose_places_do_not_compare_is_left_out(halves, monkeypatch):
     def places_of(run, *, progress):
         return known[run.path].pop() if run.path in known else run_places(run, progress=progress)
 
-    monkeypatch.setattr(join_runs, "run_places", places_of)
+    monkeypatch.setattr(session_alignment, "run_places", places_of)
     with pytest.raises(RunError, match="is of sensor lidar, and the first run of rgbd"):
         place_by_shared_places([halves[1], halves[0]])
     with pytest.raises(RunError, match="no keyframe of it can be recognised"):

@@ -13,7 +13,7 @@ from mapper.core.rotations import pose_of_row
 from mapper.core.timebase import MAX_TRUTH_GAP_NS, nearest
 from mapper.core.trajectory import Trajectory
 from mapper.mapping.config import edits_of
-from mapper.merging.joint_graph import JointGraph
+from mapper.merging.multi_session_graph import JointGraph
 from mapper.octree.config import OctreeConfig
 from mapper.octree.scan_updates import displacement_m, longest_ray_m
 from mapper.run import files

@@ -5,7 +5,7 @@ import pytest
 import small_gicp
 
 from mapper.core.geometry import apply, exp, inverse
-from mapper.registration.refining import measured, refine, refined_motion
+from mapper.registration.pair_refinement import measured, refine, refined_motion
 from mapper.registration.surfaces import prepared
 
 VOXEL_M = 0.2

@@ -11,11 +11,11 @@ import numpy as np
 from mapper.core.errors import RunError
 from mapper.core.geometry import inverse
 from mapper.loops.closure import read_closures
+from mapper.loops.inter_session_loops import SharedPlace, find_shared_places, shared_place
 from mapper.loops.map_constraints import KnownPlaces
-from mapper.loops.shared_places import SharedPlace, find_shared_places, shared_place
-from mapper.merging.joint_graph import JointGraph, SolvedWorlds, solve_jointly, solve_worlds
 from mapper.merging.merged_map import MergedMap
-from mapper.merging.placing import Placed, Placing, fit_poses
+from mapper.merging.multi_session_graph import JointGraph, SolvedWorlds, solve_jointly, solve_worlds
+from mapper.merging.world_poses import Placed, Placing, fit_poses
 from mapper.pipeline.known_map import WITHOUT_PLACES, detector_of, loops_between_days, run_places, sensor_of
 from mapper.run import files
 from mapper.run.folder import Run

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from mapper.core.geometry import exp, transform
-from mapper.graph.uncertainty import compare, with_model_error
+from mapper.graph.measurement_covariance import compare, with_model_error
 from tests.support.planar import at
 
 NOTHING = np.zeros((6, 6))

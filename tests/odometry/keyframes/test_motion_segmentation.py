@@ -8,7 +8,7 @@ import pytest
 from mapper.core.geometry import Points, Transform, apply, exp, inverse, log
 from mapper.odometry.config import LocalMapConfig
 from mapper.odometry.factory import build_frame_odometry
-from mapper.odometry.keyframes.camera_motion import CameraMotion, camera_motion
+from mapper.odometry.keyframes.motion_segmentation import CameraMotion, camera_motion
 from mapper.odometry.keyframes.pose_tracker import project
 
 T_CAMERA_WORLD = exp(np.array([0.0, 0.01, 0.0]), np.array([0.02, 0.0, 0.01]))

@@ -8,7 +8,7 @@ from scipy.sparse.csgraph import connected_components
 from mapper.graph.model import BetweenFactor
 from mapper.loops.closure import Discrepancy, exceeds
 from mapper.loops.config import GateConfig
-from mapper.loops.odometry_chain import OdometryChain, allowed
+from mapper.loops.odometry_drift import OdometryChain, allowed
 from tests.support.loop_closures import SURE
 from tests.support.planar import at
 

@@ -6,8 +6,8 @@ import pytest
 from mapper.core.geometry import exp, inverse
 from mapper.loops.config import ScanLoopsConfig
 from mapper.loops.factory import build_verifier
+from mapper.loops.inter_session_loops import find_shared_places
 from mapper.loops.map_constraints import KnownPlaces
-from mapper.loops.shared_places import find_shared_places
 from mapper.runtime.executor import Workers
 from tests.support.street_scans import on_street, street, view
 

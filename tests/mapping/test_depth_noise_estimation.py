@@ -5,7 +5,7 @@ import pytest
 
 from mapper.core.errors import FrameError
 from mapper.core.frames import PinholeCamera, RgbdFrame, ray_table
-from mapper.mapping.measured_noise import measure_noise
+from mapper.mapping.depth_noise_estimation import measure_noise
 from mapper.sensing.config import KINECT_NOISE, DepthNoiseConfig
 from mapper.sensing.depth import depth_sigma_m
 from tests.support.logs import MemoryEntry, log_in_memory

@@ -17,9 +17,9 @@ from mapper.core.geometry import Array, Points
 from mapper.navigation import floor_kernels as kernels
 from mapper.navigation.config import TraversableConfig
 from mapper.navigation.floor_kernels import OFF_PLANE, Limits, Mask, limits_of
-from mapper.octree.columns import NOWHERE, Columns, DrivenGround, occupied_columns, starts_of
 from mapper.octree.keys import KEY_ZERO
 from mapper.octree.map import OctreeMap
+from mapper.octree.occupied_columns import NOWHERE, Columns, DrivenGround, occupied_columns, starts_of
 
 MAX_SENSOR_HEIGHT_M = 4.0
 """Sensors are carried no higher than this above the ground."""

@@ -12,10 +12,10 @@ from mapper.core.errors import DataError, MapSizeError
 from mapper.core.frames import Points32, Scan
 from mapper.core.geometry import Array, Transform, apply
 from mapper.core.units import MIB
-from mapper.octree import casting_kernels as kernels
-from mapper.octree.casting_kernels import Window
+from mapper.octree import ray_casting_kernels as kernels
 from mapper.octree.config import OctreeConfig
 from mapper.octree.keys import BLOCK_BITS, BLOCK_VOXELS, KEY_BITS, KEY_COUNT, KEY_ZERO
+from mapper.octree.ray_casting_kernels import Window
 from mapper.sensing.depth import DepthLimit
 
 _LIMIT_BYTES = 8192 * MIB
