@@ -4,7 +4,7 @@ from functools import partial
 from importlib.util import find_spec
 from typing import Any, get_args
 
-from mapper.core.config import AnyConfig, with_changes
+from mapper.core.config import AnyConfig, scale_length, with_changes
 from mapper.core.errors import ConfigError
 from mapper.core.frames import Sensor
 from mapper.evaluators.compare.config import CompareConfig
@@ -133,9 +133,7 @@ def shrunk(config: AnyConfig, ratio: float) -> AnyConfig:
     """Return settings with every length, at any depth, at a part of its size."""
 
     def change(name: str, value: Any) -> Any:
-        if not name.endswith("_m"):
-            return value
-        return tuple(ratio * v for v in value) if isinstance(value, tuple) else ratio * value
+        return scale_length(value, ratio) if name.endswith("_m") else value
 
     return with_changes(config, change)
 

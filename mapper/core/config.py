@@ -98,6 +98,11 @@ def with_changes(config: AnyConfig, change: Callable[[str, Any], Any]) -> AnyCon
     return config.model_copy(update={name: new[name] for name, value in config if new[name] is not value})
 
 
+def scale_length(length: Any, factor: float) -> Any:
+    """Return a length, or each of a tuple of lengths, multiplied."""
+    return tuple(factor * one for one in length) if isinstance(length, tuple) else factor * length
+
+
 def drop_unknown(model: type[Config], tree: Any) -> list[str]:
     """Delete the names that a model does not have from what an older version wrote; return them, dotted.
 

@@ -8,12 +8,7 @@ from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, Pos
 from mapper.core.config import Config, Ratio
 from mapper.features.config import DetectorConfig, OrbConfig, UniformOrbConfig
 from mapper.graph.config import WheelNoiseConfig
-from mapper.odometry.scans.config import (
-    GicpOdometryConfig,
-    HoughOdometryConfig,
-    IcpOdometryConfig,
-    KissOdometryConfig,
-)
+from mapper.odometry.scans.config import AnyScanOdometryConfig
 from mapper.registration.config import IsvdConfig
 from mapper.sensing.config import DepthNoiseConfig
 
@@ -209,15 +204,7 @@ class OwnOdometryConfig(Config):
     """Name of its class, as a record."""
 
 
-FrameOdometryConfig = (
-    IsvdOdometryConfig
-    | LocalMapConfig
-    | PnpConfig
-    | GicpOdometryConfig
-    | IcpOdometryConfig
-    | KissOdometryConfig
-    | HoughOdometryConfig
-)
+FrameOdometryConfig = IsvdOdometryConfig | LocalMapConfig | PnpConfig | AnyScanOdometryConfig
 """Settings of the methods that use the frames' images or scans."""
 
 OdometryConfig = Annotated[

@@ -104,6 +104,10 @@ def build_frame_odometry(
     wheels: Trajectory | None = None,
 ) -> FrameOdometry[Any]:
     """Return the odometry that the settings choose among those that use the frames' images or scans."""
+    if isinstance(config, AnyScanOdometryConfig):
+        from mapper.odometry.scans.odometry import ScanOdometry
+
+        return ScanOdometry(config, _build_matcher(config), gyroscope, wheels)
     match config:
         case IsvdOdometryConfig():
             from mapper.odometry.isvd.odometry import IsvdOdometry
@@ -119,10 +123,6 @@ def build_frame_odometry(
             from mapper.odometry.keyframes.pnp_tracker import PnpPoseTracker
 
             return KeyframeOdometry(config, PnpPoseTracker, motion_check, gyroscope)
-        case GicpOdometryConfig() | IcpOdometryConfig() | KissOdometryConfig() | HoughOdometryConfig():
-            from mapper.odometry.scans.odometry import ScanOdometry
-
-            return ScanOdometry(config, _build_matcher(config), gyroscope, wheels)
         case _:
             assert_never(config)
 

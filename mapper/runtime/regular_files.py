@@ -89,7 +89,7 @@ def read_text(
     encoding: str = "utf-8",
     may_be_pipe: bool = False,
 ) -> str:
-    """Return the text of a file.
+    """Return the text of a file, without the byte order mark with which Windows programs begin one.
 
     Args:
         path: File, as of :func:`read_regular`.
@@ -104,7 +104,8 @@ def read_text(
     if (paths := _reads.get()) is not None:
         paths.add(path)
     try:
-        return read_regular(path, most_bytes=MOST_BYTES, may_be_pipe=may_be_pipe).decode(encoding)
+        text = read_regular(path, most_bytes=MOST_BYTES, may_be_pipe=may_be_pipe).decode(encoding)
+        return text.removeprefix("\ufeff")
     except OSError as why:
         raise error(f"{path}: cannot be read: {why.strerror}") from None
     except UnicodeDecodeError as why:

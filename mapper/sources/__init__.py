@@ -20,7 +20,7 @@ __all__ = ["open_source"]
 RECORDING = "ros.files"
 # The first that recognises a path reads it. Images of ICL-NUIM and Poznań are numbered too, and stamps are
 # numbers, so these come before numbered images; any log's folder may have clouds in it, so clouds come last.
-_FORMATS = (
+FORMATS = (
     "image_folders.posed_layouts",
     "image_folders.icl_nuim",
     "image_folders.tum",
@@ -125,7 +125,7 @@ def _other_data(path: Path) -> str:
 
 def format_of(path: Path) -> str | None:
     """Return the module of the format that recognises a file or folder; None if none does."""
-    recognising = (name for name in _FORMATS if import_module(f"mapper.sources.{name}").recognise(path))
+    recognising = (name for name in FORMATS if import_module(f"mapper.sources.{name}").recognise(path))
     return next(recognising, None)
 
 

@@ -23,9 +23,9 @@ from mapper.octree.map_file import write_map
 from mapper.octree.octomap_file import write_bt, write_ot
 from mapper.simulation import write_tum_log
 from mapper.sources.base import Accelerations, Log
-from mapper.sources.calibration_file import calibration_text
 from mapper.sources.ros.typestore import typestore
 from mapper.sources.writers import LogKind, write_log
+from tests.fuzz.image_logs import IMAGE_LOGS
 from tests.fuzz.sensor_logs import SENSOR_LOGS
 from tests.support.clouds import save_cloud
 from tests.support.depth_cameras import write_unregistered
@@ -40,19 +40,6 @@ from tests.support.tum_logs import FIRST_NS, picture
 FRAMES = 4
 STAMPS_NS = FIRST_NS + np.arange(FRAMES, dtype=np.int64) * (NS_PER_S // 10)
 TINY_DESK = DESK.model_copy(update={"width_px": 160, "height_px": 120, "duration_s": 0.8})
-CALIBRATION_YAML = """%YAML:1.0
-Camera.fx: 60.0
-Camera.fy: 61.0
-Camera.cx: 31.5
-Camera.cy: 23.5
-Camera.width: 64
-Camera.height: 48
-DepthMapFactor: 1000.0
-distortion_coefficients: !!opencv-matrix
-   rows: 1
-   cols: 5
-   data: [ 0.1, -0.2, 0.001, 0.002, 0.05 ]
-"""
 
 Maker = Callable[[Path], Path]
 """Makes an input in an empty folder, and returns the path to open."""
@@ -202,44 +189,6 @@ def _foxglove_json(folder: Path) -> Path:
     return path
 
 
-def _numbered(colour: str, depth: str) -> Maker:
-    def make(folder: Path) -> Path:
-        log = folder / "log"
-        poses = []
-        for i in range(FRAMES):
-            rgb, units = picture(i)
-            for kind, ending, pixels in (("rgb", colour, rgb[:, :, ::-1]), ("depth", depth, units)):
-                (log / kind).mkdir(parents=True, exist_ok=True)
-                assert cv2.imwrite(str(log / kind / f"{i:06}{ending}"), pixels)
-            matrix = "\n".join(" ".join(f"{value:.6f}" for value in row) for row in truth().T_world_body[i])
-            poses.append(f"{i} {i} {i + 1}\n{matrix}\n")
-        (log / "trajectory.log").write_text("".join(poses))
-        (log / "camera.yaml").write_text(CALIBRATION_YAML)
-        return log
-
-    return make
-
-
-def _seven_scenes(folder: Path) -> Path:
-    log = folder / "log"
-    log.mkdir()
-    for i in range(FRAMES):
-        rgb, units = picture(i)
-        assert cv2.imwrite(str(log / f"frame-{i:06}.color.png"), rgb)
-        assert cv2.imwrite(str(log / f"frame-{i:06}.depth.png"), units)
-        np.savetxt(log / f"frame-{i:06}.pose.txt", truth().T_world_body[i], fmt="%.7e", delimiter="\t")
-    (log / "calibration.toml").write_text(calibration_text(CAMERA, depth_units_per_m=1000.0))
-    return log
-
-
-def _poznan(folder: Path) -> Path:
-    log = _numbered(".png", ".png")(folder)
-    (log / "trajectory.log").unlink()
-    rows = [f"{i} {0.1 * i} 0 1 0 0 {i}" for i in range(FRAMES)]
-    (log / "groundtruth.txt").write_text("\n".join(["# number x y z roll pitch yaw, deg", *rows]) + "\n")
-    return log
-
-
 def _clouds(ending: str) -> Maker:
     def make(folder: Path) -> Path:
         log = folder / "log"
@@ -333,16 +282,11 @@ FORMATS: Mapping[str, Maker] = {
     "lidar mcap": _written(lidar_log, "mcap", "log.mcap"),
     "lidar bag": _written(lidar_log, "bag", "log.bag"),
     "kitti": _written(lidar_log, "kitti", "log"),
-    "redwood, png": _numbered(".png", ".png"),
-    "redwood, jpg": _numbered(".jpg", ".png"),
-    "redwood, tiff": _numbered(".tiff", ".tiff"),
-    "redwood, bmp": _numbered(".bmp", ".pgm"),
-    "7-scenes": _seven_scenes,
+    **IMAGE_LOGS,
     **{kind: _scan(kind) for kind in WRITERS if kind != "redwood"},
     "redwood, npy": _scan("redwood"),
     "bag, livox": _livox,
     **SENSOR_LOGS,
-    "poznan": _poznan,
     **{
         f"clouds, {ending[1:]}": _clouds(ending)
         for ending in (".bin", ".pcd", ".ply", ".xyz", ".csv", ".npy", ".las", ".laz")

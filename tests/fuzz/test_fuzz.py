@@ -3,6 +3,8 @@
 import hypothesis
 import pytest
 
+from mapper import sources
+from mapper.sources import format_of
 from tests.fuzz.command_lines import Sandbox, every_verb, lines
 from tests.fuzz.corpus import FORMATS, commands_of
 from tests.fuzz.runner import Runner, cases
@@ -22,6 +24,11 @@ def test_undamaged_inputs_are_read(runner, tmp_path):
         for command in commands_of(name)[: 4 if name == "run, old" else None]:  # the rest reads as of "run"
             reading = runner.run(command, path)
             assert reading.outcome in ("read", "noted"), (name, command, reading)
+
+
+def test_the_corpus_has_every_format(runner, tmp_path):
+    read = {format_of(runner.corpus.copy(name, tmp_path / name)) for name in FORMATS}
+    assert set(sources.FORMATS) <= read
 
 
 @hypothesis.given(case=cases())

@@ -54,9 +54,8 @@ def test_tracking_goes_on_at_the_frame_where_it_was_stopped(desk_log, desk_run, 
     assert line.endswith(" track at frame 8; track at frame 15")
 
 
-@pytest.mark.parametrize("kind", ["gicp", "kiss-icp", "icp"])
-def test_every_scan_odometry_goes_on_to_the_same_bytes(street, tmp_path, kind):
-    chosen = f"odometry.kind={kind}"
+def test_a_scan_odometry_of_a_compiled_library_goes_on_to_the_same_bytes(street, tmp_path):
+    chosen = "odometry.kind=kiss-icp"
     wanted = start(street, tmp_path / "wanted", chosen, checkpoint_s=None)
     stopped(street, tmp_path / "run", chosen, observer=StopAt(7))
     stopped(street, tmp_path / "run", chosen, observer=StopAt(7))

@@ -1,11 +1,13 @@
 """Settings of the LiDAR odometries."""
 
-from typing import ClassVar, Literal, Self
+from typing import Literal, Self
 
 from pydantic import NonNegativeInt, PositiveFloat, PositiveInt
 
-from mapper.core.config import Config, Ratio
+from mapper.core.config import Config, Ratio, scale_length
 from mapper.registration.hough.config import HoughGicpConfig, HoughNdtConfig
+
+_RANGES = frozenset({"min_range_m", "max_range_m"})
 
 
 class ScanOdometryConfig(Config):
@@ -42,14 +44,16 @@ class ScanOdometryConfig(Config):
     max_pair_distance_m: PositiveFloat = 0.5
     """Distance from the last keyframe's points within which a point counts as overlap."""
 
-    lengths: ClassVar[tuple[str, ...]] = ("voxel_m", "keyframe_distance_m", "max_pair_distance_m")
-
     def scaled(self, factor: float) -> Self:
-        """Return the settings with all lengths but the ranges multiplied."""
+        """Return the settings with their own lengths (``…_m``) but for the ranges multiplied."""
         if factor == 1.0:
             return self
-        of = {name: factor * getattr(self, name) for name in self.lengths}
-        return self.model_copy(update={"scale": factor, **of})
+        lengths = {
+            name: scale_length(value, factor)
+            for name, value in self
+            if name.endswith("_m") and name not in _RANGES
+        }
+        return self.model_copy(update={"scale": factor, **lengths})
 
 
 class GicpOdometryConfig(ScanOdometryConfig):
@@ -63,8 +67,6 @@ class GicpOdometryConfig(ScanOdometryConfig):
     max_iterations: PositiveInt = 30
     """Largest number of iterations at each cell size."""
 
-    lengths = (*ScanOdometryConfig.lengths, "cell_m", "coarse_cell_m")
-
 
 class IcpOdometryConfig(ScanOdometryConfig):
     """Scan to the last keyframes by ICP."""
@@ -77,11 +79,6 @@ class IcpOdometryConfig(ScanOdometryConfig):
     """Largest distance between the points of a pair, from coarse to fine."""
     max_iterations: PositiveInt = 40
     """Largest number of iterations at each of these distances."""
-
-    def scaled(self, factor: float) -> Self:
-        """Return the settings with all lengths but the ranges multiplied."""
-        distances_m = tuple(factor * distance_m for distance_m in self.pair_distances_m)
-        return super().scaled(factor).model_copy(update={"pair_distances_m": distances_m})
 
 
 class KissOdometryConfig(ScanOdometryConfig):
@@ -97,8 +94,6 @@ class KissOdometryConfig(ScanOdometryConfig):
     """Smaller deviations from the predicted motion do not change the adaptive threshold."""
     max_iterations: PositiveInt = 500
     """Largest number of iterations."""
-
-    lengths = (*ScanOdometryConfig.lengths, "map_voxel_m", "initial_threshold_m", "min_motion_m")
 
 
 class HoughOdometryConfig(ScanOdometryConfig):

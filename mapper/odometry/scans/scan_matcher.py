@@ -27,6 +27,10 @@ class DeskewedScan:
 class ScanMatcher(Protocol):
     """Map of earlier scans, and a method that registers a scan to it.
 
+    Poses are those in the middle of a sweep. Planar scans of a 2D laser (``scan.is_planar``) come, too.
+    What a matcher keeps are arrays, numbers and objects of this package, or it has ``__getstate__`` as
+    KissMatcher has: otherwise builds run without checkpoints.
+
     Attributes:
         uses_guess: Whether another guess can give another pose.
     """
@@ -34,7 +38,10 @@ class ScanMatcher(Protocol):
     uses_guess: bool
 
     def match(self, deskewed: DeskewedScan, T_world_body: Transform, *, reach: Reach) -> Transform | None:
-        """Return the refined T_world_body of a scan from a guess; None if the method finds none."""
+        """Return the refined T_world_body of a scan from a guess; None if the method finds none.
+
+        "far" is asked for once "near" found nothing that fits; None if the method has no wider search.
+        """
         ...
 
     def add(self, deskewed: DeskewedScan, T_world_body: Transform, *, is_keyframe: bool) -> None:

@@ -1,0 +1,105 @@
+"""Inputs of image folders whose images have no list: numbered or stamped names, and truths of their own."""
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from mapper.core.timebase import NS_PER_S
+from mapper.sources.calibration_file import calibration_text
+from tests.support.recordings import CAMERA
+from tests.support.tum_logs import FIRST_NS, picture
+
+FRAMES = 4
+CALIBRATION_YAML = """%YAML:1.0
+Camera.fx: 60.0
+Camera.fy: 61.0
+Camera.cx: 31.5
+Camera.cy: 23.5
+Camera.width: 64
+Camera.height: 48
+DepthMapFactor: 1000.0
+distortion_coefficients: !!opencv-matrix
+   rows: 1
+   cols: 5
+   data: [ 0.1, -0.2, 0.001, 0.002, 0.05 ]
+"""
+
+
+def pose(i: int) -> np.ndarray:
+    T_world_body = np.eye(4)
+    T_world_body[0, 3] = 0.1 * i
+    return T_world_body
+
+
+def _numbered(colour: str, depth: str) -> Callable[[Path], Path]:
+    def make(folder: Path) -> Path:
+        log = folder / "log"
+        poses = []
+        for i in range(FRAMES):
+            rgb, units = picture(i)
+            for kind, ending, pixels in (("rgb", colour, rgb[:, :, ::-1]), ("depth", depth, units)):
+                (log / kind).mkdir(parents=True, exist_ok=True)
+                assert cv2.imwrite(str(log / kind / f"{i:06}{ending}"), pixels)
+            matrix = "\n".join(" ".join(f"{value:.6f}" for value in row) for row in pose(i))
+            poses.append(f"{i} {i} {i + 1}\n{matrix}\n")
+        (log / "trajectory.log").write_text("".join(poses))
+        (log / "camera.yaml").write_text(CALIBRATION_YAML)
+        return log
+
+    return make
+
+
+def _seven_scenes(folder: Path) -> Path:
+    log = folder / "log"
+    log.mkdir()
+    for i in range(FRAMES):
+        rgb, units = picture(i)
+        assert cv2.imwrite(str(log / f"frame-{i:06}.color.png"), rgb)
+        assert cv2.imwrite(str(log / f"frame-{i:06}.depth.png"), units)
+        np.savetxt(log / f"frame-{i:06}.pose.txt", pose(i), fmt="%.7e", delimiter="\t")
+    (log / "calibration.toml").write_text(calibration_text(CAMERA, depth_units_per_m=1000.0))
+    return log
+
+
+def _without_poses(folder: Path) -> Path:
+    log = _numbered(".png", ".png")(folder)
+    (log / "trajectory.log").unlink()
+    return log
+
+
+def _poznan(folder: Path) -> Path:
+    log = _without_poses(folder)
+    rows = [f"{i} {0.1 * i} 0 1 0 0 {i}" for i in range(FRAMES)]
+    (log / "groundtruth.txt").write_text("\n".join(["# number x y z roll pitch yaw, deg", *rows]) + "\n")
+    return log
+
+
+def _icl_nuim(folder: Path) -> Path:
+    log = _without_poses(folder)
+    pairs = [f"{i} depth/{i:06}.png {i} rgb/{i:06}.png" for i in range(FRAMES)]
+    (log / "associations.txt").write_text("\n".join(pairs) + "\n")
+    rows = [f"{i} {0.1 * i} 0 1 0 0 0 1" for i in range(FRAMES)]
+    (log / "livingRoom1.gt.freiburg").write_text("\n".join(rows) + "\n")
+    return log
+
+
+def _stamped(folder: Path) -> Path:
+    log = _without_poses(folder)
+    for image in sorted(log.glob("*/*.png")):
+        image.rename(image.with_stem(f"{FIRST_NS + int(image.stem) * NS_PER_S // 10}"))
+    return log
+
+
+IMAGE_LOGS: Mapping[str, Callable[[Path], Path]] = {
+    "redwood, png": _numbered(".png", ".png"),
+    "redwood, jpg": _numbered(".jpg", ".png"),
+    "redwood, tiff": _numbered(".tiff", ".tiff"),
+    "redwood, bmp": _numbered(".bmp", ".pgm"),
+    "7-scenes": _seven_scenes,
+    "poznan": _poznan,
+    "icl-nuim": _icl_nuim,
+    "stamped images": _stamped,
+}
+"""Makers of these inputs."""
