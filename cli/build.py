@@ -2,8 +2,7 @@
 
 import json
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -12,7 +11,6 @@ import typer
 
 from mapper.cli.answer import Answer, Output, rows_text, untrusted
 from mapper.cli.completion import run_folders
-from mapper.cli.environment import note_compilation
 from mapper.cli.options import (
     ConfigFile,
     First,
@@ -23,26 +21,17 @@ from mapper.cli.options import (
     RequireTruth,
     RunFolder,
     Stride,
-    merged,
     refuse_with,
     refuse_without,
     selection,
+    settings_of,
 )
-from mapper.core.errors import ConfigError, ViewerError
-from mapper.runtime.result_paths import RUNS, name_of, place_of
+from mapper.core.errors import ConfigError
+from mapper.run.observers import NULL_OBSERVER, Observers
 
 if TYPE_CHECKING:
-    from mapper.config.build import BuildConfig
-    from mapper.core.geometry import Transform
-    from mapper.mapping.fusion import Maps
-    from mapper.run.folder import Run
-    from mapper.run.observers import Observer, Step
-    from mapper.run.results import RunResults
+    from mapper.run.observers import Step
     from mapper.runtime.profiler import Profiler
-    from mapper.runtime.progress import Progress
-    from mapper.sources.base import Log
-
-    ObserverFactory = Callable[[Log, BuildConfig], AbstractContextManager[Observer]]
     from mapper.simulation.config import SynthConfig
 
 
@@ -101,32 +90,32 @@ def build(
 
     Example: mapper build rgbd_dataset_freiburg1_xyz --set octree.resolution_m=0.1
     """
-    out = place_of(out, RUNS / name_of(log), overwrite=overwrite)
-    overrides = merged(selection(first, last, stride, require_truth), set_)
-    make_observer = observer_factory(rerun, step=step, overwrite=overwrite)
+    from mapper.api.build import build as build_run
+
+    if rerun is None:
+        refuse_without("--rerun", {"--step": step})
+    if onto is not None:
+        refuse_with("--onto", {"--config": config}, remedy="give single settings by --set")
+        refuse_with("--onto", {"--rerun": rerun}, remedy="look at the new run with mapper view")
+        refuse_with("--onto", {"--fresh": fresh, "--profile": profile})
     profiler = None
     if profile:
         from mapper.runtime.profiler import Profiler
 
         profiler = Profiler(output.progress(prompts=step))
-    if onto is None:
-        with profiler or nullcontext():
-            run = built(
-                log,
-                config,
-                overrides,
-                out,
-                overwrite=overwrite,
-                fresh=fresh,
-                output=output,
-                progress=profiler or output.progress(prompts=step),
-                make_observer=make_observer,
-            )
-    else:
-        refuse_with("--onto", {"--config": config}, remedy="give single settings by --set")
-        refuse_with("--onto", {"--rerun": rerun}, remedy="look at the new run with mapper view")
-        refuse_with("--onto", {"--fresh": fresh, "--profile": profile})
-        run = appended(log, onto, overrides, out, overwrite=overwrite, output=output)
+    with profiler or nullcontext():
+        run = build_run(
+            log,
+            out=out,
+            config=config,
+            settings=settings_of(selection(first, last, stride, require_truth), set_),
+            onto=onto,
+            rerun=rerun,
+            progress=profiler or output.progress(prompts=step),
+            observer=Stepping() if step else NULL_OBSERVER,
+            overwrite=overwrite,
+            fresh=fresh,
+        )
     from mapper.cli.summary import summary_of  # a build begins without what its end needs
 
     error = untrusted(run.path, run.verdict) if strict else None
@@ -153,92 +142,6 @@ def _with_profile(answer: Answer, profiler: "Profiler", run: Path) -> Answer:
     )
 
 
-def built(
-    log: Path,
-    config_file: Path | None,
-    overrides: "Sequence[str]",
-    out: Path,
-    *,
-    overwrite: bool,
-    output: Output,
-    fresh: bool = False,
-    progress: "Progress | None" = None,
-    make_observer: "ObserverFactory | None" = None,
-) -> "Run":
-    """Build a run of a log."""
-    from mapper.config.loading import load_config, load_source_config
-    from mapper.pipeline.build import build as build_run
-    from mapper.run.observers import Observers
-    from mapper.sources import open_source
-
-    source = open_source(log, load_source_config(config_file, overrides))
-    config = load_config(config_file, overrides, sensor=source.sensor)
-    progress = progress or output.progress()
-    note_compilation(progress)
-    for note in source.sentences:
-        progress.note(note)
-    preview = _preview(source, out, progress)
-    with nullcontext(preview) if make_observer is None else make_observer(source, config) as observer:
-        watching = preview if make_observer is None else Observers(observer, preview)
-        return build_run(
-            source, config, out, progress=progress, observer=watching, overwrite=overwrite, fresh=fresh
-        )
-
-
-def _preview(source: "Log", out: Path, progress: "Progress") -> "Observer":
-    from mapper.export.preview import PREVIEW, Preview
-    from mapper.runtime.atomic import partial_of
-
-    shown = partial_of(out) / PREVIEW
-    return Preview(shown.resolve(), source, on_first=lambda: progress.note(f"first picture: {shown}"))
-
-
-def observer_factory(rerun: str | None, *, step: bool, overwrite: bool) -> "ObserverFactory | None":
-    """Return the observer of a build, refusing at once what would fail at its end."""
-    if rerun is None:
-        refuse_without("--rerun", {"--step": step})
-        return None
-    from mapper.export.rerun.target import check_target
-    from mapper.runtime.atomic import refuse_existing
-
-    target = check_target(rerun)
-    refuse_existing(Path(target), overwrite=overwrite, option="--rerun")
-
-    @contextmanager
-    def make_observer(source: "Log", config: "BuildConfig") -> "Iterator[Observer]":
-        from mapper.export.rerun.live import live_recording
-
-        is_built = False
-        try:
-            with live_recording(target, source, config.rerun) as observer:
-                yield Stepping(observer) if step else observer
-                is_built = True
-        except ViewerError as error:
-            if not is_built:
-                raise
-            print(f"mapper: {error}", file=sys.stderr)
-
-    return make_observer
-
-
-def appended(
-    log: Path, onto: Path, overrides: "Sequence[str]", out: Path, *, overwrite: bool, output: Output
-) -> "Run":
-    """Build a run from a run and a later log of the same place, by the run's configuration."""
-    from mapper.config.loading import overridden
-    from mapper.pipeline.append import append
-    from mapper.run.folder import open_run
-    from mapper.sources import open_source
-    from mapper.sources.config import SourceConfig
-
-    first = open_run(onto)
-    config = overridden(first.config.model_copy(update={"source": SourceConfig()}), overrides)
-    source = open_source(log, config.source)
-    progress = output.progress()
-    preview = _preview(source, out, progress)
-    return append(source, first, config, out, progress=progress, observer=preview, overwrite=overwrite)
-
-
 def fuse(
     run: RunFolder,
     set_: Overrides = None,
@@ -256,27 +159,19 @@ def fuse(
     Example: mapper fuse runs/xyz --set octree.resolution_m=0.1 --set slice.max_height_m=1.8
     """
     from mapper.cli.summary import summary_of
-    from mapper.config.loading import overridden
-    from mapper.pipeline.fuse import fuse as fuse_run
     from mapper.run.folder import moved_log, open_run
     from mapper.sources.trajectory_files import read_tum
 
     built = open_run(run)
     if log:
         built = moved_log(built, *log)
-    config = overridden(built.config, set_ or ())
+    poses = None if trajectory is None else read_tum(trajectory)
     return summary_of(
-        fuse_run(
-            built.open_log(),
-            built,
-            config,
-            trajectory=None if trajectory is None else read_tum(trajectory),
-            progress=output.progress(),
-        )
+        built.fuse(settings=settings_of({}, set_), trajectory=poses, progress=output.progress())
     )
 
 
-DEMO_LOG = ("path=loop", "width_px=320", "height_px=240")
+DEMO_LOG = {"path": "loop", "width_px": 320, "height_px": 240}
 
 
 def demo(
@@ -290,20 +185,21 @@ def demo(
 
     Example: mapper demo --out /tmp/demo --seconds 20
     """
-    from mapper.cli.options import assignments
+    from mapper.api.build import build as build_run
     from mapper.cli.summary import summary_of
     from mapper.config.loading import load_config, overridden
     from mapper.run import files
     from mapper.simulation import write_tum_log
     from mapper.simulation.config import SynthConfig
 
-    load_config(None, set_ or ())  # what is wrong with it is better known before the log is made
+    settings = settings_of({}, set_)
+    load_config(settings)  # what is wrong with it is better known before the log is made
     log = out / "log"
-    scene = overridden(SynthConfig(), [*DEMO_LOG, *assignments({"duration_s": seconds})])
+    scene = overridden(SynthConfig(), settings=settings_of({**DEMO_LOG, "duration_s": seconds}))
     if not _is_made(log, scene):
         with output.progress().stage("render") as report:
             write_tum_log(log, scene, on_progress=report)
-    run = built(log, None, set_ or (), out / "run", overwrite=True, output=output)
+    run = build_run(log, out=out / "run", settings=settings, progress=output.progress(), overwrite=True)
     pictures = [run.path / name for name in (files.SUMMARY, files.CLOUD_VIEWS, f"{files.SLICE}.png")]
     summary, below = summary_of(run), "\n".join(map(str, pictures))
     return Answer(
@@ -321,10 +217,10 @@ def _is_made(log: Path, scene: "SynthConfig") -> bool:
     )
 
 
-class Stepping:
-    """Observer that forwards to another and waits for Enter after every frame (Somlyai, PhD thesis, §3.6)."""
+class Stepping(Observers):
+    """Waits for Enter after every frame (Somlyai, PhD thesis, §3.6)."""
 
-    def __init__(self, other: "Observer") -> None:
+    def __init__(self) -> None:
         """Refuse to wait for keys where standard input is no terminal.
 
         Raises:
@@ -332,14 +228,12 @@ class Stepping:
         """
         if not sys.stdin.isatty():
             raise ConfigError("--step: waits for Enter after each frame, but standard input is no terminal")
-        self._other = other
         self._frames = 0
         self._waits = True
         _say("stepping: Enter for the next frame, c and Enter to run on")
 
     def on_frame(self, step: "Step", /) -> None:
         """Print how the frame went, and wait."""
-        self._other.on_frame(step)
         self._frames += 1
         if not self._waits:
             return
@@ -352,14 +246,6 @@ class Stepping:
         sys.stderr.flush()
         answer = sys.stdin.readline()
         self._waits = answer.strip() != "c" and bool(answer)
-
-    def on_levelled(self, T_level_world: "Transform", /) -> None:
-        """Pass on."""
-        self._other.on_levelled(T_level_world)
-
-    def on_mapped(self, run: "Run", results: "RunResults", maps: "Maps", /) -> None:
-        """Pass on."""
-        self._other.on_mapped(run, results, maps)
 
 
 def _say(text: str, *, end: str = "\n") -> None:

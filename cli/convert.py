@@ -16,10 +16,9 @@ from mapper.cli.options import (
     RequireTruth,
     RunFolder,
     Stride,
-    assignments,
-    merged,
     refuse_with,
     selection,
+    settings_of,
 )
 from mapper.core.errors import ConfigError
 from mapper.export.exporters import EXPORTERS, Frame
@@ -53,8 +52,7 @@ def convert(
 
     Example: mapper convert rgbd_dataset_freiburg1_xyz --out xyz.mcap
     """
-    from mapper.config.loading import load_source_config
-    from mapper.sources import open_source
+    from mapper.api.logs import open_log
     from mapper.sources.reading_checks import ReadingChecks
     from mapper.sources.writers import left_out, write_log
 
@@ -64,8 +62,8 @@ def convert(
     if as_ is None:
         formats = ", ".join(get_args(LogFormat))
         raise ConfigError(f"--as: want one of {formats}; an --out that ends in .mcap or .bag says it, too")
-    selected = selection(first, last, stride, require_truth)
-    source = open_source(log, load_source_config(None, merged(selected, set_)))
+    settings = settings_of(selection(first, last, stride, require_truth), set_)
+    source = open_log(log, settings=settings)
     ending = f".{as_}" if as_ in _FILES else ""
     out = place_of(out, LOGS / f"{name_of(log)}{ending}")
     progress = output.progress()
@@ -118,7 +116,6 @@ def export(
 
     Example: mapper export runs/xyz --as octomap --out xyz.ot, or: mapper export runs/xyz --as mesh
     """
-    from mapper.config.loading import overridden
     from mapper.export.exporters import export as export_run
     from mapper.merging import open_map_folder
     from mapper.run.folder import moved_log, open_run
@@ -127,10 +124,14 @@ def export(
     if as_ != "octomap":
         refuse_with(f"--as {as_}", {"--level": level})
     built: MapFolder = moved_log(open_run(run), *log) if log else open_map_folder(run)
-    changes = merged(assignments({"octomap.level": level}), set_)
-    config = overridden(built.config, changes) if changes else None
-    progress = output.progress()
     path = export_run(
-        built, as_, out, config=config, frame=frame, box_m=crop, overwrite=overwrite, progress=progress
+        built,
+        as_,
+        out,
+        settings=settings_of({"octomap.level": level}, set_),
+        frame=frame,
+        box_m=crop,
+        overwrite=overwrite,
+        progress=output.progress(),
     )
     return made(path, kind=as_)

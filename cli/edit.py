@@ -11,7 +11,7 @@ from mapper.cli.options import MovedLogs, RunFolder, refuse_several, refuse_with
 from mapper.core.errors import ConfigError
 
 if TYPE_CHECKING:
-    from mapper.mapping.config import EditKind, Region
+    from mapper.mapping.config import EditKind
     from mapper.run.folder import Run
 
 _Corners = tuple[float, float, float, float, float, float]
@@ -68,39 +68,43 @@ def edit(
     Example: mapper edit runs/xyz --erase --box 2.1 0.3 0.1 2.9 1.05 1.5
     """
     from mapper.config.loading import read_config
-    from mapper.pipeline.edit import add_region, apply_edits, undo_region
+    from mapper.pipeline.edit import apply_edits
     from mapper.run.edits_file import EditsFile
     from mapper.run.folder import moved_log, open_run
 
     given: dict[EditKind, bool] = {"erase": erase, "keep": keep, "keepout": keepout}
     kinds = [kind for kind, is_given in given.items() if is_given]
-    region = _region(box, height, radius, polygon)
+    conditions = {
+        "box_m": None if box is None else (box[:3], box[3:]),
+        "height_m": height,
+        "path_radius_m": radius,
+        "polygon_m": None if polygon is None else [corner.split(",") for corner in polygon.split()],
+    }
+    region = {name: value for name, value in conditions.items() if value is not None}
     other = {"--undo": undo, "--from": from_, "--page": page}
     refuse_several({"--erase": erase, "--keep": keep, "--keepout": keepout, **other})
     changes = bool(kinds or undo or from_ or page)
     if not changes:
         refuse_without("--erase, --keep, --keepout, --undo, --from or --page", {"--log": log})
-    if kinds and region is None:
+    if kinds and not region:
         raise ConfigError(f"--{kinds[0]}: want a region: --box, --height, --radius or --polygon")
-    if region is not None and not kinds:
+    if region and not kinds:
         raise ConfigError("a region alone changes nothing: want --erase, --keep or --keepout with it")
     built = open_run(run)
     if changes:
         edits = None if from_ is None else read_config(from_, EditsFile)
         if log:
             built = moved_log(built, *log)
-        source, progress = built.open_log(), output.progress()
+        progress = output.progress()
         if page:
             from mapper.api.edit_page import serve_edit_page
 
             on_ready = progress.note if output.json else print_text
-            built = serve_edit_page(source, built, on_ready=on_ready, progress=progress)
+            built = serve_edit_page(built.open_log(), built, on_ready=on_ready, progress=progress)
         elif edits is not None:
-            built = apply_edits(source, built, edits, progress=progress)
-        elif region is not None:
-            built = add_region(source, built, kinds[0], region, progress=progress)
+            built = apply_edits(built.open_log(), built, edits, progress=progress)
         else:
-            built = undo_region(source, built, progress=progress)
+            built = built.edit(kinds[0] if kinds else "undo", progress=progress, **region)
     return Answer({"run": built.path, "edits": built.manifest.edits}, edits_table(built))
 
 
@@ -120,19 +124,3 @@ def edits_table(run: "Run") -> str:
             lines.append(applied.text if applied else what)
     lines += [f"{edit.text}; no longer in edits.toml: mapper fuse {run.path}" for edit in done]
     return "\n".join(lines or ["no edits"])
-
-
-def _region(
-    box: _Corners | None, height: tuple[float, float] | None, radius: float | None, polygon: str | None
-) -> "Region | None":
-    from mapper.config.loading import checked_config
-    from mapper.mapping.config import Region
-
-    given = {
-        "box_m": None if box is None else (box[:3], box[3:]),
-        "height_m": height,
-        "path_radius_m": radius,
-        "polygon_m": None if polygon is None else [corner.split(",") for corner in polygon.split()],
-    }
-    given = {name: value for name, value in given.items() if value is not None}
-    return checked_config(given, Region, "region") if given else None

@@ -5,12 +5,8 @@ import signal
 import threading
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING
 
 from mapper.core.errors import Terminated
-
-if TYPE_CHECKING:
-    from mapper.runtime.progress import Progress
 
 
 def prepare_environment() -> None:
@@ -26,14 +22,6 @@ def prepare_environment() -> None:
         cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mapper"
         os.environ.setdefault("NUMBA_CACHE_DIR", str(cache / "numba"))
     drop_stale_kernels()
-
-
-def note_compilation(progress: "Progress") -> None:
-    """Say that a verb takes longer this time, if numba has not compiled our kernels before."""
-    from mapper.runtime.kernels import compiled_kernels
-
-    if not compiled_kernels():
-        progress.note("first run here: the kernels are compiled once, which takes about a minute")
 
 
 _UNSAFE = frozenset({"importlib", "llvmlite", "numba"})

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from mapper.cli.answer import Answer, Output
-from mapper.cli.options import Overrides
+from mapper.cli.options import Overrides, settings_of
 from mapper.core.errors import DataError
 
 if TYPE_CHECKING:
@@ -31,11 +31,11 @@ def inspect(
     from mapper.api.logs import inspect as inspect_log
     from mapper.config.loading import load_config
 
-    overrides = set_ or []
-    found = inspect_log(log, overrides)
+    settings = settings_of({}, set_)
+    found = inspect_log(log, settings=settings)
     problem, plan = found.problem, ""
     if found.log is not None:
-        config = load_config(None, overrides, sensor=found.log.sensor)
+        config = load_config(settings, sensor=found.log.sensor)
         problem = problem or _too_few(found.log.frames.count, config.min_tracked_frames)
         plan = (
             f"{found.log.sensor} frames, odometry {config.odometry.kind}, loops {config.loops.kind}, "

@@ -7,7 +7,7 @@ import typer
 
 from mapper.cli.answer import Answer, Output, rows_text, untrusted
 from mapper.cli.completion import run_folders
-from mapper.cli.options import First, Last, Overrides, Overwrite, Stride, merged, selection
+from mapper.cli.options import First, Last, Overrides, Overwrite, Stride, selection, settings_of
 from mapper.runtime.result_paths import RUNS, name_of, place_of
 
 if TYPE_CHECKING:
@@ -53,9 +53,9 @@ def localise(
     from mapper.api.localise import localise as localise_log
 
     out = place_of(out, RUNS / f"{name_of(log)}-in-{name_of(in_)}", overwrite=overwrite)
-    overrides = merged(selection(first, last, stride, None), set_)
+    settings = settings_of(selection(first, last, stride, None), set_)
     manifest = localise_log(
-        log, in_, out=out, overrides=overrides, progress=output.progress(), overwrite=overwrite
+        log, in_, out=out, settings=settings, progress=output.progress(), overwrite=overwrite
     )
     error = untrusted(out, manifest.verdict) if strict and manifest.verdict is not None else None
     return Answer(_document(manifest, out), _text(manifest, out), error=error)

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -113,25 +113,22 @@ RequireTruth = Annotated[
 
 def selection(
     first: int | None, last: int | None, stride: int | None, require_truth: bool | None
-) -> list[str]:
-    """Return the overrides that short options stand for; what was not given keeps the configured value."""
-    given = {
+) -> dict[str, Any]:
+    """Return the settings that short options stand for; what was not given keeps the configured value."""
+    return {
         "source.first_frame": first,
         "source.last_frame": last,
         "source.stride": stride,
         "source.require_truth": require_truth or None,
     }
-    return assignments(given)
 
 
-def assignments(given: Mapping[str, object]) -> list[str]:
-    """Return ``key=value`` for every value that is not None."""
-    return [f"{key}={value}" for key, value in given.items() if value is not None]
+def settings_of(short_options: Mapping[str, Any], overrides: Sequence[str] | None = None) -> dict[str, Any]:
+    """Return settings by dotted name: those of short options that were given, and of ``--set``, which win."""
+    from mapper.config.loading import parse_assignments
 
-
-def merged(short_options: Sequence[str], overrides: Sequence[str] | None) -> list[str]:
-    """Return all overrides: those of short options first, as later ones win."""
-    return [*short_options, *(overrides or ())]
+    given = {name: value for name, value in short_options.items() if value is not None}
+    return given | parse_assignments(overrides or ())
 
 
 def workers_for(processes: int | None, scheduler: str | None, *, default: int) -> "Workers":

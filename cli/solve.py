@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from mapper.cli.answer import Answer, Output, rows_text
-from mapper.cli.options import Overrides, assignments, merged
+from mapper.cli.options import Overrides, settings_of
 from mapper.core.errors import listed
 from mapper.runtime.result_paths import RUNS, name_of, place_of
 
@@ -52,19 +52,19 @@ def solve(
     from mapper.graph.g2o import read_g2o
     from mapper.graph.optimize import optimize
 
-    overrides = merged(assignments({"robust": robust, "initial": initial}), set_)
-    overrides = [override.removeprefix("graph.") for override in overrides]
-    config = overridden(GraphConfig(), overrides)
-    guess_loops = config.robust != "none" and any(override.startswith("robust=") for override in overrides)
+    given = settings_of({"robust": robust, "initial": initial}, set_)
+    settings = {name.removeprefix("graph."): value for name, value in given.items()}
+    config = overridden(GraphConfig(), settings=settings)
+    guess_loops = config.robust != "none" and "robust" in settings
     out = place_of(out, RUNS / name_of(graph))
     refuse_existing_result(out)
     progress = output.progress()
     began = time.perf_counter()
-    given = read_g2o(graph, guess_loops=guess_loops, progress=progress)
+    unsolved = read_g2o(graph, guess_loops=guess_loops, progress=progress)
     read = time.perf_counter()
-    solution = optimize(given, config, progress=progress)
+    solution = optimize(unsolved, config, progress=progress)
     seconds = {"read": read - began, "solve": time.perf_counter() - read}
-    solved = SolvedGraph(graph, given, solution, config, seconds)
+    solved = SolvedGraph(graph, unsolved, solution, config, seconds)
     write_solved_graph(out, solved)
     return Answer({"path": out, **solve_report(solved)}, f"{_table(solved)}\n{out}")
 

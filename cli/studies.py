@@ -9,19 +9,18 @@ import typer
 
 from mapper.cli.answer import Answer, Output, record_in
 from mapper.cli.console import files_text
-from mapper.cli.environment import note_compilation
 from mapper.cli.options import (
     First,
     Last,
     Overrides,
     Overwrite,
     Stride,
-    assignments,
-    merged,
     selection,
+    settings_of,
     workers_for,
 )
 from mapper.core.errors import ConfigError
+from mapper.runtime.kernels import note_compilation
 
 
 def compare(
@@ -52,12 +51,12 @@ def compare(
     from mapper.evaluators.compare.files import REPORT, tables_text
     from mapper.evaluators.compare.files import compare as compare_methods
 
-    short_options = [*selection(first, last, stride, None), *assignments({"pairs": pairs, "seed": seed})]
+    short_options = {**selection(first, last, stride, None), "pairs": pairs, "seed": seed}
     comparison = compare_methods(
         log,
         methods=method or (),
         out=out,
-        overrides=merged(short_options, set_),
+        settings=settings_of(short_options, set_),
         overwrite=overwrite,
         progress=output.progress(),
     )

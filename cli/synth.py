@@ -7,7 +7,7 @@ from typing import Annotated, Literal, TypeVar
 import typer
 
 from mapper.cli.answer import Answer, Output
-from mapper.cli.options import assignments, merged, refuse_with
+from mapper.cli.options import refuse_with, settings_of
 from mapper.core.errors import ConfigError
 from mapper.runtime.result_paths import LOGS, place_of
 
@@ -129,7 +129,7 @@ def synth(
     refuse_with(f"--sensor {sensor}", {name: options[name] for name in _NOT_OF[sensor]})
     given: dict[str, object] = {"duration_s": seconds, "seed": seed}
     if sensor == "line-laser":
-        return _line_laser(place_of(out, LOGS / sensor), assignments(given), noise, set_, output)
+        return _line_laser(place_of(out, LOGS / sensor), given, noise, set_, output)
     if plane_at is not None:
         refuse_with("--plane-at", {"--path": path, "--scene": scene})
     if sensor == "rgbd":
@@ -139,12 +139,12 @@ def synth(
         name, kind, write = scene or "street", "KITTI", _write_lidar_log
         given |= {"sensor.rings": rings} | _lidar_noise(noise)
     out = place_of(out, LOGS / name)
-    write(out, name, options, merged(assignments(given), set_), output)
+    write(out, name, options, settings_of(given, set_), output)
     return Answer({"path": out, "format": kind}, f"{out}: a {kind} log; map it with mapper build {out}")
 
 
 def _write_camera_log(
-    out: Path, name: SceneName, options: Mapping[str, object], overrides: list[str], output: Output
+    out: Path, name: SceneName, options: Mapping[str, object], settings: dict[str, object], output: Output
 ) -> None:
     from mapper.config.loading import overridden
     from mapper.simulation import write_tum_log
@@ -166,13 +166,13 @@ def _write_camera_log(
         changed["imu"] = SynthImuConfig()
     if options["--uncalibrated"]:
         changed["sensor"] = start.sensor.model_copy(update=UNCALIBRATED)
-    config = overridden(start.model_copy(update=changed), overrides)
+    config = overridden(start.model_copy(update=changed), settings=settings)
     with output.progress().stage("render") as report:
         write_tum_log(out, config, on_progress=report)
 
 
 def _write_lidar_log(
-    out: Path, name: SceneName, options: Mapping[str, object], overrides: list[str], output: Output
+    out: Path, name: SceneName, options: Mapping[str, object], settings: dict[str, object], output: Output
 ) -> None:
     from mapper.config.loading import overridden
     from mapper.simulation.config import (
@@ -195,13 +195,13 @@ def _write_lidar_log(
         changed["imu"] = SynthImuConfig()
     if options["--gnss"]:
         changed["gnss"] = SynthGnssConfig()
-    config = overridden(start.model_copy(update=changed), overrides)
+    config = overridden(start.model_copy(update=changed), settings=settings)
     with output.progress().stage("scan") as report:
         write_lidar_log(out, config, on_progress=report)
 
 
 def _line_laser(
-    out: Path, given: list[str], noise: float | None, set_: list[str] | None, output: Output
+    out: Path, given: dict[str, object], noise: float | None, set_: list[str] | None, output: Output
 ) -> Answer:
     from mapper.config.loading import overridden
     from mapper.line_laser.config import LineLaserSynthConfig
@@ -209,8 +209,8 @@ def _line_laser(
 
     usual = LineLaserSynthConfig()
     if noise is not None:
-        given = [*given, f"noise_levels={noise * usual.noise_levels}"]
-    config = overridden(usual, merged(given, set_))
+        given["noise_levels"] = noise * usual.noise_levels
+    config = overridden(usual, settings=settings_of(given, set_))
     write_line_laser_log(out, config, progress=output.progress())
     vehicle = f"--wheelbase {config.wheelbase_m:g} --sensor-x {config.sensor_x_m:g}"
     return Answer(

@@ -7,7 +7,7 @@ import typer
 
 from mapper.cli.answer import Answer, Output, verb
 from mapper.cli.groups import Verb, VerbGroup
-from mapper.cli.options import Overwrite, assignments, merged
+from mapper.cli.options import Overwrite, settings_of
 from mapper.runtime.atomic import refuse_existing
 from mapper.runtime.result_paths import name_of, place_of
 
@@ -45,7 +45,7 @@ def train(
     from mapper.places.training import train as train_words
     from mapper.sources import open_source
 
-    config = overridden(VocabularyConfig(), merged(assignments({"frames_per_log": frames}), set_))
+    config = overridden(VocabularyConfig(), settings=settings_of({"frames_per_log": frames}, set_))
     out = place_of(out, Path(f"{name_of(logs[0])}.words"), overwrite=overwrite)
     refuse_existing(out, overwrite=overwrite)
     progress = output.progress()

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from mapper.cli.answer import Answer, Output
-from mapper.cli.options import First, Last, Overrides, Overwrite, Stride, merged, refuse_with, selection
+from mapper.cli.options import First, Last, Overrides, Overwrite, Stride, refuse_with, selection, settings_of
 from mapper.core.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -70,7 +70,7 @@ def depth(
 
     distances_m = _distances(logs, plane_at, fit_plane=fit_plane, keep_tilt=keep_tilt)
     where = None if patch is None else _patch(patch)
-    config = load_config(None, merged(selection(first, last, stride, None), set_)).source
+    config = load_config(settings_of(selection(first, last, stride, None), set_)).source
     sources = [open_source(log, config) for log in logs]
     with nullcontext() if out is None else atomic_folder(out, FOLDER, overwrite=overwrite) as folder:
         study = study_depth(

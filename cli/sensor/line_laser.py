@@ -7,7 +7,7 @@ import typer
 
 from mapper.cli.answer import Answer, Output
 from mapper.cli.console import files_text
-from mapper.cli.options import Overwrite, assignments
+from mapper.cli.options import Overwrite, settings_of
 from mapper.core.errors import RunError
 from mapper.runtime.result_paths import RUNS, name_of, place_of
 
@@ -137,7 +137,9 @@ def calibrate(
         raise RunError(f"{out}: the picture's place; want an --out that ends in .toml")
     for path in (out, picture):
         refuse_existing(path, overwrite=overwrite)
-    vehicle = overridden(VehicleConfig(), assignments({"wheelbase_m": wheelbase, "sensor_x_m": sensor_x}))
+    vehicle = overridden(
+        VehicleConfig(), settings=settings_of({"wheelbase_m": wheelbase, "sensor_x_m": sensor_x})
+    )
     progress = output.progress()
     config = overridden(LineLaserConfig(), set_ or [])
     seen, size_px, notes = read_shots(shots, config.stripe, progress=progress)

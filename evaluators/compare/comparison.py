@@ -30,7 +30,7 @@ from mapper.sources.base import FrameRef, Log, Skipped
 _WARM_UP_FRAMES = 2
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Comparison:
     """The results of all methods on one log.
 
@@ -61,6 +61,10 @@ class Comparison:
     scan_ms: float
     skipped: tuple[Skipped, ...]
     notes: tuple[str, ...]
+
+    def __repr__(self) -> str:
+        methods = ", ".join(run.method for run in self.runs)
+        return f"Comparison of {methods} on {self.log}, with {len(self.trials)} trials"
 
     @property
     def trials_config(self) -> TrialsConfig:

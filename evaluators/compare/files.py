@@ -50,11 +50,10 @@ _FOLDER = FolderKind(
 
 
 def compare(
-    log: AnyPath,
+    log: Log | AnyPath,
     *,
     methods: Sequence[str] = (),
     out: AnyPath = "compare",
-    overrides: Sequence[str] = (),
     settings: Settings | None = None,
     progress: AnyProgress = None,
     overwrite: bool = False,
@@ -62,11 +61,10 @@ def compare(
     """Run every method over the same frames, as ``mapper compare`` does.
 
     Args:
-        log: Recorded log.
+        log: Recorded log, or its path.
         methods: Methods to compare; none are all that fit the log.
         out: Folder to create; a comparison that was stopped is resumed.
-        overrides: ``key.path=value`` as text, such as "pairs=10".
-        settings: The same as values by dotted name.
+        settings: Values by dotted name, such as ``{"pairs": 10}``.
         progress: As for ``mapper.build``.
         overwrite: Replace OUT.
 
@@ -76,8 +74,8 @@ def compare(
         MapperError: The log cannot be opened.
     """
     given = CompareConfig(methods=tuple(methods))
-    config = overridden(given, overrides, settings=settings)
-    source = open_source(Path(log), config.source)
+    config = overridden(given, settings=settings)
+    source = log if isinstance(log, Log) else open_source(Path(log), config.source)
     return compare_into(Path(out), source, config, overwrite=overwrite, progress=receiver_of(progress))
 
 

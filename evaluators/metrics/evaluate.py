@@ -50,7 +50,7 @@ ATE_WITHOUT_OFFSET = f"{CLOCK_OFFSET}: {ATE_RMSE} without it"
 _CLOCK_NS = 1_000_000
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Assessment:
     """Evaluation of a trajectory.
 
@@ -89,7 +89,7 @@ class Assessment:
         """Absolute trajectory error, RMSE, metres, after the alignment; None without truth."""
         return next((m.value for m in self.metrics if m.quantity == ATE_RMSE), None)
 
-    def __str__(self) -> str:
+    def __repr__(self) -> str:
         return text_table(self.metrics)
 
     def _repr_html_(self) -> str:

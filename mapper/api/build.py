@@ -1,6 +1,8 @@
 """From a log to a run, by a caller's own odometry if one is given."""
 
-from collections.abc import Callable, Mapping
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -12,19 +14,31 @@ from mapper.api.progress import AnyProgress, receiver_of
 from mapper.config.build import BuildConfig
 from mapper.config.loading import Settings, load_config, overridden
 from mapper.core.config import flattened
-from mapper.core.errors import ConfigError, DataError, FrameError, TrackingError
+from mapper.core.errors import (
+    ConfigError,
+    DataError,
+    FrameError,
+    MapperWarning,
+    TrackingError,
+    ViewerError,
+)
 from mapper.core.frames import Frame
 from mapper.core.geometry import Transform, is_rigid
 from mapper.core.trajectory import Trajectory, trajectory_from
+from mapper.export.preview import PREVIEW, Preview
 from mapper.odometry.base import Odometry
 from mapper.pipeline.build import build as build_run
 from mapper.run import files
-from mapper.run.folder import Run
-from mapper.run.observers import NULL_OBSERVER, Observer
+from mapper.run.folder import Run, open_run
+from mapper.run.observers import NULL_OBSERVER, Observer, Observers
+from mapper.runtime.atomic import partial_of, refuse_existing
+from mapper.runtime.kernels import note_compilation
 from mapper.runtime.progress import Progress
 from mapper.runtime.regular_files import AnyPath
 from mapper.runtime.result_paths import RUNS, name_of, place_of
+from mapper.sources import open_source
 from mapper.sources.base import Log
+from mapper.sources.config import SourceConfig
 
 
 def poses_of(track: Callable[[Frame], ArrayLike | None], log: Log, *, progress: Progress) -> Trajectory:
@@ -89,12 +103,17 @@ def build(
     out: AnyPath | None = None,
     config: BuildConfig | Settings | AnyPath | None = None,
     settings: Settings | None = None,
+    onto: Run | AnyPath | None = None,
     odometry: OwnOdometry | None = None,
+    rerun: str | None = None,
     progress: AnyProgress = None,
     observer: Observer = NULL_OBSERVER,
     overwrite: bool = False,
+    fresh: bool = False,
 ) -> Run:
     """Build a run: track every frame, close loops, solve the graph once, and fuse all frames into the maps.
+
+    A build that was stopped is resumed, unless it has an odometry of its own.
 
     Args:
         log: A log, or its path; see :func:`open_log`. An open log is mapped as it is; give
@@ -104,24 +123,30 @@ def build(
         config: All settings, or a TOML or JSON file of them, or a mapping of some as ``settings`` takes it;
             None is what suits the log's sensor.
         settings: Values by dotted name on top, such as ``{"octree.resolution_m": 0.1}``.
+        onto: Run of the same place that the log is appended to: OUT then holds both, by that run's settings.
         odometry: Your own instead of the toolkit's: an object of the
             :class:`~mapper.odometry.base.Odometry` protocol; or a function that is called with each frame in
             turn and returns the body's pose in a world of its own, (4, 4), or None where it is lost; or a
             :class:`~mapper.core.trajectory.Trajectory`. Poses are assumed to drift by 1 % of the path;
             ``odometry.least_m``, ``path_share`` and so on change that.
+        rerun: Where Rerun shows the build while it runs: "FILE.rrd", "spawn", "connect" or "connect:URL".
         progress: Receives stages, counts and notes; or a function that is called with lines of text, such
             as ``print``. None is silent.
         observer: Receives every tracked frame and the results.
-        overwrite: Replace an existing run, once the new one is complete.
+        overwrite: Replace an existing run, and the .rrd file, once the new one is complete.
+        fresh: Begin anew, even if a stopped build could be resumed.
 
     Returns:
         The finished run; :attr:`Run.verdict <mapper.run.folder.Run.verdict>` says whether to trust it.
 
     Raises:
         SourceError: The log cannot be opened.
-        ConfigError: A setting is unknown, has no such value, or does not fit the log.
+        ConfigError: A setting is unknown, has no such value, or does not fit the log; or an argument has no
+            meaning with ``onto``.
         TrackingError: Too few frames could be tracked; the partial results stay in ``OUT.partial``.
+        LoopError: No loop connects the log with the run that it is appended to.
         RunError: OUT exists already, or cannot be made.
+        ViewerError: No viewer can be started or reached. One that goes away later is a MapperWarning.
 
     Example:
         >>> run = mapper.build(log_folder, out=new_folder, settings={"octree.resolution_m": 0.1})
@@ -129,21 +154,84 @@ def build(
         'trusted'
     """
     receiver = receiver_of(progress)
+    path = log.path if isinstance(log, Log) else Path(log)
+    out = place_of(None if out is None else Path(out), RUNS / name_of(path), overwrite=overwrite)
+    if onto is not None:
+        for name, value in (("config", config), ("odometry", odometry), ("rerun", rerun), ("fresh", fresh)):
+            if value:
+                raise ConfigError(f"{name}: has no meaning with onto")
+        return _append(log, onto, out, settings, receiver, observer, overwrite=overwrite)
+    if rerun is not None:
+        from mapper.export.rerun.target import check_target
+
+        refuse_existing(Path(check_target(rerun)), overwrite=overwrite, option="--rerun")
     if isinstance(config, Mapping):
         settings = {**flattened(config), **flattened(settings or {})}
         config = None
     if not isinstance(log, Log):
         log = _opened(log, config, settings)
-    out = place_of(None if out is None else Path(out), RUNS / name_of(log.path), overwrite=overwrite)
     own = _own_odometry(odometry, log, receiver)
     wanted = {**_first_settings(own, out), **flattened(settings or {})}
     if isinstance(config, BuildConfig):
         resolved = overridden(config, settings=wanted)
     else:
         resolved = load_config(config, settings=wanted, sensor=log.sensor)
-    return build_run(
-        log, resolved, out, odometry=own, progress=receiver, observer=observer, overwrite=overwrite
-    )
+    note_compilation(receiver)
+    for note in log.sentences:
+        receiver.note(note)
+    with _observers(log, resolved, out, rerun, observer, receiver) as watching:
+        return build_run(
+            log,
+            resolved,
+            out,
+            odometry=own,
+            progress=receiver,
+            observer=watching,
+            overwrite=overwrite,
+            fresh=fresh,
+        )
+
+
+def _append(
+    log: Log | AnyPath,
+    onto: Run | AnyPath,
+    out: Path,
+    settings: Settings | None,
+    progress: Progress,
+    observer: Observer,
+    *,
+    overwrite: bool,
+) -> Run:
+    from mapper.pipeline.append import append
+
+    first = onto if isinstance(onto, Run) else open_run(onto)
+    config = overridden(first.config.model_copy(update={"source": SourceConfig()}), settings=settings)
+    second = log if isinstance(log, Log) else open_source(Path(log), config.source)
+    with _observers(second, config, out, None, observer, progress) as watching:
+        return append(second, first, config, out, progress=progress, observer=watching, overwrite=overwrite)
+
+
+@contextmanager
+def _observers(
+    log: Log, config: BuildConfig, out: Path, rerun: str | None, observer: Observer, progress: Progress
+) -> Iterator[Observer]:
+    """Yield the caller's observer, the picture of the build, and Rerun where it is wanted."""
+    shown = partial_of(out) / PREVIEW
+    preview = Preview(shown.resolve(), log, on_first=lambda: progress.note(f"first picture: {shown}"))
+    if rerun is None:
+        yield Observers(observer, preview)
+        return
+    from mapper.export.rerun.live import live_recording
+
+    is_built = False
+    try:
+        with live_recording(rerun, log, config.rerun) as live:
+            yield Observers(live, observer, preview)
+            is_built = True
+    except ViewerError as error:
+        if not is_built:
+            raise
+        warnings.warn(str(error), MapperWarning, stacklevel=3)
 
 
 def _opened(path: AnyPath, config: BuildConfig | AnyPath | None, settings: Settings | None) -> Log:

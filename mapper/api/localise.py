@@ -1,25 +1,25 @@
 """New logs in finished maps."""
 
-from collections.abc import Sequence
 from pathlib import Path
 
 from mapper.api.progress import AnyProgress, receiver_of
 from mapper.config.loading import Settings, overridden
 from mapper.pipeline.known_map import load_known_map
 from mapper.pipeline.localise import localise as localise_log
+from mapper.run.folder import Run
 from mapper.run.manifest import LocalisedManifest
 from mapper.runtime.regular_files import AnyPath
 from mapper.runtime.result_paths import RUNS, name_of, place_of
 from mapper.sources import open_source
+from mapper.sources.base import Log
 from mapper.sources.config import SourceConfig
 
 
 def localise(
-    log: AnyPath,
-    known: AnyPath,
+    log: Log | AnyPath,
+    known: Run | AnyPath,
     *,
     out: AnyPath | None = None,
-    overrides: Sequence[str] = (),
     settings: Settings | None = None,
     progress: AnyProgress = None,
     overwrite: bool = False,
@@ -27,11 +27,10 @@ def localise(
     """Place a new log in a finished map, as ``mapper localise`` does; ``OUT/trajectory.tum`` has its poses.
 
     Args:
-        log: Recorded log, from the same kind of sensor as the map.
-        known: Run or merged map; it is not changed.
+        log: Recorded log, or its path, from the same kind of sensor as the map.
+        known: Run, or folder of a run or a merged map; it is not changed.
         out: Folder to create; None is ``runs/LOG-in-RUN``, or with a number.
-        overrides: ``key.path=value`` as text.
-        settings: The same as values by dotted name.
+        settings: Values by dotted name on top of the map's.
         progress: As for ``mapper.build``.
         overwrite: Replace OUT.
 
@@ -42,13 +41,14 @@ def localise(
         TrackingError: The log is of another place.
         MapperError: The log or the map cannot be read, or a setting is wrong.
     """
-    receiver, path = receiver_of(progress), Path(log)
-    usual = RUNS / f"{name_of(path)}-in-{name_of(Path(known))}"
+    receiver, path = receiver_of(progress), log.path if isinstance(log, Log) else Path(log)
+    map_folder = known.path if isinstance(known, Run) else Path(known)
+    usual = RUNS / f"{name_of(path)}-in-{name_of(map_folder)}"
     folder = place_of(None if out is None else Path(out), usual, overwrite=overwrite)
-    finished = load_known_map(Path(known), progress=receiver)
+    finished = load_known_map(map_folder, progress=receiver)
     base = finished.config.model_copy(update={"source": SourceConfig()})
-    config = overridden(base, overrides, settings=settings)
-    source = open_source(path, config.source)
+    config = overridden(base, settings=settings)
+    source = log if isinstance(log, Log) else open_source(path, config.source)
     for note in source.sentences:
         receiver.note(note)
     return localise_log(source, finished, config, folder, progress=receiver, overwrite=overwrite)

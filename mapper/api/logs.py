@@ -1,6 +1,5 @@
 """Recorded logs, and single frames, by name."""
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -49,15 +48,12 @@ def open_log(path: AnyPath, *, config: AnyPath | None = None, settings: Settings
     return open_source(Path(path), load_source_config(config, settings=settings))
 
 
-def inspect(
-    path: AnyPath, overrides: Sequence[str] = (), *, settings: Settings | None = None
-) -> "Inspection":
+def inspect(path: AnyPath, *, settings: Settings | None = None) -> "Inspection":
     """Return what is in a log, as ``mapper inspect`` shows it: topics, rates, gaps, calibration, truth.
 
     Args:
         path: As of :func:`open_log`.
-        overrides: ``key.path=value`` as text.
-        settings: The same as values by dotted name.
+        settings: Values by dotted name.
 
     Returns:
         The findings; their ``problem`` says why nothing can be mapped, or is None.
@@ -74,13 +70,13 @@ def inspect(
         from mapper.odometry.scans.adapted_lengths import adapted_to
         from mapper.odometry.scans.config import AnyScanOdometryConfig
 
-        odometry = load_config(None, overrides, settings=settings, sensor=log.sensor).odometry
+        odometry = load_config(settings=settings, sensor=log.sensor).odometry
         odometry = adapted_to(odometry, log)
         if not isinstance(odometry, AnyScanOdometryConfig):
             return None
         return scan_observation.why_untrackable(log, odometry)
 
-    config = load_source_config(None, overrides, settings=settings)
+    config = load_source_config(settings=settings)
     return inspect_log(Path(path), config, check=why_untrackable)
 
 

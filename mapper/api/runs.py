@@ -23,19 +23,10 @@ from mapper.runtime.regular_files import AnyPath
 from mapper.runtime.result_paths import distinct_names
 
 
-def export(
-    run: Run,
-    kind: str,
-    path: AnyPath | None,
-    *,
-    settings: Settings | None,
-    progress: AnyProgress,
-    **options: Any,
-) -> Path:
+def export(run: Run, kind: str, path: AnyPath | None, *, progress: AnyProgress, **options: Any) -> Path:
     """Write a run for another program; see :meth:`mapper.run.folder.Run.export`."""
-    config = overridden(run.config, settings=settings) if settings else None
     out = None if path is None else Path(path)
-    return export_kind(run, kind, out, config=config, progress=receiver_of(progress), **options)
+    return export_kind(run, kind, out, progress=receiver_of(progress), **options)
 
 
 def fuse(run: Run, *, settings: Settings | None, trajectory: Trajectory | None, progress: AnyProgress) -> Run:

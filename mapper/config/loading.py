@@ -240,13 +240,23 @@ def _drop_other_kinds(tree: dict[str, Any], changed: Mapping[str, Any]) -> None:
             _drop_other_kinds(part, value)
 
 
-def _put_all(tree: dict[str, Any], overrides: Sequence[str], settings: Settings | None) -> None:
+def parse_assignments(overrides: Sequence[str]) -> dict[str, str]:
+    """Return the values of ``name=value`` by dotted name; of several of one name the last.
+
+    Raises:
+        ConfigError: One has no name or no ``=``.
+    """
+    values = {}
     for override in overrides:
         dotted, equals, value = override.partition("=")
         if not equals or not dotted:
             raise ConfigError(f"setting {override!r}: want name=value, such as octree.resolution_m=0.1")
-        _put(tree, dotted, value)
-    for dotted, value in _by_name(settings).items():
+        values[dotted] = value
+    return values
+
+
+def _put_all(tree: dict[str, Any], overrides: Sequence[str], settings: Settings | None) -> None:
+    for dotted, value in (*parse_assignments(overrides).items(), *_by_name(settings).items()):
         _put(tree, dotted, value)
 
 

@@ -1,7 +1,7 @@
 """Exports of a run: the kinds of file, and the function that writes any of them."""
 
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from difflib import get_close_matches
@@ -92,7 +92,7 @@ EXPORTERS = {
         "colmap:colmap",
         settings="cloud",
     ),
-    "rosbag2": Exporter("folder for ros2 bag play and RViz: paths, maps, images", "rosbag2:rosbag2"),
+    "rosbag2": _Part("folder for ros2 bag play and RViz: paths, maps, images", "rosbag2:rosbag2"),
     "tum": Exporter(
         "trajectory as TUM text",
         "exporters:tum",
@@ -107,7 +107,7 @@ EXPORTERS = {
     "foxglove-layout": Exporter(
         "how Foxglove is to show run.mcap", "foxglove_layout:layout", "foxglove_layout.json", (".json",)
     ),
-    "g2o": Exporter("pose graph", "", "graph.g2o", (".g2o",), is_built=True),
+    "g2o": Exporter("pose graph", "exporters:g2o", "graph.g2o", (".g2o",), is_built=True, moves=True),
 }
 
 
@@ -116,7 +116,7 @@ def export(
     kind: str,
     out: Path | None = None,
     *,
-    config: "BuildConfig | None" = None,
+    settings: Mapping[str, Any] | None = None,
     frame: Frame = "map",
     box_m: Sequence[float] | None = None,
     overwrite: bool = False,
@@ -128,7 +128,7 @@ def export(
         run: A finished run, or a merged map, which has some kinds only.
         kind: A key of ``EXPORTERS``.
         out: The file; None keeps it in the run, under the name that this kind has there.
-        config: The run's own configuration with the kind's settings turned.
+        settings: Values by dotted name that the kind reads, such as ``{"mesh.voxel_m": 0.01}``.
         frame: Frame of its poses and points.
         box_m: Lowest and highest corner of what is written, x y z x y z in the levelled world; None is all.
         overwrite: Replace what is at OUT.
@@ -146,7 +146,10 @@ def export(
     exporter = EXPORTERS[kind]
     if not exporter.of_merged:
         _refuse_merged(run, kind)
-    if config is not None:
+    if settings:
+        from mapper.config.loading import overridden
+
+        config = overridden(run.config, settings=settings)
         _refuse_idle_settings(run, config, kind=kind)
         run = run.with_config(config)
     whole, run = run, _part_of(run, kind, out, frame=frame, box_m=box_m)
@@ -255,6 +258,13 @@ def kitti(run: "Run", path: Path, _progress: Progress) -> None:
     from mapper.sources.trajectory_files import write_kitti
 
     write_kitti(path, run.trajectory)
+
+
+def g2o(run: "Run", path: Path, _progress: Progress) -> None:
+    """Write the pose graph, solved."""
+    from mapper.graph.g2o import write_g2o
+
+    write_g2o(path, run.graph)
 
 
 def grid(run: "MapFolder", path: Path, _progress: Progress) -> None:

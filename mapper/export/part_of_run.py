@@ -13,6 +13,7 @@ from mapper.core.errors import ConfigError
 from mapper.core.frames import Cloud, Points32
 from mapper.core.geometry import Transform, apply, inverse
 from mapper.core.trajectory import Trajectory
+from mapper.graph.model import PoseGraph
 from mapper.mapping.config import Edits, Region
 from mapper.mapping.edits import MapEditor
 from mapper.octree.grid import OccupancyGrid
@@ -43,19 +44,23 @@ class PartOfRun(Run):
         """Occupancy map."""
         octree = super().octree
         if self.region is not None:
-            self._editor.crop(octree)
+            self.editor.crop(octree)
             octree.drop_unknown()
         return octree
 
     @cached_property
     def cloud(self) -> Cloud:
         """Coloured cloud."""
-        cloud = super().cloud
-        if self.region is not None:
-            whole, cloud = cloud, cloud.select(self._editor.leave(cloud.points))
-            if not len(cloud):
-                raise ConfigError(f"crop: no point of the cloud is in it; {_reach(whole.points)}")
-        return replace(cloud, points=placed(self, cloud.points))
+        whole = super().cloud
+        cloud = part_of_cloud(self, whole)
+        if not len(cloud):
+            raise ConfigError(f"crop: no point of the cloud is in it; {_reach(whole.points)}")
+        return cloud
+
+    @cached_property
+    def graph(self) -> PoseGraph:
+        """Pose graph with its nodes at the solution."""
+        return super().graph.moved(self.T_frame_map)
 
     @cached_property
     def slice(self) -> OccupancyGrid:
@@ -74,7 +79,8 @@ class PartOfRun(Run):
         return None if grid is None else self._cropped(grid)
 
     @property
-    def _editor(self) -> MapEditor:
+    def editor(self) -> MapEditor:
+        """Editor that leaves what lies in the region."""
         keep = () if self.region is None else (self.region,)
         return MapEditor(Edits(keep=keep), np.empty((0, 3)), room_m=0.0)
 
@@ -123,6 +129,15 @@ def part_of(run: MapFolder, frame: str, box_m: Sequence[float] | None) -> MapFol
 def in_map(run: Run) -> Run:
     """Return the same part of a run in the levelled world."""
     return replace(run, T_frame_map=np.eye(4)) if isinstance(run, PartOfRun) else run
+
+
+def part_of_cloud(run: Run, cloud: Cloud) -> Cloud:
+    """Return the points of a cloud in the levelled world that a run has, in its frame."""
+    if not isinstance(run, PartOfRun):
+        return cloud
+    if run.region is not None:
+        cloud = cloud.select(run.editor.leave(cloud.points))
+    return replace(cloud, points=placed(run, cloud.points))
 
 
 def placed(run: Run, points_map: Points32) -> Points32:

@@ -8,6 +8,7 @@ import numpy as np
 
 from mapper.core.errors import DataError
 from mapper.core.frames import PinholeCamera
+from mapper.export.part_of_run import part_of_cloud
 from mapper.export.run_mcap import BODY, CAMERA
 from mapper.mapping.config import edits_of
 from mapper.mapping.edits import MapEditor
@@ -35,7 +36,7 @@ def maps_of(run: Run) -> Maps:
     return Maps(
         octree=run.octree,
         cloud=run.cloud,
-        dynamic=read_cloud(run.file(files.DYNAMIC)),
+        dynamic=part_of_cloud(run, read_cloud(run.file(files.DYNAMIC))),
         grid=run.slice,
         traversable=run.traversable,
         storeys=tuple(_storeys(run)),

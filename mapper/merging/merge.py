@@ -61,7 +61,7 @@ from mapper.runtime.resumable_jobs import Cost, JobRunner, Stages
 DEFAULT_TILE_M = 50.0
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, repr=False)
 class Merged:
     """A finished merge.
 
@@ -75,6 +75,9 @@ class Merged:
     map: MergedMap
     costs: Mapping[str, Sequence[Cost]]
     shuffle_bytes: int
+
+    def __repr__(self) -> str:
+        return f"Merged({self.map}, {self.map.manifest.summary})"
 
 
 def merge(

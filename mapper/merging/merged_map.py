@@ -195,7 +195,7 @@ def tiling_for(resolution_m: float, tile_m: float) -> Tiling:
     return Tiling(resolution_m, round(log2(tile_m / resolution_m)))
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, repr=False)
 class MergedMap:
     """A merged map on disk.
 
@@ -208,6 +208,9 @@ class MergedMap:
     path: Path
     manifest: MapManifest
     config: BuildConfig
+
+    def __repr__(self) -> str:
+        return f"MergedMap({str(self.path)!r})"
 
     @property
     def octree(self) -> OctreeMap:

@@ -7,7 +7,7 @@ from functools import partial
 from typing import Any
 
 from mapper.config.build import BuildConfig
-from mapper.core.errors import ConfigError, FrameError
+from mapper.core.errors import ConfigError, DataError, FrameError
 from mapper.core.trajectory import Trajectory
 from mapper.features.frame_view import FrameView
 from mapper.graph.components import component_numbers
@@ -28,7 +28,7 @@ from mapper.run.observers import NULL_OBSERVER, Observer, Step
 from mapper.runtime.ordered_map import ordered_map
 from mapper.runtime.progress import Progress
 from mapper.sources.base import FrameRef, Log, Skipped
-from mapper.sources.depth_scale import depth_warnings
+from mapper.sources.depth_scale import depth_warnings, why_no_depth
 from mapper.sources.image_order import time_warnings
 from mapper.sources.reading_checks import ReadingChecks
 from mapper.sources.scan_frame import scan_frame_warnings
@@ -305,7 +305,13 @@ def _wheel_measurements(source: Log, config: BuildConfig) -> WheelMeasurements:
 
 
 def noted_log_warnings(source: Log, progress: Progress) -> list[RunWarning]:
-    """Return what is implausible about a log's stamps, depth or scans, before it is tracked, and note it."""
+    """Return what is implausible about a log's stamps, depth or scans, before it is tracked, and note it.
+
+    Raises:
+        DataError: Its depth is none that a camera measures.
+    """
+    if (why := why_no_depth(source)) is not None:
+        raise DataError(f"{source.path}: {why}")
     warnings = [
         *(RunWarning(kind="stamps", sentence=text, weight="doubt") for text in time_warnings(source)),
         *(RunWarning(kind="depth", sentence=text, weight="doubt") for text in depth_warnings(source)),

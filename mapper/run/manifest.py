@@ -258,7 +258,7 @@ class Manifest(Config):
     mapper_version: str = mapper.__version__
     python_version: str = platform.python_version()
     platform: str = f"{sys.platform} {platform.machine()}"
-    libraries: dict[str, str] = Field(default_factory=dict)
+    libraries: dict[str, str] = Field(default_factory=dict, repr=False)
     input: Input
     counts: Counts = Counts()
     skipped: tuple[SkippedFrame, ...] = ()
@@ -277,7 +277,7 @@ class Manifest(Config):
     edits: tuple[AppliedEdit, ...] = ()
     """The edits by hand that are in the maps: ``edits.toml`` as it was when they were made."""
     timing: Timing = Timing()
-    files: dict[str, FileDigest] = Field(default_factory=dict)
+    files: dict[str, FileDigest] = Field(default_factory=dict, repr=False)
     """Every file of the run but this; empty while it is being built."""
 
     def with_body_rates(self, log: Log) -> Log:

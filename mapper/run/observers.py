@@ -4,16 +4,15 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
-from mapper.core.geometry import Transform
-from mapper.features.frame_view import FrameView
-from mapper.loops.detector import LoopDetector
-from mapper.odometry.base import FeatureMatches, FrameResult
-from mapper.sources.base import FrameRef
-
-if TYPE_CHECKING:
+if TYPE_CHECKING:  # a command line that only helps loads none of it
+    from mapper.core.geometry import Transform
+    from mapper.features.frame_view import FrameView
+    from mapper.loops.detector import LoopDetector
     from mapper.mapping.fusion import Maps
+    from mapper.odometry.base import FeatureMatches, FrameResult
     from mapper.run.folder import Run
     from mapper.run.results import RunResults
+    from mapper.sources.base import FrameRef
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -28,11 +27,11 @@ class Step:
         detector: The loops so far, and the current estimates of node poses.
     """
 
-    entry: FrameRef
-    track: FrameResult
-    view: Callable[[], FrameView]
-    matches: Callable[[], FeatureMatches | None]
-    detector: LoopDetector
+    entry: "FrameRef"
+    track: "FrameResult"
+    view: "Callable[[], FrameView]"
+    matches: "Callable[[], FeatureMatches | None]"
+    detector: "LoopDetector"
 
 
 class Observer(Protocol):
@@ -42,7 +41,7 @@ class Observer(Protocol):
         """Receive a frame that was read, in time order, in the thread that tracks."""
         ...
 
-    def on_levelled(self, T_level_world: Transform, /) -> None:
+    def on_levelled(self, T_level_world: "Transform", /) -> None:
         """Receive the pose of the odometry's world in the levelled one, once the graph is solved."""
         ...
 
@@ -64,7 +63,7 @@ class Observers:
         for observer in self._observers:
             observer.on_frame(step)
 
-    def on_levelled(self, T_level_world: Transform, /) -> None:
+    def on_levelled(self, T_level_world: "Transform", /) -> None:
         """Pass the world on."""
         for observer in self._observers:
             observer.on_levelled(T_level_world)

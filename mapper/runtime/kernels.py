@@ -6,6 +6,7 @@ from pathlib import Path
 from zlib import crc32
 
 import mapper
+from mapper.runtime.progress import Progress
 
 _MODULES = "modules.crc"
 
@@ -18,6 +19,12 @@ def kernel_folder() -> Path:
 def compiled_kernels() -> set[Path]:
     """Return the kernels that are compiled, as files without the line and the version at the end."""
     return {file.with_name(file.name.rpartition("-")[0]) for file in kernel_folder().rglob("*.nbi")}
+
+
+def note_compilation(progress: Progress) -> None:
+    """Say that a job takes longer this time, if numba has not compiled our kernels before."""
+    if not compiled_kernels():
+        progress.note("first run here: the kernels are compiled once, which takes about a minute")
 
 
 def drop_stale_kernels() -> None:

@@ -21,6 +21,8 @@ LOOKED_AT = 8
 _MIN_MEASURED_SHARE = 0.05
 _NEAR_M, _FAR_M = 0.1, 8.0
 """Least median and largest 90th percentile of depth that cameras deliver; farther surfaces return little."""
+_POSSIBLE_M = 0.005, 300.0
+"""Median depths outside of which units are wrong: microscopes see nearer, and stereo pairs not as far."""
 _USUALLY_NEAR_M = 0.3
 """Least depth of most cameras and ways to hold them: nearer values may be millimetres taken for TUM's fifths
 of these, unless units are stated and the values are whole millimetres in them."""
@@ -51,6 +53,23 @@ class _Features:
 
     points_camera: Array
     descriptors: cv2.typing.MatLike
+
+
+def why_no_depth(log: Log) -> str | None:
+    """Return why an RGB-D log's depth is none that a camera measures, by a few frames; None if it may be."""
+    frames = [frame for entry in log.spread_entries(LOOKED_AT) if (frame := read_depth(entry)) is not None]
+    medians_m = [_median_m(frame) for frame in frames if frame.depth_m.any()]
+    if frames and not medians_m:
+        return f"no depth in any of {len(frames)} frames looked at: all of it is 0, or the limit of 16 bits"
+    least_m, most_m = _POSSIBLE_M
+    if not medians_m or least_m < np.median(medians_m) < most_m:
+        return None
+    units_per_m = _units_per_m(log)
+    setting = "source.camera.depth_factor" + ("" if units_per_m is None else f"={units_per_m:g}")
+    return (
+        f"depth of {np.median(medians_m):.2g} m (median), where cameras measure {least_m:g} to {most_m:g} m; "
+        f"is {setting} right, in units per metre?"
+    )
 
 
 def depth_warnings(log: Log) -> list[str]:

@@ -12,9 +12,9 @@ from mapper.core.timebase import GAP_INTERVALS, MAX_TRUTH_GAP_NS, NS_PER_S, Stam
 from mapper.core.trajectory import Trajectory
 from mapper.runtime.ordered_map import ordered_map
 from mapper.sources import RECORDING, format_of, open_source
-from mapper.sources.base import Log, read_depth
+from mapper.sources.base import Log
 from mapper.sources.config import SourceConfig
-from mapper.sources.depth_scale import LOOKED_AT, depth_warnings
+from mapper.sources.depth_scale import depth_warnings, why_no_depth
 from mapper.sources.image_order import time_warnings
 from mapper.sources.reading_checks import ReadingChecks
 from mapper.sources.ros import files as recordings
@@ -197,16 +197,8 @@ def _inspected(
         warnings=[*time_warnings(source), *depth_warnings(source), *scan_frame_warnings(source)],
         vehicle=vehicle_box(source),
     )
-    why = problem or _without_depth(source) or _unwritable(source) or check(source)
+    why = problem or why_no_depth(source) or _unwritable(source) or check(source)
     return Inspection(path, topics, log, why)
-
-
-def _without_depth(source: Log) -> str | None:
-    """Return that an RGB-D log has no depth; None if it has."""
-    frames = [frame for entry in source.spread_entries(LOOKED_AT) if (frame := read_depth(entry)) is not None]
-    if not frames or any((frame.depth_m > 0.0).any() for frame in frames):
-        return None
-    return f"no depth in any of {len(frames)} frames looked at: all of it is 0, or the limit of 16 bits"
 
 
 def _unwritable(source: Log) -> str | None:

@@ -172,7 +172,7 @@ def test_ctrl_c_ends_with_130_and_one_line(desk_log, tmp_path, monkeypatch):
     def interrupt(*_arguments, **_options):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("mapper.pipeline.build.build", interrupt)
+    monkeypatch.setattr("mapper.api.build.build_run", interrupt)
     result = mapper("build", desk_log, "--out", tmp_path / "run", status=130)
     assert result.stderr == "mapper: interrupted\n"
 
@@ -181,7 +181,7 @@ def test_a_bug_keeps_its_traceback(desk_log, tmp_path, monkeypatch):
     def stumble(*_arguments, **_options):
         raise ZeroDivisionError
 
-    monkeypatch.setattr("mapper.pipeline.build.build", stumble)
+    monkeypatch.setattr("mapper.api.build.build_run", stumble)
     with pytest.raises(ZeroDivisionError):
         mapper("build", desk_log, "--out", tmp_path / "run")
 

@@ -9,9 +9,9 @@ from types import SimpleNamespace
 
 import pytest
 
-from mapper.cli.environment import interrupt, note_compilation
+from mapper.cli.environment import interrupt
 from mapper.core.errors import Terminated
-from mapper.runtime.kernels import drop_stale_kernels
+from mapper.runtime.kernels import drop_stale_kernels, note_compilation
 
 
 def test_compilation_is_noted_until_numba_has_kept_its_code(tmp_path, monkeypatch):

@@ -12,7 +12,7 @@ import pytest
 from plyfile import PlyData
 from pypcd4 import PointCloud
 
-from mapper.config.loading import load_config, overridden
+from mapper.config.loading import load_config
 from mapper.core.errors import ConfigError, DependencyError, MapSizeError, RunError, WriteError
 from mapper.export.exporters import EXPORTERS, export
 from mapper.graph.g2o import read_g2o
@@ -195,8 +195,8 @@ def out_of(folder, kind):
 
 @pytest.mark.parametrize("ending", [".bt", ".ot"])
 def test_an_octree_of_wider_voxels_is_one_that_octomap_reads(untouched, tmp_path, ending):
-    config = overridden(untouched.config, ["octomap.level=2"])
-    path = export(untouched, "octomap", tmp_path / f"coarse{ending}", config=config)
+    settings = {"octomap.level": 2}
+    path = export(untouched, "octomap", tmp_path / f"coarse{ending}", settings=settings)
     tree = pyoctomap.OcTree(1.0)
     if ending == ".bt":
         assert tree.readBinary(str(path))
@@ -209,9 +209,9 @@ def test_an_octree_of_wider_voxels_is_one_that_octomap_reads(untouched, tmp_path
 
 
 def test_an_octree_of_wider_voxels_does_not_replace_the_run_s_own(untouched):
-    config = overridden(untouched.config, ["octomap.level=2"])
+    settings = {"octomap.level": 2}
     with pytest.raises(RunError, match="name another file"):
-        export(untouched, "octomap", config=config)
+        export(untouched, "octomap", settings=settings)
 
 
 def test_what_is_written_is_read_by_others(untouched, kind, tmp_path):
@@ -308,12 +308,12 @@ def test_a_run_with_a_hole_says_which_file(run, tmp_path, name):
 
 
 def test_settings_that_a_kind_does_not_read_are_refused(untouched):
-    turned = overridden(untouched.config, ["mesh.voxel_m=0.1"])
+    turned = {"mesh.voxel_m": 0.1}
     with pytest.raises(ConfigError, match="mesh: export --as ply has no settings"):
-        export(untouched, "ply", config=turned)
-    turned = overridden(untouched.config, ["octree.resolution_m=0.2"])
+        export(untouched, "ply", settings=turned)
+    turned = {"octree.resolution_m": 0.2}
     with pytest.raises(ConfigError, match="octree: export --as mesh reads mesh settings only"):
-        export(untouched, "mesh", config=turned)
+        export(untouched, "mesh", settings=turned)
 
 
 class Missing:
@@ -363,13 +363,13 @@ def test_a_mesh_refuses_what_it_cannot_make(untouched, desk_log, tmp_path):
     with pytest.raises(Exception, match=r"rgb.txt"):
         export(another, "mesh", tmp_path / "mesh.ply")
 
-    tiny = overridden(untouched.config, ["mesh.voxel_m=1e-6"])
+    tiny = {"mesh.voxel_m": 1e-6}
     with pytest.raises(MapSizeError, match=r"needs .* GiB and this machine has .*; raise mesh.voxel_m"):
-        export(untouched, "mesh", tmp_path / "mesh.ply", config=tiny)
+        export(untouched, "mesh", tmp_path / "mesh.ply", settings=tiny)
 
-    shy = overridden(untouched.config, ["mesh.min_observations=100"])
+    shy = {"mesh.min_observations": 100}
     with pytest.raises(RunError, match=r"no surface within [\d.]+ m was seen in 100 fused frames"):
-        export(untouched, "mesh", tmp_path / "mesh.ply", config=shy)
+        export(untouched, "mesh", tmp_path / "mesh.ply", settings=shy)
     assert list(tmp_path.iterdir()) == []
 
 

@@ -9,6 +9,7 @@ from mapper.config.loading import load_config
 from mapper.core.errors import ConfigError, MapperError
 from mapper.core.geometry import apply, inverse
 from mapper.export.exporters import EXPORTERS, export
+from mapper.graph.g2o import read_g2o
 from mapper.octree.grid import read_grid
 from mapper.octree.map import read_octree
 from mapper.pipeline.build import build
@@ -75,10 +76,16 @@ def test_in_the_start_frame_the_first_pose_is_the_identity(run, tmp_path):
     np.testing.assert_allclose(points, apply(T_start_map, run.cloud.points), atol=1e-5)
 
 
+def test_a_graph_is_moved_with_its_path(run, tmp_path):
+    graph = read_g2o(export(run, "g2o", tmp_path / "start.g2o", frame="start"))
+    node, T_map_node = next(iter(run.graph.T_world_node.items()))
+    np.testing.assert_allclose(graph.T_world_node[node], inverse(run.trajectory[0]) @ T_map_node, atol=1e-9)
+    assert [(f.i, f.j) for f in graph.factors] == [(f.i, f.j) for f in run.graph.factors]
+
+
 def test_a_mesh_is_cropped_and_moved(run, box, tmp_path):
     o3d = pytest.importorskip("open3d", reason="the mesh extra is not installed", exc_type=ImportError)
-    config = run.config
-    path = export(run, "mesh", tmp_path / "part.stl", config=config, frame="start", box_m=box)
+    path = export(run, "mesh", tmp_path / "part.stl", frame="start", box_m=box)
     points = np.asarray(o3d.io.read_triangle_mesh(str(path)).vertices)
     assert len(points) > 100
     # depth counts up to a voxel's diagonal beside the occupied voxels that are left

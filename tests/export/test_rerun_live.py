@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from mapper.cli.answer import Output
-from mapper.cli.build import built, observer_factory
+import mapper
+from mapper.cli.build import Stepping
 from mapper.config.build import RerunConfig
 from mapper.core.frames import Scan
 from mapper.export.rerun.live import LiveRerun
@@ -152,14 +152,12 @@ def test_stepping_waits_after_each_frame_until_told_to_run_on(desk_log, tmp_path
     keys = Log(["\n", "\n", "c\n"])
     monkeypatch.setattr("mapper.cli.build.sys.stdin", keys)
     path = tmp_path / "stepped.rrd"
-    built(
+    mapper.build(
         desk_log,
-        None,
-        ["source.last_frame=11"],
-        tmp_path / "run",
-        overwrite=False,
-        output=Output(quiet=True),
-        make_observer=observer_factory(str(path), step=True, overwrite=False),
+        out=tmp_path / "run",
+        settings={"source.last_frame": 11},
+        rerun=str(path),
+        observer=Stepping(),
     )
     assert keys.lines == []
     assert len(Told(path).values("/diagnostics/features", "Scalars:scalars")) == 12

@@ -248,11 +248,13 @@ def test_a_log_of_few_frames_says_how_many_could_not_be_read(damaged_log, tmp_pa
         build(open_source(damaged_log, config.source), config, tmp_path / "run")
 
 
-def test_a_log_without_texture_and_depth_ends_in_an_error_and_leaves_what_there_is(damaged_log, tmp_path):
+def test_a_log_with_almost_no_texture_and_depth_ends_in_an_error(damaged_log, tmp_path):
     for image in (damaged_log / "rgb").iterdir():
         image.write_bytes(_black_png())
     for depth in (damaged_log / "depth").iterdir():
-        cv2.imwrite(str(depth), np.zeros_like(cv2.imread(str(depth), cv2.IMREAD_UNCHANGED)))
+        recorded = np.zeros_like(cv2.imread(str(depth), cv2.IMREAD_UNCHANGED))
+        recorded[0, 0] = 5000
+        cv2.imwrite(str(depth), recorded)
 
     with pytest.raises(TrackingError, match="only 0 of 31 frames read could be tracked, want at least 10"):
         build_run(damaged_log, tmp_path / "run")

@@ -1,12 +1,15 @@
 """Depth in the wrong units is noticed, and the setting named, before and after a build."""
 
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from mapper.api.logs import inspect as mapper_inspect
 from mapper.config.loading import load_config
+from mapper.core.errors import DataError
 from mapper.core.frames import PinholeCamera, RgbdFrame
 from mapper.core.timebase import NS_PER_S
 from mapper.pipeline.build import build
@@ -47,6 +50,15 @@ def test_a_wrong_factor_is_found_by_the_truth_and_the_right_one_is_named(desk_lo
         f"depth: {wrong} for the true motion of the camera; "
         f"source.camera.depth_factor=5000 fits, not {factor}"
     ]
+
+
+@pytest.mark.parametrize("factor", [1, 5_000_000])
+def test_depth_that_no_camera_measures_is_refused_before_tracking(desk_log, tmp_path, factor):
+    config = load_config({"source.camera.depth_factor": factor})
+    with pytest.raises(DataError, match=re.escape(f"depth_factor={factor:g}")):
+        build(open_source(desk_log, config.source), config, tmp_path / "run")
+    assert list(tmp_path.iterdir()) == []
+    assert f"depth_factor={factor:g}" in mapper_inspect(desk_log, settings=config.model_dump()).problem
 
 
 def in_other_units(source, scale):
