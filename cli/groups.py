@@ -26,6 +26,14 @@ _UsageError: type[Exception] = typer.BadParameter.__mro__[1]  # Typer gives it n
 class Verb(TyperCommand):
     """A verb."""
 
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Parse the words; an error knows whose they are also where an option lacks its value."""
+        try:
+            return list(super().parse_args(ctx, args))
+        except _UsageError as error:
+            error.ctx = error.ctx or ctx  # type: ignore[attr-defined]
+            raise
+
     def get_help_option(self, ctx: Any) -> Any:
         """Return the option that prints the help, coloured on a terminal."""
         return _printing_help(super().get_help_option(ctx))

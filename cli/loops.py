@@ -25,7 +25,7 @@ class WithPairs(Verb):
         """Join the two words that follow each of these options to one."""
         words = iter(args)
         joined = [f"{word}={' '.join(islice(words, 2))}" if word in _PAIR_OPTIONS else word for word in words]
-        return list(super().parse_args(ctx, joined))
+        return super().parse_args(ctx, joined)
 
 
 def loops(

@@ -32,7 +32,7 @@ class WithPoints(Verb):
             else:
                 joined.append(word)
                 takes_numbers = word in _POINT_OPTIONS
-        return list(super().parse_args(ctx, joined))
+        return super().parse_args(ctx, joined)
 
 
 def plan(

@@ -24,7 +24,7 @@ from mapper.octree.sparse_grid import log_odds
 from mapper.run.folder import Run
 from mapper.runtime.atomic import MANIFEST_NAME, FolderKind, atomic_folder, write_json
 
-_TOLERANCE_VOXELS = 2.0
+_TOLERANCE_VOXELS, _MOST_TOLERANCE_VOXELS = 2.0, 20
 _MIN_VOXELS = 8
 _SURE_HITS, _SURE_MISSES = 2, 4
 _LEAST_SAME = 0.8
@@ -113,7 +113,7 @@ def differences_of(
         min_voxels: Smaller clusters are counted, not listed.
 
     Raises:
-        ConfigError: The maps have different resolutions.
+        ConfigError: The maps have different resolutions, or the tolerance is more than 20 voxels.
     """
     old, new = (placed.run.octree for placed in (before, after))
     if old.resolution_m != new.resolution_m:
@@ -124,6 +124,8 @@ def differences_of(
         )
     T_before_after = inverse(before.T_map_world) @ after.T_map_world
     tolerance_m = _TOLERANCE_VOXELS * old.resolution_m if tolerance_m is None else tolerance_m
+    if not 0.0 <= tolerance_m <= (most_m := _MOST_TOLERANCE_VOXELS * old.resolution_m):
+        raise ConfigError(f"tolerance_m is {tolerance_m:g} m; want 0 to {most_m:g}; 0.05 is 5 cm")
     return compare_maps(old, new, T_before_after, tolerance_m=tolerance_m, min_voxels=min_voxels)
 
 

@@ -34,6 +34,7 @@ def test_the_first_option_that_is_given_is_named_with_its_value(value, shown):
     [
         (["build", "LOG", "--onto", "RUN", "--fresh"], "--fresh: has no meaning with --onto; leave it out"),
         (["diff", "A", "B", "--place", "auto", "--poses", "P"], "--place and --poses: choose one"),
+        (["diff", "A", "B", "--place", "built", "--tolerance-m", 50], "tolerance_m is 50 m; want 0 to 1"),
         (["doctor", "RUN", "--accept", "slice.pgm", "--warm"], "RUN RUN: has no meaning with --warm"),
         (["edit", "RUN", "--log", "LOG"], "has no meaning without --erase, --keep, --keepout, --undo"),
         (["eval", "RUN", "--tolerance", 0], "--tolerance 0: has no meaning without --map"),
@@ -50,3 +51,7 @@ def test_no_option_is_ignored(words, expected, desk_run):
     result = mapper(*words, status=1)
     expected = expected.replace("RUN RUN", f"RUN {desk_run.path}")
     assert expected in result.stderr
+
+
+def test_an_option_without_its_value_names_the_verb(tmp_path):
+    assert "mapper: doctor: " in mapper("doctor", tmp_path, "--bundle", status=2).stderr
