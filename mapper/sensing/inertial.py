@@ -202,11 +202,12 @@ def _fit(A: Array, b: Array) -> tuple[Array, Array]:
     weight, sigma = np.ones(len(b)), 1.0
     for _ in range(_ITERATIONS):
         information = A.T @ (A * (weight / sigma**2)[:, None]) + np.diag(precisions)
-        found = np.linalg.solve(information, A.T @ (b * weight) / sigma**2)
+        covariance = np.linalg.pinv(information, hermitian=True)  # of a still log it is singular
+        found = covariance @ (A.T @ (b * weight)) / sigma**2
         off = np.abs(b - A @ found)
         sigma = max(SIGMAS_PER_MAD * float(np.median(off)), 1e-4)
         weight = np.minimum(1.0, 2.0 * sigma / np.maximum(off, 1e-12))
-    return np.asarray(found, np.float64), np.asarray(np.linalg.inv(information), np.float64)
+    return np.asarray(found, np.float64), np.asarray(covariance, np.float64)
 
 
 def _rotations(vectors: Array) -> Array:
