@@ -13,8 +13,6 @@ from mapper.odometry.scans.pose_candidate import Jump
 from mapper.odometry.scans.scan_fit import ScanFit
 
 _SECTORS = 12  # of azimuth, each of two elevations
-_FEWEST = 10  # points of a sector that tells how much its distances agree
-_MEDIAN_CHI2 = 0.455  # of one degree of freedom
 _IN_PLANE = slice(2, 5)  # yaw, x and y of a tangent
 _LEAST_SHARE, _LEAST_SCATTER = 1e-9, 1e-2  # relative to the best known motion; to independent distances
 _SCATTER = 0.75
@@ -35,16 +33,11 @@ _WHEELS = WheelNoiseConfig()
 def surface_covariance(fit: ScanFit) -> Array:
     """Return the (6, 6) covariance of the scan's tangent from its distances to the keyframe's surfaces.
 
-    Distances of neighbouring points share the errors of one normal, of the map and of the sensor. Two
-    estimates allow for that: the one of independent distances, σ²H⁻¹, times their design effect (Kish 1965,
-    §5.4), one number for all motions, and the scatter of the steps of 24 sectors (Liang & Zeger 1986, eq. 8),
-    a matrix. The first is blind to motions that few sectors show; the second takes for errors of the pose
-    what a map of many keyframes averages. Theirs is the geometric mean, weighted 1 : 3. Of planar scans z and
-    tilt have no covariance.
-
-    To it comes the square of the step that would fit the scan to this keyframe best, as far as it exceeds
-    what the scatter explains: a matcher that is biased, or a map that disagrees with the keyframe, is off by
-    as much.
+    Distances of neighbouring points share the errors of one normal, of the map and of the sensor, so that
+    σ²H⁻¹, which takes them for independent, is too small. The scatter of the steps of 24 sectors (Liang &
+    Zeger 1986, eq. 8) allows for that, but takes for errors of the pose what a map of many keyframes
+    averages. The result is their geometric mean, weighted 1 : 3. Of planar scans z and tilt have no
+    covariance.
 
     Args:
         fit: With rows, distances and points.
@@ -56,33 +49,19 @@ def surface_covariance(fit: ScanFit) -> Array:
     known, motions = np.linalg.eigh(hessian / np.outer(scale, scale))
     sigmas = np.maximum(known, _LEAST_SHARE * known[-1]) ** -0.5
     sectors = _sectors(fit.points)
-    points = np.bincount(sectors)
-    variance = float(np.mean(residuals_m**2)) * _design_effect(residuals_m, sectors, points)
+    variance = float(np.mean(residuals_m**2))
     if variance == 0.0:
         return np.zeros((6, 6))
     gradients = np.stack([np.bincount(sectors, column * residuals_m) for column in rows.T], axis=1)
     steps: Array = (gradients / scale) @ (motions * (sigmas / np.sqrt(variance)))
-    used = int((points > 0).sum())
+    used = len(np.unique(sectors))
     freedom = rows.shape[1]
     scatter, axes = np.linalg.eigh(np.einsum("ci,cj->ij", steps, steps) * (used / max(used - freedom, 1)))
     scatter = np.maximum(scatter, _LEAST_SCATTER)
-    step = steps.sum(axis=0) @ axes
-    chi2 = float(np.sum(step**2 / scatter))
-    unexplained = max(0.0, 1.0 - freedom / chi2) if chi2 > 0.0 else 0.0
     to_tangent = (motions * (sigmas * np.sqrt(variance))) @ axes / scale[:, None]
-    along_axes = to_tangent @ (np.diag(scatter**_SCATTER) + unexplained * np.outer(step, step))
     covariance = np.zeros((6, 6))
-    covariance[measured, measured] = along_axes @ to_tangent.T
+    covariance[measured, measured] = (to_tangent * scatter**_SCATTER) @ to_tangent.T
     return covariance
-
-
-def _design_effect(residuals_m: Array, sectors: NDArray[np.intp], points: NDArray[np.intp]) -> float:
-    """Return how many times the variance exceeds that of independent distances; 1 with too few points."""
-    sums, squares = (np.bincount(sectors, weights) for weights in (residuals_m, residuals_m**2))
-    enough = (points >= _FEWEST) & (squares > 0.0)
-    if not enough.any():
-        return 1.0
-    return max(1.0, float(np.median(sums[enough] ** 2 / squares[enough])) / _MEDIAN_CHI2)
 
 
 def _sectors(points: Array) -> NDArray[np.intp]:
