@@ -12,9 +12,9 @@ OTHER_UNIT = 2.0
 
 
 def unit_of_gravity(length: float) -> float | None:
-    """Return the unit in which the length of an acceleration is gravity's: 1 m/s² or g; None if in neither.
+    """Return the unit in which the length of an acceleration is gravity's, m/s²; None if in no usual one.
 
-    ROS says m/s²; drivers of Livox and Hesai write g.
+    ROS says m/s²; drivers of Livox and Hesai write g, others cm/s² or mg, which nearly are the same.
     """
-    units = (unit for unit in (1.0, GRAVITY_MPS2) if 0.5 < length * unit / GRAVITY_MPS2 < 2.0)
-    return next(units, None)
+    units = (1.0, GRAVITY_MPS2, 0.001 * GRAVITY_MPS2)
+    return next((unit for unit in units if 0.5 < length * unit / GRAVITY_MPS2 < 2.0), None)

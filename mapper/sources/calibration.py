@@ -1,11 +1,12 @@
 """Intrinsics of a log, and the cameras of well-known data sets."""
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mapper.core.errors import SourceError
+from mapper.core.errors import SourceError, listed
 from mapper.core.frames import NO_DISTORTION, PinholeCamera
 from mapper.core.geometry import Transform, angle_between
 from mapper.core.rotations import pose_of_row
@@ -41,6 +42,7 @@ class Calibration:
         size_px: (width, height) the numbers hold for, if stated.
         depth_units_per_m: Depth image units per metre, if stated.
         depth: Depth camera beside this one, if depth images are its own.
+        unread: Names of other files of intrinsics beside the log.
     """
 
     origin: str
@@ -53,10 +55,13 @@ class Calibration:
     size_px: tuple[int, int] | None = None
     depth_units_per_m: float | None = None
     depth: "DepthCamera | None" = None
+    unread: Sequence[str] = ()
 
     def notes(self) -> list[str]:
         """Return sentences on what is made of the images as they are read."""
         notes = [] if self.depth is None else [self.depth.note]
+        if self.unread:
+            notes.append(f"intrinsics are read from {self.origin}, and not from {listed(self.unread)}")
         if self.lens is not None:
             notes.append(f"the distortion {self.lens.model} is taken out of the images as they are read")
         return notes

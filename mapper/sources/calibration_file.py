@@ -48,13 +48,20 @@ _FILE_NAMES = (
 )
 """Globs in a log's folder, the first that is there counts."""
 
+_BY_CONTENT = (".yaml", ".yml", ".json")
+
 _Numbers = Mapping[str, Sequence[float]]
 
 
-def calibration_file(folder: Path) -> Path | None:
-    """Return the file of intrinsics beside a log; None without one."""
-    found = (path for name in _FILE_NAMES for path in sorted(folder.glob(name)) if path.is_file())
-    return next((path for path in found if not path.name.endswith(_MAY_BE_OTHER) or _has_camera(path)), None)
+def calibration_files(folder: Path) -> list[Path]:
+    """Return the files of intrinsics beside a log, by names or else contents; the first counts."""
+    named = [path for name in _FILE_NAMES for path in sorted(folder.glob(name)) if path.is_file()]
+    found = [path for path in named if not path.name.endswith(_MAY_BE_OTHER) or _has_camera(path)]
+    if found:
+        return list(dict.fromkeys(found))
+    others = [path for path in sorted(folder.glob("*")) if path.suffix in _BY_CONTENT and path.is_file()]
+    found = [path for path in others if "depth" not in path.name.lower() and _has_camera(path)]
+    return found if len(found) == 1 else []
 
 
 def read_calibration(path: Path) -> Calibration:
@@ -121,19 +128,20 @@ def calibration_text(camera: PinholeCamera, *, depth_units_per_m: float) -> str:
     return f"{toml_text(values)}\n"
 
 
-# What each number is called: by us, ROS, OpenCV, Kalibr and ORB-SLAM ("Camera.fx" counts as "fx").
+# What each number is called: by us, ROS, OpenCV, Kalibr, librealsense, ORB-SLAM ("Camera.fx" counts as "fx").
 _NAMES = {
     "fx": ("fx_px", "fx", "fl_x"),
     "fy": ("fy_px", "fy", "fl_y"),
-    "cx": ("cx_px", "cx"),
-    "cy": ("cy_px", "cy"),
+    "cx": ("cx_px", "cx", "ppx"),
+    "cy": ("cy_px", "cy", "ppy"),
     "width": ("width_px", "width", "image_width", "w"),
     "height": ("height_px", "height", "image_height", "h"),
     "size": ("resolution",),
     "depth_factor": ("depth_factor", "depthmapfactor"),
+    "scale_of_depth": ("depth_scale",),
     "matrix": ("camera_matrix", "k"),
     "intrinsics": ("intrinsics",),
-    "distortion": ("distortion", "distortion_coefficients", "distortion_coeffs", "d"),
+    "distortion": ("distortion", "distortion_coefficients", "distortion_coeffs", "coeffs", "d"),
     "k1": ("k1",),
     "k2": ("k2",),
     "p1": ("p1",),
@@ -168,6 +176,8 @@ def _interpret(numbers: _Numbers, model: str, origin: str) -> Calibration:
     distortion, lens = _distortion(
         found.get("distortion") or [one.get(name, 0.0) for name in coefficients], model
     )
+    if scale := one.get("scale_of_depth"):  # metres per unit of librealsense, units per metre of Open3D
+        one.setdefault("depth_factor", 1.0 / scale if scale < 1.0 else scale)
     low, high = _UNITS_PER_M
     if not low <= one.get("depth_factor", 1.0) <= high:
         raise DataError(f"depth_factor {one['depth_factor']:g}, want {low:g} to {high:g} units per metre")
@@ -235,7 +245,9 @@ _OTHER_LENS = re.compile(
     r"equidistant|fisheye|kannala_?brandt|(?:^|:)\s*\"?(?P<unknown>omni|mei|eucm|ds|fov|atan)\"?\s*$",
     _ANY_LINE,
 )
-_KEY_AND_NUMBER = re.compile(r"(?:fl?_?x(?:_px)?|camera_matrix|\bk)\"?\s*[:=]", re.IGNORECASE)
+_KEY_AND_NUMBER = re.compile(
+    r"(?:fl?_?x(?:_px)?|camera_matrix|\bk(?=\"?\s*[:=]\s*(?:[\[-]|\S+[ ,]+\S)))\"?\s*[:=]", re.IGNORECASE
+)
 _COLOUR_SECTION = re.compile(r"^\w*(?:color|colour|rgb)\w*:[ \t]*\n(?:[ \t]+.*\n?|\s*\n)+", _ANY_LINE)
 _YAML_ENTRY = re.compile(
     r"^[ \t]*(?:\w+\.)?(?P<key>\w+)[ \t]*:[ \t]*(?P<value>\[[^\]]*\]|(?:\n[ \t]*-[ \t][^\n]*)+|[^\n#]*)",
@@ -303,6 +315,8 @@ def _json_numbers(table: Any) -> tuple[_Numbers, str]:
     if len(K := numbers.get("intrinsic_matrix", numbers.get("k", ()))) == 9:
         is_by_column = not (K[2] or K[5])
         numbers["k"] = np.reshape(K, (3, 3)).T.ravel().tolist() if is_by_column else K
+    if "inverse" in f"{camera.get('model', '')}".lower() and any(numbers.get("coeffs", ())):
+        raise DataError(f"{camera['model']} lens; known are plumb_bob, rational_polynomial and equidistant")
     if camera is not table and "scale" in numbers:
         numbers["depth_factor"] = numbers["scale"]
     return numbers, model

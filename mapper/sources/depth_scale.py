@@ -28,7 +28,7 @@ _USUALLY_NEAR_M = 0.3
 of these, unless units are stated and the values are whole millimetres in them."""
 _DESK_M = 1.5
 """Depth of most of a desk or an object; nearer than that a whole room is not."""
-_USUAL_UNITS_PER_M = (MM_PER_M, TUM_UNITS_PER_M)
+_USUAL_UNITS_PER_M = (MM_PER_M, TUM_UNITS_PER_M, 10_000.0, 100.0)
 _CHANGE = 3.0
 """Ratio of the median depths of two consecutive frames by which units change, if all frames before are more
 like the one and all after more like the other: usual units differ by 4 or 5, or by 1000."""

@@ -10,7 +10,7 @@ from mapper.core.geometry import Array
 from mapper.core.timebase import Stamps, seconds_text_from_ns
 from mapper.sensing.gyroscope import Gyroscope
 from mapper.sources.base import Accelerations
-from mapper.sources.text import parse_numbers, parse_stamp, read_lines, table, time_order
+from mapper.sources.text import parse_numbers, parse_stamp, read_lines, rows, table, time_order
 
 BOTH, RATES = "imu.csv", "gyroscope.txt"
 _COLUMNS = np.dtype([("stamp_ns", "<i8"), ("rates", "<f8", 3), ("accelerations", "<f8", 3)])
@@ -64,11 +64,13 @@ def read_euroc_imu(path: Path) -> tuple[Gyroscope | None, Accelerations | None, 
 
 def _readings(path: Path, lines: Sequence[str]) -> tuple[Gyroscope | None, Accelerations | None, list[str]]:
     try:
-        rows = np.loadtxt(lines, _COLUMNS, delimiter=",", ndmin=1)
+        readings = np.loadtxt(lines, _COLUMNS, delimiter=",", ndmin=1)
     except ValueError as error:
-        raise SourceError(f"{path}: {error}; want stamp_ns,wx,wy,wz,ax,ay,az") from None
-    gyroscope, notes = _gyroscope(path, rows["stamp_ns"], rows["rates"])
-    felt = rows[np.isfinite(rows["accelerations"]).all(axis=1)]
+        lengths = ((number, len(words)) for number, words in rows(path, separator=","))
+        wrong = (f"line {number} has {n} columns between commas" for number, n in lengths if n != 7)
+        raise SourceError(f"{path}: {next(wrong, error)}; want stamp_ns,wx,wy,wz,ax,ay,az") from None
+    gyroscope, notes = _gyroscope(path, readings["stamp_ns"], readings["rates"])
+    felt = readings[np.isfinite(readings["accelerations"]).all(axis=1)]
     order, _ = time_order(felt["stamp_ns"], what=path.name)
     felt = felt[order]
     accelerations = Accelerations(felt["stamp_ns"], felt["accelerations"]) if len(felt) else None

@@ -6,7 +6,7 @@ import pytest
 
 from mapper.core.errors import SourceError
 from mapper.sources import open_source
-from mapper.sources.calibration_file import calibration_file, read_calibration
+from mapper.sources.calibration_file import calibration_files, read_calibration
 from tests.support.tum_logs import write_picture
 
 MATRIX = "60.0 0.0 31.5\n0.0 61.0 23.5\n0.0 0.0 1.0\n"
@@ -156,7 +156,7 @@ def test_eight_coefficients_are_a_rational_lens(tmp_path):
 @pytest.mark.parametrize("text", [b"recorded on a Tuesday\n", b"am Dienstag, den 3. M\xe4rz\n"])
 def test_notes_on_something_else_are_no_calibration(tmp_path, text):
     (tmp_path / "info.txt").write_bytes(text)
-    assert calibration_file(tmp_path) is None
+    assert calibration_files(tmp_path) == []
 
 
 @pytest.mark.parametrize(
@@ -185,9 +185,36 @@ def test_what_is_none_or_of_two_cameras_is_refused_in_words(tmp_path, name, text
         read_calibration(tmp_path / name)
 
 
-def test_a_file_of_another_name_is_mentioned_where_intrinsics_are_unknown(tiny_tum_log):
+def test_a_file_of_another_name_is_read_if_it_alone_has_intrinsics(tiny_tum_log):
     folder = tiny_tum_log()
     (folder / "calibration.toml").unlink()
-    (folder / "TUM1.yaml").write_text("Camera.fx: 60.0\n")
-    with pytest.raises(SourceError, match=r"unknown; .*; if TUM1.yaml has them, call it camera.yaml"):
+    (folder / "settings.yaml").write_text("voxel_size: 0.1\nk: 5\n")
+    with pytest.raises(SourceError, match="intrinsics unknown"):
         open_source(folder)
+    (folder / "TUM1.yaml").write_text(ORB_SLAM3.split("Camera1.k1")[0].replace("KannalaBrandt8", "PinHole"))
+    assert next(iter(open_source(folder))).camera.fx_px == 60.0
+    (folder / "TUM2.yaml").write_text("Camera.fx: 61.0\n")
+    with pytest.raises(SourceError, match="intrinsics unknown"):
+        open_source(folder)
+
+
+def test_intrinsics_that_are_not_read_are_named(tiny_tum_log):
+    folder = tiny_tum_log()
+    assert not any("camera_info.yaml" in note for note in open_source(folder).notes)
+    (folder / "camera_info.yaml").write_text("camera_matrix:\n  data: [90, 0, 31.5, 0, 90, 23.5, 0, 0, 1]\n")
+    log = open_source(folder)
+    assert sum("camera_info.yaml" in note for note in log.notes) == 1
+    assert next(iter(log)).camera.fx_px == 60.0
+
+
+@pytest.mark.parametrize("scale", [0.0002, 5000])
+def test_intrinsics_as_librealsense_prints_them(tmp_path, scale):
+    path = tmp_path / "intrinsics.json"
+    text = f"""{{"width": 64, "height": 48, "fx": 60.0, "fy": 61.0, "ppx": 31.5, "ppy": 23.5,
+        "depth_scale": {scale}, "model": "Inverse Brown Conrady", "coeffs": [0, 0, 0, 0, 0]}}"""
+    path.write_text(text)
+    assert read_calibration(path).depth_units_per_m == pytest.approx(5000.0)
+    assert (read_calibration(path).cx_px, read_calibration(path).cy_px) == (31.5, 23.5)
+    path.write_text(text.replace("[0, 0", "[0.1, 0"))
+    with pytest.raises(SourceError, match="Inverse Brown Conrady lens"):
+        read_calibration(path)

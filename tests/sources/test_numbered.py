@@ -1,9 +1,10 @@
 import shutil
 
+import cv2
 import numpy as np
 import pytest
 
-from mapper.core.errors import SourceError
+from mapper.core.errors import FrameError, SourceError
 from mapper.core.geometry import exp
 from mapper.sources import open_source
 from mapper.sources.config import SourceConfig
@@ -209,3 +210,22 @@ def test_a_tum_folder_that_lost_a_list_is_not_taken_for_numbered_images(tiny_tum
     source = open_source(log)
     assert (source.kind, len(source)) == ("tum", 2)
     assert source.entry_at(0).files.depth_units_per_m == 5000.0
+
+
+@pytest.mark.parametrize(("unit_m", "kind"), [(1.0, np.float32), (0.001, np.uint16)])
+def test_depth_in_tiffs_is_metres_in_floats_and_else_millimetres(tmp_path, unit_m, kind):
+    folder = redwood(tmp_path, ["000000", "000001"])
+    expected_m = np.full((48, 64), 1.5)
+    for path in (folder / "depth").iterdir():
+        cv2.imwrite(str(path.with_suffix(".tiff")), (expected_m / unit_m).astype(kind))
+        path.unlink()
+    np.testing.assert_array_equal(open_source(folder)[0].depth_m, expected_m)
+
+
+def test_depth_of_floats_that_is_no_metres_is_refused_with_the_setting(tmp_path):
+    folder = redwood(tmp_path, ["000000", "000001"])
+    for path in (folder / "depth").iterdir():
+        np.save(path.with_suffix(".npy"), np.full((48, 64), 1e5, np.float32))
+        path.unlink()
+    with pytest.raises(FrameError, match="depth_factor=1000"):
+        open_source(folder)[0]

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from io import BytesIO
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import cv2
 import numpy as np
@@ -14,7 +14,7 @@ from mapper.core.errors import DataError, FrameError
 from mapper.core.frames import DepthImage, Image, PinholeCamera, RgbdFrame, Scan
 from mapper.runtime.regular_files import MOST_BYTES, read_regular
 from mapper.sources.base import ImageFile
-from mapper.sources.cloud_files.parsing import load_array
+from mapper.sources.cloud_files.parsing import MAX_RANGE_M, load_array
 from mapper.sources.image_files import jpeg, png
 from mapper.sources.image_files.decoded import SATURATED, DecodedColour, DecodedDepth
 from mapper.sources.image_files.size import check_pixels
@@ -87,17 +87,20 @@ def read_depth_m(path: ImageFile, units_per_m: float) -> DepthImage:
 
 
 def read_array_m(path: ImageFile, units_per_m: float, float_units_per_m: float) -> DepthImage:
-    """Return the (H, W) float32 depth in metres of a .npy file; 0 is no measurement, and so is NaN.
+    """Return the (H, W) float32 depth in metres of a .npy or TIFF file; 0 is no measurement, and so is NaN.
 
     Args:
-        path: Array of (H, W), (H, W, 1) or (1, H, W) numbers.
+        path: Array of (H, W), (H, W, 1) or (1, H, W) numbers, or a TIFF of 16 bits or float32.
         units_per_m: Units per metre of whole numbers.
         float_units_per_m: Units per metre of others.
 
     Raises:
-        FrameError: The file is missing, damaged or no such array.
+        FrameError: The file is missing, damaged or no such array, or all of it is beyond any camera's reach.
     """
-    array = load_array(BytesIO(bytes_of(path)), path)
+    data = bytes_of(path)
+    array: NDArray[Any] = (
+        load_array(BytesIO(data), path) if path.suffix == ".npy" else decode_depth(data, f"{path}")
+    )
     if array.ndim == 3 and 1 in (array.shape[0], array.shape[2]):
         array = array[0] if array.shape[0] == 1 else array[..., 0]
     if array.ndim != 2 or array.dtype.kind not in "uif" or not array.size:
@@ -106,8 +109,7 @@ def read_array_m(path: ImageFile, units_per_m: float, float_units_per_m: float) 
         return depth_m_from(array, units_per_m)
     unit = float_units_per_m if array.dtype.kind == "f" else units_per_m
     with np.errstate(all="ignore"):  # a damaged file's numbers may be too large, or signalling NaN
-        depth_m: DepthImage = array.astype(np.float32) / np.float32(unit)
-    return np.where(np.isfinite(depth_m) & (depth_m > 0.0), depth_m, np.float32(0.0))
+        return valid_depth(array, unit, where=f"{path}")
 
 
 def decode_depth_units(data: bytes, where: str) -> NDArray[np.uint16]:
@@ -140,6 +142,25 @@ def depth_m_from(units: NDArray[np.uint16], units_per_m: float) -> DepthImage:
     """Return (H, W) float32 metres of 16-bit units; 0, and what is saturated, is no measurement."""
     depth_m: DepthImage = _metres(units, np.float32(units_per_m))
     return depth_m
+
+
+def valid_depth(depth: NDArray[np.number], units_per_m: float, *, where: str) -> DepthImage:
+    """Return metres, 0 where depth is not finite, negative, or beyond the reach of every depth camera.
+
+    Raises:
+        FrameError: All of it is beyond that reach.
+    """
+    valid: DepthImage = np.array(depth, dtype=np.float32)  # aligned, which a message need not be
+    valid /= np.float32(units_per_m)
+    is_measured = valid > 0.0
+    is_near = is_measured & (valid < MAX_RANGE_M)
+    if not is_near.any() and (is_far := is_measured & np.isfinite(valid)).any():
+        raise FrameError(
+            f"{where}: the median depth is {np.median(valid[is_far]):.0f} m, at most {MAX_RANGE_M:.0f} m can "
+            "be measured; millimetres? --set source.camera.depth_factor=1000 reads them"
+        )
+    np.copyto(valid, 0.0, where=~is_near)
+    return valid
 
 
 def scan_of(depth_m: DepthImage, camera: PinholeCamera, *, stamp_ns: int) -> Scan:

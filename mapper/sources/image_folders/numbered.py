@@ -22,7 +22,7 @@ from mapper.core.trajectory import Trajectory
 from mapper.core.units import MM_PER_M
 from mapper.sources.base import Log
 from mapper.sources.calibration import PRIMESENSE, SEVEN_SCENES
-from mapper.sources.calibration_file import calibration_file
+from mapper.sources.calibration_file import calibration_files
 from mapper.sources.config import SourceConfig
 from mapper.sources.image_folders.pairing import ordered_pairs
 from mapper.sources.image_folders.rgbd import FramePair, assumed_camera_note, find_calibration, rgbd_log
@@ -101,7 +101,7 @@ def read_log(path: Path, config: SourceConfig) -> Log:
         raise SourceError(f"{path}: no colour and depth images with the same numbers; want {LOOKED_FOR}")
     is_seven_scenes = _SEVEN_SCENES.fullmatch(images.pairs[0].colour.name) is not None
     known = SEVEN_SCENES if is_seven_scenes else PRIMESENSE
-    beside = next((folder for folder in (path, opened) if calibration_file(folder)), path)
+    beside = next((folder for folder in (path, opened) if calibration_files(folder)), path)
     calibration = find_calibration(beside, config.camera, known=known)
     notes = list(images.notes)
     if calibration.origin == known.origin:

@@ -20,7 +20,7 @@ from mapper.sources.calibration import (
     configured_depth_intrinsics,
     configured_depth_pose,
 )
-from mapper.sources.calibration_file import calibration_file, read_calibration
+from mapper.sources.calibration_file import calibration_files, read_calibration
 from mapper.sources.config import CameraConfig
 from mapper.sources.image_files.decoded import DecodedDepth
 from mapper.sources.image_files.image_sizes import RecordedCamera, Size, recorded_camera
@@ -161,8 +161,8 @@ def rgbd_log(
 
 
 def _with_array(pair: FramePair, units_per_m: float, float_units_per_m: float) -> FramePair:
-    """Return a pair whose depth is decoded if it is an array: whole numbers as in an image, else metres."""
-    if pair.depth.suffix != ".npy":
+    """Return a pair whose depth is decoded if it may be floats: whole numbers as in an image, else metres."""
+    if pair.depth.suffix not in (".npy", ".tif", ".tiff"):
         return pair
     decode = partial(read_array_m, pair.depth, units_per_m, float_units_per_m)
     return replace(pair, depth=DecodedDepth(pair.depth, decode, TUM_UNITS_PER_M))
@@ -181,8 +181,8 @@ def find_calibration(folder: Path, config: CameraConfig | None, *, known: Calibr
     Raises:
         SourceError: None of the three exists, or the file is malformed.
     """
-    path = calibration_file(folder)
-    stated = known if path is None else read_calibration(path)
+    files = calibration_files(folder)
+    stated = read_calibration(files[0]) if files else known
     units_per_m = None if stated is None else stated.depth_units_per_m
     depth = _depth_camera(None if stated is None else stated.depth, config)
     if config is not None:
@@ -194,9 +194,10 @@ def find_calibration(folder: Path, config: CameraConfig | None, *, known: Calibr
     if stated is None:
         raise SourceError(
             f"{folder}: intrinsics unknown; put a calibration.toml with fx_px, fy_px, cx_px and cy_px there, "
-            f"or --set source.camera.fx_px=… and so on{_renamed(folder)}"
+            f"or --set source.camera.fx_px=… and so on"
         )
-    return replace(stated, depth_units_per_m=units_per_m, depth=depth)
+    unread = tuple(path.name for path in files[1:])
+    return replace(stated, depth_units_per_m=units_per_m, depth=depth, unread=unread)
 
 
 def _depth_camera(stated: DepthCamera | None, config: CameraConfig | None) -> DepthCamera | None:
@@ -217,12 +218,6 @@ def _depth_camera(stated: DepthCamera | None, config: CameraConfig | None) -> De
 def assumed_camera_note(camera: Calibration) -> str:
     """Return the note on a log whose camera is taken to be that of its format."""
     return f"camera assumed to be the {camera.origin}; if not, put a calibration.toml beside the log"
-
-
-def _renamed(folder: Path) -> str:
-    """Return advice on a file that may hold intrinsics under a name of its own, as ORB-SLAM's TUM1.yaml."""
-    found = [path.name for ending in ("yaml", "yml") for path in sorted(folder.glob(f"*.{ending}"))]
-    return f"; if {found[0]} has them, call it camera.yaml" if len(found) == 1 else ""
 
 
 def _camera_of(

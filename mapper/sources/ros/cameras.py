@@ -27,6 +27,8 @@ from mapper.sources.ros.reader import RecordingReader
 from mapper.sources.ros.topics import CameraTopics, ImageTopics, is_called_registered, shared_namespaces
 from mapper.sources.text import pose_from_numbers
 
+_LOOKED_AT = 8
+"""Calibrations, spread over the recording, that should be the same."""
 _SAME_LENS_RATIO = 0.01
 _SAME_PLACE_M = 0.005
 """Colour cameras lie farther beside the depth camera, 14 mm at least; frames of one lens may be turned."""
@@ -66,11 +68,40 @@ def calibrate(
     if topics.own_info is not None and topics.own_info is not topics.info:
         own = _colour_calibration(reader, topics, topics.own_info, config, colour_px)
     depth, notes = _depth_camera(reader, topics, own, config, frames, colour_px, depth_px)
+    if topics.info is not None and configured(config) is None:
+        notes += _doubts_about(reader, topics.info, images_frame=frames[0])
     if depth is not None:
         return replace(calibration, depth=depth), notes
     if frames[0] != frames[1]:
         notes.append(f"depth in frame {frames[1]} is taken to be registered to colour in {frames[0]}")
     return calibration, notes
+
+
+def _doubts_about(reader: RecordingReader, infos: Series, *, images_frame: str) -> list[str]:
+    """Return notes on calibrations that change during the recording, or are of another coordinate frame."""
+    name, first, notes = infos.topic.name, _first_info(reader, infos), list[str]()
+    if first is None:
+        return notes
+    if (frame := frame_of(first)) != images_frame and frame and images_frame:
+        notes.append(
+            f"{name} is of frame {frame}, colour images of {images_frame}: is it theirs? "
+            "source.topics.camera_info=… names another"
+        )
+    for info in reader.spread_messages(infos, most=_LOOKED_AT):
+        if not isinstance(info, CameraMessage) or not info.K[:1].any() or info.K.shape != first.K.shape:
+            continue
+        if np.abs(info.K - first.K).max() > _SAME_LENS_RATIO * np.abs(first.K).max():
+            notes.append(
+                f"{name}: the intrinsics change from {_numbers(first)} to {_numbers(info)}; the first are "
+                "used: map the parts apart (source.first_frame, source.last_frame) with those of each in "
+                "source.camera"
+            )
+            break
+    return notes
+
+
+def _numbers(info: CameraMessage) -> str:
+    return ", ".join(f"{value:g}" for value in info.K.ravel()[[0, 4, 2, 5]])
 
 
 def images_beside(reader: RecordingReader, topics: ImageTopics, *, body: str) -> CameraImages | str:

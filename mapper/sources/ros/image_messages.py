@@ -12,9 +12,14 @@ from numpy.typing import NDArray
 from mapper.core.errors import FrameError
 from mapper.core.frames import DepthImage, Image
 from mapper.core.units import MM_PER_M
-from mapper.sources.cloud_files.parsing import MAX_RANGE_M
 from mapper.sources.image_files import png
-from mapper.sources.image_files.reading import decode_colour, decode_depth, decode_grey, depth_m_from
+from mapper.sources.image_files.reading import (
+    decode_colour,
+    decode_depth,
+    decode_grey,
+    depth_m_from,
+    valid_depth,
+)
 from mapper.sources.ros.messages import FileMessage, ImageMessage, PixelsMessage
 
 
@@ -44,7 +49,7 @@ _COLOUR = {
     "bayer_gbrg8": _Encoding(1, cv2.COLOR_BayerGR2RGB, cv2.COLOR_BayerGR2GRAY),
     "bayer_grbg8": _Encoding(1, cv2.COLOR_BayerGB2RGB, cv2.COLOR_BayerGB2GRAY),
 }
-_DEPTH = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
+_DEPTH = {"16UC1": "u2", "mono16": "u2", "16SC1": "i2", "32FC1": "f4", "64FC1": "f8"}
 _TIFF_STARTS = (b"II*\x00", b"MM\x00*")
 _IMAGE_STARTS = (b"\xff\xd8", b"\x89PNG", b"BM", *_TIFF_STARTS, b"RIFF", b"P")
 DEPTH_HEADER = struct.Struct("<iff")  # compressedDepth's: how it is stored, and two parameters of that
@@ -57,6 +62,12 @@ def is_depth(message: ImageMessage) -> bool:
     head = bytes(_without_header(message)[:64])
     is_called_depth = "compressedDepth" in message.format or message.format.startswith(tuple(_DEPTH))
     return is_called_depth or png.is_grey16(head) or _is_float_tiff(message)
+
+
+def is_mono16(message: ImageMessage) -> bool:
+    """Return whether an image is called grey of 16 bits, as infrared ones are, and some of depth."""
+    stated = message.encoding if isinstance(message, PixelsMessage) else message.format
+    return stated.startswith("mono16")
 
 
 def size_of(message: ImageMessage, *, where: str) -> tuple[int, int]:
@@ -83,8 +94,8 @@ def image_of(message: ImageMessage, *, colour: bool, where: str) -> Image:
         FrameError: The image is damaged, or in an encoding that is not read; ``where`` is what it names.
     """
     if isinstance(message, FileMessage):
-        _refuse_video(message, where=where)
         data = bytes(message.data)
+        _refuse_video(data, message.format, where=where)
         return decode_colour(data, where) if colour else decode_grey(data, where)
     encoding = _COLOUR.get(message.encoding)
     if encoding is None:
@@ -122,9 +133,9 @@ def depth_m_of(
         raise FrameError(f"{where}: depth encoded as {message.encoding}; known are {', '.join(_DEPTH)}")
     order = ">" if message.is_big_endian else "<"
     pixels = _pixels(message, order + kind, 1, where=where)
-    if kind == "f4":
-        return _valid_depth(pixels, float_units_per_m, where=where)
-    return depth_m_from(np.ascontiguousarray(pixels, dtype=np.uint16), units_per_m)
+    if kind.startswith("f"):
+        return valid_depth(pixels, float_units_per_m, where=where)
+    return depth_m_from(np.ascontiguousarray(np.maximum(pixels, 0), dtype=np.uint16), units_per_m)
 
 
 def depth_file_of(message: ImageMessage) -> bytes | None:
@@ -138,7 +149,7 @@ def depth_file_of(message: ImageMessage) -> bytes | None:
 def has_float_depth(message: ImageMessage) -> bool:
     """Return whether depth is stored as 32-bit numbers, or was before it was compressed."""
     if isinstance(message, PixelsMessage):
-        return message.encoding == "32FC1"
+        return _DEPTH.get(message.encoding, "").startswith("f")
     return message.format.startswith("32FC1") or _is_float_tiff(message)
 
 
@@ -167,44 +178,25 @@ def _depth_m_of_file(
     if "compressedDepth" in message.format and len(message.data) < DEPTH_HEADER.size:
         raise FrameError(f"{where}: compressedDepth of {len(message.data)} bytes")
     file = _without_header(message)
+    _refuse_video(bytes(file), message.format, where=where)
     units = decode_depth(bytes(file), where)
     if units.dtype == np.float32:
-        return _valid_depth(units.astype(np.float32), float_units_per_m, where=where)
+        return valid_depth(units.astype(np.float32), float_units_per_m, where=where)
     if not message.format.startswith("32FC1") or len(file) == len(message.data):
         return depth_m_from(units.astype(np.uint16, copy=False), units_per_m)
     _, a, b = DEPTH_HEADER.unpack_from(message.data)
     with np.errstate(divide="ignore"):
         depth_m = np.float32(a) / (units.astype(np.float32) - np.float32(b))
-    return _valid_depth(np.where(units > 0, depth_m, np.float32(0.0)), float_units_per_m, where=where)
+    return valid_depth(np.where(units > 0, depth_m, np.float32(0.0)), float_units_per_m, where=where)
 
 
-def _refuse_video(message: FileMessage, *, where: str) -> None:
+def _refuse_video(data: bytes, format_: str, *, where: str) -> None:
     """Refuse data that is no image file: a frame of a video shows only what changed."""
-    is_image = bytes(message.data[:4]).startswith(_IMAGE_STARTS)
-    if len(message.data) and not is_image:
+    if data and not data.startswith(_IMAGE_STARTS):
         raise FrameError(
-            f"{where}: its format is {message.format!r}, which is no image file; "
+            f"{where}: its format is {format_!r}, which is no image file; "
             "video is not read: record raw images, JPEG or PNG"
         )
-
-
-def _valid_depth(depth: DepthImage, units_per_m: float, *, where: str) -> DepthImage:
-    """Return metres, 0 where depth is not finite, negative, or beyond the reach of every depth camera.
-
-    Raises:
-        FrameError: All of it is beyond that reach.
-    """
-    valid: DepthImage = np.array(depth, dtype=np.float32)  # aligned, which a message need not be
-    valid /= np.float32(units_per_m)
-    is_measured = valid > 0.0
-    is_near = is_measured & (valid < MAX_RANGE_M)
-    if not is_near.any() and (is_far := is_measured & np.isfinite(valid)).any():
-        raise FrameError(
-            f"{where}: the median depth is {np.median(valid[is_far]):.0f} m, at most {MAX_RANGE_M:.0f} m can "
-            "be measured; millimetres? --set source.camera.depth_factor=1000 reads them"
-        )
-    np.copyto(valid, 0.0, where=~is_near)
-    return valid
 
 
 def _pixels(message: PixelsMessage, kind: str, channels: int, *, where: str) -> NDArray[Any]:

@@ -17,7 +17,16 @@ from mapper.sources.ros import decode_foxglove
 from mapper.sources.ros.decode import decode, decompressed
 from mapper.sources.ros.image_messages import size_of
 from mapper.sources.ros.imu_messages import readings_of
-from mapper.sources.ros.messages import CLOUDS, IMUS, READ, SMALL, WITH_HEADER, ImageMessage, Message
+from mapper.sources.ros.messages import (
+    CLOUDS,
+    IMUS,
+    READ,
+    SMALL,
+    WITH_HEADER,
+    CameraMessage,
+    ImageMessage,
+    Message,
+)
 from mapper.sources.ros.recording import Place, Recording, Topic
 
 _TRIED = 10
@@ -149,14 +158,21 @@ def _are_unset(stamps_ns: Stamps, log_ns: Stamps) -> NDArray[np.bool_]:
 
 
 def first_messages(recording: Recording, series: Iterable[Series]) -> dict[str, Message]:
-    """Return each topic's first message that is whole, by the topic's name; only of types that are read."""
+    """Return each topic's first message that is whole, by the topic's name; only of types that are read.
+
+    Of calibrations it is the first that is one: some drivers publish zeros until they have theirs.
+    """
     firsts: dict[str, Message] = {}
     for one in series:
         if one.topic.type not in READ:
             continue
         for i in range(min(_TRIED, len(one))):
             with suppress(DataError, DependencyError, FrameError):
-                firsts[one.topic.name] = _whole_message(recording, one, i)
+                message = _whole_message(recording, one, i)
+                firsts.setdefault(one.topic.name, message)
+                if isinstance(message, CameraMessage) and not message.K[:1].any():
+                    continue
+                firsts[one.topic.name] = message
                 break
     return firsts
 

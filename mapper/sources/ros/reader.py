@@ -80,6 +80,11 @@ class RecordingReader:
         """Return message ``i`` of a topic, to be read later."""
         return Located(self.recording, series.topic, int(series.stamps_ns[i]), series.place(i))
 
+    def spread_messages(self, series: Series, *, most: int) -> list[Message]:
+        """Return a topic's first message, its last, and others between them; damaged ones are left out."""
+        indices = np.unique(np.linspace(0, len(series) - 1, most).astype(np.intp))
+        return [message for _, message in self._messages(series, indices)]
+
     def truth(self, series: Series | None, *, body: str) -> tuple[Trajectory | None, list[str]]:
         """Return the poses of a topic as those of the body, and notes."""
         if series is None:
@@ -132,9 +137,11 @@ class RecordingReader:
             return None, [*notes, f"{series.topic.name}: no readings"]
         stamps_ns, acceleration_imu = series.stamps_ns[order], series.imu[order, 3:]
         unit = unit_of_gravity(float(np.median(np.linalg.norm(acceleration_imu, axis=1))))
-        if unit == GRAVITY_MPS2:
+        if unit not in (None, 1.0):
             acceleration_imu *= unit
-            notes.append(f"{series.topic.name}: accelerations are as long as 1 at rest: taken as g")
+            name = "g" if unit == GRAVITY_MPS2 else "mg"
+            at_rest = GRAVITY_MPS2 / unit
+            notes.append(f"{series.topic.name}: accelerations are about {at_rest:g} at rest: taken as {name}")
         imu = frame_of(self.firsts.get(series.topic.name))
         tree = self.tree_of(body, imu)
         known, T_body_imu = tree.find_each(body, imu, stamps_ns)

@@ -30,6 +30,7 @@ from mapper.sources.ros.messages import (
     CloudMessage,
     FileMessage,
     ImageMessage,
+    Message,
     frame_of,
 )
 from mapper.sources.ros.reader import SAME_CLOCK_NS, RecordingReader
@@ -254,15 +255,15 @@ def _lidar(reader: RecordingReader, clouds: Series, config: SourceConfig) -> _Fr
     if clouds.topic.type in VELODYNE:
         require_decoder()
     i, notes = ordered(clouds)
-    first = reader.firsts.get(clouds.topic.name)
-    if isinstance(first, CloudMessage):
-        notes += [f"{clouds.topic.name}: {note}" for note in first.notes]
-        times = time_field(first.points.dtype.names or ())
-        values = None if times is None else first.points[times]
-        if values is not None and relative_times_s(values, first.stamp_ns) is None:
-            notes.append(f"{clouds.topic.name}: field {times} holds no times; scans are not deskewed")
-        elif values is not None and counted_on(values) is not values:
-            notes.append(f"{clouds.topic.name}: field {times} begins anew during a sweep; counted on")
+    first = _first_of(reader, clouds)
+    assert isinstance(first, CloudMessage)
+    notes += [f"{clouds.topic.name}: {note}" for note in first.notes]
+    times = time_field(first.points.dtype.names or ())
+    values = None if times is None else first.points[times]
+    if values is not None and relative_times_s(values, first.stamp_ns) is None:
+        notes.append(f"{clouds.topic.name}: field {times} of the first cloud holds no times; not deskewed")
+    elif values is not None and counted_on(values) is not values:
+        notes.append(f"{clouds.topic.name}: field {times} begins anew during a sweep; counted on")
     frame, is_planar = frame_of(first), clouds.topic.type in LASERS
     if is_planar and config.body_frame is None:
         config = config.model_copy(update={"body_frame": reader.base_of(frame)})
@@ -345,11 +346,17 @@ def _body_of(
     return body, notes
 
 
-def _first_image(reader: RecordingReader, series: Series) -> ImageMessage:
+def _first_of(reader: RecordingReader, series: Series) -> Message:
     first = reader.firsts.get(series.topic.name)
-    if not isinstance(first, ImageMessage):
+    if first is None:
         raise SourceError(
-            f"{reader.recording.path}: none of the first images can be read: "
+            f"{reader.recording.path}: none of the first messages can be read: "
             f"{why_unread(reader.recording, series)}"
         )
+    return first
+
+
+def _first_image(reader: RecordingReader, series: Series) -> ImageMessage:
+    first = _first_of(reader, series)
+    assert isinstance(first, ImageMessage)
     return first

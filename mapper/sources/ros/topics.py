@@ -10,7 +10,7 @@ import numpy as np
 
 from mapper.core.errors import SourceError
 from mapper.sources.config import TopicsConfig
-from mapper.sources.ros.image_messages import is_depth
+from mapper.sources.ros.image_messages import is_depth, is_mono16
 from mapper.sources.ros.message_index import Series
 from mapper.sources.ros.messages import (
     CAMERAS,
@@ -139,7 +139,13 @@ def choose(
         SourceError: A chosen topic is not there or of another type, or nothing can be mapped.
     """
     pick = _Picker(series, path)
-    depths = {name for name, first in firsts.items() if isinstance(first, ImageMessage) and is_depth(first)}
+    depths = {
+        name
+        for name, first in firsts.items()
+        if isinstance(first, ImageMessage)
+        and is_depth(first)
+        and not (_is_infrared(name) and is_mono16(first))
+    }
     colors = pick.candidates("color", config.color, IMAGES, where=lambda name: name not in depths)
     depth_images = pick.candidates("depth", config.depth, IMAGES, where=depths.__contains__)
     color, depth = _of_one_camera(colors, depth_images, firsts)
@@ -162,9 +168,11 @@ def choose(
         ]
         wheels = _best(driven, _plain_rank)
     pick.refuse_own_runs()
+    notes: list[str] = []
+    if imu is not None and gyroscope is None:
+        notes.append(f"{imu.topic.name}: its angular velocities are all 0 or no numbers; not used")
     frames: CameraTopics | StereoTopics | Series
     cameras: list[ImageTopics] = []
-    notes: list[str] = []
     if color is not None and depth is not None and config.points is None:
         infos = pick.all(CAMERAS)
         info = pick.one("camera_info", config.camera_info, CAMERAS, _plain_rank, where=set().__contains__)

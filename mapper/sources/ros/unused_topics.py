@@ -16,6 +16,8 @@ _BOOKKEEPING = re.compile(
     r"|foxglove\.Log|sensor_msgs/msg/Joy"
 )
 """Beginnings of types of messages about programs, plans and pictures, which no sensor measured."""
+_PACKED = re.compile("video|ffmpeg|theora|compressed", re.IGNORECASE)
+"""Words in types of videos and of packed clouds."""
 
 
 def unused_notes(
@@ -38,7 +40,9 @@ def unused_notes(
             kind = image_reason and f"point clouds that are not used, as {reason}"
         elif type_ in IMUS and not feels_gravity(one):
             name = f"{name} ({usual_acceleration(one):.3g})"
-            kind = "accelerations that are not used, as they are not as long as gravity, 9.81 m/s² or 1 g"
+            kind = (
+                "accelerations that are not used, as their length is not gravity's, 9.81 m/s², 1 g, 1000 mg"
+            )
         elif type_ in IMUS:
             kind = "accelerations that are not used, as one topic is enough (source.topics.imu)"
         elif type_ in FIXES:
@@ -49,6 +53,8 @@ def unused_notes(
             kind = None
         else:
             name, kind = f"{name} ({type_})", "topics of types that are not read"
+            if _PACKED.search(type_):
+                kind = "packed topics that are not read (record raw images, JPEG or PNG; PointCloud2)"
         if kind is not None:
             kinds.setdefault(kind, []).append(name)
     return [f"{kind}: {listed(names)}" for kind, names in kinds.items()]
@@ -72,12 +78,11 @@ def what_there_is(color: Series | None, depth: Series | None, series: Iterable[S
         depth: Its likeliest depth images, if there are any.
         series: Every topic.
     """
-    if color is not None:
-        others = [one for one in series if one.topic.type in IMAGES]
-        names = listed([color.topic.name, *(one.topic.name for one in others if one is not color)])
-        return f"colour images {names}, but neither depth images nor point clouds"
-    if depth is not None:
-        return f"depth images {depth.topic.name}, but neither colour images nor point clouds"
+    for kind, other, likeliest in (("colour", "depth", color), ("depth", "colour", depth)):
+        if likeliest is not None:
+            others = [one for one in series if one.topic.type in IMAGES and one is not likeliest]
+            names = listed([one.topic.name for one in (likeliest, *others)])
+            return f"{kind} images {names}, but neither {other} images nor point clouds"
     names = ", ".join(
         f"{one.topic.name} ({one.topic.type}{', a single one' if len(one) == 1 else ''})" for one in series
     )

@@ -1,5 +1,7 @@
 """Recordings whose depth comes from a camera of its own: registered as they are read, or refused."""
 
+import struct
+
 import numpy as np
 import pytest
 from mcap.writer import Writer as McapWriter
@@ -229,3 +231,14 @@ def test_depth_in_colour_s_frame_is_registered_whatever_the_driver_s_topic_says(
             writer.finish()
         notes = open_source(path).notes
         assert any("as it is read" in note for note in notes) != is_registered
+
+
+def test_calibrations_that_are_not_set_yet_are_passed_over_and_changes_are_noted(tmp_path):
+    messages = shots(6)
+    for i, focal_px in ((2, 0.0), (5, 0.0), (14, 90.0), (17, 90.0)):
+        cdr = messages[i].cdr.replace(struct.pack("<d", CAMERA.fx_px), struct.pack("<d", focal_px))
+        messages[i] = messages[i]._replace(cdr=cdr)
+    log = open_source(write(tmp_path / "a.mcap", messages))
+    assert log[0].camera == CAMERA
+    assert sum("intrinsics change" in note for note in log.notes) == 1
+    assert not any("intrinsics" in note for note in open_source(write(tmp_path / "b.mcap", shots(6))).notes)

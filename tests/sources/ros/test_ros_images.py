@@ -113,6 +113,25 @@ def test_depth_of_16_bits_is_millimetres(encoding, is_big_endian):
     assert is_depth(message)
 
 
+def test_depth_of_signed_numbers_is_that_of_unsigned_ones_and_none_where_negative():
+    stored = (UNITS // 2).astype(np.int16)
+    expected_m = depth_m_of(pixels(stored.astype(np.uint16), "16UC1"), units_per_m=1000.0, where="m")
+    stored[0, :5] = -1
+    expected_m[0, :5] = 0.0
+    message = pixels(stored, "16SC1")
+    np.testing.assert_array_equal(depth_m_of(message, units_per_m=1000.0, where="m"), expected_m)
+    assert is_depth(message)
+
+
+def test_depth_of_64_bits_is_metres():
+    depth_m = np.linspace(0.5, 4.0, 48 * 64).reshape(48, 64)
+    message = pixels(depth_m, "64FC1")
+    assert has_float_depth(message)
+    np.testing.assert_array_equal(
+        depth_m_of(message, units_per_m=1000.0, where="m"), depth_m.astype(np.float32)
+    )
+
+
 @pytest.mark.parametrize("kind", ["<f4", ">f4"])
 def test_depth_of_32_bits_is_metres_and_what_is_no_depth_is_zero(kind):
     depth = np.linspace(0.5, 4.0, 48 * 64, dtype=np.float32).reshape(48, 64)
@@ -206,6 +225,7 @@ def test_what_is_no_image_is_refused(message, why):
         (pixels(RGB, "rgb8"), "depth encoded as rgb8; known are 16UC1"),
         (file(bytes(4), "16UC1; compressedDepth png"), "compressedDepth of 4 bytes"),
         (file(bytes(40), "16UC1; compressedDepth rvl"), "RVL is not read; record it as PNG or raw"),
+        (file(b"\0\0\0\1\x40" + bytes(40), "h265"), "video is not read"),
         (file(encoded(GREY, ".png"), "16UC1; png"), "want one channel of 16 bits"),
     ],
 )

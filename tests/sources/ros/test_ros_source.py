@@ -106,6 +106,7 @@ def test_topics_that_are_not_used_are_named_with_the_reason(tmp_path):
         "/nmea/fix",
         "/odom, /vio",
         "1 of 1 messages have no latitude, longitude and height (NaN, or zeros); left out",
+        "its angular velocities are all 0 or no numbers; not used",
         "no fixes",
     ]
     damaged = [m._replace(cdr=m.cdr[:30]) if m.topic == "/fish/image_raw" else m for m in messages]
@@ -119,6 +120,11 @@ def test_infrared_of_16_bits_is_not_taken_for_depth(tmp_path):
     for i, t in enumerate(stamps(3)):
         messages += [image(t, f"/cam/{name}/image", picture(i)[1], "16UC1") for name in ("ir", "z")]
     assert opened(tmp_path / "a.mcap", messages).choices[0].startswith(f"colour {COLOR}, depth /cam/z/image")
+    infrared = [one._replace(topic="/cam/ir/image") if one.topic == DEPTH else one for one in shots(3)]
+    for i, t in enumerate(stamps(3)):
+        infrared[3 * i] = image(t, "/cam/ir/image", picture(i)[1], "mono16")
+    with pytest.raises(SourceError, match="neither depth images"):
+        opened(tmp_path / "b.mcap", infrared)
 
 
 def test_the_likeliest_of_several_topics_is_taken_and_another_can_be_chosen(tmp_path):
@@ -374,7 +380,7 @@ def test_depth_in_a_coding_that_is_not_read_is_named_with_the_reason(tmp_path):
 
 def test_a_topic_whose_images_are_all_damaged_is_named(tmp_path):
     messages = [m._replace(cdr=m.cdr[:40]) if m.topic == COLOR else m for m in shots(3)]
-    with pytest.raises(SourceError, match="first images can be read: /cam/color/image_raw: a damaged m"):
+    with pytest.raises(SourceError, match="first messages can be read: /cam/color/image_raw: a damaged m"):
         opened(tmp_path / "a.mcap", messages)
 
 

@@ -18,9 +18,9 @@ def cloud(stamp_ns):
     return cloud_message("/points", Scan(stamp_ns, POINTS), frame="lidar")
 
 
-def imu(stamp_ns, length):
+def imu(stamp_ns, length, *, rate=0.1):
     up = np.array([0.0, 0.0, length])
-    rates = np.array([0.1, 0.0, 0.0])
+    rates = np.array([rate, 0.0, 0.0])
     return imu_message(stamp_ns, "/imu", rates_radps=rates, acceleration_mps2=up, frame="imu")
 
 
@@ -49,9 +49,25 @@ def test_topics_that_cannot_be_read_are_named_where_nothing_can_be_mapped(tmp_pa
 
 
 def test_accelerations_that_are_not_used_beside_their_gyroscope_are_named(tmp_path):
-    for name, length, named in (("a", 1000.0, 1), ("b", 0.0, 0), ("c", 9.8, 0)):
+    for name, length, named in (("a", 100.0, 1), ("b", 0.0, 0), ("c", 9.8, 0)):
         readings = [imu(t, length) for t in STAMPS_NS]
         log = opened(tmp_path / f"{name}.mcap", [*readings, *(cloud(t) for t in STAMPS_NS)])
         assert log.gyroscope is not None
-        assert sum("/imu (1e+03)" in note for note in log.notes) == named
+        assert sum("/imu (100)" in note for note in log.notes) == named
         assert (log.accelerations is not None) == (length == 9.8)
+
+
+@pytest.mark.parametrize(("unit", "tolerance"), [(1.0, 1e-4), (1000.0, 1e-4), (980.665, 0.02)])
+def test_accelerations_in_g_mg_or_cm_become_metres(tmp_path, unit, tolerance):
+    log = opened(tmp_path / "a.mcap", [one for t in STAMPS_NS for one in (imu(t, unit), cloud(t))])
+    lengths = np.linalg.norm(log.accelerations.acceleration_mps2, axis=1)
+    np.testing.assert_allclose(lengths, 9.80665, rtol=tolerance)
+    assert sum("accelerations" in note for note in log.notes) == 1
+
+
+@pytest.mark.parametrize(("rate", "noted"), [(0.1, 0), (0.0, 1)])
+def test_a_gyroscope_that_measures_nothing_is_noted(tmp_path, rate, noted):
+    messages = [one for t in STAMPS_NS for one in (imu(t, 9.8, rate=rate), cloud(t))]
+    log = opened(tmp_path / "a.mcap", messages)
+    assert (log.gyroscope is None) == bool(noted)
+    assert sum("angular velocities" in note for note in log.notes) == noted
