@@ -263,6 +263,7 @@ class _FirstPass:
             *(RunWarning(kind="frozen", sentence=note) for note in checks.frozen()),
             *(RunWarning(kind="far returns", sentence=note) for note in checks.far_returns()),
             *(RunWarning(kind="log", sentence=note) for note in checks.untimed_returns()),
+            *(RunWarning(kind="log", sentence=note) for note in checks.untimed_scans()),
             *(RunWarning(kind="conflict", sentence=note, weight="doubt") for note in conflicts),
         ]
         if isinstance(odometry, SensorCheck):

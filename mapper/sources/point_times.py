@@ -31,6 +31,9 @@ _USUAL_SWEEP_NS = NS_PER_S // 10
 """A sweep whose returns all lie to one side is shorter, but begins no later after its stamp."""
 _MAX_WRONG_SHARE = 0.05
 """Share of the points whose times may be damaged; with more of them nothing tells which times are right."""
+_LEAST_UNSET_SHARE, _MOST_UNSET_SHARE, _UNSET_RATIO = 0.01, 0.25, 5
+"""Shares of points whose time 0 may mean that there is none, and their ratio to those of any other time: a
+spinning LiDAR's first column has as many as the others. A quarter of them may be a LiDAR's without times."""
 _SAMPLED = 1000
 _PERIODS = (float(1 << 32), *(s * unit for s in (1, 3600, 86_400, 604_800) for unit in UNITS_PER_S))
 """Counts after which times begin anew: 32 bits; a second, an hour, a day and a week in every unit."""
@@ -60,7 +63,8 @@ def relative_times_s(values: NDArray[np.number], stamp_ns: int) -> NDArray[np.fl
     stamp.
 
     A few values that are not within ``MAX_SWEEP_S`` of the others are damaged: the driver wrote zero or NaN.
-    Where a counter of 32 bits, or of the second, hour, day or week began anew, it is counted on.
+    So are zeros among offsets that are far more than the points of any other time. Where a counter of 32
+    bits, or of the second, hour, day or week began anew, it is counted on.
 
     Args:
         values: (N,) of any integer or floating type, of the points that measured something.
@@ -79,7 +83,15 @@ def relative_times_s(values: NDArray[np.number], stamp_ns: int) -> NDArray[np.fl
     first, last = values.min(), values.max()  # NaN is the least and the largest of all
     if not (np.isfinite(first) and np.isfinite(last) and _less(last, first) <= MAX_SWEEP_S * units_per_s):
         return _without_damage(values, middle, units_per_s, stamp_ns)
-    return None if first == last else _after_stamp_s(values, first, units_per_s, stamp_ns)
+    if first == last:
+        return None
+    times_s = _after_stamp_s(values, first, units_per_s, stamp_ns)
+    is_zero = values == 0
+    if _LEAST_UNSET_SHARE < is_zero.mean() < _MOST_UNSET_SHARE:
+        _, counts = np.unique(values[~is_zero], return_counts=True)
+        if is_zero.sum() > _UNSET_RATIO * counts.max():
+            times_s[is_zero] = np.nan
+    return times_s
 
 
 def without_untimed(scan: Scan) -> Scan:

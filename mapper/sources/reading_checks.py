@@ -124,8 +124,8 @@ class ReadingChecks:
         counts = [reading.untimed_returns for reading in self._readings.values() if reading.untimed_returns]
         if counts:
             yield (
-                f"{sum(counts)} returns in {len(counts)} of {len(self._readings)} scans have times more than "
-                f"{MAX_SWEEP_S:g} s from those of their scan; left out"
+                f"{sum(counts)} returns in {len(counts)} of {len(self._readings)} scans have no times (0, "
+                f"NaN, or more than {MAX_SWEEP_S:g} s from the others'); left out"
             )
 
     def untimed_scans(self) -> Iterator[str]:

@@ -2,25 +2,33 @@
 
 import re
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.core.errors import SourceError
-from mapper.core.timebase import NS_PER_S, UNITS_PER_S, Stamps, ns_from_seconds_text
+from mapper.core.errors import DataError, SourceError
+from mapper.core.timebase import NS_PER_S, UNITS_PER_S, Stamps, ns_from_date_text, ns_from_seconds_text
 from mapper.sources.image_folders.numbered import stamp_at
 from mapper.sources.text import parse_date, parse_stamp, rows
 
 RATE_HZ = 10.0
 
 _DECIMAL = re.compile(r"(?<!\d)\d{1,10}\.\d+$")
+_DECIMAL_FIRST = re.compile(r"(?<!\d)\d{10}\.\d+(?=[_-]\d+$)")  # and a counter
+_DATE = re.compile(
+    r"(?<!\d)((?:19|20)\d\d)[-_]?(\d\d)[-_]?(\d\d)[-_T]?(\d\d)[-_h]?(\d\d)[-_m]?(\d\d)(?:[-_.](\d{1,9}))?Z?$"
+)
 _TWO_PARTS = re.compile(r"(?<!\d)(\d{10})[_-](\d{1,9})$")
 _WHOLE = re.compile(r"(?<!\d)\d+$")
 _NUMBER = re.compile(r"\d+(?=\D*$)")
 _EPOCH_DIGITS = 10  # of seconds, in the years 2001 to 2286
 _UNIT_DIGITS = (3, 6, 9)  # of ms, µs and ns in a second
+
+
+UNPADDED_NOTE = "fractions of the stamps are taken as whole numbers without leading zeros"
 
 
 def in_order(paths: Iterable[Path]) -> list[Path]:
@@ -63,17 +71,17 @@ def scan_stamps(
     """
     named = None if chosen else _stamps_of(files)
     if named is not None:
-        is_unpadded = _unpadded_stamps([path.stem for path in files]) is not None
-        note = "fractions of the stamps in the names are taken as whole numbers without leading zeros"
-        return named, [note] if is_unpadded else []
+        is_unpadded = unpadded_stamps([path.stem for path in files]) is not None
+        return named, [UNPADDED_NOTE] if is_unpadded else []
     if listed := chosen or beside:
         return _listed(listed, files, wording), []
     rate_hz = rate_hz or RATE_HZ
     numbers = numbers_of(files)
+    step = 1 if numbers is None else int(np.gcd.reduce(numbers - numbers.min()))
     counts = range(len(files)) if numbers is None else numbers.tolist()
     note = (
         f"no stamps in the names or in a times.txt; {rate_hz:g} {wording.files} a second assumed "
-        f"({wording.rate})"
+        f"({wording.rate}){f'; the numbers go in steps of {step}' if step > 1 else ''}"
     )
     return np.array([stamp_at(count, rate_hz=rate_hz) for count in counts], dtype=np.int64), [note]
 
@@ -123,7 +131,7 @@ def stamps_in(stems: Sequence[str]) -> Stamps | None:
 
     pcl_ros once wrote SECONDS.NANOSECONDS without leading zeros; such fractions are whole numbers of a unit.
     """
-    unpadded_ns = _unpadded_stamps(stems)
+    unpadded_ns = unpadded_stamps(stems)
     if unpadded_ns is not None:
         return unpadded_ns
     stamps_ns = [_stamp_in(stem) for stem in stems]
@@ -132,7 +140,7 @@ def stamps_in(stems: Sequence[str]) -> Stamps | None:
     return np.array(stamps_ns, dtype=np.int64)
 
 
-def _unpadded_stamps(stems: Sequence[str]) -> Stamps | None:
+def unpadded_stamps(stems: Sequence[str]) -> Stamps | None:
     """Return stamps with fractions of whole ms, µs or ns without leading zeros; None where they are decimals.
 
     Such fractions differ in length and none begins with a zero. So may decimals that lost the zeros at their
@@ -157,7 +165,11 @@ def _unevenness_ns(stamps_ns: Stamps) -> float:
 
 
 def _stamp_in(stem: str) -> int | None:
-    if found := _DECIMAL.search(stem):
+    if found := _DATE.search(stem):
+        year, month, day, hour, minute, second, fraction = found.groups(default="0")
+        with suppress(DataError):
+            return ns_from_date_text(f"{year}-{month}-{day} {hour}:{minute}:{second}.{fraction}")
+    if found := _DECIMAL.search(stem) or _DECIMAL_FIRST.search(stem):
         return ns_from_seconds_text(found[0])
     if found := _TWO_PARTS.search(stem):
         return int(found[1]) * NS_PER_S + int(found[2])

@@ -114,3 +114,14 @@ def test_the_last_32_bits_of_the_epoch_are_no_offsets_from_the_stamp():
         times_s = relative_times_s(ns.astype(np.uint32), stamp_ns)
         if ns[0] > 100_000_000:  # 1 in 43 sweeps looks like offsets from its stamp
             np.testing.assert_allclose(times_s, SWEEP_S, atol=1e-6)
+
+
+def test_zeros_of_returns_without_a_time_are_none_but_those_of_a_first_column_stay():
+    columns = np.repeat(np.linspace(0.0, 0.0999, 100), 10)
+    times_s = np.round(columns * 1e9).astype(np.uint32)
+    np.testing.assert_allclose(relative_times_s(times_s, STAMP_NS), columns, atol=1e-6)
+    times_s[::9] = 0
+    found_s = relative_times_s(times_s, STAMP_NS)
+    assert np.isnan(found_s).sum() == (times_s == 0).sum()
+    known = times_s > 0
+    np.testing.assert_allclose(found_s[known], columns[known], atol=1e-6)

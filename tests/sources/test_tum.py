@@ -258,3 +258,16 @@ def test_depth_of_a_camera_of_its_own_is_registered_by_the_calibration_or_by_set
     other = CameraConfig(depth_in_color=(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0))
     (note,) = (one for one in open_source(log, SourceConfig(camera=other)).notes if "registered" in one)
     assert "(source.camera)" in note
+
+
+def test_fractions_of_listed_stamps_without_leading_zeros_are_whole_numbers(tiny_tum_log):
+    folder = tiny_tum_log(12)
+    expected_ns = [1_700_000_000_007_000_000 + i * 100_000_000 for i in range(12)]
+    for name in ("rgb.txt", "depth.txt"):
+        files = [line.split()[1] for line in (folder / name).read_text().splitlines()[1:]]
+        stamps = [f"{ns // 10**9}.{ns % 10**9}" for ns in expected_ns]
+        lines = (" ".join(words) for words in zip(stamps, files, strict=True))
+        (folder / name).write_text("\n".join(lines) + "\n")
+    log = open_source(folder)
+    assert log.stamps_ns.tolist() == expected_ns
+    assert sum("leading zeros" in note for note in log.notes) == 2

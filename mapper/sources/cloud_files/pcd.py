@@ -2,6 +2,7 @@
 
 import os
 import struct
+from contextlib import suppress
 from io import BytesIO
 from itertools import islice
 from pathlib import Path
@@ -30,6 +31,16 @@ def read_pcd(path: Path) -> Columns:
     if len(fields) != stated:
         raise FrameError(f"{path}: {len(fields)} points, but the header says {stated}; was the file cut?")
     return {name: fields[name] for name in fields.dtype.names or ()}
+
+
+def viewpoint_note(path: Path) -> list[str]:
+    """Return a note on the pose of the sensor that a PCD file states, if it is another than identity."""
+    with path.open("rb") as stream:
+        line = next((line for line in _header_lines(stream) if line.startswith("VIEWPOINT")), "")
+    with suppress(ValueError):
+        if [float(word) for word in line.split()[1:]] in ([], [0, 0, 0, 1, 0, 0, 0]):
+            return []
+    return [f"{path.name}: its {line} is not used; points are taken to be around the sensor"]
 
 
 def _read(stream: BinaryIO) -> tuple[NDArray[np.void], int]:

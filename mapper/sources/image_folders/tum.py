@@ -22,6 +22,7 @@ from mapper.sources.image_files.reading import TUM_UNITS_PER_M
 from mapper.sources.image_folders.pairing import ImageList, pair_images
 from mapper.sources.image_folders.rgbd import find_calibration, rgbd_log
 from mapper.sources.listed_files import present, within
+from mapper.sources.scan_stamps import UNPADDED_NOTE, unpadded_stamps
 from mapper.sources.text import (
     parse_numbers,
     parse_stamp,
@@ -166,6 +167,9 @@ def _images(folder: Path, rows: Sequence[tuple[str, ...]], notes: list[str], *, 
         stamps_ns.append(parse_stamp(stamp, where=where))
         paths.append(within(folder, filename, where=where))
     name = path.name
+    if (unpadded_ns := unpadded_stamps([stamp for _, stamp, _ in rows])) is not None:
+        stamps_ns = unpadded_ns.tolist()
+        notes.append(f"{name}: {UNPADDED_NOTE}")
     if not paths:
         raise SourceError(f"{path}: empty list; want lines of: stamp filename")
     exists = present(paths)

@@ -18,7 +18,7 @@ _FIXED_FRAMES = frozenset(
     {"map", "odom", "world", "earth", "utm", "enu", "global", "combined", "init", "origin"}
 )
 """Last words of frames that do not move with the robot: REP 105's, odom_combined of robot_pose_ekf,
-camera_init of LOAM (Zhang & Singh 2014), local_origin of mavros."""
+camera_init of LOAM (Zhang & Singh 2014), local_origin of mavros, odom_frame of a T265."""
 _MAX_GAP_NS = NS_PER_S
 """Longer than any publisher of a moving frame pauses; tf2 keeps 10 s and interpolates over any gap."""
 _SAME_POSE = 1e-6
@@ -26,7 +26,8 @@ _SAME_POSE = 1e-6
 
 def is_fixed(frame: str) -> bool:
     """Return whether a frame's name says that it does not move with the robot."""
-    return re.split("[/_]", frame.lower())[-1] in _FIXED_FRAMES
+    words = re.findall("[a-z]+", frame.lower())
+    return bool(words) and words[-2 if words[-1] == "frame" and words[1:] else -1] in _FIXED_FRAMES
 
 
 class FrameTree:

@@ -5,6 +5,7 @@ from pathlib import Path
 from mapper.core.errors import SourceError
 from mapper.core.frames import Scan
 from mapper.sources.base import Log
+from mapper.sources.cloud_files.pcd import viewpoint_note
 from mapper.sources.config import SourceConfig
 from mapper.sources.scan_folders.scan_folder import (
     STAMP_FILES,
@@ -52,6 +53,8 @@ def read_log(path: Path, config: SourceConfig) -> Log:
     folder, files, notes = readable[0]
     if not files:
         raise SourceError(f"{folder}: no cloud matches source.pattern={config.pattern}")
+    if files[-1].suffix == ".pcd":
+        notes = [*notes, *viewpoint_note(files[-1])]
     return scan_log(
         path,
         files,

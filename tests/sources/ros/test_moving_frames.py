@@ -87,7 +87,9 @@ def test_where_nothing_moves_in_tf_they_are_refused(tmp_path, tf):
         opened(tmp_path / "a.mcap", [*tf, *on_map()])
 
 
-@pytest.mark.parametrize("frame", ["robot1/odom", "odom_combined", "Map", "lio_map", "utm"])
+@pytest.mark.parametrize(
+    "frame", ["robot1/odom", "odom_combined", "Map", "lio_map", "utm", "odom_frame", "map1"]
+)
 def test_frames_that_stay_have_several_names(tmp_path, frame):
     with pytest.raises(SourceError, match="which stays"):
         opened(tmp_path / "a.mcap", clouds(drive, frame=frame))
