@@ -30,13 +30,15 @@ def inspect(
 
     from mapper.api.logs import inspect as inspect_log
     from mapper.config.loading import load_config
+    from mapper.sources.selection import too_few_text
 
     settings = settings_of({}, set_)
     found = inspect_log(log, settings=settings)
     problem, plan = found.problem, ""
     if found.log is not None:
         config = load_config(settings, sensor=found.log.sensor)
-        problem = problem or _too_few(found.log.frames.count, config.min_tracked_frames)
+        if problem is None and (frames := found.log.frames.count) < config.min_tracked_frames:
+            problem = too_few_text(frames, config.min_tracked_frames, found.log.notes)
         plan = (
             f"{found.log.sensor} frames, odometry {config.odometry.kind}, loops {config.loops.kind}, "
             f"octree of {config.octree.resolution_m:g} m"
@@ -46,12 +48,6 @@ def inspect(
     answer = {**dataclasses.asdict(found), "problem": problem, "build": plan}
     error = None if problem is None else DataError(f"nothing can be mapped: {problem}")
     return Answer(answer, "\n".join(_lines(found, plan)), error=error)
-
-
-def _too_few(frames: int, least: int) -> str | None:
-    if frames >= least:
-        return None
-    return f"number of frames: {frames}, want at least {least} (min_tracked_frames); give more of the log"
 
 
 def _lines(found: "Inspection", plan: str) -> Iterator[str]:

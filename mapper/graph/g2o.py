@@ -239,7 +239,7 @@ def _tables(path: Path, progress: Progress) -> dict[str, _Table]:
     """Sort the lines by their tags; numbers are checked in bulk afterwards."""
     tables: dict[str, _Table] = {}
     priors = uninformed = 0
-    lines = read_text(path, error=GraphError, encoding="ascii").splitlines()
+    lines = read_text(path, error=GraphError).splitlines()
     for line, text in enumerate(lines, start=1):
         body, _, note = text.partition("#")
         tag, *words = body.split() or [""]

@@ -19,6 +19,7 @@ from mapper.run.manifest import RunWarning
 from mapper.run.stored_tracking import StoredTracking
 from mapper.run.writer import RunWriter
 from mapper.sources.base import Skipped
+from mapper.sources.selection import too_few_text
 
 BY_POSES = ("wheels", "given")
 """Kinds of odometry without tracking: frames have the poses of wheels, or known ones."""
@@ -107,10 +108,7 @@ def refuse_a_fragment(
     if tracking.skipped:
         unread = f"; {len(tracking.skipped)} could not be read, the first: {tracking.skipped[0].reason}"
     if tracked == read:
-        raise TrackingError(
-            f"only {read} {'frame was' if read == 1 else 'frames were'} read, want at least {enough:.0f} "
-            f"(min_tracked_frames); give more of the log{unread}"
-        )
+        raise TrackingError(f"{too_few_text(read, enough, (one.sentence for one in known))}{unread}")
     implausible = [warning.sentence for warning in known if warning.weight == "doubt"]
     hint = (
         "; ".join(implausible) or _HINTS[config.odometry.kind if config.odometry.kind in BY_POSES else sensor]

@@ -1,5 +1,6 @@
 """The part of a log that is used: a range of frames, a stride, frames with truth only, no own vehicle."""
 
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -50,6 +51,14 @@ def selected(log: Log, config: SourceConfig) -> Log:
     used = np.flatnonzero(is_used)
     notes.append(f"{len(used)} of {total} frames selected")
     return replace(log.subset(used), notes=notes)
+
+
+def too_few_text(frames: int, least: float, notes: Iterable[str]) -> str:
+    """Return that a log has too few frames for a map, with what was left out of it by its notes."""
+    left_out = next((note for note in notes if "left out" in note), None)
+    read = f"only {frames} {'frame was' if frames == 1 else 'frames were'} read"
+    remedy = "record longer, or lower that limit" if left_out is None else left_out
+    return f"{read}, want at least {least:.0f} (min_tracked_frames); {remedy}"
 
 
 def _has_truth(log: Log, *, max_gap_s: float) -> NDArray[np.bool_]:

@@ -112,9 +112,9 @@ def test_the_exit_status_is_1_where_nothing_can_be_mapped(tmp_path, tiny_tum_log
 
 def test_a_log_of_too_few_frames_cannot_be_mapped(tiny_tum_log):
     log = tiny_tum_log(3)
-    assert "nothing: number of frames: 3, want at least 10 (min_tracked_frames)" in printed(log, status=1)
+    assert "nothing: only 3 frames were read, want at least 10 (min_tracked_frames)" in printed(log, status=1)
     assert printed(log, "--set", "min_tracked_frames=3").count("nothing") == 0
-    assert json.loads(printed(log, "--json", status=1))["problem"].startswith("number of frames: 3")
+    assert json.loads(printed(log, "--json", status=1))["problem"].startswith("only 3 frames were read")
 
 
 def test_what_is_no_log_is_refused(tmp_path):

@@ -14,6 +14,8 @@ from mapper.sources.ros.recording import Recording
 from mapper.sources.ros.source import recording_log
 
 _ENDINGS = (".mcap", ".bag", ".db3")
+_UNFINISHED = ".active"
+"""What rosbag appends to the name while it records, and leaves where it is killed."""
 _PACKED = ".zstd"
 _NAMED = re.compile(r"^\s*-\s*([^:\n]+\.(?:mcap|db3)(?:\.zstd)?)\s*$", re.MULTILINE)
 _IN_FOLDERS = (".mcap", ".db3", _PACKED, ".bag")
@@ -23,7 +25,7 @@ def recognise(path: Path) -> bool:
     """Return whether a path is named as a recording, or is a folder of the parts of one."""
     if path.is_dir():
         return bool(_parts(path))
-    return path.suffix in (*_ENDINGS, _PACKED) and path.is_file()
+    return path.suffix in (*_ENDINGS, _PACKED, _UNFINISHED) and path.is_file()
 
 
 def read_log(path: Path, config: SourceConfig) -> Log:
@@ -86,7 +88,7 @@ def _opened(path: Path) -> Recording:
         from mapper.sources.ros.mcap_file import open_mcap
 
         return open_mcap(path)
-    if path.suffix == ".bag":
+    if path.suffix in (".bag", _UNFINISHED):
         from mapper.sources.ros.ros1_bag import open_bag
 
         return open_bag(path)
@@ -110,8 +112,9 @@ def _parts(folder: Path) -> list[Path]:
     from mapper.sources.ros.ros2_bag import in_sequence
 
     for ending in _IN_FOLDERS:
-        parts = [path for path in folder.glob(f"*{ending}") if path.is_file()]
-        if len({re.sub(r"[\d_.-]+", "", path.stem) for path in parts}) > 1:
+        found = [*folder.glob(f"*{ending}"), *folder.glob(f"*{ending}{_UNFINISHED}")]
+        parts = [path for path in found if path.is_file()]
+        if len({re.sub(r"[\d_.-]+", "", path.name.partition(ending)[0]) for path in parts}) > 1:
             named = _named_by_rosbag2(folder)
             parts = [path for path in parts if path.name in named]
         if parts:

@@ -104,6 +104,13 @@ def test_recordings_of_other_names_are_no_parts_unless_rosbag2_lists_them(tmp_pa
         assert sum("night.mcap" in note for note in source.notes) == 1
 
 
+def test_the_part_that_a_killed_rosbag_left_is_read(tmp_path):
+    write(tmp_path / "drive/drive_0.bag", shots(6)[:9])
+    write(tmp_path / "drive/drive_1.bag", shots(6)[9:]).rename(tmp_path / "drive/drive_1.bag.active")
+    assert len(open_source(tmp_path / "drive")) == 6
+    assert len(open_source(tmp_path / "drive/drive_1.bag.active")) == 3
+
+
 def test_a_recording_of_another_kind_beside_the_parts_is_named(tmp_path):
     write(tmp_path / "drive/drive_0.mcap", shots(3))
     write(tmp_path / "drive/drive.bag", shots(3))
