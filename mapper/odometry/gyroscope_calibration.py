@@ -24,6 +24,7 @@ _SAME_UNIT = 1.25  # ratio of the turns of two units that are one
 _LEFT_HANDED_COST = 0.5  # of that of right-handed axes, below which they are left-handed
 CERTAIN_RAD = 0.05  # standard deviation of a mounting that is known
 _CLEAR_RAD = 0.02  # smaller turns do not show the unit
+_FASTEST_RADPS = 8.0  # no sensor turns faster for half of a log: the unit is °/s
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -119,10 +120,18 @@ def body_readings(log: Log, calibration: GyroscopeCalibration) -> InertialReadin
 
 
 def uncalibrated(gyroscope: Gyroscope) -> GyroscopeCalibration:
-    """Return what is known before the first frame: the mounting that the log states, if it does."""
+    """Return what is known before the first frame: the unit, and the mounting if the log states it.
+
+    Of a wrong unit the first sweeps are bent so much that no frame after them measures the right one.
+    """
     R = gyroscope.R_body_imu
+    is_in_degrees = np.median(np.linalg.norm(gyroscope.rates_radps, axis=1)) > _FASTEST_RADPS
     return GyroscopeCalibration(
-        np.eye(3) if R is None else R, np.zeros(3), 0.0, 1.0, np.diag(_prior_sigmas(gyroscope) ** 2)
+        np.eye(3) if R is None else R,
+        np.zeros(3),
+        0.0,
+        DEGREES if is_in_degrees else 1.0,
+        np.diag(_prior_sigmas(gyroscope) ** 2),
     )
 
 

@@ -69,6 +69,16 @@ def test_mounting_bias_and_offset_are_found_within_their_uncertainty(seed, offse
     assert found.scale == 1.0
 
 
+@pytest.mark.parametrize("rms_radps", [0.3, 1.0])
+@pytest.mark.parametrize("unit", [1.0, 180.0 / np.pi])
+def test_the_first_turn_is_predicted_in_either_unit_by_a_stated_mounting(unit, rms_radps):
+    times_s, rates, R = swinging(4, rms_radps=rms_radps)
+    prior = MotionPrior(readings(times_s, rates, offset_s=0.0, unit=unit, stated=R_BODY_IMU))
+    stamps_ns, R_world_body = frames(times_s, R)
+    predicted = prior.turn(*stamps_ns[3:5].tolist())
+    assert angle_rad(predicted, R_world_body[3].T @ R_world_body[4]) < 0.01
+
+
 def test_degrees_and_left_handed_axes_are_recognised():
     times_s, rates, R = swinging(4)
     found = calibrated(readings(times_s, rates, unit=180.0 / np.pi), *frames(times_s, R))
