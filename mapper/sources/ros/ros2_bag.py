@@ -10,6 +10,9 @@ from mapper.core.errors import DataError, FrameError, SourceError
 from mapper.runtime.regular_files import MOST_BYTES
 from mapper.sources.ros.recording import Place, Recorded, Recording, Topic
 
+_MOST_EARLY_SHARE = 0.1
+"""Share of a file's messages that may be older than the last of the files before it: latched ones repeat."""
+
 
 class DatabaseRecording:
     """Recording in a .db3 file; the place of a message is its row. See :class:`Recording`."""
@@ -90,7 +93,7 @@ class JoinedRecording:
         """
         self.path = path
         self._parts = parts
-        self._lost = lost
+        self._lost = list(lost)
 
     @property
     def kind(self) -> str:
@@ -104,10 +107,23 @@ class JoinedRecording:
 
     def messages(self) -> Iterator[Recorded]:
         """Yield every message that can be read, file by file."""
+        ends_ns: dict[str, int] = {}
         for number, part in enumerate(self._parts):
+            last_ns = dict(ends_ns)
+            count = early = 0
             for message in part.messages():
+                name, log_ns = message.topic.name, message.log_ns
+                count += 1
+                early += log_ns < ends_ns.get(name, log_ns)
+                last_ns[name] = max(log_ns, last_ns.get(name, log_ns))
                 block = message.place.block * len(self._parts) + number
                 yield message._replace(place=message.place._replace(block=block))
+            if early > _MOST_EARLY_SHARE * count:
+                self._lost.append(
+                    f"{part.path.name}: {early} of {count} messages were recorded before the files before it "
+                    "end, with topics of the same names; if it is a recording of its own, open it alone"
+                )
+            ends_ns = last_ns
 
     def read(self, place: Place) -> memoryview:
         """Return a message's bytes; safe in any thread.

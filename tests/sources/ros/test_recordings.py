@@ -104,6 +104,15 @@ def test_recordings_of_other_names_are_no_parts_unless_rosbag2_lists_them(tmp_pa
         assert sum("night.mcap" in note for note in source.notes) == 1
 
 
+@pytest.mark.parametrize(("begin", "noted"), [(0, 1), (1, 1), (5, 0), (6, 0)])
+def test_files_of_the_same_time_and_topics_are_noted(tmp_path, begin, noted):
+    messages = shots(12)
+    write(tmp_path / "drive/drive_0.bag", messages[:18])
+    write(tmp_path / "drive/drive_1.bag", messages[3 * begin :])
+    notes = open_source(tmp_path / "drive").notes
+    assert sum("drive_1.bag" in note for note in notes) == noted
+
+
 def test_the_part_that_a_killed_rosbag_left_is_read(tmp_path):
     write(tmp_path / "drive/drive_0.bag", shots(6)[:9])
     write(tmp_path / "drive/drive_1.bag", shots(6)[9:]).rename(tmp_path / "drive/drive_1.bag.active")
