@@ -131,8 +131,7 @@ class RecordingReader:
         """Return the readings of a topic, in the body's axes where tf ties the two, and notes."""
         if series is None:
             return None, []
-        order, notes = ordered(series)
-        order = order[np.isfinite(series.imu[order, 3:]).all(axis=1)]
+        order, notes = _finite(series, series.imu[:, 3:], what="accelerations")
         if not len(order):
             return None, [*notes, f"{series.topic.name}: no readings"]
         stamps_ns, acceleration_imu = series.stamps_ns[order], series.imu[order, 3:]
@@ -155,8 +154,7 @@ class RecordingReader:
         """Return the angular velocities of a topic, with the mounting if tf has one that stays, and notes."""
         if series is None:
             return None, []
-        order, notes = ordered(series)
-        order = order[np.isfinite(series.imu[order, :3]).all(axis=1)]
+        order, notes = _finite(series, series.imu[:, :3], what="angular velocities")
         imu = frame_of(self.firsts.get(series.topic.name))
         tree = self.tree_of(body, imu)
         T_body_imu = None if tree.moves(body, imu) else tree.find(body, imu)
@@ -252,6 +250,17 @@ class RecordingReader:
             with suppress(FrameError, DataError):
                 data = series.kept.get(i) or self.recording.read(series.place(i))
                 yield int(series.stamps_ns[i]), decode(series.topic, memoryview(data))
+
+
+def _finite(series: Series, values: NDArray[np.float64], *, what: str) -> tuple[NDArray[np.intp], list[str]]:
+    """Return the indices of the messages whose values are finite, in time order, and notes."""
+    order, notes = ordered(series)
+    are_finite = np.isfinite(values[order]).all(axis=1)
+    if not are_finite.all():
+        notes.append(
+            f"{series.topic.name}: {(~are_finite).sum()} of {len(order)} {what} are not finite; left out"
+        )
+    return order[are_finite], notes
 
 
 def _spread(indices: NDArray[np.intp], *, most: int) -> NDArray[np.intp]:

@@ -71,3 +71,13 @@ def test_a_gyroscope_that_measures_nothing_is_noted(tmp_path, rate, noted):
     log = opened(tmp_path / "a.mcap", messages)
     assert (log.gyroscope is None) == bool(noted)
     assert sum("angular velocities" in note for note in log.notes) == noted
+
+
+def test_readings_that_are_no_numbers_are_left_out_and_counted(tmp_path):
+    readings = [
+        imu(t, np.nan if i == 1 else 9.8, rate=np.inf if i > 1 else 0.1) for i, t in enumerate(STAMPS_NS)
+    ]
+    log = opened(tmp_path / "a.mcap", [*readings, *(cloud(t) for t in STAMPS_NS)])
+    assert (len(log.accelerations.stamps_ns), len(log.gyroscope)) == (3, 2)
+    counts = [note.split(": ")[1].split(" of 4")[0] for note in log.notes if "not finite" in note]
+    assert sorted(counts) == ["1", "2"]
