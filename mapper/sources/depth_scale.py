@@ -21,11 +21,14 @@ LOOKED_AT = 8
 _MIN_MEASURED_SHARE = 0.05
 _NEAR_M, _FAR_M = 0.1, 8.0
 """Least median and largest 90th percentile of depth that cameras deliver; farther surfaces return little."""
-_POSSIBLE_M = 0.005, 300.0
-"""Median depths outside of which units are wrong: microscopes see nearer, and stereo pairs not as far."""
+_POSSIBLE_M = 0.02, 150.0
+"""Median depths outside of which units are wrong: microscopes see nearer, and stereo pairs not as far. A room
+in units 1000 times too large or too small lies outside."""
 _USUALLY_NEAR_M = 0.3
 """Least depth of most cameras and ways to hold them: nearer values may be millimetres taken for TUM's fifths
 of these, unless units are stated and the values are whole millimetres in them."""
+_OBJECT_M = 0.5
+"""Largest 90th percentile of depth of a single object, held close: rooms in centimetres look like that."""
 _DESK_M = 1.5
 """Depth of most of a desk or an object; nearer than that a whole room is not."""
 _USUAL_UNITS_PER_M = (MM_PER_M, TUM_UNITS_PER_M, 10_000.0, 100.0)
@@ -64,11 +67,11 @@ def why_no_depth(log: Log) -> str | None:
     least_m, most_m = _POSSIBLE_M
     if not medians_m or least_m < np.median(medians_m) < most_m:
         return None
-    units_per_m = _units_per_m(log)
+    median_m, units_per_m = float(np.median(medians_m)), _units_per_m(log)
     setting = "source.camera.depth_factor" + ("" if units_per_m is None else f"={units_per_m:g}")
     return (
-        f"depth of {np.median(medians_m):.2g} m (median), where cameras measure {least_m:g} to {most_m:g} m; "
-        f"is {setting} right, in units per metre?"
+        f"depth of {median_m:.2g} m (median), where cameras measure {least_m:g} to {most_m:g} m; "
+        f"is {setting} right, in units per metre?{_fitting_units(units_per_m, median_m, median_m)}"
     )
 
 
@@ -115,6 +118,8 @@ def _range_warning(log: Log, frames: Collection[RgbdFrame]) -> list[str]:
         found = f"half of it is within {median_m:.2g} m"
     elif near_m < _USUALLY_NEAR_M and (log.are_units_assumed or not _are_whole_millimetres(log, frames)):
         found, least_m = f"a twentieth of it is within {near_m:.2g} m", _USUALLY_NEAR_M
+    elif far_m < _OBJECT_M:
+        found, least_m = f"nine tenths of it is within {far_m:.2g} m", _USUALLY_NEAR_M
     elif log.are_units_assumed and far_m < _DESK_M and not _are_whole_millimetres(log, frames):
         found = f"nine tenths of it is within {far_m:.2g} m and it is no whole millimetres"
     elif far_m > _FAR_M:

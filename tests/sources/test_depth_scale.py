@@ -52,7 +52,7 @@ def test_a_wrong_factor_is_found_by_the_truth_and_the_right_one_is_named(desk_lo
     ]
 
 
-@pytest.mark.parametrize("factor", [1, 5_000_000])
+@pytest.mark.parametrize("factor", [1, 20, 400_000, 5_000_000])
 def test_depth_that_no_camera_measures_is_refused_before_tracking(desk_log, tmp_path, factor):
     config = load_config({"source.camera.depth_factor": factor})
     with pytest.raises(DataError, match=re.escape(f"depth_factor={factor:g}")):
@@ -102,6 +102,7 @@ def plain(depths_m, *, image=None):
         ([0.2, 2.0, 7.9], None),
         ([0.0, 2.0, 2.0], None),
         ([7.0, 12.0, 13.0], "depth: a tenth of it is beyond 12 m, but cameras measure 0.1 to 8 m"),
+        ([0.45, 0.45], "depth: nine tenths of it is within 0.45 m, but cameras measure 0.3 to 8 m"),
         ([0.002, 0.002], "depth: half of it is within 0.002 m, but cameras measure 0.1 to 8 m"),
         ([0.0, 0.0, 2.0], "depth: 100.0% of the pixels measured nothing: 0, or the limit of 16 bits"),
     ],
