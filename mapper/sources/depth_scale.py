@@ -27,8 +27,8 @@ in units 1000 times too large or too small lies outside."""
 _USUALLY_NEAR_M = 0.3
 """Least depth of most cameras and ways to hold them: nearer values may be millimetres taken for TUM's fifths
 of these, unless units are stated and the values are whole millimetres in them."""
-_OBJECT_M = 0.5
-"""Largest 90th percentile of depth of a single object, held close: rooms in centimetres look like that."""
+_OBJECT_M = 0.7
+"""Depth of most of an object before a camera that sees nearer than usual, and of rooms in centimetres."""
 _DESK_M = 1.5
 """Depth of most of a desk or an object; nearer than that a whole room is not."""
 _USUAL_UNITS_PER_M = (MM_PER_M, TUM_UNITS_PER_M, 10_000.0, 100.0)
@@ -118,7 +118,7 @@ def _range_warning(log: Log, frames: Collection[RgbdFrame]) -> list[str]:
         found = f"half of it is within {median_m:.2g} m"
     elif near_m < _USUALLY_NEAR_M and (log.are_units_assumed or not _are_whole_millimetres(log, frames)):
         found, least_m = f"a twentieth of it is within {near_m:.2g} m", _USUALLY_NEAR_M
-    elif far_m < _OBJECT_M:
+    elif near_m < _USUALLY_NEAR_M and far_m < _OBJECT_M:
         found, least_m = f"nine tenths of it is within {far_m:.2g} m", _USUALLY_NEAR_M
     elif log.are_units_assumed and far_m < _DESK_M and not _are_whole_millimetres(log, frames):
         found = f"nine tenths of it is within {far_m:.2g} m and it is no whole millimetres"

@@ -101,8 +101,9 @@ def plain(depths_m, *, image=None):
     [
         ([0.2, 2.0, 7.9], None),
         ([0.0, 2.0, 2.0], None),
+        ([0.6, 0.6], None),
         ([7.0, 12.0, 13.0], "depth: a tenth of it is beyond 12 m, but cameras measure 0.1 to 8 m"),
-        ([0.45, 0.45], "depth: nine tenths of it is within 0.45 m, but cameras measure 0.3 to 8 m"),
+        ([0.25, 0.25], "depth: nine tenths of it is within 0.25 m, but cameras measure 0.3 to 8 m"),
         ([0.002, 0.002], "depth: half of it is within 0.002 m, but cameras measure 0.1 to 8 m"),
         ([0.0, 0.0, 2.0], "depth: 100.0% of the pixels measured nothing: 0, or the limit of 16 bits"),
     ],
