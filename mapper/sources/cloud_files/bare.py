@@ -78,7 +78,7 @@ def read_npy(path: Path) -> Columns:
 
 
 def read_text(path: Path) -> Columns:
-    """Read lines of x y z …, separated by blanks, commas or semicolons.
+    """Read lines of x y z …, separated by blanks, commas or semicolons; beside these a comma may be decimal.
 
     A header with as many names as there are columns says which are x, y and z; else they are the first.
 
@@ -86,7 +86,7 @@ def read_text(path: Path) -> Columns:
         FrameError: It is not text, or its lines are not as many numbers each, three or more.
     """
     try:
-        text = path.read_text(encoding="utf-8-sig").replace(",", " ").replace(";", " ")
+        text = _in_blanks(path.read_text(encoding="utf-8-sig"))
     except UnicodeDecodeError:
         raise FrameError(f"{path}: not a text file") from None
     names, skipped = _header(text)
@@ -97,6 +97,12 @@ def read_text(path: Path) -> Columns:
     if len(names) == values.shape[1]:
         return {name: values[:, column] for column, name in enumerate(names)}
     return _xyz(values)
+
+
+def _in_blanks(text: str) -> str:
+    """Return lines whose numbers are separated by blanks, with decimal points."""
+    is_decimal = ";" in text and "." not in text
+    return text.replace(",", "." if is_decimal else " ").replace(";", " ")
 
 
 def why_no_points(path: Path) -> str | None:
@@ -110,7 +116,7 @@ def why_no_points(path: Path) -> str | None:
             head, is_cut = stream.read(HEAD_BYTES), bool(stream.read(1))
     except OSError as error:
         return f"cannot be read: {error.strerror}"
-    text = head.decode("utf-8-sig", errors="replace").replace(",", " ").replace(";", " ")
+    text = _in_blanks(head.decode("utf-8-sig", errors="replace"))
     text = text.replace("\r\n", "\n").replace("\r", "\n")  # as text files are read
     lines = text.split("\n")[: -1 if is_cut else None]
     names, skipped = _header(text)

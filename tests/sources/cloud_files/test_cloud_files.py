@@ -400,3 +400,11 @@ def test_intensities_that_say_nothing_are_none(tmp_path):
     values[3] = np.nan
     np.column_stack([POINTS, values]).astype(np.float32).tofile(path)
     assert read_cloud(path).intensities.tolist() == [1.0] * 3 + [0.0] + [1.0] * (N - 4)
+
+
+@pytest.mark.parametrize("header", ["", "x;y;z\n"])
+def test_commas_beside_semicolons_are_decimal(tmp_path, header):
+    rows = ";".join(["%.3f"] * 3)
+    lines = [(rows % tuple(point)).replace(".", ",") for point in POINTS]
+    (tmp_path / "cloud.csv").write_text(header + "\n".join(lines))
+    np.testing.assert_allclose(read_cloud(tmp_path / "cloud.csv").points, POINTS, atol=6e-4)
