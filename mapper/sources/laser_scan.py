@@ -47,9 +47,10 @@ def laser_records(
     """Return the same as (M,) records of x, y and z, with intensity and time after the first where known.
 
     Raises:
-        DataError: The directions are no numbers, or of more than two turns.
+        DataError: The directions are no numbers, all the same, or of more than two turns.
     """
-    if not np.isfinite([first_rad, step_rad]).all() or abs(step_rad) * len(ranges_m) > MOST_RAD:
+    is_one = step_rad == 0.0 and len(ranges_m) > 1
+    if is_one or not np.isfinite([first_rad, step_rad]).all() or abs(step_rad) * len(ranges_m) > MOST_RAD:
         raise DataError(
             f"{len(ranges_m)} beams from {first_rad:g} rad by {step_rad:g} rad: no laser's directions"
         )

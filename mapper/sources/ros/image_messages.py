@@ -209,6 +209,8 @@ def _pixels(message: PixelsMessage, kind: str, channels: int, *, where: str) -> 
         row_bytes = used_bytes  # whatever the message says: without padding there is one way to read it
     strides = (row_bytes, channels * pixel.itemsize, pixel.itemsize)
     try:
+        if not len(message.data):
+            raise ValueError("no data")  # for which NumPy checks no size, and takes what memory holds
         if message.height_px > 1 and row_bytes < used_bytes:
             raise ValueError("rows overlap")  # a copy of them could be of any size
         pixels = np.ndarray(shape, pixel, buffer=message.data, strides=strides)

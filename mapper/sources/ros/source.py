@@ -259,7 +259,7 @@ def _lidar(reader: RecordingReader, clouds: Series, config: SourceConfig) -> _Fr
     assert isinstance(first, CloudMessage)
     notes += [f"{clouds.topic.name}: {note}" for note in first.notes]
     times = time_field(first.points.dtype.names or ())
-    values = None if times is None else first.points[times]
+    values = None if times is None or not len(first.points) else first.points[times]
     if values is not None and relative_times_s(values, first.stamp_ns) is None:
         notes.append(f"{clouds.topic.name}: field {times} of the first cloud holds no times; not deskewed")
     elif values is not None and counted_on(values) is not values:

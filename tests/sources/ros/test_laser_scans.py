@@ -8,9 +8,10 @@ import pytest
 from foxglove.channels import LaserScanChannel
 from foxglove.messages import LaserScan, Pose, Quaternion, Timestamp, Vector3
 
-from mapper.core.errors import SourceError
+from mapper.core.errors import DataError, SourceError
 from mapper.sources import open_source
 from mapper.sources.config import SourceConfig
+from mapper.sources.laser_scan import laser_records
 from tests.support.planar_drives import RPLIDAR, Drive, drive, flat, write_ros
 
 
@@ -88,3 +89,10 @@ def test_foxglove_scans_have_the_same_directions(tmp_path):
     x, y, _ = log[0].points_body.T
     assert np.arctan2(y, x) == pytest.approx(np.linspace(-1.0, 1.0, 101), abs=1e-6)
     assert log.sensor == "lidar-2d"
+
+
+def test_beams_of_one_direction_are_no_scan(driven):
+    beams = {"first_rad": -1.0, "intensities": np.zeros(0)}
+    with pytest.raises(DataError, match="no laser's directions"):
+        laser_records(driven.ranges_m[0], step_rad=0.0, **beams)
+    assert len(laser_records(np.array([2.0]), step_rad=0.0, **beams)) == 1

@@ -207,6 +207,7 @@ def test_rows_that_follow_each_other_are_read_whatever_step_says():
     ("message", "why"),
     [
         (replace(pixels(RGB, "rgb8"), height_px=0), "px"),
+        (replace(pixels(RGB, "rgb8"), data=memoryview(b"")), "but 0 bytes are there"),
         (pixels(RGB, "rgb16"), "colour encoded as rgb16; known are rgb8"),
         (file(encoded(BGR, ".jpg")[:-50], "jpeg"), "truncated JPEG"),
         (file(b"", "jpeg"), "empty file"),
