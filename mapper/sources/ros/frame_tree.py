@@ -31,7 +31,11 @@ def is_fixed(frame: str) -> bool:
 
 
 class FrameTree:
-    """Tree of coordinate frames; those that move in their parent keep their poses over time."""
+    """Tree of coordinate frames; those that move in their parent keep their poses over time.
+
+    Attributes:
+        damaged: Parents and children, "parent → child", between which no pose is finite and rigid.
+    """
 
     def __init__(self, poses: Iterable[PoseMessage]) -> None:
         """Keep the poses of every frame in its first parent; of several with one stamp the first."""
@@ -40,10 +44,13 @@ class FrameTree:
             link = links.setdefault((pose.child.lstrip("/"), pose.parent.lstrip("/")), {})
             link.setdefault(min(max(pose.stamp_ns, 0), LATEST_NS), pose.numbers)
         self._parents: dict[str, tuple[str, Trajectory]] = {}
+        self.damaged: list[str] = []
         for (child, parent), numbers in links.items():
             found = zip(numbers, poses_from_numbers(np.array(list(numbers.values()))), strict=True)
             path = [(stamp_ns, T) for stamp_ns, T in found if T is not None]
-            if path and child not in self._parents:
+            if not path:
+                self.damaged.append(f"{parent} → {child}")
+            elif child not in self._parents:
                 stays = np.ptp([T for _, T in path], axis=0).max() < _SAME_POSE
                 self._parents[child] = (
                     parent,

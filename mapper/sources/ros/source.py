@@ -100,6 +100,9 @@ def recording_log(reader: RecordingReader, config: SourceConfig) -> Log:
         wheels, still_notes = rolling(wheels)
         wheel_notes = [*wheel_notes, *still_notes]
     gnss, gnss_notes = reader.gnss(choice.gnss, body=frames.body)
+    tf_notes = [
+        f"tf {link}: its poses are not finite or have no direction; left out" for link in reader.tree.damaged
+    ]
     beside = [images_beside(reader, camera, body=frames.body) for camera in choice.cameras]
     images = [one for one in beside if isinstance(one, CameraImages)]
     return Log(
@@ -128,6 +131,7 @@ def recording_log(reader: RecordingReader, config: SourceConfig) -> Log:
             *problems,
             *clock_notes,
             *frames.notes,
+            *tf_notes,
             *truth_notes,
             *wheel_notes,
             *imu_notes,

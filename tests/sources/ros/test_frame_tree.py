@@ -33,6 +33,10 @@ def test_frames_are_found_up_down_and_across():
     np.testing.assert_allclose(TREE.find("imu", "/lidar"), T_imu_lidar, atol=1e-12)
 
 
+def test_links_without_a_rigid_pose_are_named():
+    assert TREE.damaged == ["base → broken"]
+
+
 def test_a_frame_is_itself_even_if_nobody_tells_of_it():
     np.testing.assert_array_equal(TREE.find("nobody", "nobody"), np.eye(4))
 

@@ -7,7 +7,7 @@ from mapper.core.errors import SourceError
 from mapper.core.frames import Scan
 from mapper.sources import open_source
 from mapper.sources.ros.encode_ros import cloud_message, imu_message
-from tests.support.recordings import COLOR, DEPTH, shots, write
+from tests.support.recordings import COLOR, DEPTH, shots, transforms, write
 from tests.support.tum_logs import FIRST_NS, PERIOD_NS
 
 STAMPS_NS = [FIRST_NS + i * PERIOD_NS for i in range(4)]
@@ -81,3 +81,13 @@ def test_readings_that_are_no_numbers_are_left_out_and_counted(tmp_path):
     assert (len(log.accelerations.stamps_ns), len(log.gyroscope)) == (3, 2)
     counts = [note.split(": ")[1].split(" of 4")[0] for note in log.notes if "not finite" in note]
     assert sorted(counts) == ["1", "2"]
+
+
+@pytest.mark.parametrize(("x_m", "noted"), [(0.3, 0), (np.nan, 1)])
+def test_a_mounting_of_no_numbers_is_noted(tmp_path, x_m, noted):
+    T_base_lidar = np.eye(4)
+    T_base_lidar[0, 3] = x_m
+    messages = [transforms(("base_link", "lidar", T_base_lidar)), *(cloud(t) for t in STAMPS_NS)]
+    log = opened(tmp_path / "a.mcap", messages)
+    assert sum("base_link → lidar" in note for note in log.notes) == noted
+    assert (log.T_base_body is None) == bool(noted)
