@@ -336,6 +336,8 @@ def _strided(
     """Return an array that lies in bytes as another lay in memory."""
     if dtype.hasobject:
         raise DataError("a state with an array of objects, which is no part of one")
+    if not extent.size and 0 not in shape:  # NumPy checks no size of an empty buffer
+        raise DataError(f"a state with an array of shape {shape} without its bytes")
     return np.ndarray(shape, dtype, extent.data, first, strides)
 
 

@@ -137,3 +137,12 @@ def test_what_cannot_be_written_is_told():
 def test_half_a_state_is_refused(cut):
     with pytest.raises(DataError, match="a state that cannot be read"):
         loads(dumps(BASE[:, :2])[:cut])
+
+
+def test_an_array_larger_than_its_bytes_is_refused():
+    for count in (0, 2):
+        state = dumps({"array": np.zeros(count)})
+        larger = state.replace(f"[{count}],[".encode(), b"[9],[")
+        assert larger != state
+        with pytest.raises(DataError):
+            loads(larger)
