@@ -10,11 +10,11 @@ SIGMAS_PER_MAD = 1.4826
 class RunningMedian:
     """Median and robust standard deviation of a figure's last values."""
 
-    def __init__(self, *, memory: int | None, fewest: int = 1) -> None:
+    def __init__(self, *, memory: int, fewest: int = 1) -> None:
         """Start without values.
 
         Args:
-            memory: Number of values that count, the last ones; None counts all.
+            memory: Number of values that count, the last ones.
             fewest: With fewer values nothing is known.
         """
         self._values: deque[float] = deque(maxlen=memory)

@@ -80,7 +80,7 @@ def compare(
     )
 
 
-def with_model_error(information: Array, T_i_j: Transform, *, scale: float = 1.0) -> Array:
+def with_model_error(information: Array, T_i_j: Transform) -> Array:
     """Return the (6, 6) information of a relative pose with the errors that its features share.
 
     Hundreds of features with independent errors give a sigma of fractions of a millimetre. Calibration and
@@ -90,14 +90,13 @@ def with_model_error(information: Array, T_i_j: Transform, *, scale: float = 1.0
     Args:
         information: (6, 6) of j's tangent (rotation, translation) from the features alone.
         T_i_j: (4, 4) the measurement.
-        scale: Factor on the standard deviations of that error: less than 1 where residuals show less of it.
     """
     angle_rad = float(np.linalg.norm(rotation_log(T_i_j[:3, :3])))
     distance_m = float(np.linalg.norm(T_i_j[:3, 3]))
     return inflated(
         information,
-        sigma_rad=scale * (_LEAST + MODEL_SHARE * angle_rad),
-        sigma_m=scale * (_LEAST + MODEL_SHARE * distance_m),
+        sigma_rad=_LEAST + MODEL_SHARE * angle_rad,
+        sigma_m=_LEAST + MODEL_SHARE * distance_m,
     )
 
 

@@ -31,7 +31,7 @@ from mapper.registration.reprojection import (
     normal_matrix,
     ransac_p3p,
     refine_pose,
-    residual_statistics,
+    variance_factor,
 )
 from mapper.registration.surfaces import prepared
 from mapper.sensing.config import KINECT_NOISE
@@ -171,7 +171,7 @@ class ImageVerifier:
             T_ci_cj = inverse(T_j_i)
             # i's points were measured no better than j's pixels, so the information is halved.
             information = 0.5 * normal_matrix(*seen)
-            scale = 1.0 / residual_statistics(*seen).variance_factor
+            scale = 1.0 / variance_factor(*seen)
         assert information is not None  # ISVD converged
         T_i_j, information = _between_bodies(i, j, T_ci_cj, information)
         sigma_m = _largest_sigma_m(with_model_error(information, T_i_j))
@@ -327,7 +327,7 @@ def _pose(i: ImageView, j: ImageView, pairs: Pairs) -> tuple[Transform, Pairs] |
 def _measured(i: ImageView, j: ImageView, pairs: Pairs, T_j_i: Transform, *, matches: int) -> Verification:
     seen = (T_j_i, i.points_camera[pairs[:, 0]], *_wide_measurements(j, pairs[:, 1]))
     # i's points were measured no better than j's pixels, so the information is halved.
-    information = 0.5 * normal_matrix(*seen) / residual_statistics(*seen).variance_factor
+    information = 0.5 * normal_matrix(*seen) / variance_factor(*seen)
     T_i_j, information = _between_bodies(i, j, inverse(T_j_i), information)
     information = with_model_error(information, T_i_j)
     return Verification(matches, "", len(pairs), None, _rms_residual_px(*seen), T_i_j, information)

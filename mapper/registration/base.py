@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 import numpy as np
 
 from mapper.core.errors import DataError
 from mapper.core.frames import Scan
 from mapper.core.geometry import Array, Transform, is_rigid
-
-if TYPE_CHECKING:
-    from mapper.registration.reprojection import ResidualStatistics
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -27,7 +24,6 @@ class Alignment:
         pairs: Number of pairs that agree.
         reason: Why it did not converge; empty when it did.
         information: (6, 6) Fisher information of the source's tangent (rotation, translation), where known.
-        residuals: Statistics of the residuals that the information rests on, where known.
     """
 
     T_target_source: Transform
@@ -37,7 +33,6 @@ class Alignment:
     pairs: int = 0
     reason: str = ""
     information: Array | None = field(default=None, repr=False)
-    residuals: ResidualStatistics | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         if not is_rigid(self.T_target_source):

@@ -1,7 +1,5 @@
 """Camera poses from 3D–2D pairs: P3P without a first guess, least reprojection error, and how sure it is."""
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 from numba import njit
@@ -276,33 +274,16 @@ def ransac_p3p(
     return T_camera_world, np.sort(order[inliers[:, 0]])
 
 
-@dataclass(frozen=True, slots=True)
-class ResidualStatistics:
-    """Size and dependence of a pose's residuals.
-
-    Attributes:
-        variance: Their mean square in standard deviations: features may be found better or worse than their
-            weights say.
-        design_effect: By how much residuals that agree within a cell of the image carry less information than
-            independent ones (Kish 1965, §5.4); about 1 if they are independent.
-    """
-
-    variance: float
-    design_effect: float
-
-    @property
-    def variance_factor(self) -> float:
-        """By how much the inverse of the normal matrix has to be multiplied to be the covariance."""
-        return max(1.0, self.design_effect) * self.variance
-
-
-def residual_statistics(
+def variance_factor(
     T_camera_world: Transform, points: Points, measured: Array, weights: Array, intrinsics: Array
-) -> ResidualStatistics:
-    """Return the statistics of a pose's residuals.
+) -> float:
+    """Return by how much the inverse of a pose's normal matrix has to be multiplied to be its covariance.
 
-    The design effect is the cluster-robust covariance of the scores (Liang & Zeger 1986, eq. 8) relative to
-    that of independent ones: one number for all directions, as a few cells do not determine a matrix.
+    It is the mean square of the residuals in standard deviations, times their design effect: by how much
+    residuals that agree within a cell of the image carry less information than independent ones (Kish 1965,
+    §5.4), at least 1. That is the cluster-robust covariance of the scores (Liang & Zeger 1986, eq. 8)
+    relative to that of independent ones: one number for all directions, as a few cells do not determine a
+    matrix.
 
     Args:
         T_camera_world: (4, 4) at the least squares.
@@ -314,15 +295,15 @@ def residual_statistics(
     gradients, squares = scores(T_camera_world, points, measured, weights, intrinsics)
     freedom = int(np.isfinite(measured).sum()) - 6
     if freedom <= 0:
-        return ResidualStatistics(1.0, 1.0)
+        return 1.0
     variance = float(squares.sum()) / freedom
     share = measured[:, :2] / (2.0 * intrinsics[2:4])
     cell = np.clip((share * [_COLUMNS, _ROWS]).astype(np.intp), 0, [_COLUMNS - 1, _ROWS - 1])
     cells, cell_of = np.unique(cell @ [1, _COLUMNS], return_inverse=True)
     if len(cells) < 2:
-        return ResidualStatistics(variance, 1.0)
+        return variance
     sums = np.zeros((len(cells), 6))
     np.add.at(sums, cell_of, gradients)
     covariance = np.linalg.inv(normal_matrix(T_camera_world, points, measured, weights, intrinsics))
     together, alone = (float(np.einsum("na,ab,nb->", g, covariance, g)) for g in (sums, gradients))
-    return ResidualStatistics(variance, together * len(cells) / (len(cells) - 1) / alone)
+    return variance * max(1.0, together * len(cells) / (len(cells) - 1) / alone)

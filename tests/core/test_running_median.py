@@ -14,7 +14,7 @@ def test_the_last_values_count():
 
 
 def test_too_few_values_say_nothing():
-    running = RunningMedian(memory=None, fewest=3)
+    running = RunningMedian(memory=10, fewest=3)
     for value in (7.0, 8.0):
         running.add(value)
     assert (running.median, running.sigma, running.is_known) == (0.0, 0.0, False)
@@ -24,7 +24,7 @@ def test_too_few_values_say_nothing():
 
 
 def test_sigma_is_the_standard_deviation_of_normal_values_whatever_the_outliers():
-    running = RunningMedian(memory=None)
+    running = RunningMedian(memory=1000)
     rng = np.random.default_rng(0)
     for value in (*rng.normal(5.0, 2.0, 900), *np.full(50, 1e6)):
         running.add(value)

@@ -11,7 +11,7 @@ from mapper.registration.reprojection import (
     normal_matrix,
     refine_pose,
     residual,
-    residual_statistics,
+    variance_factor,
 )
 
 INTRINSICS = np.array([525.0, 525.0, 319.5, 239.5, 40.0])
@@ -58,7 +58,7 @@ def nees(rng: np.random.Generator, *, sigma_px: float, shared_px: float, n: int 
     seen = T, points[agree], measured[agree], weights[agree], INTRINSICS
     twist = np.concatenate(log(T))
     plain = float(twist @ normal_matrix(*seen) @ twist) / 6.0
-    return plain, plain / residual_statistics(*seen).variance_factor
+    return plain, plain / variance_factor(*seen)
 
 
 def averages(**errors: float) -> tuple[float, float]:
@@ -83,9 +83,4 @@ def test_errors_that_neighbours_share_count_for_more():
 def test_too_few_features_are_taken_as_they_are():
     point = np.array([[0.1, 0.0, 2.0]])
     measured = np.column_stack([apply(np.eye(4), point)[:, :2] / 2.0 * 525.0 + 300.0, [[20.0]]])
-    assert (
-        residual_statistics(
-            exp(np.zeros(3), np.zeros(3)), point, measured, np.ones((1, 3)), INTRINSICS
-        ).variance_factor
-        == 1.0
-    )
+    assert variance_factor(exp(np.zeros(3), np.zeros(3)), point, measured, np.ones((1, 3)), INTRINSICS) == 1.0

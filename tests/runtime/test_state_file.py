@@ -11,7 +11,7 @@ import pytest
 from mapper.core.errors import DataError
 from mapper.core.frames import PinholeCamera, Scan
 from mapper.loops.scan_context_proposer import ScanPlace
-from mapper.odometry.keyframes.local_mapping import LogResiduals
+from mapper.odometry.keyframes.focal_length import FocalLengthCheck
 from mapper.runtime.archived import Archivable, archived
 from mapper.runtime.state_file import dumps, fixed_parts, loads
 
@@ -51,7 +51,7 @@ def test_what_was_one_object_is_one_again():
 
 def test_fixed_parts_are_not_written_but_taken_from_the_new_object():
     camera = PinholeCamera(4, 3, 1.0, 1.0, 2.0, 1.5)
-    state = LogResiduals()
+    state = FocalLengthCheck()
     state.camera = camera
     parts = fixed_parts(state, (PinholeCamera,))
     assert parts == {".camera": camera}

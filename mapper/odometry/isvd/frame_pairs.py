@@ -14,7 +14,7 @@ from mapper.odometry.config import MatchConfig
 from mapper.registration.base import Alignment, failed
 from mapper.registration.config import IsvdConfig
 from mapper.registration.isvd import Isvd
-from mapper.registration.reprojection import classify, normal_matrix, refine_pose, residual_statistics
+from mapper.registration.reprojection import classify, normal_matrix, refine_pose, variance_factor
 from mapper.runtime.archived import Archivable
 
 _ROUNDS, _ITERATIONS = 3, 10
@@ -124,7 +124,7 @@ class PairRegistration:
             return failed(f"{count} of {among} pairs agree in the image")
         seen = T_camera_target, points[agree], measured[agree], weights[agree], source.intrinsics
         # The target's points were measured no better than the source's pixels, so the information is halved.
-        information = 0.5 * normal_matrix(*seen) / residual_statistics(*seen).variance_factor
+        information = 0.5 * normal_matrix(*seen) / variance_factor(*seen)
         to_camera = adjoint(inverse(source.T_body_camera))
         T_target_source = inverse(source.T_body_camera @ T_camera_target)
         points_target, points_source = shared_points(target, source, pairs)

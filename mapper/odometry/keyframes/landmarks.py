@@ -13,7 +13,7 @@ from mapper.odometry.keyframes.focal_length import Bundle
 from mapper.odometry.keyframes.growing_table import GrowingTable
 from mapper.odometry.keyframes.keyframe import DepthLink, Keyframe, RecentObservations
 from mapper.odometry.keyframes.landmark_kernels import count_observers, observations_of
-from mapper.registration.reprojection import ResidualStatistics, normal_matrix, residual_statistics
+from mapper.registration.reprojection import normal_matrix
 from mapper.runtime.archived import archived
 
 Ids = NDArray[np.int32]
@@ -370,22 +370,6 @@ class LandmarkMap:
         to_camera = adjoint(inverse(observation.T_body_camera))
         H_body: Array = to_camera.T @ H_camera @ to_camera
         return H_body + _WEAK_PRIOR
-
-    def residual_statistics(self, index: int) -> ResidualStatistics | None:
-        """Return the statistics of a keyframe's residuals; None where few landmarks have another observer."""
-        keyframe = self.keyframes[index]
-        ids = keyframe.landmark_of_feature
-        features = np.flatnonzero((ids >= 0) & (self.landmarks["observers"][ids] > 1))
-        if len(features) < MIN_SHARED_LANDMARKS:
-            return None
-        observation = self.observation(index)
-        return residual_statistics(
-            keyframe.T_camera_world,
-            self.landmarks["position"][ids[features]],
-            observation.measured[features],
-            observation.weights[features],
-            observation.intrinsics,
-        )
 
     def depth_information(self, target: int, source: int) -> Array:
         """Return the (6, 6) information of the source's pose in the target from their depth images.

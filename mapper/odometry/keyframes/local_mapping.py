@@ -4,10 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 
-import numpy as np
-
-from mapper.core.geometry import Array, Transform, inverse
-from mapper.core.running_median import RunningMedian
+from mapper.core.geometry import Array, inverse
 from mapper.graph.measurement_covariance import inflated, with_model_error
 from mapper.graph.model import BetweenFactor
 from mapper.odometry.config import KeyframeOdometryConfig
@@ -16,18 +13,9 @@ from mapper.odometry.keyframes.frame_doubts import UNDOUBTED, Assessment
 from mapper.odometry.keyframes.landmarks import MIN_SHARED_LANDMARKS, LandmarkMap
 from mapper.odometry.keyframes.pose_tracker import TrackedPose
 from mapper.odometry.keyframes.relocalizer import Relocalizer
-from mapper.registration.reprojection import ResidualStatistics
 
 _FACTORS_PER_KEYFRAME = 4
 """Factors of each keyframe, to the earlier ones that share most landmarks with it."""
-
-_MIN_KEYFRAMES = 5
-"""With fewer keyframes, features count as their weights say, with the whole model error."""
-_NO_EFFECT, _FULL_EFFECT = 1.0, 1.5
-"""Design effects at which residuals show no model error, and all of it. Synthetic logs without errors of
-calibration have 0.75 to 1.0, real and uncalibrated ones 1.5 to 2.3."""
-_MIN_MODEL_ERROR = 0.125
-"""Share of the model error that is always added."""
 
 
 class LocalMapping:
@@ -39,7 +27,6 @@ class LocalMapping:
         self._config = config
         self._map = landmark_map
         self._relocalizer = relocalizer
-        self._residuals = LogResiduals()
         self._focal_length = FocalLengthCheck()
 
     def add_keyframe(
@@ -75,8 +62,6 @@ class LocalMapping:
         self._map.follow_readout()
         self._map.cull()
         self._check_focal_length()
-        if (statistics := self._map.residual_statistics(index)) is not None:
-            self._residuals.add(statistics)
         keyframe = self._map.keyframes[index]
         keyframe.doubt_rad, keyframe.doubt_m = assessed.sigma_rad, assessed.sigma_m
         return replace(
@@ -96,7 +81,7 @@ class LocalMapping:
         keyframes = self._map.keyframes
         T_i_j = inverse(keyframes[i].body_pose) @ keyframes[j].body_pose
         information = self._map.information(i, j) + self._map.depth_information(i, j)
-        information = self.rescale(information, T_i_j) / math.sqrt(shared_by)
+        information = with_model_error(information, T_i_j) / math.sqrt(shared_by)
         doubtful = self._map.keyframes[j]
         if doubtful.doubt_m > 0.0:
             information = inflated(information, sigma_rad=doubtful.doubt_rad, sigma_m=doubtful.doubt_m)
@@ -119,10 +104,6 @@ class LocalMapping:
             factors += [self.factor(i, j, shared_by=len(targets)) for i in targets]
         return factors
 
-    def rescale(self, information: Array, T_i_j: Transform) -> Array:
-        """Return the (6, 6) information of a relative pose as the residuals of the log show it."""
-        return self._residuals.rescale(information, T_i_j)
-
     def calibration_warnings(self) -> Sequence[str]:
         """Return whether the images contradict the focal length that they are said to have."""
         if not self._map.keyframes:
@@ -137,33 +118,3 @@ class LocalMapping:
         if len(self._map.keyframes) % WINDOW_KEYFRAMES or len(origins) > 1 or self._focal_length.is_complete:
             return
         self._focal_length.add(self._map.bundle(newest))
-
-
-class LogResiduals:
-    """Medians of the keyframes' residual statistics.
-
-    Errors of calibration, shutter and depth move neighbouring features alike, so residuals that depend on
-    each other tell how much of such errors a log has.
-    """
-
-    def __init__(self) -> None:
-        self._variance_factor = RunningMedian(memory=None, fewest=_MIN_KEYFRAMES)
-        self._design_effect = RunningMedian(memory=None, fewest=_MIN_KEYFRAMES)
-
-    def add(self, keyframe: ResidualStatistics) -> None:
-        """Add a keyframe's."""
-        self._variance_factor.add(keyframe.variance_factor)
-        self._design_effect.add(keyframe.design_effect)
-
-    def rescale(self, information: Array, T_i_j: Transform) -> Array:
-        """Return the (6, 6) information of a relative pose by what the residuals show.
-
-        Args:
-            information: (6, 6) from features whose errors are independent, and as large as their weights say.
-            T_i_j: (4, 4) the measurement.
-        """
-        if not self._variance_factor.is_known:
-            return with_model_error(information, T_i_j)
-        share = (self._design_effect.median - _NO_EFFECT) / (_FULL_EFFECT - _NO_EFFECT)
-        model_error = float(np.clip(share, _MIN_MODEL_ERROR, 1.0))
-        return with_model_error(information / self._variance_factor.median, T_i_j, scale=model_error)

@@ -10,7 +10,7 @@ from mapper.core.frames import Frame
 from mapper.core.geometry import Array, Transform, inverse
 from mapper.features.factory import build_detector
 from mapper.features.frame_view import ImageView
-from mapper.graph.measurement_covariance import inflated
+from mapper.graph.measurement_covariance import inflated, with_model_error
 from mapper.graph.model import BetweenFactor
 from mapper.odometry.base import (
     Diagnostics,
@@ -215,7 +215,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
     def _frame(self, pose: TrackedPose, information: Array, assessed: Assessment) -> FrameResult:
         """Return the result of a frame that is no keyframe, with its covariance."""
         result = self._result(pose)
-        information = self._mapping.rescale(_OWN_SHARE * information, result.T_node_body)
+        information = with_model_error(_OWN_SHARE * information, result.T_node_body)
         if assessed.doubts:
             information = inflated(information, sigma_rad=assessed.sigma_rad, sigma_m=assessed.sigma_m)
         return replace(result, doubts=assessed.doubts, covariance=covariance_of(information))
