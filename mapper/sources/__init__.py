@@ -22,6 +22,7 @@ RECORDING = "ros.files"
 # numbers, so these come before numbered images; any log's folder may have clouds in it, so clouds come last.
 FORMATS = (
     "image_folders.posed_layouts",
+    "image_folders.azure_kinect",
     "image_folders.icl_nuim",
     "image_folders.tum",
     "image_folders.mbag",
@@ -58,7 +59,7 @@ def open_source(path: Path, config: SourceConfig = _DEFAULTS) -> "Log":
     Args:
         path: Folder of a TUM, ICL-NUIM, Poznań, 7-Scenes, Redwood, ScanNet, Replica, EuRoC or KITTI log,
             of an app's export (Stray Scanner, Record3D, Polycam, nerfstudio) or of clouds; an mbag, .sens,
-            .r3d, .e57, .pcap or MCAP file, a CARMEN log, or a ROS bag.
+            .r3d, .mkv (Azure Kinect), .e57, .pcap or MCAP file, a CARMEN log, or a ROS bag.
         config: Selection, pairing, camera, and what the files of a log do not state.
 
     Raises:

@@ -40,7 +40,7 @@ def read_imu(folder: Path) -> tuple[Gyroscope | None, Accelerations | None, list
             stamps_ns.append(parse_stamp(words[0], where=where))
             rates.append(parse_numbers(words[1:], where=where))
         stamps = np.array(stamps_ns, np.int64)
-        gyroscope, notes = _gyroscope(path, stamps, np.array(rates, np.float64).reshape(-1, 3))
+        gyroscope, notes = gyroscope_of(path.name, stamps, np.array(rates, np.float64).reshape(-1, 3))
         return gyroscope, None, notes
     path = folder / BOTH
     if not path.is_file():
@@ -69,7 +69,7 @@ def _readings(path: Path, lines: Sequence[str]) -> tuple[Gyroscope | None, Accel
         lengths = ((number, len(words)) for number, words in rows(path, separator=","))
         wrong = (f"line {number} has {n} columns between commas" for number, n in lengths if n != 7)
         raise SourceError(f"{path}: {next(wrong, error)}; want stamp_ns,wx,wy,wz,ax,ay,az") from None
-    gyroscope, notes = _gyroscope(path, readings["stamp_ns"], readings["rates"])
+    gyroscope, notes = gyroscope_of(path.name, readings["stamp_ns"], readings["rates"])
     felt = readings[np.isfinite(readings["accelerations"]).all(axis=1)]
     order, _ = time_order(felt["stamp_ns"], what=path.name)
     felt = felt[order]
@@ -112,13 +112,20 @@ def _stray_rates(path: Path, lines: Sequence[str]) -> tuple[Gyroscope | None, No
         stamps_ns.append(parse_stamp(words[at[0]].strip(), where=where))
         rates.append(parse_numbers([words[i] for i in at[4:]], where=where))
     stamps = np.array(stamps_ns, np.int64)
-    gyroscope, notes = _gyroscope(path, stamps, np.array(rates, np.float64).reshape(-1, 3))
+    gyroscope, notes = gyroscope_of(path.name, stamps, np.array(rates, np.float64).reshape(-1, 3))
     return gyroscope, None, notes
 
 
-def _gyroscope(path: Path, stamps_ns: Stamps, rates_radps: Array) -> tuple[Gyroscope | None, list[str]]:
+def gyroscope_of(name: str, stamps_ns: Stamps, rates_radps: Array) -> tuple[Gyroscope | None, list[str]]:
+    """Return the finite readings in time order within the unit's range, None without any, and notes.
+
+    Args:
+        name: Topic or file.
+        stamps_ns: (N,) int64 nanoseconds, in any order.
+        rates_radps: (N, 3) in the unit's own axes.
+    """
     finite = np.isfinite(rates_radps).all(axis=1)
-    order, notes = time_order(stamps_ns[finite], what=path.name)
-    gyroscope = Gyroscope(path.name, stamps_ns[finite][order], rates_radps[finite][order])
+    order, notes = time_order(stamps_ns[finite], what=name)
+    gyroscope = Gyroscope(name, stamps_ns[finite][order], rates_radps[finite][order])
     sound, more = gyroscope.without_saturation()
     return sound, [*notes, *more]

@@ -6,8 +6,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from mapper.core.frames import PinholeCamera
 from mapper.core.timebase import NS_PER_S
 from mapper.sources.calibration_file import calibration_text
+from tests.support.azure_kinect import Capture, write_azure_kinect
 from tests.support.recordings import CAMERA
 from tests.support.tum_logs import FIRST_NS, picture
 
@@ -92,6 +94,15 @@ def _stamped(folder: Path) -> Path:
     return log
 
 
+def _azure_kinect(folder: Path) -> Path:
+    depth = PinholeCamera(320, 288, 252.0, 252.0, 160.0, 165.0)
+    units = np.full((288, 320), 1500, np.uint16)
+    captures = [Capture(100_000 * i, picture(i)[0], units) for i in range(FRAMES)]
+    readings = [(1000 * i, (0.0, 0.0, 9.8), (0.1, 0.0, 0.0)) for i in range(100)]
+    places = {"colour": CAMERA, "depth": depth, "T_color_depth": np.eye(4)}
+    return write_azure_kinect(folder / "log.mkv", captures, samples=readings, **places)
+
+
 IMAGE_LOGS: Mapping[str, Callable[[Path], Path]] = {
     "redwood, png": _numbered(".png", ".png"),
     "redwood, jpg": _numbered(".jpg", ".png"),
@@ -101,5 +112,6 @@ IMAGE_LOGS: Mapping[str, Callable[[Path], Path]] = {
     "poznan": _poznan,
     "icl-nuim": _icl_nuim,
     "stamped images": _stamped,
+    "azure-kinect": _azure_kinect,
 }
 """Makers of these inputs."""

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -64,6 +65,29 @@ class DecodedDepth:
     def read_bytes(self) -> bytes:
         """Return the image as a file, encoded as a PNG of 16 bits if it is none yet."""
         return self.file() or encode_depth(self.decode(), self.units_per_m)
+
+
+@dataclass(frozen=True, slots=True)
+class FilePart:
+    """Bytes of a file that are an image; see :class:`mapper.sources.base.ImageFile`."""
+
+    path: Path
+    offset: int
+    size: int
+    suffix: str
+
+    def __str__(self) -> str:
+        return f"{self.path}, byte {self.offset}"
+
+    def read_bytes(self) -> bytes:
+        """Return them.
+
+        Raises:
+            OSError: The file cannot be read.
+        """
+        with self.path.open("rb") as file:
+            file.seek(self.offset)
+            return file.read(self.size)
 
 
 def encode_colour(image: Image) -> bytes:

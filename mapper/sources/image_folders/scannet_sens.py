@@ -4,7 +4,7 @@ https://github.com/ScanNet/ScanNet/tree/master/SensReader
 """
 
 import zlib
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import BinaryIO
@@ -17,7 +17,7 @@ from mapper.core.units import MM_PER_M
 from mapper.runtime.regular_files import MOST_BYTES
 from mapper.sources.calibration import Calibration
 from mapper.sources.config import SourceConfig
-from mapper.sources.image_files.decoded import DecodedDepth
+from mapper.sources.image_files.decoded import DecodedDepth, FilePart
 from mapper.sources.image_files.reading import depth_m_from
 from mapper.sources.image_folders.numbered import RATE_HZ, stamp_at
 from mapper.sources.image_folders.posed import PosedFrame, PosedFrames, camera_of
@@ -40,29 +40,6 @@ _HEADER = np.dtype(
 _FRAME = np.dtype([("pose", "<f4", (4, 4)), ("stamps_us", "<u8", 2), ("bytes", "<u8", 2)])
 _COLOUR_ENDINGS = {1: ".png", 2: ".jpg"}
 _RAW, _ZLIB = 0, 1
-
-
-@dataclass(frozen=True, slots=True)
-class FilePart:
-    """Bytes of a file that are an image; see :class:`mapper.sources.base.ImageFile`."""
-
-    path: Path
-    offset: int
-    size: int
-    suffix: str
-
-    def __str__(self) -> str:
-        return f"{self.path}, byte {self.offset}"
-
-    def read_bytes(self) -> bytes:
-        """Return them.
-
-        Raises:
-            OSError: The file cannot be read.
-        """
-        with self.path.open("rb") as file:
-            file.seek(self.offset)
-            return file.read(self.size)
 
 
 def read_frames(path: Path, config: SourceConfig) -> PosedFrames:
