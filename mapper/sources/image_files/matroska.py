@@ -4,7 +4,8 @@ Libraries that read it return packets in the order of the file, and not where th
 are read in any order, by several threads.
 """
 
-from collections.abc import Iterable, Mapping
+from array import array
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO
@@ -25,8 +26,9 @@ _READ = {
     *(_FILE_NAME, _FILE_DATA),
 }
 _BLOCKS = {0xA3, 0xA1}  # SimpleBlock, and Block of a BlockGroup
-_MOST_BYTES = 1 << 20  # of an element that is read whole
-_LATEST_NS = 1 << 62
+_MOST_BYTES = 1 << 20  # of an element or a sample that is read whole
+_HEAD_BYTES, _CHUNK_BYTES = 16, 1 << 14  # two numbers of variable length; read at once
+_LATEST_NS = 1 << 62  # stamps are 64-bit
 _EPOCH_NS = 978_307_200 * 10**9  # 2001-01-01, from which dates count
 
 
@@ -40,15 +42,17 @@ class Track:
         width_px: Width of its images; 0 of other tracks.
         height_px: Height of them.
         stamps_ns: Time of each block since the epoch if the file has a date, else since its beginning.
-        blocks: Where their data are.
+        images: Where the blocks are, of a track of images.
+        samples: Their data, of other tracks.
     """
 
     name: str = ""
     codec_private: bytes = b""
     width_px: int = 0
     height_px: int = 0
-    stamps_ns: list[int] = field(default_factory=list)
-    blocks: list[FilePart] = field(default_factory=list)
+    stamps_ns: "array[int]" = field(default_factory=lambda: array("q"))
+    images: list[FilePart] = field(default_factory=list)
+    samples: list[bytes] = field(default_factory=list)
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +71,7 @@ class MatroskaFile:
 
 
 def read_matroska(path: Path) -> MatroskaFile:
-    """Return what a file contains; of the blocks only their heads are read.
+    """Return what a file contains; of the blocks of images only their heads are read.
 
     Raises:
         SourceError: It cannot be read, or is no Matroska file.
@@ -81,26 +85,10 @@ def read_matroska(path: Path) -> MatroskaFile:
         raise SourceError(f"{path}: cannot be read: {error.strerror}") from None
 
 
-def read_parts(path: Path, parts: Iterable[FilePart]) -> bytes:
-    """Return the data of parts of a file, one after the other.
-
-    Raises:
-        SourceError: It cannot be read.
-    """
-    data = bytearray()
-    try:
-        with path.open("rb") as file:
-            for part in parts:
-                file.seek(part.offset)
-                data += file.read(part.size)
-    except OSError as error:
-        raise SourceError(f"{path}: cannot be read: {error.strerror}") from None
-    return bytes(data)
-
-
 class _Reader:
     def __init__(self, file: BinaryIO, path: Path) -> None:
         self._file, self._path, self._size = file, path, path.stat().st_size
+        self._chunk, self._chunk_start = b"", 0
         self._tracks: dict[int, Track] = {}
         self._track = Track()
         self._attachments: dict[str, bytes] = {}
@@ -111,9 +99,10 @@ class _Reader:
         """Go through the elements: those with others inside are entered, so that their size is not needed."""
         position = 0
         while position < self._size:
-            self._file.seek(position)
-            element, size = self._number(keeps_marker=True), self._number()
-            start = self._file.tell()
+            head = self._bytes(position, _HEAD_BYTES)
+            element, after = _number(head, 0, keeps_marker=True)
+            size, after = _number(head, after)
+            start = position + after
             if element is None or size is None:
                 break
             if element in _ENTERED:
@@ -127,36 +116,34 @@ class _Reader:
             if element in _BLOCKS:
                 self._add_block(start, size)
             elif element in _READ and size <= _MOST_BYTES:
-                self._set(element, self._file.read(size))
+                self._set(element, self._bytes(start, size))
         tracks = {track.name: track for track in self._tracks.values()}
         return MatroskaFile(tracks, self._attachments, is_cut_off=position < self._size)
 
-    def _number(self, *, keeps_marker: bool = False) -> int | None:
-        """Return the next number of variable length (RFC 8794, §4); None where there is none."""
-        first = self._file.read(1)
-        if not first or not first[0]:
-            return None
-        more = 8 - first[0].bit_length()
-        rest = self._file.read(more)
-        if len(rest) < more:
-            return None
-        value = int.from_bytes(first + rest)
-        return value if keeps_marker else value & ((1 << 7 * (more + 1)) - 1)
+    def _bytes(self, position: int, size: int) -> bytes:
+        """Return bytes of the file, fewer at its end; it is read ahead, as most elements are small."""
+        first = position - self._chunk_start
+        if first < 0 or first + size > len(self._chunk):
+            self._file.seek(position)
+            self._chunk, self._chunk_start, first = self._file.read(max(size, _CHUNK_BYTES)), position, 0
+        return self._chunk[first : first + size]
 
     def _add_block(self, start: int, size: int) -> None:
-        number = self._number()
-        time = self._file.read(2)
-        data = self._file.tell() + 1  # a byte of flags
-        if number in self._tracks and data <= start + size:
-            track = self._tracks[number]
-            ticks = self._cluster_time + int.from_bytes(time, signed=True)
-            stamp_ns = self._date_ns + ticks * self._scale_ns
-            if not 0 <= stamp_ns <= _LATEST_NS:
-                raise SourceError(
-                    f"{self._path}: a block's time is {stamp_ns} ns, not within 0 … {_LATEST_NS}"
-                )
-            track.stamps_ns.append(stamp_ns)
-            track.blocks.append(FilePart(self._path, data, start + size - data, ""))
+        head = self._bytes(start, _HEAD_BYTES)
+        number, after = _number(head, 0)
+        data, data_bytes = start + after + 3, size - after - 3  # two bytes of time and one of flags
+        track = self._tracks.get(-1 if number is None else number)
+        if track is None or data_bytes < 0 or (not track.width_px and data_bytes > _MOST_BYTES):
+            return
+        ticks = self._cluster_time + int.from_bytes(head[after : after + 2], signed=True)
+        stamp_ns = self._date_ns + ticks * self._scale_ns
+        if not 0 <= stamp_ns <= _LATEST_NS:
+            raise SourceError(f"{self._path}: a block's time is {stamp_ns} ns, not within 0 … {_LATEST_NS}")
+        track.stamps_ns.append(stamp_ns)
+        if track.width_px:
+            track.images.append(FilePart(self._path, data, data_bytes, ""))
+        else:
+            track.samples.append(self._bytes(data, data_bytes))
 
     def _set(self, element: int, data: bytes) -> None:
         number, text = int.from_bytes(data[:8]), data.rstrip(b"\0").decode(errors="replace")
@@ -180,3 +167,13 @@ class _Reader:
             self._file_name = text
         elif element == _FILE_DATA:
             self._attachments[self._file_name] = data
+
+
+def _number(data: bytes, at: int, *, keeps_marker: bool = False) -> tuple[int | None, int]:
+    """Return a number of variable length (RFC 8794, §4), None where there is none, and the place after it."""
+    more = 8 - data[at].bit_length() if at < len(data) else 8
+    after = at + more + 1
+    if more == 8 or after > len(data):
+        return None, at
+    value = int.from_bytes(data[at:after])
+    return value if keeps_marker else value & ((1 << 7 * (more + 1)) - 1), after

@@ -21,7 +21,7 @@ from mapper.sources.base import Accelerations, ImageFile, Log
 from mapper.sources.calibration import Calibration, DepthCamera
 from mapper.sources.config import SourceConfig
 from mapper.sources.image_files.decoded import DecodedColour, DecodedDepth, FilePart
-from mapper.sources.image_files.matroska import MAGIC, Track, read_matroska, read_parts
+from mapper.sources.image_files.matroska import MAGIC, Track, read_matroska
 from mapper.sources.image_files.reading import bytes_of, depth_m_from
 from mapper.sources.image_files.size import MOST_MEGAPIXELS
 from mapper.sources.image_folders.json_files import parse_json
@@ -39,7 +39,7 @@ _DEPTH_MODES = {
     (512, 512): (512, 0, 0),
     (1024, 1024): (1024, 0, 0),
 }
-"""Side of the whole sensor in pixels of a mode, and its part's first column and row, by the images' size."""
+"""Side of the whole sensor in a mode's pixels, and first column and row of its part, by the images' size."""
 _CODEC = slice(16, 20)  # of a BITMAPINFOHEADER
 _JPEG, _DEPTH_CODEC = b"MJPG", b"b16g"
 _RAW = {b"NV12": (cv2.COLOR_YUV2RGB_NV12, 1.5), b"YUY2": (cv2.COLOR_YUV2RGB_YUY2, 2.0)}
@@ -109,15 +109,15 @@ def read_log(path: Path, config: SourceConfig) -> Log:
     tracks = {name.upper(): track for name, track in found.tracks.items()}
     colour, depth = tracks.get("COLOR", Track()), tracks.get("DEPTH", Track())
     for name, track in (("COLOR", colour), ("DEPTH", depth)):
-        if not track.blocks:
+        if not track.images:
             raise SourceError(
                 f"{path}: no images in a track {name}; want an Azure Kinect's recording of both"
             )
     stated = _calibration(found.attachments.get("calibration.json"), colour, depth, f"{path}")
     units_per_m = (config.camera and config.camera.depth_factor) or MM_PER_M
     pairs, notes = pair_images(
-        _ordered(colour, [_colour(colour, part) for part in colour.blocks]),
-        _ordered(depth, [_depth(depth, part, units_per_m) for part in depth.blocks]),
+        _ordered(colour, [_colour(colour, part) for part in colour.images]),
+        _ordered(depth, [_depth(depth, part, units_per_m) for part in depth.images]),
         config,
         path=path,
     )
@@ -201,10 +201,10 @@ def _pixels(part: FilePart, size_px: tuple[int, int], bytes_per_px: float) -> Im
 
 def _with_imu(log: Log, track: Track) -> Log:
     """Return the log with the readings of a track's samples, one in each block."""
-    whole = [i for i, part in enumerate(track.blocks) if part.size == _SAMPLE.itemsize]
+    whole = [i for i, sample in enumerate(track.samples) if len(sample) == _SAMPLE.itemsize]
     if not whole:
         return log
-    samples = np.frombuffer(read_parts(log.path, [track.blocks[i] for i in whole]), _SAMPLE)
+    samples = np.frombuffer(b"".join(track.samples[i] for i in whole), _SAMPLE)
     stamps_ns = np.array(track.stamps_ns, np.int64)[whole]
     later_ns = (samples["turned_at_ns"] - samples["at_ns"]).astype(np.int64)
     rates = samples["radps"].astype(np.float64)
