@@ -66,6 +66,8 @@ def solve(
     seconds = {"read": read - began, "solve": time.perf_counter() - read}
     solved = SolvedGraph(graph, unsolved, solution, config, seconds)
     write_solved_graph(out, solved)
+    if solved.contradiction:
+        progress.note(solved.contradiction)
     return Answer({"path": out, **solve_report(solved)}, f"{_table(solved)}\n{out}")
 
 

@@ -40,6 +40,18 @@ def with_a_false_loop(graph):
     return graph
 
 
+@pytest.mark.parametrize(("robust", "is_contradicting"), [("none", True), ("gnc", False)])
+def test_edges_that_contradict_each_other_are_named(tmp_path, robust, is_contradicting):
+    graph, _ = ring()
+    write_g2o(tmp_path / "ring.g2o", with_a_false_loop(graph))
+
+    result = mapper("solve", tmp_path / "ring.g2o", "--robust", robust, "--out", tmp_path / "out")
+
+    report = json.loads((tmp_path / "out/solve.json").read_text())
+    assert (report["chi2_per_freedom"] > 10.0) == is_contradicting
+    assert ("contradict each other" in result.stderr) == is_contradicting
+
+
 def test_a_folder_holds_graph_path_picture_and_report(tmp_path):
     graph, truth = ring()
     write_g2o(tmp_path / "ring.g2o", with_a_false_loop(graph))
