@@ -12,6 +12,8 @@ from tests.support.azure_kinect import DATE_S, NFOV, Capture, calibration_json, 
 COLOUR = PinholeCamera(320, 180, 150.0, 151.0, 158.0, 91.0, distortion=(0.05, -0.02, 0.001, -0.002, 0.01))
 T_COLOR_DEPTH = exp(np.array([0.1, 0.0, 0.0]), np.array([-0.032, -0.002, 0.004]))
 
+CALIBRATION = calibration_json(COLOUR, NFOV, T_COLOR_DEPTH)
+
 
 def captures(count=4):
     rows, columns = np.mgrid[:180, :320]
@@ -81,10 +83,8 @@ def test_of_a_recording_that_was_cut_off_the_whole_frames_are_read(tmp_path):
         ({"codec": b"H264"}, "H264"),
         ({"calibration": b"{}"}, "CalibrationInformation"),
         ({"depth": PinholeCamera(600, 576, 504.0, 504.0, 300.0, 300.0)}, "600×576"),
-        (
-            {"calibration": calibration_json(COLOUR, NFOV, T_COLOR_DEPTH).replace(b"BrownConrady", b"Theta")},
-            "Theta",
-        ),
+        ({"calibration": CALIBRATION.replace(b"BrownConrady", b"Theta")}, "Theta"),
+        ({"calibration": CALIBRATION.replace(b"-0.032", b"Infinity")}, "finite"),
     ],
 )
 def test_what_cannot_be_read_is_refused_by_name(tmp_path, changes, named):

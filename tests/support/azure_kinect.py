@@ -46,7 +46,12 @@ def block(number: int, data: bytes) -> bytes:
 
 
 def camera_json(
-    purpose: str, camera: PinholeCamera, whole_px: Sequence[int], first_px: Sequence[float], T: Transform
+    purpose: str,
+    camera: PinholeCamera,
+    sensor_px: tuple[int, int],
+    whole_px: tuple[int, int],
+    first_px: tuple[float, float],
+    T: Transform,
 ) -> dict[str, object]:
     k1, k2, p1, p2, k3 = camera.distortion
     width, height = whole_px
@@ -59,15 +64,18 @@ def camera_json(
             "ModelParameters": parameters,
             "ModelType": "CALIBRATION_LensDistortionModelBrownConrady",
         },
+        "SensorWidth": sensor_px[0],
+        "SensorHeight": sensor_px[1],
         "Rt": {"Rotation": T[:3, :3].ravel().tolist(), "Translation": T[:3, 3].tolist()},
     }
 
 
 def calibration_json(colour: PinholeCamera, depth: PinholeCamera, T_color_depth: Transform) -> bytes:
-    whole = (colour.width_px, colour.width_px * 3 // 4)
+    whole, side = (colour.width_px, colour.width_px * 3 // 4), (1024, 1024)
+    top = (whole[1] - colour.height_px) / 2
     cameras = [
-        camera_json("Depth", depth, (1024, 1024), (192, 180), np.eye(4)),
-        camera_json("PhotoVideo", colour, whole, (0, (whole[1] - colour.height_px) / 2), T_color_depth),
+        camera_json("Depth", depth, side, side, (192, 180), np.eye(4)),
+        camera_json("PhotoVideo", colour, (4096, 3072), whole, (0, top), T_color_depth),
     ]
     return json.dumps({"CalibrationInformation": {"Cameras": cameras}}).encode()
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from pydantic import BaseModel, Field
+from pydantic import BaseModel, Field, FiniteFloat, PositiveInt
 
 from mapper.core.errors import FrameError, SourceError
 from mapper.core.frames import DepthImage, Image
@@ -49,18 +49,20 @@ _SAMPLE = np.dtype([("at_ns", "<u8"), ("mps2", "<f4", 3), ("turned_at_ns", "<u8"
 
 class _Intrinsics(BaseModel):
     model: str = Field(alias="ModelType")
-    parameters: list[float] = Field(alias="ModelParameters", min_length=14)
+    parameters: list[FiniteFloat] = Field(alias="ModelParameters", min_length=14)
 
 
 class _Place(BaseModel):
-    R: list[float] = Field(alias="Rotation", min_length=9, max_length=9)
-    t: list[float] = Field(alias="Translation", min_length=3, max_length=3)
+    R: list[FiniteFloat] = Field(alias="Rotation", min_length=9, max_length=9)
+    t: list[FiniteFloat] = Field(alias="Translation", min_length=3, max_length=3)
 
 
 class _Camera(BaseModel):
     purpose: str = Field(alias="Purpose")
     intrinsics: _Intrinsics = Field(alias="Intrinsics")
     place: _Place = Field(alias="Rt")
+    width_px: PositiveInt = Field(alias="SensorWidth")
+    height_px: PositiveInt = Field(alias="SensorHeight")
 
     @property
     def device_pose(self) -> Transform:
@@ -150,10 +152,11 @@ def _calibration(data: bytes | None, colour: Track, depth: Track, where: str) ->
         )
     side_px, *first_px = _DEPTH_MODES[depth.width_px, depth.height_px]
     of_depth = cameras[_DEPTH].calibration(where, (side_px, side_px), (first_px[0], first_px[1]))
-    whole_height_px = colour.width_px * 3 // 4  # of modes of another ratio rows are cut off
-    top_px = (whole_height_px - colour.height_px) / 2
-    camera = cameras[_COLOUR].calibration(where, (colour.width_px, whole_height_px), (0, top_px))
-    T_color_depth = cameras[_COLOUR].device_pose @ inverse(cameras[_DEPTH].device_pose)
+    whole = cameras[_COLOUR]
+    whole_height_px = colour.width_px * whole.height_px // whole.width_px
+    top_px = (whole_height_px - colour.height_px) / 2  # of modes of another ratio rows are cut off
+    camera = whole.calibration(where, (colour.width_px, whole_height_px), (0, top_px))
+    T_color_depth = whole.device_pose @ inverse(cameras[_DEPTH].device_pose)
     return replace(camera, depth=DepthCamera(of_depth, T_color_depth, "calibration.json"))
 
 
