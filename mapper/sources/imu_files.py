@@ -70,10 +70,7 @@ def _readings(path: Path, lines: Sequence[str]) -> tuple[Gyroscope | None, Accel
         wrong = (f"line {number} has {n} columns between commas" for number, n in lengths if n != 7)
         raise SourceError(f"{path}: {next(wrong, error)}; want stamp_ns,wx,wy,wz,ax,ay,az") from None
     gyroscope, notes = gyroscope_of(path.name, readings["stamp_ns"], readings["rates"])
-    felt = readings[np.isfinite(readings["accelerations"]).all(axis=1)]
-    order, _ = time_order(felt["stamp_ns"], what=path.name)
-    felt = felt[order]
-    accelerations = Accelerations(felt["stamp_ns"], felt["accelerations"]) if len(felt) else None
+    accelerations, _ = accelerations_of(path.name, readings["stamp_ns"], readings["accelerations"])
     return gyroscope, accelerations, notes
 
 
@@ -124,8 +121,20 @@ def gyroscope_of(name: str, stamps_ns: Stamps, rates_radps: Array) -> tuple[Gyro
         stamps_ns: (N,) int64 nanoseconds, in any order.
         rates_radps: (N, 3) in the unit's own axes.
     """
-    finite = np.isfinite(rates_radps).all(axis=1)
-    order, notes = time_order(stamps_ns[finite], what=name)
-    gyroscope = Gyroscope(name, stamps_ns[finite][order], rates_radps[finite][order])
-    sound, more = gyroscope.without_saturation()
+    stamps_ns, rates_radps, notes = _sound(name, stamps_ns, rates_radps)
+    sound, more = Gyroscope(name, stamps_ns, rates_radps).without_saturation()
     return sound, [*notes, *more]
+
+
+def accelerations_of(
+    name: str, stamps_ns: Stamps, acceleration_mps2: Array
+) -> tuple[Accelerations | None, list[str]]:
+    """Return the finite readings in time order, None without any, and notes; arguments as above."""
+    stamps_ns, acceleration_mps2, notes = _sound(name, stamps_ns, acceleration_mps2)
+    return Accelerations(stamps_ns, acceleration_mps2) if len(stamps_ns) else None, notes
+
+
+def _sound(name: str, stamps_ns: Stamps, values: Array) -> tuple[Stamps, Array, list[str]]:
+    finite = np.isfinite(values).all(axis=1)
+    order, notes = time_order(stamps_ns[finite], what=name)
+    return stamps_ns[finite][order], values[finite][order], notes

@@ -68,6 +68,14 @@ def test_samples_of_the_imu_are_read_with_their_own_times(tmp_path):
     assert log.accelerations.acceleration_mps2[0] == pytest.approx([0.0, 0.0, 9.8], abs=1e-5)
 
 
+def test_readings_that_are_not_finite_are_left_out(tmp_path):
+    damaged = [(at, (np.nan, 0.0, 9.8), radps) for at, _, radps in samples()]
+    log = open_source(recording(tmp_path, samples=[*samples(3), *damaged[3:]]))
+    assert log.accelerations is not None
+    assert len(log.accelerations.stamps_ns) == 3
+    assert open_source(recording(tmp_path, samples=damaged)).accelerations is None
+
+
 def test_of_a_recording_that_was_cut_off_the_whole_frames_are_read(tmp_path):
     path = recording(tmp_path)
     path.write_bytes(path.read_bytes()[:-1000])

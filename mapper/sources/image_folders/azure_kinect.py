@@ -17,7 +17,7 @@ from mapper.core.errors import FrameError, SourceError
 from mapper.core.frames import DepthImage, Image
 from mapper.core.geometry import Transform, inverse, nearest_rotation, transform
 from mapper.core.units import MM_PER_M
-from mapper.sources.base import Accelerations, ImageFile, Log
+from mapper.sources.base import ImageFile, Log
 from mapper.sources.calibration import Calibration, DepthCamera
 from mapper.sources.config import SourceConfig
 from mapper.sources.image_files.decoded import DecodedColour, DecodedDepth, FilePart
@@ -28,9 +28,8 @@ from mapper.sources.image_folders.json_files import parse_json
 from mapper.sources.image_folders.pairing import ImageList, pair_images
 from mapper.sources.image_folders.posed import camera_of
 from mapper.sources.image_folders.rgbd import rgbd_log
-from mapper.sources.imu_files import gyroscope_of
+from mapper.sources.imu_files import accelerations_of, gyroscope_of
 from mapper.sources.lens import Lens
-from mapper.sources.text import time_order
 
 _COLOUR, _DEPTH = "CALIBRATION_CameraPurposePhotoVideo", "CALIBRATION_CameraPurposeDepth"
 _DEPTH_MODES = {
@@ -150,8 +149,8 @@ def _calibration(data: bytes | None, colour: Track, depth: Track, where: str) ->
         raise SourceError(
             f"{where}: depth of {depth.width_px}×{depth.height_px} px is of no mode of the sensor"
         )
-    side_px, *first_px = _DEPTH_MODES[depth.width_px, depth.height_px]
-    of_depth = cameras[_DEPTH].calibration(where, (side_px, side_px), (first_px[0], first_px[1]))
+    side_px, column, row = _DEPTH_MODES[depth.width_px, depth.height_px]
+    of_depth = cameras[_DEPTH].calibration(where, (side_px, side_px), (column, row))
     whole = cameras[_COLOUR]
     whole_height_px = colour.width_px * whole.height_px // whole.width_px
     top_px = (whole_height_px - colour.height_px) / 2  # of modes of another ratio rows are cut off
@@ -212,8 +211,7 @@ def _with_imu(log: Log, track: Track) -> Log:
     later_ns = (samples["turned_at_ns"] - samples["at_ns"]).astype(np.int64)
     rates = samples["radps"].astype(np.float64)
     gyroscope, notes = gyroscope_of(f"{log.path.name}, IMU", stamps_ns + later_ns, rates)
-    finite = np.isfinite(samples["mps2"]).all(axis=1)
-    order, more = time_order(stamps_ns[finite], what=f"{log.path.name}, IMU")
-    measured = samples["mps2"][finite][order].astype(np.float64)
-    accelerations = Accelerations(stamps_ns[finite][order], measured)
-    return replace(log, gyroscope=gyroscope, accelerations=accelerations, notes=[*log.notes, *notes, *more])
+    measured = samples["mps2"].astype(np.float64)
+    accelerations, more = accelerations_of(f"{log.path.name}, IMU", stamps_ns, measured)
+    notes = list(dict.fromkeys([*log.notes, *notes, *more]))
+    return replace(log, gyroscope=gyroscope, accelerations=accelerations, notes=notes)

@@ -177,9 +177,9 @@ def _depth_m_of_file(
         raise FrameError(f"{where}: depth compressed as RVL is not read; record it as PNG or raw")
     if "compressedDepth" in message.format and len(message.data) < DEPTH_HEADER.size:
         raise FrameError(f"{where}: compressedDepth of {len(message.data)} bytes")
-    file = _without_header(message)
-    _refuse_video(bytes(file), message.format, where=where)
-    units = decode_depth(bytes(file), where)
+    file = bytes(_without_header(message))
+    _refuse_video(file, message.format, where=where)
+    units = decode_depth(file, where)
     if units.dtype == np.float32:
         return valid_depth(units.astype(np.float32), float_units_per_m, where=where)
     if not message.format.startswith("32FC1") or len(file) == len(message.data):
