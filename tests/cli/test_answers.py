@@ -48,8 +48,8 @@ ANSWERS = {
     "merge": (["RUN", "--out", "TMP/map"], "path runs ties left_out summary worker_s shuffle_bytes"),
     "solve": (
         ["RUN/graph.g2o", "--out", "TMP/solved"],
-        "path graph config nodes edges loops rejected component_sizes error_before error_after iterations "
-        "seconds",
+        "path graph config nodes edges loops rejected component_sizes error_before error_after "
+        "chi2_per_freedom iterations seconds",
     ),
     "inspect": (["LOG"], "path topics log problem build"),
     "convert": (["LOG", "--as", "mbag", "--out", "TMP/log"], "path format frames skipped"),
