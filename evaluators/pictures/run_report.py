@@ -5,6 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
+from mapper.core.errors import MapperError
+from mapper.evaluators.metrics.agreement import CommonViews, agreement_metrics
 from mapper.evaluators.metrics.evaluate import assess
 from mapper.evaluators.metrics.loops import loop_metrics_of_run
 from mapper.evaluators.metrics.metric import shown
@@ -55,6 +57,7 @@ def _figures(run: Run) -> list[Figure]:
     if run.truth is not None:
         metrics += loop_metrics_of_run(run, run.truth)
     figures = [Figure(name, value, "Is it right?") for name, value in _correctness(run)]
+    figures.append(Figure("disagreement of views, RMS", _agreement(run), "Is it right?"))
     figures += [Figure(name, value, "Is it complete?") for name, value in _completeness(run)]
     for metric in metrics:
         name, value, unit = shown(metric, digits=_DIGITS)
@@ -71,6 +74,16 @@ def _correctness(run: Run) -> list[tuple[str, str]]:
     if counts.loop_candidates:
         rows.append(("loops that hold", f"{counts.loops} of {counts.loop_candidates} candidates"))
     return rows
+
+
+def _agreement(run: Run) -> str:
+    """Return how far the poses are from what views of one place show, which needs the log."""
+    try:
+        views = CommonViews(run.open_log()).disagreements(run.tracked_trajectory)
+    except MapperError as error:
+        return f"not measured: {error}"
+    rms_m, low_m, high_m = (metric.value for metric in agreement_metrics(views)[1:])
+    return f"{rms_m:.{_DIGITS}g} m; 95 %: {low_m:.{_DIGITS}g} to {high_m:.{_DIGITS}g} m"
 
 
 def _completeness(run: Run) -> list[tuple[str, str]]:

@@ -9,7 +9,9 @@ import pytest
 from mapper.config.build import BuildConfig
 from mapper.core.doubts import Doubt
 from mapper.core.errors import ConfigError
+from mapper.evaluators.metrics.agreement import CommonViews
 from mapper.evaluators.metrics.evaluate import evaluate
+from mapper.evaluators.pictures.run_report import report
 from mapper.export.report.data import Figure, chapter_of, drawn
 from mapper.export.report.page import page_of, write_report
 from mapper.pipeline.build import build
@@ -67,6 +69,18 @@ def test_the_numbers_are_the_run_s(runs):
     assert [(loop["i"], loop["j"], loop["verdict"]) for loop in data["loops"]] == [
         (loop.i, loop.j, loop.verdict) for loop in run.loops
     ]
+
+
+def test_agreement_of_views_is_measured_where_the_log_is(runs, page, tmp_path):
+    run = runs[0]
+    measured = CommonViews(run.open_log()).disagreements(run.tracked_trajectory)
+    assert f"{measured.rms_m:.3g} m; 95 %: " in page.read_text(encoding="utf-8")
+
+    manifest = run.manifest.model_copy(
+        update={"input": run.manifest.input.model_copy(update={"path": str(tmp_path / "moved")})}
+    )
+    moved = report([replace(run, manifest=manifest)], tmp_path / "moved.html")
+    assert f"{measured.rms_m:.3g} m; 95 %: " not in moved.read_text(encoding="utf-8")
 
 
 def test_uncertainty_and_doubt_are_the_poses_s(runs):
