@@ -126,8 +126,7 @@ def evaluate(
     Example: mapper eval runs/xyz --align yaw --plot plots, or: mapper eval 00.txt --truth poses/00.txt, or:
     mapper eval runs/flat --map logs/flat --sharpness
     """
-    from mapper.evaluators.metrics.evaluate import estimate_and_truth
-    from mapper.evaluators.metrics.loops import agreement_of_loops, loop_metrics_of_run
+    from mapper.evaluators.metrics.evaluate import estimate_and_truth, run_metrics
     from mapper.run.manifest import is_merged_map
 
     of_log = {"--sharpness": sharpness, "--agreement": agreement, "--against": against}
@@ -163,9 +162,8 @@ def evaluate(
     )
     metrics = list(found.metrics)
     if run is not None:
-        metrics += [] if known is None else loop_metrics_of_run(run, known)
-        metrics += agreement_of_loops(run.graph)
-    if run is None:
+        metrics += run_metrics(run, known)
+    else:
         refuse_with(f"{estimate}, a trajectory alone", of_log, remedy="give the folder of its run")
     if map_ is None:
         quality = None

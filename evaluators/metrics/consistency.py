@@ -1,4 +1,4 @@
-"""Consistency of covariances: normalised estimation error squared (NEES) of relative poses."""
+"""Covariances of poses: normalised estimation error squared (NEES), and the drift to be expected by them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,9 +8,11 @@ import numpy as np
 from mapper.core.geometry import Array, Transform, adjoint, inverse, log
 from mapper.core.timebase import MAX_TRUTH_GAP_NS, NS_PER_S
 from mapper.core.trajectory import Trajectory
+from mapper.evaluators.metrics.metric import Metric
 from mapper.graph.marginals import marginals_of
 from mapper.graph.model import BetweenFactor, PoseGraph
 from mapper.run.frame_outcomes import FrameRecord, stamps_of
+from mapper.run.pose_covariances import UncertainPoses
 from mapper.sensing.wheel_kinematics import pose_at
 
 _NEXT_TO_NOTHING = 1e-6 * np.eye(6)
@@ -75,6 +77,17 @@ def window_nees(
         covariance = covariance + _own(b) + _carried(_own(a), inverse(T_a_b))
         errors.append(_nees(T_a_b, inverse(T_true_a) @ T_true_b, covariance))
     return _summary(errors)
+
+
+def drift_metrics(poses: UncertainPoses) -> list[Metric]:
+    """Return the drift to be expected by the covariances, which needs no truth; nothing where unknown."""
+    path_m = poses.trajectory.path_length_m
+    if not (path_m > 0.0 and np.isfinite(poses.end_sigma_m)):
+        return []
+    return [
+        Metric("uncertainty of the last position", poses.end_sigma_m, "m", "1 σ"),
+        Metric("expected drift", 100.0 * poses.end_sigma_m / path_m, "%", "1 σ"),
+    ]
 
 
 def factor_nees(factors: Sequence[BetweenFactor], graph: PoseGraph, truth: Trajectory) -> Nees:

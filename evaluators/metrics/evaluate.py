@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from html import escape
 from pathlib import Path
 
@@ -109,7 +109,7 @@ def evaluate(
     max_gap_s: float = 0.02,
     lengths_m: Sequence[float] | None = None,
 ) -> Assessment:
-    """Evaluate a path: its length, coverage, and with truth ATE, RPE and relative errors.
+    """Evaluate a path: its length, coverage, and with truth ATE, RPE and relative errors; a run's loops too.
 
     Args:
         estimate: A run or its folder, a trajectory, or a file of TUM or KITTI text.
@@ -141,7 +141,7 @@ def evaluate(
         str(one) if isinstance(one, str | os.PathLike) else default
         for one, default in ((estimate, "the estimate"), (truth, "the truth"))
     ]
-    return assess(
+    found = assess(
         trajectory,
         known,
         alignment=alignment,
@@ -150,6 +150,16 @@ def evaluate(
         max_gap_s=max_gap_s,
         names=(names[0], names[1]),
     )
+    return found if run is None else replace(found, metrics=(*found.metrics, *run_metrics(run, known)))
+
+
+def run_metrics(run: Run, truth: Trajectory | None) -> list[Metric]:
+    """Return what a run's loops and covariances show, and with truth how many loops are right."""
+    from mapper.evaluators.metrics.consistency import drift_metrics  # need GTSAM, which few verbs do
+    from mapper.evaluators.metrics.loops import agreement_of_loops, loop_metrics_of_run
+
+    right = [] if truth is None else loop_metrics_of_run(run, truth)
+    return [*right, *drift_metrics(run.poses), *agreement_of_loops(run.graph)]
 
 
 def assess(

@@ -97,12 +97,8 @@ def wheel_warnings(results: RunResults) -> Iterator[RunWarning]:
 
 def uncertainty_warnings(results: RunResults, suggestion: str) -> Iterator[RunWarning]:
     """Yield a warning, with what to try, if the end of the path is uncertain."""
-    poses = results.poses
-    known = np.flatnonzero(np.isfinite(poses.position_sigmas_m) & ~poses.is_doubtful)
-    if len(known) < 2:
-        return
     path_m = results.trajectory.path_length_m
-    sigma_m = float(poses.position_sigmas_m[known[-1]])
+    sigma_m = results.poses.end_sigma_m  # no limit is exceeded by NaN
     share = sigma_m / max(path_m, 1e-9)
     if sigma_m > HARMLESS_M and share > _MAX_SIGMA_SHARE:
         yield RunWarning(

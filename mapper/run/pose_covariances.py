@@ -66,6 +66,13 @@ class UncertainPoses:
         return _largest_sigmas(self.covariances[:, 3:, 3:])
 
     @property
+    def end_sigma_m(self) -> float:
+        """Standard deviation of the last position that is known and not doubtful; NaN without any."""
+        sigmas_m = self.position_sigmas_m
+        known = np.flatnonzero(np.isfinite(sigmas_m) & ~self.is_doubtful)
+        return float(sigmas_m[known[-1]]) if len(known) > 1 else np.nan
+
+    @property
     def horizontal_sigmas_m(self) -> Array:
         """(N,) the same of the position seen from above."""
         return _largest_sigmas(self.position_covariances_world[:, :2, :2])

@@ -5,10 +5,11 @@ import pytest
 
 from mapper.core.geometry import exp
 from mapper.core.trajectory import Trajectory
-from mapper.evaluators.metrics.consistency import factor_nees, window_nees
+from mapper.evaluators.metrics.consistency import drift_metrics, factor_nees, window_nees
 from mapper.graph.model import BetweenFactor, PoseGraph, PoseSigmas
 from mapper.odometry.base import Diagnostics
 from mapper.run.frame_outcomes import FrameRecord
+from mapper.run.pose_covariances import UncertainPoses
 
 NODES, STEP_NS = 120, 250_000_000
 SIGMAS = PoseSigmas(rotation_rad=0.002, translation_m=0.005)
@@ -83,3 +84,14 @@ def test_without_a_truth_at_the_time_nothing_is_compared():
     later = Trajectory(truth.stamps_ns + 10**12, truth.T_world_body)
     assert window_nees(found, graph, keyframes(found.stamps_ns), later).count == 0
     assert factor_nees(graph.factors, graph, later).count == 0
+
+
+def test_the_expected_drift_is_that_of_the_last_pose_that_is_not_doubtful():
+    stamps_ns = np.arange(3, dtype=np.int64) * STEP_NS
+    T_world_body = np.array([exp(np.zeros(3), np.array([x, 0.0, 0.0])) for x in (0.0, 4.0, 8.0)])
+    covariances = np.array([np.diag([0.0] * 3 + [sigma_m**2, 0.0, 0.0]) for sigma_m in (0.0, 0.2, 0.9)])
+    poses = UncertainPoses(Trajectory(stamps_ns, T_world_body), np.array([False, False, True]), covariances)
+    told = {metric.quantity: metric.value for metric in drift_metrics(poses)}
+    assert told == pytest.approx({"uncertainty of the last position": 0.2, "expected drift": 2.5})
+    unknown = UncertainPoses(poses.trajectory, poses.is_doubtful, np.full((3, 6, 6), np.nan))
+    assert drift_metrics(unknown) == []
