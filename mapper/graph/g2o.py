@@ -1,6 +1,7 @@
 """Pose graphs as g2o text (Kümmerle et al. 2011), as GTSAM, g2o and SE-Sync read it."""
 
 from collections.abc import Callable, Container, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import chain, pairwise
 from pathlib import Path
@@ -231,6 +232,8 @@ _EDGES = {"EDGE_SE3:QUAT": _Form(2, 7, pose_of_row, 6), "EDGE_SE2": _Form(2, 3, 
 _FORMS = _VERTICES | _EDGES
 _FIX = "FIX"
 _PRIORS = frozenset({"EDGE_SE3_PRIOR", "EDGE_PRIOR_SE2", "EDGE_PRIOR_SE2_XY", "EDGE_SE2_PRIOR"})
+_FORTRAN = str.maketrans("Dd", "ee")
+"""Fortran writes exponents as 1.0D+00."""
 _IDENTITY_INFORMATION = {n: ["1" if i == j else "0" for i in range(n) for j in range(i, n)] for n in (3, 6)}
 """Words of the upper triangle of an identity matrix, by its rows."""
 
@@ -260,7 +263,7 @@ def _tables(path: Path, progress: Progress) -> dict[str, _Table]:
         table = tables.setdefault(tag, _Table())
         try:
             table.ids.append([int(word) for word in words[: form.ids]])
-            table.numbers.append([float(word) for word in words[form.ids :]])
+            table.numbers.append(_floats(words[form.ids :]))
         except ValueError as error:
             remedy = "; numbers need a decimal point, not a comma" if "," in body else ""
             raise GraphError(f"{path}:{line}: {error}{remedy}") from None
@@ -273,6 +276,15 @@ def _tables(path: Path, progress: Progress) -> dict[str, _Table]:
     for table in tables.values():
         table.refuse(path, np.array([min(ids, default=0) < 0 for ids in table.ids]), "an id is negative")
     return tables
+
+
+def _floats(words: Sequence[str]) -> list[float]:
+    try:
+        return [float(word) for word in words]
+    except ValueError:
+        with suppress(ValueError):
+            return [float(word.translate(_FORTRAN)) for word in words]
+        raise
 
 
 def _in_order(

@@ -53,15 +53,18 @@ _BY_CONTENT = (".yaml", ".yml", ".json")
 _Numbers = Mapping[str, Sequence[float]]
 
 
-def calibration_files(folder: Path) -> list[Path]:
-    """Return the files of intrinsics beside a log, by names or else contents; the first counts."""
+def calibration_files(folder: Path) -> tuple[list[Path], bool]:
+    """Return the files of intrinsics beside a log, by names or else contents, and whether the first counts.
+
+    It does not where there are several of unknown names.
+    """
     named = [path for name in _FILE_NAMES for path in sorted(folder.glob(name)) if path.is_file()]
     found = [path for path in named if not path.name.endswith(_MAY_BE_OTHER) or _has_camera(path)]
     if found:
-        return list(dict.fromkeys(found))
+        return list(dict.fromkeys(found)), True
     others = [path for path in sorted(folder.glob("*")) if path.suffix in _BY_CONTENT and path.is_file()]
     found = [path for path in others if "depth" not in path.name.lower() and _has_camera(path)]
-    return found if len(found) == 1 else []
+    return found, len(found) == 1
 
 
 def read_calibration(path: Path) -> Calibration:
@@ -246,7 +249,9 @@ _OTHER_LENS = re.compile(
     _ANY_LINE,
 )
 _KEY_AND_NUMBER = re.compile(
-    r"(?:fl?_?x(?:_px)?|camera_matrix|\bk(?=\"?\s*[:=]\s*(?:[\[-]|\S+[ ,]+\S)))\"?\s*[:=]", re.IGNORECASE
+    r"(?:fl?_?x(?:_px)?|camera_matrix|intrinsics?(?:_matrix)?(?=\"?\s*:\s*\[\s*[\d.]+\s*,)|"
+    r"\bk(?=\"?\s*[:=]\s*(?:[\[-]|\S+[ ,]+\S)))\"?\s*[:=]",
+    re.IGNORECASE,
 )
 _COLOUR_SECTION = re.compile(r"^\w*(?:color|colour|rgb)\w*:[ \t]*\n(?:[ \t]+.*\n?|\s*\n)+", _ANY_LINE)
 _YAML_ENTRY = re.compile(

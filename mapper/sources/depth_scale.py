@@ -177,7 +177,8 @@ def _median_m(frame: RgbdFrame) -> float:
 
 def _are_whole_millimetres(log: Log, frames: Collection[RgbdFrame]) -> bool:
     """Return whether depth was recorded in whole millimetres, as cameras deliver it, and scaled since."""
-    units_per_mm = (_units_per_m(log) or MM_PER_M) / MM_PER_M
+    units_per_m = _units_per_m(log) or MM_PER_M
+    units_per_mm = (units_per_m if units_per_m >= MM_PER_M else TUM_UNITS_PER_M) / MM_PER_M
     units = np.concatenate([np.rint(frame.depth_m * units_per_mm * MM_PER_M) for frame in frames])
     return bool((np.remainder(units, units_per_mm) == 0.0).all())
 

@@ -70,8 +70,8 @@ def _readings(path: Path, lines: Sequence[str]) -> tuple[Gyroscope | None, Accel
         wrong = (f"line {number} has {n} columns between commas" for number, n in lengths if n != 7)
         raise SourceError(f"{path}: {next(wrong, error)}; want stamp_ns,wx,wy,wz,ax,ay,az") from None
     gyroscope, notes = gyroscope_of(path.name, readings["stamp_ns"], readings["rates"])
-    accelerations, _ = accelerations_of(path.name, readings["stamp_ns"], readings["accelerations"])
-    return gyroscope, accelerations, notes
+    accelerations, more = accelerations_of(path.name, readings["stamp_ns"], readings["accelerations"])
+    return gyroscope, accelerations, list(dict.fromkeys([*notes, *more]))
 
 
 def write_gyroscope(folder: Path, gyroscope: Gyroscope) -> None:
@@ -121,7 +121,7 @@ def gyroscope_of(name: str, stamps_ns: Stamps, rates_radps: Array) -> tuple[Gyro
         stamps_ns: (N,) int64 nanoseconds, in any order.
         rates_radps: (N, 3) in the unit's own axes.
     """
-    stamps_ns, rates_radps, notes = _sound(name, stamps_ns, rates_radps)
+    stamps_ns, rates_radps, notes = _finite(name, stamps_ns, rates_radps, what="angular velocities")
     sound, more = Gyroscope(name, stamps_ns, rates_radps).without_saturation()
     return sound, [*notes, *more]
 
@@ -130,11 +130,13 @@ def accelerations_of(
     name: str, stamps_ns: Stamps, acceleration_mps2: Array
 ) -> tuple[Accelerations | None, list[str]]:
     """Return the finite readings in time order, None without any, and notes; arguments as above."""
-    stamps_ns, acceleration_mps2, notes = _sound(name, stamps_ns, acceleration_mps2)
+    stamps_ns, acceleration_mps2, notes = _finite(name, stamps_ns, acceleration_mps2, what="accelerations")
     return Accelerations(stamps_ns, acceleration_mps2) if len(stamps_ns) else None, notes
 
 
-def _sound(name: str, stamps_ns: Stamps, values: Array) -> tuple[Stamps, Array, list[str]]:
-    finite = np.isfinite(values).all(axis=1)
-    order, notes = time_order(stamps_ns[finite], what=name)
-    return stamps_ns[finite][order], values[finite][order], notes
+def _finite(name: str, stamps_ns: Stamps, values: Array, *, what: str) -> tuple[Stamps, Array, list[str]]:
+    are_finite = np.isfinite(values).all(axis=1)
+    order, notes = time_order(stamps_ns[are_finite], what=name)
+    if left_out := int((~are_finite).sum()):
+        notes.append(f"{name}: {left_out} of {len(values)} {what} are not finite; left out")
+    return stamps_ns[are_finite][order], values[are_finite][order], notes

@@ -132,6 +132,8 @@ def pose_from_matrix(matrix: Sequence[Sequence[float]] | Array) -> Transform | N
 
     Files say that a camera was lost by numbers that are not finite, or by zeros.
     """
+    if len({len(row) for row in matrix}) != 1:
+        return None
     T = np.asarray(matrix, np.float64)
     if T.ndim != 2 or T.shape[0] not in (3, 4) or T.shape[1] != 4 or not np.isfinite(T).all():
         return None

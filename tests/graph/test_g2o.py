@@ -204,6 +204,13 @@ def test_files_of_others_need_no_notes(tmp_path):
     np.testing.assert_array_equal(graph.factors[0].information, np.eye(6))
 
 
+def test_exponents_of_fortran_are_read(tmp_path):
+    (tmp_path / "e.g2o").write_text(VERTICES.replace(" 1 1 0", " 1 1.25e+01 0") + EDGE)
+    (tmp_path / "D.g2o").write_text(VERTICES.replace(" 1 1 0", " 1 1.25D+01 0") + EDGE)
+    one, other = (read_g2o(tmp_path / name).T_world_node[1] for name in ("e.g2o", "D.g2o"))
+    assert one[0, 3] == other[0, 3] == 12.5
+
+
 @pytest.mark.parametrize(
     ("text", "line", "message"),
     [

@@ -7,6 +7,7 @@ import pytest
 from mapper.core.errors import SourceError
 from mapper.sources import open_source
 from mapper.sources.calibration_file import calibration_files, read_calibration
+from mapper.sources.config import SourceConfig
 from tests.support.tum_logs import write_picture
 
 MATRIX = "60.0 0.0 31.5\n0.0 61.0 23.5\n0.0 0.0 1.0\n"
@@ -156,7 +157,7 @@ def test_eight_coefficients_are_a_rational_lens(tmp_path):
 @pytest.mark.parametrize("text", [b"recorded on a Tuesday\n", b"am Dienstag, den 3. M\xe4rz\n"])
 def test_notes_on_something_else_are_no_calibration(tmp_path, text):
     (tmp_path / "info.txt").write_bytes(text)
-    assert calibration_files(tmp_path) == []
+    assert calibration_files(tmp_path) == ([], False)
 
 
 @pytest.mark.parametrize(
@@ -218,3 +219,18 @@ def test_intrinsics_as_librealsense_prints_them(tmp_path, scale):
     path.write_text(text.replace("[0, 0", "[0.1, 0"))
     with pytest.raises(SourceError, match="Inverse Brown Conrady lens"):
         read_calibration(path)
+
+
+def test_two_files_of_unknown_names_are_named_and_one_can_be_chosen(tmp_path):
+    for i in range(2):
+        write_picture(tmp_path / "color" / f"{i:06d}.png", tmp_path / "depth" / f"{i:06d}.png", i)
+    (tmp_path / "mine.yaml").write_text(KALIBR)
+    (tmp_path / "yours.yaml").write_text(KALIBR.replace("31.5", "33.0"))
+    with pytest.raises(SourceError, match=r"mine\.yaml, yours\.yaml .* camera\.yaml .*source\.camera\.fx_px"):
+        open_source(tmp_path)
+    numbers = {"fx_px": 60.0, "fy_px": 61.0, "cx_px": 31.5, "cy_px": 23.5}
+    chosen = open_source(tmp_path, SourceConfig.model_validate({"camera": numbers}))
+    assert chosen[0].camera.cx_px == 31.5
+    assert [note for note in chosen.notes if "not from mine.yaml, yours.yaml" in note]
+    (tmp_path / "yours.yaml").rename(tmp_path / "camera.yaml")
+    assert open_source(tmp_path)[0].camera.cx_px == 33.0

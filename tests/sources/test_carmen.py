@@ -94,6 +94,7 @@ def test_readings_of_the_largest_range_are_no_returns(tmp_path):
         "FLASER 3 1.5 2.5 0 0 0 0 0 0 5.0 host",
         "ROBOTLASER1 0 -1.57 3.14 100.0 80 0.01 0 1000 1.0",
         "ROBOTLASER1 0 -1.57",
+        "ROBOTLASER1 0 -1.57 3.14 0.0175",
         "FLASER",
     ],
 )

@@ -15,7 +15,15 @@ def test_a_csv_of_euroc_has_both_readings(tmp_path):
     assert gyroscope.stamps_ns.tolist() == [1000, 2000]
     np.testing.assert_array_equal(gyroscope.rates_radps, [[0.4, 0.5, 0.6], [0.1, 0.2, 0.3]])
     assert accelerations.stamps_ns.tolist() == [2000, 3000]
-    assert len(notes) == 1
+    assert [sum(words in note for note in notes) for words in ("1 places", "1 of 3")] == [1, 2]
+    assert len(notes) == 3
+
+
+def test_angular_velocities_that_are_not_finite_are_counted(tmp_path):
+    (tmp_path / "gyroscope.txt").write_text("1 0 0 nan\n2 0 0 0.1\n3 inf 0 0\n4 0 0 0.2\n")
+    gyroscope, _, notes = read_imu(tmp_path)
+    assert len(gyroscope) == 2
+    assert [note for note in notes if "2 of 4" in note]
 
 
 def test_a_csv_of_another_layout_is_named_and_not_used(tmp_path):

@@ -8,6 +8,7 @@ from mapper.core.errors import FrameError, SourceError
 from mapper.core.geometry import exp
 from mapper.sources import open_source
 from mapper.sources.config import SourceConfig
+from mapper.sources.depth_scale import why_no_depth
 from tests.support.tum_logs import CALIBRATION, write_picture
 
 POSES = [exp(np.array([0.1 * i, -0.2, 0.3 * i]), np.array([i, 2.0, -0.5 * i])) for i in range(4)]
@@ -229,3 +230,15 @@ def test_depth_of_floats_that_is_no_metres_is_refused_with_the_setting(tmp_path)
         path.unlink()
     with pytest.raises(FrameError, match="depth_factor=1000"):
         open_source(folder)[0]
+
+
+@pytest.mark.parametrize(("ending", "kind", "assumed"), [(".npy", np.float32, 1), (".tiff", np.uint16, 1000)])
+def test_depth_of_no_camera_names_the_units_that_were_assumed(tmp_path, ending, kind, assumed):
+    folder = redwood(tmp_path, ["000000", "000001"])
+    for path in (folder / "depth").iterdir():
+        depth = np.full((48, 64), 400 if kind is np.float32 else 2, kind)
+        np.save(path.with_suffix(ending), depth) if ending == ".npy" else cv2.imwrite(
+            str(path.with_suffix(ending)), depth
+        )
+        path.unlink()
+    assert f"depth_factor={assumed} right" in why_no_depth(open_source(folder))

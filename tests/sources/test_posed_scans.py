@@ -1,6 +1,7 @@
 """Exports of phones and published scans are read as they lie, and mapped."""
 
 import contextlib
+import json
 import os
 import sys
 
@@ -165,3 +166,20 @@ def _read_all(path):
         with contextlib.suppress(FrameError):
             entry.load()
     return ""
+
+
+def test_a_matrix_that_lost_a_number_is_no_pose(shots, tmp_path):
+    folder = WRITERS["nerfstudio"][0](tmp_path / "scan", shots)
+    listed = json.loads((folder / "transforms.json").read_text())
+    listed["frames"][1]["transform_matrix"][2].pop()
+    (folder / "transforms.json").write_text(json.dumps(listed))
+    log = open_source(folder)
+    assert (len(log), len(log.device_poses)) == (len(shots.frames), len(shots.frames) - 1)
+
+
+def test_an_image_of_endless_width_is_refused(shots, tmp_path):
+    folder = WRITERS["polycam"][0](tmp_path / "scan", shots)
+    first = min((folder / "keyframes/cameras").iterdir())
+    first.write_text(json.dumps({**json.loads(first.read_text()), "width": 1e300}).replace("1e+300", "1e400"))
+    with pytest.raises(SourceError, match=f"{first.name}: width"):
+        open_source(folder)

@@ -7,7 +7,7 @@ from mapper.core.errors import SourceError
 from mapper.sources import open_source
 from mapper.sources.config import CameraConfig, SourceConfig
 from mapper.sources.depth_scale import depth_warnings
-from mapper.sources.image_folders.tum import MILLIMETRES_NOTE, UNITS_NOTE
+from mapper.sources.image_folders.tum import METRES_NOTE, MILLIMETRES_NOTE, UNITS_NOTE
 from tests.support.tum_logs import CALIBRATION, FIRST_NS, PERIOD_NS, write_picture
 
 N = 4
@@ -117,3 +117,14 @@ def write_near(folder):
         units = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
         ramp = np.linspace(1000, 3000, units.size).reshape(units.shape)
         assert cv2.imwrite(str(path), ramp.astype(np.uint16))
+
+
+def test_floats_in_the_list_of_a_tum_folder_are_metres(tiny_tum_log):
+    folder = tiny_tum_log()
+    (folder / "calibration.toml").write_text(CALIBRATION)
+    for path in (folder / "depth").iterdir():
+        np.save(path.with_suffix(".npy"), np.full((48, 64), 1.5, np.float32))
+    (folder / "depth.txt").write_text((folder / "depth.txt").read_text().replace(".png", ".npy"))
+    log = open_source(folder)
+    assert [note in log.notes for note in (METRES_NOTE, UNITS_NOTE)] == [True, False]
+    assert log[0].depth_m.max() == 1.5

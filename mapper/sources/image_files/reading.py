@@ -1,6 +1,7 @@
 """Image files as arrays: whole and of the right kind, or an error that names the file."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from io import BytesIO
 from pathlib import Path
 from typing import Any, cast
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 
 from mapper.core.errors import DataError, FrameError
 from mapper.core.frames import DepthImage, Image, PinholeCamera, RgbdFrame, Scan
+from mapper.core.units import MM_PER_M
 from mapper.runtime.regular_files import MOST_BYTES, read_regular
 from mapper.sources.base import ImageFile
 from mapper.sources.cloud_files.parsing import MAX_RANGE_M, load_array
@@ -21,6 +23,9 @@ from mapper.sources.image_files.size import check_pixels
 
 TUM_UNITS_PER_M = 5000.0
 """16-bit units of a metre in which depth in metres goes into files: 0.2 mm (Sturm et al. 2012)."""
+
+ARRAYS = (".npy", ".tif", ".tiff")
+"""Endings of depth images that may be of floating-point numbers."""
 
 # A camera's calibration holds for the pixels as stored, so a rotation tag must not turn them.
 _RGB = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION
@@ -97,6 +102,27 @@ def read_array_m(path: ImageFile, units_per_m: float, float_units_per_m: float) 
     Raises:
         FrameError: The file is missing, damaged or no such array, or all of it is beyond any camera's reach.
     """
+    array = _array_of(path)
+    if array.dtype == np.uint16:
+        return depth_m_from(array, units_per_m)
+    unit = float_units_per_m if array.dtype.kind == "f" else units_per_m
+    with np.errstate(all="ignore"):  # a damaged file's numbers may be too large, or signalling NaN
+        return valid_depth(array, unit, where=f"{path}")
+
+
+def has_floats(path: ImageFile) -> bool:
+    """Return whether a depth image is a .npy or TIFF file of floating-point numbers; a damaged one is not."""
+    with suppress(FrameError):
+        return path.suffix in ARRAYS and _array_of(path).dtype.kind == "f"
+    return False
+
+
+def _array_of(path: ImageFile) -> NDArray[Any]:
+    """Return the (H, W) numbers of a .npy or TIFF file of depth.
+
+    Raises:
+        FrameError: The file is missing, damaged or no such array.
+    """
     data = bytes_of(path)
     array: NDArray[Any] = (
         load_array(BytesIO(data), path) if path.suffix == ".npy" else decode_depth(data, f"{path}")
@@ -105,11 +131,7 @@ def read_array_m(path: ImageFile, units_per_m: float, float_units_per_m: float) 
         array = array[0] if array.shape[0] == 1 else array[..., 0]
     if array.ndim != 2 or array.dtype.kind not in "uif" or not array.size:
         raise FrameError(f"{path}: array of {array.dtype} {array.shape}, want rows and columns of depth")
-    if array.dtype == np.uint16:
-        return depth_m_from(array, units_per_m)
-    unit = float_units_per_m if array.dtype.kind == "f" else units_per_m
-    with np.errstate(all="ignore"):  # a damaged file's numbers may be too large, or signalling NaN
-        return valid_depth(array, unit, where=f"{path}")
+    return array
 
 
 def decode_depth_units(data: bytes, where: str) -> NDArray[np.uint16]:
@@ -155,9 +177,11 @@ def valid_depth(depth: NDArray[np.number], units_per_m: float, *, where: str) ->
     is_measured = valid > 0.0
     is_near = is_measured & (valid < MAX_RANGE_M)
     if not is_near.any() and (is_far := is_measured & np.isfinite(valid)).any():
+        remedy = "millimetres? --set source.camera.depth_factor=1000 reads them"
         raise FrameError(
-            f"{where}: the median depth is {np.median(valid[is_far]):.0f} m, at most {MAX_RANGE_M:.0f} m can "
-            "be measured; millimetres? --set source.camera.depth_factor=1000 reads them"
+            f"{where}: the median depth is {np.median(valid[is_far]):.0f} m by {units_per_m:g} units per "
+            f"metre, at most {MAX_RANGE_M:.0f} m can be measured; "
+            f"{remedy if units_per_m < MM_PER_M else 'is source.camera.depth_factor right?'}"
         )
     np.copyto(valid, 0.0, where=~is_near)
     return valid

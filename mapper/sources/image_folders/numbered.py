@@ -101,7 +101,7 @@ def read_log(path: Path, config: SourceConfig) -> Log:
         raise SourceError(f"{path}: no colour and depth images with the same numbers; want {LOOKED_FOR}")
     is_seven_scenes = _SEVEN_SCENES.fullmatch(images.pairs[0].colour.name) is not None
     known = SEVEN_SCENES if is_seven_scenes else PRIMESENSE
-    beside = next((folder for folder in (path, opened) if calibration_files(folder)), path)
+    beside = next((folder for folder in (path, opened) if calibration_files(folder)[0]), path)
     calibration = find_calibration(beside, config.camera, known=known)
     notes = list(images.notes)
     if calibration.origin == known.origin:

@@ -32,8 +32,8 @@ class _Camera(BaseModel):
     fy: float
     cx: float
     cy: float
-    width: float
-    height: float
+    width: int
+    height: int
     t_00: float
     t_01: float
     t_02: float
@@ -74,7 +74,7 @@ def read_frames(folder: Path, config: SourceConfig) -> PosedFrames:
     stated, notes = median_camera(
         [one.intrinsics_px() for one in cameras],
         origin=f"{keyframes.name}/{prefix}cameras",
-        size_px=(int(cameras[0].width), int(cameras[0].height)),
+        size_px=(cameras[0].width, cameras[0].height),
     )
     camera = camera_of(folder, config, stated)
     depths, depth_notes = confident_depths(

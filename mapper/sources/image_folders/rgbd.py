@@ -8,12 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
-from mapper.core.errors import FrameError, SourceError
+from mapper.core.errors import FrameError, SourceError, listed
 from mapper.core.frames import DepthImage, Image, RgbdFrame, Scan
 from mapper.core.timebase import NS_PER_S
 from mapper.core.trajectory import Trajectory
 from mapper.sources.base import Accelerations, ImageFile, ImageFiles, Log
 from mapper.sources.calibration import (
+    PRIMESENSE,
     Calibration,
     DepthCamera,
     configured,
@@ -25,7 +26,9 @@ from mapper.sources.config import CameraConfig
 from mapper.sources.image_files.decoded import DecodedDepth
 from mapper.sources.image_files.image_sizes import RecordedCamera, Size, recorded_camera
 from mapper.sources.image_files.reading import (
+    ARRAYS,
     TUM_UNITS_PER_M,
+    has_floats,
     read_array_m,
     read_colour,
     read_depth_m,
@@ -131,7 +134,10 @@ def rgbd_log(
     files = (image.where if isinstance(image, DecodedDepth) else image for image in images)
     refuse_links_out((file for file in files if isinstance(file, Path)), log=folder)
     units_per_m = calibration.depth_units_per_m or depth_units_per_m
-    pairs = [_with_array(pair, units_per_m, calibration.depth_units_per_m or 1.0) for pair in pairs]
+    float_units_per_m = calibration.depth_units_per_m or 1.0
+    array = next((pair.depth for pair in pairs if pair.depth.suffix in ARRAYS), None)
+    recorded_units_per_m = (float_units_per_m if has_floats(array) else units_per_m) if array else None
+    pairs = [_with_array(pair, units_per_m, float_units_per_m) for pair in pairs]
     camera = _camera_of(pairs, calibration, depth_units_per_m=units_per_m, path=path)
     accelerations, acceleration_notes = read_accelerations(folder)
 
@@ -144,6 +150,7 @@ def rgbd_log(
             pair.depth.units_per_m if isinstance(pair.depth, DecodedDepth) else units_per_m,
             colour_px=camera.colour_px,
             depth_px=camera.depth_px,
+            recorded_units_per_m=recorded_units_per_m,
         )
         return RgbdEntry(pair.stamp_ns, files, camera)
 
@@ -162,7 +169,7 @@ def rgbd_log(
 
 def _with_array(pair: FramePair, units_per_m: float, float_units_per_m: float) -> FramePair:
     """Return a pair whose depth is decoded if it may be floats: whole numbers as in an image, else metres."""
-    if pair.depth.suffix not in (".npy", ".tif", ".tiff"):
+    if pair.depth.suffix not in ARRAYS:
         return pair
     decode = partial(read_array_m, pair.depth, units_per_m, float_units_per_m)
     return replace(pair, depth=DecodedDepth(pair.depth, decode, TUM_UNITS_PER_M))
@@ -179,10 +186,14 @@ def find_calibration(folder: Path, config: CameraConfig | None, *, known: Calibr
         known: The camera that the log's format or name implies.
 
     Raises:
-        SourceError: None of the three exists, or the file is malformed.
+        SourceError: None of the three exists, the file is malformed, or several of unknown names would stand
+            against a camera that is only assumed.
     """
-    files = calibration_files(folder)
-    stated = read_calibration(files[0]) if files else known
+    files, first_counts = calibration_files(folder)
+    names = tuple(path.name for path in files)
+    if known is PRIMESENSE and not first_counts and len(files) > 1:
+        known = None
+    stated = read_calibration(files[0]) if first_counts else known
     units_per_m = None if stated is None else stated.depth_units_per_m
     depth = _depth_camera(None if stated is None else stated.depth, config)
     if config is not None:
@@ -192,12 +203,12 @@ def find_calibration(folder: Path, config: CameraConfig | None, *, known: Calibr
             chosen = replace(chosen, fy_px=math.copysign(chosen.fy_px, stated.fy_px))
         stated = chosen
     if stated is None:
+        found = f": {listed(names)} state some; name one camera.yaml or intrinsic.json" if names else ""
         raise SourceError(
-            f"{folder}: intrinsics unknown; put a calibration.toml with fx_px, fy_px, cx_px and cy_px there, "
-            f"or --set source.camera.fx_px=… and so on"
+            f"{folder}: intrinsics unknown{found}; put a calibration.toml with fx_px, fy_px, cx_px and "
+            "cy_px there, or --set source.camera.fx_px=… and so on"
         )
-    unread = tuple(path.name for path in files[1:])
-    return replace(stated, depth_units_per_m=units_per_m, depth=depth, unread=unread)
+    return replace(stated, depth_units_per_m=units_per_m, depth=depth, unread=names[first_counts:])
 
 
 def _depth_camera(stated: DepthCamera | None, config: CameraConfig | None) -> DepthCamera | None:

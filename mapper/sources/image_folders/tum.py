@@ -18,7 +18,7 @@ from mapper.core.units import MM_PER_M
 from mapper.sources.base import Log
 from mapper.sources.calibration import freiburg_camera
 from mapper.sources.config import SourceConfig
-from mapper.sources.image_files.reading import TUM_UNITS_PER_M
+from mapper.sources.image_files.reading import TUM_UNITS_PER_M, has_floats
 from mapper.sources.image_folders.pairing import ImageList, pair_images
 from mapper.sources.image_folders.rgbd import find_calibration, rgbd_log
 from mapper.sources.listed_files import present, within
@@ -37,6 +37,7 @@ DEVICE_POSES = "device_poses.txt"
 """File of a phone's own poses in a converted log, as its groundtruth.txt."""
 MILLIMETRES_NOTE = "depth taken to be in millimetres; if not, source.camera.depth_factor (TUM's is 5000)"
 UNITS_NOTE = "depth taken as TUM's 5000 units a metre; source.camera.depth_factor=1000 reads millimetres"
+METRES_NOTE = "depth of floats taken as metres; source.camera.depth_factor=1000 reads millimetres"
 _LISTS = (("rgb.txt", "depth.txt"), ("color.txt", "aligned_depth.txt"))
 """Lists of colour and of depth images, of TUM and of OpenLORIS."""
 _BASE_NOTE = ("the truth of OpenLORIS is that of the robot's base, not of the camera",)
@@ -99,7 +100,8 @@ def log_of_images(
     calibration = find_calibration(path, config.camera, known=known)
     are_units_assumed = known is None and calibration.depth_units_per_m is None
     if are_units_assumed:
-        pair_notes.append(MILLIMETRES_NOTE if depth_units_per_m == MM_PER_M else UNITS_NOTE)
+        millimetres_or_tum = MILLIMETRES_NOTE if depth_units_per_m == MM_PER_M else UNITS_NOTE
+        pair_notes.append(METRES_NOTE if has_floats(pairs[0].depth) else millimetres_or_tum)
     log = rgbd_log(
         pairs,
         calibration,

@@ -24,7 +24,8 @@ from mapper.sources.ros.message_index import Series
 from mapper.sources.ros.message_order import ordered
 from mapper.sources.ros.messages import CAMERAS, EXTRINSICS, CameraMessage, ImageMessage, Window, frame_of
 from mapper.sources.ros.reader import RecordingReader
-from mapper.sources.ros.topics import CameraTopics, ImageTopics, is_called_registered, shared_namespaces
+from mapper.sources.ros.topic_ranks import is_called_registered, shared_namespaces
+from mapper.sources.ros.topics import CameraTopics, ImageTopics
 from mapper.sources.text import pose_from_numbers
 
 _LOOKED_AT = 8

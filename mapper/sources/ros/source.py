@@ -70,7 +70,13 @@ def recording_log(reader: RecordingReader, config: SourceConfig) -> Log:
     ]
     problems = [*filter(None, unread), *recording.notes]
     try:
-        choice = choose(reader.series, reader.firsts, config.topics, path=recording.path)
+        choice = choose(
+            reader.series,
+            reader.firsts,
+            config.topics,
+            frames_of_tf=reader.tree.frames,
+            path=recording.path,
+        )
     except SourceError as error:
         raise SourceError("; ".join([str(error), *problems])) from None
     main = _main_of(choice.frames)

@@ -3,7 +3,7 @@
 import re
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import product, takewhile
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -16,26 +16,33 @@ from mapper.sources.ros.messages import (
     CAMERAS,
     CLOUDS,
     FIXES,
-    GPS_FIXES,
     IMAGES,
     IMUS,
     LASERS,
     ODOMETRY,
     POSES,
     READ,
-    SENTENCES,
     ImageMessage,
     Message,
     frame_of,
 )
-from mapper.sources.ros.recording import Topic
+from mapper.sources.ros.topic_ranks import (
+    TRANSPORTS,
+    cloud_rank,
+    color_rank,
+    depth_rank,
+    fix_rank,
+    is_called_registered,
+    is_infrared,
+    plain_rank,
+    shared_namespaces,
+)
 from mapper.sources.ros.unused_topics import feels_gravity, unused_notes, usual_acceleration, what_there_is
 
 TRUTH, WHEELS = "/ground_truth", "/wheel_odometry"
 
 _ESTIMATED = re.compile("map|laser|lidar|icp|rf2o|visual|camera|gps|gnss|truth|amcl|slam")
 """Names of odometry that is not of wheels, or not of them alone."""
-_TRANSPORTS = ("/compressedDepth", "/compressed")  # what image_transport appends to an image's own topic
 _OWN_TYPES = "mapper/msg/"
 _SIDES = re.compile(r"left|infra1|Infrared_1|cam0|camera0", re.IGNORECASE)
 _OTHER_SIDE = {
@@ -125,7 +132,12 @@ class Choice:
 
 
 def choose(
-    series: Mapping[str, Series], firsts: Mapping[str, Message], config: TopicsConfig, *, path: Path
+    series: Mapping[str, Series],
+    firsts: Mapping[str, Message],
+    config: TopicsConfig,
+    *,
+    frames_of_tf: Collection[str],
+    path: Path,
 ) -> Choice:
     """Return the topics to read: images where colour has depth, else clouds, else stereo pairs.
 
@@ -133,6 +145,7 @@ def choose(
         series: Every topic.
         firsts: The first message of those that can be read.
         config: The user's choice of topics.
+        frames_of_tf: Coordinate frames: of several IMUs one whose mounting they may state goes first.
         path: Recording, for errors.
 
     Raises:
@@ -144,29 +157,34 @@ def choose(
         for name, first in firsts.items()
         if isinstance(first, ImageMessage)
         and is_depth(first)
-        and not (_is_infrared(name) and is_mono16(first))
+        and not (is_infrared(name) and is_mono16(first))
     }
     colors = pick.candidates("color", config.color, IMAGES, where=lambda name: name not in depths)
     depth_images = pick.candidates("depth", config.depth, IMAGES, where=depths.__contains__)
     color, depth = _of_one_camera(colors, depth_images, firsts)
     clouds = pick.candidates("points", config.points, CLOUDS, where=lambda name: len(series[name]) > 1)
-    points = _best([one for one in clouds if one.topic.type not in LASERS] or clouds, _cloud_rank)
-    imu = pick.one("imu", config.imu, IMUS, _plain_rank, where=lambda name: feels_gravity(series[name]))
+    points = _best([one for one in clouds if one.topic.type not in LASERS] or clouds, cloud_rank)
+    imus = pick.candidates("imu", config.imu, IMUS, where=lambda name: feels_gravity(series[name]))
+
+    def is_in_tf(name: str) -> bool:
+        return frame_of(firsts.get(name)) in frames_of_tf
+
+    imu = _best(imus, lambda name: (not is_in_tf(name), *plain_rank(name)))
     gyroscope = imu if imu is not None and _turns(imu) and config.gyroscope is None else None
     if gyroscope is None:
         gyroscope = pick.one(
-            "gyroscope", config.gyroscope, IMUS, _plain_rank, where=lambda name: _turns(series[name])
+            "gyroscope", config.gyroscope, IMUS, plain_rank, where=lambda name: _turns(series[name])
         )
     gnss = pick.one(
-        "gnss", config.gnss, FIXES, lambda name: _fix_rank(series[name].topic), where=lambda _name: True
+        "gnss", config.gnss, FIXES, lambda name: fix_rank(series[name].topic), where=lambda _name: True
     )
-    truth = pick.one("truth", config.truth, POSES, _plain_rank, where=lambda name: name == TRUTH)
-    wheels = pick.one("wheels", config.wheels, POSES, _plain_rank, where=lambda name: name == WHEELS)
+    truth = pick.one("truth", config.truth, POSES, plain_rank, where=lambda name: name == TRUTH)
+    wheels = pick.one("wheels", config.wheels, POSES, plain_rank, where=lambda name: name == WHEELS)
     if wheels is None and points is not None and points.topic.type in LASERS:
         driven = [
             one for one in pick.all(ODOMETRY) if one is not truth and not _ESTIMATED.search(one.topic.name)
         ]
-        wheels = _best(driven, _plain_rank)
+        wheels = _best(driven, plain_rank)
     pick.refuse_own_runs()
     notes: list[str] = []
     if imu is not None and gyroscope is None:
@@ -175,7 +193,7 @@ def choose(
     cameras: list[ImageTopics] = []
     if color is not None and depth is not None and config.points is None:
         infos = pick.all(CAMERAS)
-        info = pick.one("camera_info", config.camera_info, CAMERAS, _plain_rank, where=set().__contains__)
+        info = pick.one("camera_info", config.camera_info, CAMERAS, plain_rank, where=set().__contains__)
         own = _info_of(color, _without_those_of_depth(infos, color, depth), firsts)
         depth_info = next((one for one in _beside(depth, infos) if one is not own), None)
         frames = CameraTopics(color, depth, info or own, own, depth_info)
@@ -211,6 +229,11 @@ def choose(
         unread = unused_notes(strange, firsts, image_reason=None)
         found = what_there_is(color, depth, series.values())
         raise SourceError("; ".join([f"{path}: nothing to map: {found}", *unread]))
+    if imu is not None and len(imus) > 1:
+        why = (
+            "whose frame is in tf" if is_in_tf(imu.topic.name) else "by its name, as tf has the frame of none"
+        )
+        choices.append(_choice_note(f"accelerations {imu.topic.name}, {why}", "imu", others=True))
     if wheels is not None:
         choices.append(
             _choice_note(f"wheel odometry {wheels.topic.name}", "wheels", others=config.wheels is None)
@@ -286,11 +309,11 @@ def _of_one_camera(
         apart, shared = frames[0] != frames[1] or not frames[0], shared_namespaces(color, depth)
         fewest = min(map(len, pair))
         other = apart and not shared
-        return other, _color_rank(color), _depth_rank(depth), apart, -shared, -fewest, color, depth
+        return other, color_rank(color), depth_rank(depth), apart, -shared, -fewest, color, depth
 
     if colors and depths:
         return min(product(colors, depths), key=rank)
-    return _best(colors, _color_rank), min(depths, key=lambda one: one.topic.name, default=None)
+    return _best(colors, color_rank), min(depths, key=lambda one: one.topic.name, default=None)
 
 
 def _stereo_pairs(lefts: Sequence[Series], images: Sequence[Series]) -> list[tuple[Series, Series]]:
@@ -313,54 +336,8 @@ def _best(topics: Sequence[Series], rank: Callable[[str], tuple[int, ...]]) -> S
     return min(topics, key=lambda one: (*rank(one.topic.name), -len(one), one.topic.name), default=None)
 
 
-def shared_namespaces(name: str, other: str) -> int:
-    """Return how many namespaces two topics begin with in common."""
-    parts = zip(name.strip("/").split("/")[:-1], other.strip("/").split("/")[:-1], strict=False)
-    return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], parts))
-
-
 def _choice_note(choice: str, option: str, *, others: bool) -> str:
     return f"{choice}; choose others with source.topics.{option}=…" if others else choice
-
-
-def _color_rank(name: str) -> tuple[int, ...]:
-    lower = name.lower()
-    return int(_is_infrared(name)), int("color" not in lower and "rgb" not in lower), int(_is_packed(name))
-
-
-def _depth_rank(name: str) -> tuple[int, ...]:
-    return int(_is_infrared(name)), int(not is_called_registered(name)), int(_is_packed(name))
-
-
-def _is_infrared(name: str) -> bool:
-    return re.search(r"infra|fisheye|[/_]ir(?![a-z])", name.lower()) is not None
-
-
-def is_called_registered(name: str) -> bool:
-    """Return whether the name of a depth topic says that it is registered to colour."""
-    return any(word in name.lower() for word in ("aligned", "registered", "to_rgb", "to_color"))
-
-
-def _cloud_rank(name: str) -> tuple[int, ...]:
-    """Rank clouds of a driver before clouds that were computed from them, and before its packets."""
-    lower = name.lower()
-    is_made = any(word in lower for word in ("map", "filter", "ground", "cluster", "registered", "depth"))
-    is_driven = any(word in lower for word in ("lidar", "velodyne", "ouster", "points"))
-    return int(is_made), int(not is_driven), int("packets" in lower)
-
-
-def _plain_rank(name: str) -> tuple[int, ...]:
-    return (name.count("/"),)
-
-
-def _fix_rank(topic: Topic) -> tuple[int, ...]:
-    """Rank fixes before sentences, and a receiver's before those that a filter made of several sensors."""
-    is_filtered = any(word in topic.name.lower() for word in ("filter", "fused", "odom"))
-    return is_filtered, topic.type in SENTENCES, topic.type in GPS_FIXES, topic.name.count("/")
-
-
-def _is_packed(name: str) -> bool:
-    return name.endswith(_TRANSPORTS)
 
 
 def _beside(image: Series, infos: Sequence[Series]) -> list[Series]:
@@ -369,7 +346,7 @@ def _beside(image: Series, infos: Sequence[Series]) -> list[Series]:
     realsense-viewer has /device_0/sensor_1/Color_0/info/camera_info beside …/Color_0/image/data.
     """
     name = image.topic.name
-    for transport in _TRANSPORTS:
+    for transport in TRANSPORTS:
         name = name.removesuffix(transport)
     own = [one for one in infos if one.topic.name.rpartition("/")[0] == name.rpartition("/")[0]]
     if own:
@@ -390,7 +367,7 @@ def _cameras(
 ) -> list[ImageTopics]:
     """Return the calibrated cameras of some images, of each coordinate frame the one that ranks first."""
     found: dict[str, ImageTopics] = {}
-    for one in sorted(colors, key=lambda one: (_color_rank(one.topic.name), one.topic.name)):
+    for one in sorted(colors, key=lambda one: (color_rank(one.topic.name), one.topic.name)):
         frame, info = frame_of(firsts.get(one.topic.name)), _info_of(one, infos, firsts)
         if frame and info is not None:
             found.setdefault(frame, ImageTopics(one, info))

@@ -165,8 +165,9 @@ def _laser_line(number: int, words: Sequence[str]) -> _Line:
         first_rad, step_rad = _guessed_beams(len(ranges_m))
         laser, robot = _numbers(words[end : end + 3]), _numbers(words[end + 3 : end + 6])
         return _Line(number, _stamp(words, end + 6), ranges_m, first_rad, step_rad, np.inf, laser, robot)
+    count = _count(words, 8)
     first_rad, _, step_rad, max_m = _numbers(words[2:6])
-    if abs(step_rad) * _count(words, 8) > MOST_RAD:
+    if abs(step_rad) * count > MOST_RAD:
         raise DataError(f"{words[8]} beams in steps of {step_rad:g} rad are more than two turns")
     ranges_m, end = _counted(words, 8)
     _, end = _counted(words, end)

@@ -91,3 +91,18 @@ def test_a_mounting_of_no_numbers_is_noted(tmp_path, x_m, noted):
     log = opened(tmp_path / "a.mcap", messages)
     assert sum("base_link → lidar" in note for note in log.notes) == noted
     assert (log.T_base_body is None) == bool(noted)
+
+
+@pytest.mark.parametrize(("is_in_tf", "expected"), [(True, "/sensors/imu"), (False, "/imu")])
+def test_of_two_imus_one_whose_frame_is_in_tf_is_chosen_and_named_with_the_setting(
+    tmp_path, is_in_tf, expected
+):
+    other = [one._replace(topic="/sensors/imu") for one in (imu(t, 9.8) for t in STAMPS_NS)]
+    apart = imu_message(
+        FIRST_NS, "/imu", rates_radps=np.ones(3), acceleration_mps2=np.array([0.0, 9.8, 0.0]), frame="apart"
+    )
+    messages = [*other, apart, *(cloud(t) for t in STAMPS_NS)]
+    tied = [transforms(("lidar", "imu", np.eye(4)))] if is_in_tf else []
+    log = opened(tmp_path / "a.mcap", [*messages, *tied])
+    assert len(log.accelerations.stamps_ns) == (len(STAMPS_NS) if is_in_tf else 1)
+    assert sum(expected in one and "source.topics.imu=" in one for one in log.choices) == 1
