@@ -94,7 +94,7 @@ HOMES = {
     "lzfse": ("mapper/sources/image_folders/record3d.py",),
     "pye57": ("mapper/sources/scan_folders/e57.py",),
     "velodyne_decoder": ("mapper/sources/velodyne_packets.py",),
-    "dpkt": ("mapper/sources/scan_folders/velodyne_pcap.py",),
+    "dpkt": ("mapper/sources/captures.py",),
     "pyarrow": ("evaluators/study/table.py",),
 }
 

@@ -24,11 +24,11 @@ from mapper.sources.image_files.decoded import DecodedColour, DecodedDepth, File
 from mapper.sources.image_files.matroska import MAGIC, Track, read_matroska
 from mapper.sources.image_files.reading import bytes_of, depth_m_from
 from mapper.sources.image_files.size import MOST_MEGAPIXELS
-from mapper.sources.image_folders.json_files import parse_json
 from mapper.sources.image_folders.pairing import ImageList, pair_images
 from mapper.sources.image_folders.posed import camera_of
 from mapper.sources.image_folders.rgbd import rgbd_log
 from mapper.sources.imu_files import accelerations_of, gyroscope_of
+from mapper.sources.json_files import parse_json
 from mapper.sources.lens import Lens
 
 _COLOUR, _DEPTH = "CALIBRATION_CameraPurposePhotoVideo", "CALIBRATION_CameraPurposeDepth"

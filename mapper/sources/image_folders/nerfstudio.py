@@ -15,9 +15,9 @@ from mapper.core.units import MM_PER_M
 from mapper.runtime.regular_files import read_text
 from mapper.sources.calibration_file import read_calibration
 from mapper.sources.config import SourceConfig
-from mapper.sources.image_folders.json_files import read_json
 from mapper.sources.image_folders.numbered import RATE_HZ, NumberedPair, stamped
 from mapper.sources.image_folders.posed import PosedFrame, PosedFrames, camera_of, pose_of_opengl
+from mapper.sources.json_files import read_json
 from mapper.sources.listed_files import within
 
 FILES = ("transforms.json",)

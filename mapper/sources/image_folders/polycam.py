@@ -13,7 +13,6 @@ from mapper.core.errors import SourceError
 from mapper.core.units import MM_PER_M
 from mapper.sources.config import SourceConfig
 from mapper.sources.image_files.confidence import confident_depths
-from mapper.sources.image_folders.json_files import read_json
 from mapper.sources.image_folders.numbered import RATE_HZ, NumberedPair, stamped
 from mapper.sources.image_folders.posed import (
     PosedFrame,
@@ -22,6 +21,7 @@ from mapper.sources.image_folders.posed import (
     median_camera,
     pose_of_opengl,
 )
+from mapper.sources.json_files import read_json
 from mapper.sources.listed_files import refuse_links_out
 
 FILES = ("keyframes/*cameras/*.json", "keyframes/*images/*", "keyframes/depth/*.png")

@@ -23,7 +23,6 @@ from mapper.sources.image_files.confidence import NOTE, without_low_confidence
 from mapper.sources.image_files.decoded import DecodedColour, DecodedDepth
 from mapper.sources.image_files.reading import TUM_UNITS_PER_M, bytes_of, decode_colour, decode_grey
 from mapper.sources.image_files.size import MOST_MEGAPIXELS
-from mapper.sources.image_folders.json_files import parse_json
 from mapper.sources.image_folders.numbered import stamp_at
 from mapper.sources.image_folders.posed import (
     PosedFrame,
@@ -32,6 +31,7 @@ from mapper.sources.image_folders.posed import (
     median_camera,
     pose_of_opengl,
 )
+from mapper.sources.json_files import parse_json
 from mapper.sources.listed_files import refuse_links_out
 from mapper.sources.text import poses_from_numbers
 

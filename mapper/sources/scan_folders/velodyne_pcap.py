@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from ipaddress import ip_address
 from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
@@ -10,24 +11,16 @@ import numpy as np
 
 from mapper.core.errors import DataError, FrameError, SourceError
 from mapper.core.frames import Scan
-from mapper.core.timebase import NS_PER_S
-from mapper.runtime.extras import extra
 from mapper.sources.base import ImageFiles, Log
+from mapper.sources.captures import ENDINGS, Datagram, captured
 from mapper.sources.config import SourceConfig
 from mapper.sources.ros.cloud_messages import scan_from
 from mapper.sources.ros.messages import CloudMessage
 from mapper.sources.text import time_order
 from mapper.sources.velodyne_packets import PACKET_BYTES, decode_packets, require_decoder
 
-_ENDINGS = (".pcap", ".pcapng")
 _LEAST_SHARE = 0.5
 """Share of the usual number of packets that a turn must have: the first and the last one are cut."""
-
-
-class _Packet(NamedTuple):
-    received_ns: int
-    sender: bytes
-    payload: bytes
 
 
 class _Turn(NamedTuple):
@@ -41,7 +34,7 @@ class _Turn(NamedTuple):
 
 def recognise(path: Path) -> bool:
     """Return whether a path is named as a capture."""
-    return path.suffix.lower() in _ENDINGS and path.is_file()
+    return path.suffix.lower() in ENDINGS and path.is_file()
 
 
 def read_log(path: Path, config: SourceConfig) -> Log:
@@ -61,8 +54,9 @@ def read_log(path: Path, config: SourceConfig) -> Log:
     sender = max(by_sender, key=lambda one: sum(turn.packets for turn in by_sender[one]))
     turns, notes = by_sender[sender], []
     if len(by_sender) > 1:
-        address = ".".join(map(str, sender))
-        notes.append(f"packets of {len(by_sender)} sensors; those of {address}, the most, are mapped")
+        notes.append(
+            f"packets of {len(by_sender)} sensors; those of {ip_address(sender)}, the most, are mapped"
+        )
     usual = np.median([turn.packets for turn in turns])
     whole = [turn for turn in turns if turn.packets >= _LEAST_SHARE * usual]
     if len(whole) < len(turns):
@@ -102,8 +96,8 @@ class _TurnEntry:
             FrameError: They are damaged, or the file has changed.
         """
         where = f"{self.path}: turn at {self.stamp_ns}"
-        captured = islice(_captured(self.path, self.turn.offset), self.turn.captured)
-        packets = [packet for _, packet in captured if packet is not None and packet.sender == self.sender]
+        turn = islice(_captured(self.path, self.turn.offset), self.turn.captured)
+        packets = [packet for _, packet in turn if packet is not None and packet.sender == self.sender]
         received_ns = np.array([packet.received_ns for packet in packets], np.int64)
         try:
             points = decode_packets([packet.payload for packet in packets], received_ns, self.stamp_ns)
@@ -140,45 +134,11 @@ def _turns(path: Path) -> dict[bytes, list[_Turn]]:
     return turns
 
 
-def _captured(path: Path, offset: int | None = None) -> Iterator[tuple[int, _Packet | None]]:
+def _captured(path: Path, offset: int | None = None) -> Iterator[tuple[int, Datagram | None]]:
     """Yield the place of every captured packet from one on, and what it is if it has a data packet's size.
 
     Raises:
         SourceError: It is no capture.
     """
-    with extra("velodyne", "reading captured packets"):
-        from dpkt.pcap import UniversalReader
-    try:
-        with path.open("rb") as file:
-            try:
-                packets = iter(UniversalReader(file))
-            except Exception as error:  # the library raises whatever the bytes that it meets raise
-                raise SourceError(f"{path}: no capture of packets: {error}") from None
-            if offset is not None:
-                file.seek(offset)
-            while True:
-                place = file.tell()
-                try:
-                    received_s, data = next(packets)
-                except Exception:  # it ends, is cut off, or damaged from here on
-                    return
-                if not data:  # zeros: a file system's hole may have terabytes of them
-                    return
-                yield place, _unwrap(received_s, data)
-    except OSError as error:
-        raise SourceError(f"{path}: cannot be read: {error.strerror}") from None
-
-
-def _unwrap(received_s: float, data: bytes) -> _Packet | None:
-    """Return a UDP packet of the size of a data packet; None of any other."""
-    from dpkt.ethernet import Ethernet
-    from dpkt.ip import IP
-    from dpkt.udp import UDP
-
-    try:
-        ip = Ethernet(data).data
-    except Exception:  # damaged
-        return None
-    if not (isinstance(ip, IP) and isinstance(ip.data, UDP) and len(ip.data.data) == PACKET_BYTES):
-        return None
-    return _Packet(round(received_s * NS_PER_S), bytes(ip.src), bytes(ip.data.data))
+    for place, one in captured(path, offset):
+        yield place, one if one is not None and len(one.payload) == PACKET_BYTES else None
