@@ -32,6 +32,7 @@ FORMATS = (
     "scan_folders.kitti",
     "image_folders.stereo_pairs",
     RECORDING,
+    "scan_folders.ouster_pcap",
     "scan_folders.velodyne_pcap",
     "scan_folders.e57",
     "scan_folders.carmen",
@@ -49,6 +50,7 @@ _OTHER_FILES = {
     **dict.fromkeys(_ARCHIVES, "an archive; unpack it, and open the folder"),
     **dict.fromkeys(_VIDEOS, "a video, which has no depth; open the folder of its log"),
     **dict.fromkeys(_IMAGES, "one image; open the folder of its log"),
+    ".osf": "an Ouster's own format; with pip install ouster-sdk: ouster-cli source X.osf save X.pcap",
 }
 """What files are that are no logs, and what to do, by their ending."""
 

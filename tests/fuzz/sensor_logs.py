@@ -1,4 +1,4 @@
-"""Small logs of stereo cameras, lasers and scanners, and of a Velodyne's packets, for the corpus."""
+"""Small logs of stereo cameras, lasers and scanners, and of LiDARs' packets, for the corpus."""
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -8,6 +8,7 @@ import numpy as np
 from tests.support.driver_recordings import street, write_pcap, write_vlp16
 from tests.support.e57_files import fields as e57_fields
 from tests.support.e57_files import write as write_e57
+from tests.support.ouster_packets import imu_packet, simulated, write_capture, write_recording
 from tests.support.planar_drives import Drive, Laser, drive, hall, write_carmen, write_ros
 from tests.support.recordings import write
 from tests.support.stereo_rig import (
@@ -28,6 +29,15 @@ def _velodyne(folder: Path) -> Path:
 
 def _pcap(folder: Path) -> Path:
     return write_pcap(folder / "log.pcap", street(azimuth_steps=90, duration_s=0.3), packets=200)
+
+
+def _ouster(folder: Path, *, is_captured: bool) -> Path:
+    log = street(azimuth_steps=64, duration_s=0.4).log()
+    sensor, lidar, imu = simulated(log, rings_deg=np.linspace(-15.0, 15.0, 16).tolist(), columns=64)
+    imu = [(lidar[0][0] + i, imu_packet(lidar[0][0] + i, np.ones(3), np.ones(3))) for i in range(3)]
+    if is_captured:
+        return write_capture(folder / "log.pcap", lidar, imu, metadata=sensor.metadata())
+    return write_recording(folder / "log.bag", lidar, imu, metadata=sensor.metadata(flat=True))
 
 
 def _stereo(folder: Path) -> Path:
@@ -52,6 +62,8 @@ def _laser() -> Drive:
 SENSOR_LOGS: Mapping[str, Callable[[Path], Path]] = {
     "bag, velodyne": _velodyne,
     "pcap": _pcap,
+    "pcap, ouster": lambda folder: _ouster(folder, is_captured=True),
+    "bag, ouster": lambda folder: _ouster(folder, is_captured=False),
     "rosbag2, stereo": _stereo,
     "euroc": _euroc,
     "euroc, kalibr": lambda folder: write_euroc(folder / "log", FISHEYE, kalibr=True),

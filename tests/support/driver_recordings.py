@@ -29,6 +29,7 @@ _DEFINITIONS = {
     "CustomPoint[] points",
     "VelodynePacket": "time stamp\nuint8[1206] data",
     "VelodyneScan": "std_msgs/Header header\nVelodynePacket[] packets",
+    "PacketMsg": "uint8[] buf",
 }
 _VLP16_RINGS_DEG = np.array([-15, 1, -13, 3, -11, 5, -9, 7, -7, 9, -5, 11, -3, 13, -1, 15])
 _FIRING_S, _SEQUENCE_S, _SEQUENCES = 2.304e-6, 55.296e-6, 24

@@ -9,6 +9,7 @@ from mapper.runtime.regular_files import read_text
 from mapper.sources.base import Log
 from mapper.sources.config import SourceConfig
 from mapper.sources.listed_files import refuse_links_out
+from mapper.sources.ros.ouster_recording import OusterRecording
 from mapper.sources.ros.reader import RecordingReader
 from mapper.sources.ros.recording import Recording
 from mapper.sources.ros.source import recording_log
@@ -44,7 +45,7 @@ def open_recording(path: Path) -> Recording:
         SourceError: The file, or every file of the folder, is not what its name says or cannot be read.
     """
     if not path.is_dir():
-        return _opened(path)
+        return OusterRecording(_opened(path))
     from mapper.sources.ros.ros2_bag import JoinedRecording
 
     files = _parts(path)
@@ -65,7 +66,7 @@ def open_recording(path: Path) -> Recording:
     ]
     others = [one.name for one in path.glob("*") if one.suffix in _ENDINGS and one not in files]
     lost += [f"{name}: another recording, which is not read; open it alone" for name in sorted(others)]
-    return JoinedRecording(path, sorted(parts, key=_begin_ns), lost=lost)
+    return OusterRecording(JoinedRecording(path, sorted(parts, key=_begin_ns), lost=lost))
 
 
 def _begin_ns(part: Recording) -> int:

@@ -205,6 +205,9 @@ LIVOX = frozenset(
 )
 VELODYNE = frozenset({"velodyne_msgs/msg/VelodyneScan"})
 DRIVER_CLOUDS = LIVOX | VELODYNE
+OUSTER_PACKETS = frozenset(
+    f"{package}/msg/PacketMsg" for package in ("ouster_ros", "ouster_sensor_msgs", "ouster_msgs")
+)
 LASERS = frozenset({"sensor_msgs/msg/LaserScan", "foxglove.LaserScan"})
 CLOUDS = frozenset({"sensor_msgs/msg/PointCloud2", "foxglove.PointCloud"}) | DRIVER_CLOUDS | LASERS
 IMUS = frozenset({"sensor_msgs/msg/Imu"})

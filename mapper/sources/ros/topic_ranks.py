@@ -46,8 +46,8 @@ def cloud_rank(name: str) -> tuple[int, ...]:
 
 
 def plain_rank(name: str) -> tuple[int, ...]:
-    """Rank topics of few namespaces first."""
-    return (name.count("/"),)
+    """Rank topics of few namespaces first, and packets last."""
+    return int("packets" in name), name.count("/")
 
 
 def fix_rank(topic: Topic) -> tuple[int, ...]:

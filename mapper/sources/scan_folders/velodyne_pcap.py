@@ -48,8 +48,9 @@ def read_log(path: Path, config: SourceConfig) -> Log:
     by_sender = _turns(path)
     if not by_sender:
         raise SourceError(
-            f"{path}: no packets of a Velodyne in it (UDP, {PACKET_BYTES} bytes); play those of another "
-            "LiDAR through its driver and record the clouds"
+            f"{path}: no packets of a Velodyne in it (UDP, {PACKET_BYTES} bytes), nor whole ones of an "
+            "Ouster (a filter by port keeps the first fragments alone); play those of another LiDAR through "
+            "its driver and record the clouds"
         )
     sender = max(by_sender, key=lambda one: sum(turn.packets for turn in by_sender[one]))
     turns, notes = by_sender[sender], []
