@@ -10,7 +10,7 @@ from mapper.core.trajectory import Trajectory
 from mapper.mapping.cloud import CloudBuilder, height_colors
 from mapper.mapping.colouring import ScanColouring
 from mapper.mapping.config import FuseSettings
-from mapper.mapping.placed_frames import PlacedFrame, placed_frames, within_reach
+from mapper.mapping.placed_frames import PlacedFrame, fused_frames, within_reach
 from mapper.octree.moving_objects import MovingObjects
 from mapper.octree.ray_casting import depth_limit_of
 from mapper.runtime.ordered_map import ordered_map
@@ -41,7 +41,7 @@ def fuse_clouds(
     """
     still, moving = CloudBuilder(config.cloud.voxel_m), CloudBuilder(config.cloud.voxel_m)
     stride = config.cloud.frame_stride
-    frames = [frame for frame in placed_frames(source, trajectory) if frame.index % stride == 0]
+    frames = [frame for frame in fused_frames(source, trajectory) if frame.index % stride == 0]
     depth_limit, begin_ns = depth_limit_of(config.octree), int(trajectory.stamps_ns[0])
 
     colouring = ScanColouring(source.images, trajectory) if source.images else None
@@ -53,13 +53,16 @@ def fuse_clouds(
         except FrameError:
             return None
         scan, _ = within_reach(scan, frame.T_world_body, config.octree)
-        if depth_limit is not None:
+        if depth_limit is not None and frame.sensor == "rgbd":
             scan, _ = depth_limit.split(scan)
         R, t = (part.astype(np.float32) for part in (frame.T_world_body[:3, :3], frame.T_world_body[:3, 3]))
         points_world, colors, has_color = scan.points_body @ R.T + t, scan.colors, None
         if colors is None and colouring is not None:
             colors, has_color = colouring.colour(points_world, scan.stamp_ns)
-        elif colors is None:  # the sensor has no colour: heights are shown by it
+        elif colors is None and source.has_colours:  # those of a LiDAR beside a camera
+            colors = np.zeros(scan.points_body.shape, np.uint8)
+            has_color = np.zeros(len(colors), np.bool_)
+        elif colors is None:  # no sensor has colours: heights are shown by them
             colors = height_colors(points_world[:, 2], between_m=_COLOURED_HEIGHTS_M)
         cloud = Cloud(points_world, colors, scan.intensities)
         moved = np.zeros(len(cloud), np.bool_) if objects is None else objects.returns_of(points_world)

@@ -10,12 +10,11 @@ from numpy.typing import NDArray
 from mapper.core.errors import FrameError
 from mapper.core.frames import Points32
 from mapper.core.geometry import Array, Transform, apply, inverse
-from mapper.core.timebase import NS_PER_S, nearest
+from mapper.core.timebase import nearest
 from mapper.core.trajectory import Trajectory
+from mapper.mapping.placed_frames import MOST_APART_NS
 from mapper.sources.base import CameraImages
 
-_MOST_APART_NS = NS_PER_S // 2
-"""An image farther in time from a scan, or from the next pose of the path, colours nothing."""
 _IN_FRONT = 0.8
 """What lies nearer than this share of a depth covers it. Of ground and walls at grazing angles, points of
 one cell differ by less up to 40 m before a car, or 10 m before a small robot."""
@@ -50,7 +49,7 @@ class ScanColouring:
         for images in self._images:
             (index,), (apart_ns,) = nearest(images.stamps_ns, np.array([stamp_ns]))
             T_world_body = self._pose(int(images.stamps_ns[index]))
-            if T_world_body is None or apart_ns > _MOST_APART_NS:
+            if T_world_body is None or apart_ns > MOST_APART_NS:
                 continue
             T_camera_world = inverse(T_world_body @ images.T_body_camera)
             points, pixels = _visible(apply(T_camera_world, points_world.astype(np.float64)), images)
@@ -71,7 +70,7 @@ class ScanColouring:
         """Return T_world_body at an image's time; None where it is too far from any pose."""
         stamps_ns = self._trajectory.stamps_ns
         _, (apart_ns,) = nearest(stamps_ns, np.array([stamp_ns]))
-        if apart_ns > _MOST_APART_NS:
+        if apart_ns > MOST_APART_NS:
             return None
         return self._trajectory.at(int(np.clip(stamp_ns, stamps_ns[0], stamps_ns[-1])))
 

@@ -7,14 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from mapper.core.errors import DataError, FrameError
-from mapper.core.frames import Cloud, Frame, PinholeCamera, Points32, RgbdFrame, Scan
+from mapper.core.frames import Cloud, Frame, PinholeCamera, Points32, RgbdFrame, Scan, Sensor
 from mapper.core.geometry import Transform
 from mapper.core.trajectory import Trajectory
 from mapper.core.voxel_grid import thin
 from mapper.mapping.cloud_fusion import fuse_clouds
 from mapper.mapping.config import AppliedEdit, Edits, FuseSettings, McapConfig
 from mapper.mapping.edits import MapEditor
-from mapper.mapping.placed_frames import PlacedFrame, placed_frames, within_reach
+from mapper.mapping.placed_frames import PlacedFrame, fused_frames, sensor_paths, within_reach
 from mapper.mapping.thumbnails import encode_jpeg, shrunk_camera
 from mapper.navigation.reachable_floor import driven_ground, reachable_floor
 from mapper.navigation.traversable_grid import traversable
@@ -36,6 +36,10 @@ from mapper.registration.config import VOXEL_M
 from mapper.runtime.ordered_map import ordered_map
 from mapper.runtime.progress import Progress
 from mapper.sources.base import Log, Skipped
+
+_FARTHEST_VOXELS = 500
+"""Longest ray, in voxels, of a LiDAR beside a depth camera, whose voxels are small: 25 m in voxels of 5 cm.
+Rays of 100 m would take 50 times the memory, and the maps of the camera end at some metres."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -144,6 +148,8 @@ def fuse_log(
 ) -> Maps:
     """Fuse every frame of the trajectory, in time order; decoding and casting run ahead in threads.
 
+    Frames of the sensors beside the tracked one are fused too, at the poses of the path at their times.
+
     Then what moved is removed, unless ``octree.moving`` keeps it, and the edits by hand are made. The cached
     update of a frame whose pose is the same is merged without reading the frame, to the same bits.
 
@@ -246,19 +252,22 @@ def _fuse_scans(
         cached = None  # updates have no colours
     log_stride = 0 if on_snapshot is None else config.mcap.image_stride
     jobs = _jobs(source, trajectory, config, cached, log_stride=log_stride)
-    casters, moved, unreached = _Casters(config.octree), 0, 0
-    prepared = ordered_map(lambda job: _prepared(job, config, casters.caster), jobs, workers=config.workers)
+    casters, moved, unreached = _Casters(config.octree, source.sensor), 0, 0
+    total = sum(len(path) for _, path in sensor_paths(source, trajectory))
+    T_world_camera: list[Transform | None] = []
+    prepared = ordered_map(lambda job: _prepared(job, config, casters), jobs, workers=config.workers)
     with progress.stage("fuse") as report:
         for done, one in enumerate(prepared, start=1):
-            report(done, len(trajectory))
+            report(done, total)
             if isinstance(one, Skipped):
                 progress.note(f"not fused: {one.reason}")
                 continue
             if one.scan is not None and config.octree.attributes:
-                octree.insert(one.scan, one.job.frame.T_world_body)
+                octree.insert(one.scan, one.job.frame.T_world_body, casters.of(one.job.frame.sensor))
             else:
                 octree.merge(one.update)
             updates.add(one.cached)
+            T_world_camera.append(one.cached.T_world_body if one.job.frame.sensor == "rgbd" else None)
             moved += one.job.cached is None
             unreached += one.unreached
             if one.snapshot is not None and on_snapshot is not None:
@@ -269,22 +278,37 @@ def _fuse_scans(
             f"origin, beyond the reach of {config.octree.resolution_m:g} m voxels; left out"
         )
     if cached is not None:
-        progress.note(f"fused again: {moved} of {len(trajectory)} frames, which had moved or were not known")
+        progress.note(f"fused again: {moved} of {total} frames, which had moved or were not known")
     if config.octree.moving != "removed":
         return octree, None
     with updates.reopen() as written:
         return octree, remove_moving_objects(
-            octree,
-            written.replay(workers=config.workers),
-            T_world_camera=written.poses_world if source.sensor == "rgbd" else None,
+            octree, written.replay(workers=config.workers), T_world_camera=T_world_camera
         )
 
 
-class _Casters(threading.local):
-    """A caster for every thread."""
+def _rays_of(config: OctreeConfig, sensor: Sensor, tracked: Sensor) -> OctreeConfig:
+    """Return the settings of a sensor's rays: only a depth camera's are limited by the noise of depth."""
+    if sensor == "rgbd" or (sensor == tracked and config.depth_noise is None):
+        return config
+    range_m = config.max_range_m
+    if range_m is None and tracked == "rgbd":
+        range_m = _FARTHEST_VOXELS * config.resolution_m
+    return config.model_copy(update={"depth_noise": None, "max_range_m": range_m})
 
-    def __init__(self, config: OctreeConfig) -> None:
-        self.caster = Caster(config)
+
+class _Casters(threading.local):
+    """A caster for every thread and sensor."""
+
+    def __init__(self, config: OctreeConfig, tracked: Sensor) -> None:
+        self._config, self._tracked = config, tracked
+        self._by_sensor: dict[Sensor, Caster] = {}
+
+    def of(self, sensor: Sensor) -> Caster:
+        """Return the caster of a kind of sensor."""
+        if sensor not in self._by_sensor:
+            self._by_sensor[sensor] = Caster(_rays_of(self._config, sensor, self._tracked))
+        return self._by_sensor[sensor]
 
 
 def _jobs(
@@ -295,19 +319,16 @@ def _jobs(
     *,
     log_stride: int,
 ) -> Iterator[_Job]:
-    for frame in placed_frames(source, trajectory):
-        update = None
-        if cached is not None and (
-            source.sensor == "rgbd" or _neighbours_hold(cached, trajectory, frame.index, config.octree)
-        ):
-            update = cached.lookup(frame.entry.stamp_ns, frame.T_world_body, config=config.octree)
+    for frame in fused_frames(source, trajectory):
+        update, rays = None, _rays_of(config.octree, frame.sensor, source.sensor)
+        if cached is not None and (frame.sensor == "rgbd" or _neighbours_hold(cached, frame, rays)):
+            update = cached.lookup(frame.entry.stamp_ns, frame.T_world_body, config=rays)
         yield _Job(frame, update, is_logged=log_stride > 0 and frame.index % log_stride == 0)
 
 
-def _neighbours_hold(
-    cached: ScanUpdateFile, trajectory: Trajectory, index: int, config: OctreeConfig
-) -> bool:
+def _neighbours_hold(cached: ScanUpdateFile, frame: PlacedFrame, config: OctreeConfig) -> bool:
     """Return whether the poses before and after one still hold: a scan is deskewed between them."""
+    trajectory, index = frame.trajectory, frame.index
     return all(
         cached.holds(int(trajectory.stamps_ns[neighbour]), trajectory.T_world_body[neighbour], config=config)
         for neighbour in (index - 1, index + 1)
@@ -315,9 +336,10 @@ def _neighbours_hold(
     )
 
 
-def _prepared(job: _Job, config: FuseSettings, caster: Caster) -> _Prepared | Skipped:
+def _prepared(job: _Job, config: FuseSettings, casters: _Casters) -> _Prepared | Skipped:
     """Read and cast one frame as far as needed: images cost most, and cached updates nothing."""
     frame, scan, snapshot = job.frame, None, None
+    caster = casters.of(frame.sensor)
     try:
         if job.is_logged or config.octree.attributes:
             loaded = frame.entry.load()

@@ -1,19 +1,24 @@
 """Frames of a log at their final poses, read as the maps take them."""
 
+import heapq
 from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
 from mapper.core.deskew import deskewed
-from mapper.core.frames import Frame, Scan
+from mapper.core.frames import Frame, Scan, Sensor
 from mapper.core.geometry import Transform
+from mapper.core.timebase import NS_PER_S, nearest
 from mapper.core.trajectory import Trajectory
 from mapper.octree.config import OctreeConfig
 from mapper.octree.ray_casting import reach_m
 from mapper.sensing.gyroscope import Gyroscope
 from mapper.sensing.sweep_motion import motion_during
 from mapper.sources.base import FrameRef, Log
+
+MOST_APART_NS = NS_PER_S // 2
+"""Time from the next pose of the path beyond which nothing is said of where another sensor was."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -22,14 +27,16 @@ class PlacedFrame:
 
     Attributes:
         entry: The frame.
+        sensor: What took it.
         index: Index of its pose in the trajectory.
         T_world_body: (4, 4) its final pose.
-        trajectory: Final poses of all frames.
+        trajectory: Final poses of all frames of the same sensor.
         gyroscope: Readings of the log, for deskewing.
         wheels: T_odom_body of the log, for the same.
     """
 
     entry: FrameRef
+    sensor: Sensor
     index: int
     T_world_body: Transform
     trajectory: Trajectory
@@ -49,7 +56,27 @@ def placed_frames(source: Log, trajectory: Trajectory) -> Iterator[PlacedFrame]:
     for entry in source.entries_of(index_of):
         index = index_of[entry.stamp_ns]
         T_world_body = trajectory.T_world_body[index]
-        yield PlacedFrame(entry, index, T_world_body, trajectory, source.gyroscope, source.wheels)
+        yield PlacedFrame(
+            entry, source.sensor, index, T_world_body, trajectory, source.gyroscope, source.wheels
+        )
+
+
+def sensor_paths(source: Log, trajectory: Trajectory) -> list[tuple[Log, Trajectory]]:
+    """Return a log with its path, and the sensors beside it with theirs, where the path has poses nearby."""
+    paths = [(source, trajectory)]
+    for sensor in source.beside:
+        stamps_ns = sensor.log.stamps_ns
+        _, apart_ns = nearest(trajectory.stamps_ns, stamps_ns)
+        is_near = (apart_ns <= MOST_APART_NS) & (stamps_ns >= trajectory.stamps_ns[0])
+        path = trajectory.interpolate(stamps_ns[is_near & (stamps_ns <= trajectory.stamps_ns[-1])])
+        paths.append((sensor.log, Trajectory(path.stamps_ns, path.T_world_body @ sensor.T_body_sensor)))
+    return paths
+
+
+def fused_frames(source: Log, trajectory: Trajectory) -> Iterator[PlacedFrame]:
+    """Yield the frames that have a pose, of a log and of the sensors beside it, in the order of time."""
+    frames = [placed_frames(log, path) for log, path in sensor_paths(source, trajectory)]
+    return heapq.merge(*frames, key=lambda frame: frame.entry.stamp_ns)
 
 
 def within_reach(scan: Scan, T_world_body: Transform, config: OctreeConfig) -> tuple[Scan, int]:

@@ -82,32 +82,38 @@ class OctreeMap(MapView):
             raise MapFileError(f"{path}: want a name that ends in {', '.join(writers)}")
         writers[path.suffix](path, self)
 
-    def insert(self, scan: Scan, T_world_body: Transform) -> None:
+    def insert(self, scan: Scan, T_world_body: Transform, caster: Caster | None = None) -> None:
         """Fuse one scan: a miss along every ray, a hit at its end; each voxel changes once, and a hit wins.
+
+        Args:
+            scan: The scan.
+            T_world_body: (4, 4) its pose.
+            caster: Caster of its rays, where these have limits of their own; None is that of the map.
 
         Raises:
             DataError: A point or the origin has no key.
             MapSizeError: The scan or the map would be too large; the map has not changed then.
         """
-        cast = self._caster.cast(scan, T_world_body)
+        caster = self._caster if caster is None else caster
+        cast = caster.cast(scan, T_world_body)
         try:
             slots = self.blocks.claim(cast.codes)
             if self.attributes is not None:
                 self.attributes.claim(slots[ended_blocks(cast.window.cells, cast.positions)])
         except MapSizeError:
-            self._caster.reset()
+            caster.reset()
             raise
         ray_casting_kernels.merge(
             cast.window.cells, cast.positions, slots, self.blocks.table.values, self.sensor
         )
         if self.attributes is not None:
-            if (limit := depth_limit_of(self.config)) is not None:
+            if (limit := depth_limit_of(caster.config)) is not None:
                 scan, _ = limit.split(scan)
             self.attributes.add(
                 scan.points_body,
                 T_world_body,
                 origin_world=apply(T_world_body, scan.origin_body[np.newaxis])[0],
-                config=self.config,
+                config=caster.config,
                 colors=scan.colors,
                 stamp_ns=scan.stamp_ns,
             )

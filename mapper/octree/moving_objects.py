@@ -32,8 +32,9 @@ hit and at most one aside, belong to the object. The cloud is made without them.
 What remains of the voxels that were ever hit is occupied, unless its void misses alone outweigh its hits.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from itertools import zip_longest
 from math import ceil
 
 import numpy as np
@@ -42,7 +43,7 @@ from numpy import float32, int64, uint64
 from numpy.typing import NDArray
 
 from mapper.core.frames import Points32
-from mapper.core.geometry import Array, Points, Transform
+from mapper.core.geometry import Points, Transform
 from mapper.core.voxel_index import row_of, voxel_index
 from mapper.octree.bit_planes import (
     ALL_SET,
@@ -142,7 +143,7 @@ def remove_moving_objects(
     octree: OctreeMap,
     scans: Callable[[], Iterable[ScanUpdate]],
     *,
-    T_world_camera: Array | None = None,
+    T_world_camera: Sequence[Transform | None] = (),
 ) -> MovingObjects:
     """Free the voxels of an octree in which something moved, and keep those of grazed surfaces.
 
@@ -152,7 +153,8 @@ def remove_moving_objects(
     Args:
         octree: The map of all scans; changed in place.
         scans: Returns the map's scans, in the order of time; it is called more than once.
-        T_world_camera: (S, 4, 4) poses of the depth camera that made them, z forward; None for a LiDAR.
+        T_world_camera: (4, 4) pose of the depth camera that made each, z forward; None of a LiDAR's. Empty
+            if all are of a LiDAR.
     """
     blocks = octree.blocks
     ever = np.zeros((len(blocks), WORDS), np.uint64)
@@ -221,17 +223,18 @@ def _evidence(scan: ScanUpdate, margins: NDArray[np.int64] | None) -> tuple[Word
 def _count_scans(
     octree: OctreeMap,
     scans: Iterable[ScanUpdate],
-    T_world_camera: Array | None,
+    T_world_camera: Sequence[Transform | None],
     ever: Words,
     starts: NDArray[np.int64],
     count: int,
 ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]:
     """Return (count,) hits and voids, and passes and those seen through in the longest stretch."""
     counts, misses = np.zeros((count, 2), np.int32), np.zeros((count, 3, 2), np.int32)
-    noise, margins = octree.config.depth_noise, None
-    for i, scan in enumerate(scans):
-        if T_world_camera is not None and noise is not None:
-            margins = _depth_margins(scan.codes, T_world_camera[i], noise, octree.config)
+    noise = octree.config.depth_noise
+    for scan, T in zip_longest(scans, T_world_camera):
+        margins = None
+        if T is not None and noise is not None:
+            margins = _depth_margins(scan.codes, T, noise, octree.config)
         _count(*_evidence(scan, margins), _slots_of(octree.blocks, scan), ever, starts, counts, misses)
     around = misses[:, _FIRST] + misses[:, _NOW]
     return *counts.T, *np.maximum(misses[:, _LONGEST], around, out=around).T

@@ -21,7 +21,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from mapper.core.errors import DataError, MapFileError
-from mapper.core.geometry import Array, Transform, angle_between
+from mapper.core.geometry import Transform, angle_between
 from mapper.core.units import MIB
 from mapper.octree.config import OctreeConfig
 from mapper.octree.keys import BLOCK_VOXELS, PACKED_BYTES
@@ -190,11 +190,6 @@ class ScanUpdateFile:
     def __len__(self) -> int:
         """Return the number of frames."""
         return len(self._heads)
-
-    @property
-    def poses_world(self) -> Array:
-        """(S, 4, 4) poses at which the frames were cast, in the order of the file."""
-        return np.array([head["T_world_body"] for head, _ in self._heads.values()]).reshape(-1, 4, 4)
 
     def entries(self, first: int = 0) -> Iterator[CachedUpdate]:
         """Yield every frame's update, in the order of the file, from the ``first``-th on."""

@@ -247,11 +247,13 @@ def _write_counts(writer: RunWriter, maps: Maps, trajectory: Trajectory) -> None
 def _with_depth_noise(writer: RunWriter, source: Log, config: BuildConfig, progress: Progress) -> BuildConfig:
     """Return the settings with the noise of the log's camera, which limits the depth that counts."""
     octree = config.octree
-    if source.sensor != "rgbd" or octree.max_range_m is not None:
+    logs = (source, *(sensor.log for sensor in source.beside))
+    camera = next((log for log in logs if log.sensor == "rgbd"), None)
+    if camera is None or octree.max_range_m is not None:
         writer.update(depth=None)
         return config
     given = octree.depth_noise or getattr(config.odometry, "depth_noise", None)
-    measured = measure_noise(source, given=given, workers=config.workers)
+    measured = measure_noise(camera, given=given, workers=config.workers)
     settings = octree.model_copy(update={"depth_noise": measured.noise})
     limit_m = DepthLimit(measured.noise, max_sigma_m=octree.resolution_m).depth_m
     reach = DepthReach(

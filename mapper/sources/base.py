@@ -163,6 +163,19 @@ class CameraImages:
         return f"the cloud gets its colours from {self.name}"
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class SensorBeside:
+    """A sensor beside the one that is tracked, which is fused at the poses of its path.
+
+    Attributes:
+        log: The sensor's frames, in a body of its own.
+        T_body_sensor: (4, 4) pose of that body in the tracked one.
+    """
+
+    log: "Log"
+    T_body_sensor: Transform
+
+
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Log:
     """A recorded log: the same frames in time order, however often it is read.
@@ -180,6 +193,7 @@ class Log:
         gyroscope: Gyroscope readings, if the log has them.
         gnss: Fixes of a GNSS receiver, if the log has them.
         images: Images of the cameras beside a LiDAR, which colour its cloud.
+        beside: Sensors whose frames are fused too; no two frames, nor one of the log, have the same stamp.
         T_base_body: Mounting of the body on the robot, whose base has x forward and z up (REP 103), if the
             log states it.
         base_frame: Name of the robot's base in the log.
@@ -204,6 +218,7 @@ class Log:
     gyroscope: Gyroscope | None = None
     gnss: GnssFixes | None = None
     images: Sequence[CameraImages] = ()
+    beside: Sequence[SensorBeside] = ()
     T_base_body: Transform | None = None
     base_frame: str = ""
     body_frame: str = ""

@@ -1,7 +1,7 @@
 """Settings of a log: which part is used, and what its files do not state."""
 
 from pathlib import Path
-from typing import Self
+from typing import Literal, Self
 
 from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, model_validator
 
@@ -74,6 +74,9 @@ class TopicsConfig(Config):
     """True poses (Odometry, PoseStamped, TransformStamped); None is /ground_truth, if there is one."""
     wheels: str | None = None
     """Wheel odometry (Odometry, PoseStamped, TransformStamped); None is /wheel_odometry, if there is one."""
+    others: Literal["fused", "unused"] = "fused"
+    """Whether other LiDARs and the RGB-D camera beside the sensor that is tracked are fused into the maps, at
+    the poses of its path, where tf says how they are mounted."""
 
 
 class WheelsConfig(Config):

@@ -59,7 +59,7 @@ def chained(first: Log, second: Log, *, shift_ns: int | None = None) -> Log:
     end_ns, begin_ns = int(first.stamps_ns[-1]), int(second.stamps_ns[0])
     if shift_ns is None:
         shift_ns = 0 if begin_ns > end_ns else end_ns + _PAUSE_NS - begin_ns
-    sessions = (*sessions_of(first), Session(_shifted(second, shift_ns), shift_ns))
+    sessions = (*sessions_of(first), Session(shifted(second, shift_ns), shift_ns))
     logs = [session.log for session in sessions]
     truth, notes = _joined_truth(logs)
     notes += [f"{log.name}: {note}" for log in logs for note in log.notes]
@@ -89,6 +89,7 @@ def chained(first: Log, second: Log, *, shift_ns: int | None = None) -> Log:
         truth=truth,
         gyroscope=_joined_gyroscope(logs),
         images=[images for log in logs for images in log.images],
+        beside=[sensor for log in logs for sensor in log.beside],
         T_base_body=logs[0].T_base_body,
         base_frame=logs[0].base_frame,
         body_frame=logs[0].body_frame,
@@ -103,7 +104,7 @@ def sessions_of(log: Log) -> Sequence[Session]:
     return log.sessions or (Session(log, 0),)
 
 
-def _shifted(log: Log, shift_ns: int) -> Log:
+def shifted(log: Log, shift_ns: int) -> Log:
     """Return a log on a clock that is ahead of its own."""
     if not shift_ns:
         return log
@@ -118,6 +119,7 @@ def _shifted(log: Log, shift_ns: int) -> Log:
         gyroscope=_later(log.gyroscope, shift_ns),
         gnss=_later(log.gnss, shift_ns),
         images=[replace(one, stamps_ns=one.stamps_ns + shift_ns) for one in log.images],
+        beside=[replace(one, log=shifted(one.log, shift_ns)) for one in log.beside],
     )
 
 

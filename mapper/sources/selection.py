@@ -50,7 +50,8 @@ def selected(log: Log, config: SourceConfig) -> Log:
         return log
     used = np.flatnonzero(is_used)
     notes.append(f"{len(used)} of {total} frames selected")
-    return replace(log.subset(used), notes=notes)
+    beside = [replace(one, log=one.log[:: config.stride]) for one in log.beside]
+    return replace(log.subset(used), beside=beside, notes=notes)
 
 
 def too_few_text(frames: int, least: float, notes: Iterable[str]) -> str:

@@ -79,10 +79,16 @@ def left_out(source: Log, kind: LogKind) -> list[str]:
         "angular velocities": source.gyroscope is not None,
         "GNSS fixes": source.gnss is not None,
         "images beside the LiDAR": len(source.images) > 0,
+        "frames of the sensors beside it": len(source.beside) > 0,
         "the plane of a 2D laser's scans": source.sensor == "lidar-2d",
         "the noise of its depth": source.depth_noise is not None,
     }
-    of_all = ["images beside the LiDAR", "the plane of a 2D laser's scans", "the noise of its depth"]
+    of_all = [
+        "images beside the LiDAR",
+        "frames of the sensors beside it",
+        "the plane of a 2D laser's scans",
+        "the noise of its depth",
+    ]
     no_place: dict[LogKind, list[str]] = {
         "mbag": ["wheel odometry", "device poses", "angular velocities", "GNSS fixes"],
         "mcap": ["device poses"],

@@ -14,6 +14,7 @@ from mapper.sources.ros.message_index import Series, why_unread
 from mapper.sources.ros.messages import READ
 from mapper.sources.ros.reader import SAME_CLOCK_NS, RecordingReader
 from mapper.sources.ros.recorded_frames import lidar_frames, rgbd_frames, stereo_frames
+from mapper.sources.ros.sensors_beside import sensors_beside
 from mapper.sources.ros.topics import CameraTopics, Choice, StereoTopics, choose
 
 
@@ -72,8 +73,9 @@ def recording_log(reader: RecordingReader, config: SourceConfig) -> Log:
     tf_notes = [
         f"tf {link}: its poses are not finite or have no direction; left out" for link in reader.tree.damaged
     ]
-    beside = [images_beside(reader, camera, body=frames.body) for camera in choice.cameras]
-    images = [one for one in beside if isinstance(one, CameraImages)]
+    cameras = [images_beside(reader, camera, body=frames.body) for camera in choice.cameras]
+    images = [one for one in cameras if isinstance(one, CameraImages)]
+    beside, beside_choices = sensors_beside(reader, choice.beside, frames, config)
     return Log(
         path=recording.path,
         name=recording.path.resolve().stem,
@@ -86,6 +88,7 @@ def recording_log(reader: RecordingReader, config: SourceConfig) -> Log:
         gyroscope=gyroscope,
         gnss=gnss,
         images=images,
+        beside=beside,
         T_base_body=reader.mounting(frames.body),
         base_frame=reader.base_of(frames.body) or "",
         body_frame=frames.body,
@@ -93,7 +96,8 @@ def recording_log(reader: RecordingReader, config: SourceConfig) -> Log:
         depth_noise=frames.depth_noise,
         choices=[
             *choice.choices,
-            *(one.choice if isinstance(one, CameraImages) else one for one in beside),
+            *(one.choice if isinstance(one, CameraImages) else one for one in cameras),
+            *beside_choices,
         ],
         notes=[
             *choice.notes,
@@ -130,6 +134,12 @@ def _on_clock_of(main: Series, choice: Choice) -> tuple[Choice, list[str]]:
         frames = replace(frames, depth=moved(frames.depth))
     elif isinstance(frames, StereoTopics):
         frames = replace(frames, right=moved(frames.right))
+    beside = [
+        replace(one, color=moved(one.color), depth=moved(one.depth))
+        if isinstance(one, CameraTopics)
+        else moved(one)
+        for one in choice.beside
+    ]
     others = (choice.imu, choice.gyroscope, choice.gnss, choice.truth, choice.wheels)
     imu, gyroscope, gnss, truth, wheels = (one and moved(one) for one in others)
     cameras = [replace(camera, images=moved(camera.images)) for camera in choice.cameras]
@@ -142,6 +152,7 @@ def _on_clock_of(main: Series, choice: Choice) -> tuple[Choice, list[str]]:
         truth=truth,
         wheels=wheels,
         cameras=cameras,
+        beside=beside,
     )
     return followed, list(dict.fromkeys(notes))
 

@@ -10,6 +10,8 @@ import numpy as np
 
 from mapper.core.errors import SourceError
 from mapper.sources.config import TopicsConfig
+from mapper.sources.ros.camera_infos import info_of, infos_beside, without_those_of_depth
+from mapper.sources.ros.frame_tree import is_fixed
 from mapper.sources.ros.image_messages import is_depth, is_mono16
 from mapper.sources.ros.message_index import Series
 from mapper.sources.ros.messages import (
@@ -27,12 +29,10 @@ from mapper.sources.ros.messages import (
     frame_of,
 )
 from mapper.sources.ros.topic_ranks import (
-    TRANSPORTS,
     cloud_rank,
     color_rank,
     depth_rank,
     fix_rank,
-    is_called_registered,
     is_infrared,
     plain_rank,
     shared_namespaces,
@@ -116,6 +116,7 @@ class Choice:
         truth: True poses, if there are any.
         wheels: Wheel odometry, if it was requested or is called so.
         cameras: Cameras beside the clouds, one of each coordinate frame, which colour them.
+        beside: Topics of other sensors that are fused.
         choices: What is used, a sentence each.
         notes: What is not, or may be wrong, a sentence each.
     """
@@ -127,6 +128,7 @@ class Choice:
     truth: Series | None
     wheels: Series | None
     cameras: Sequence[ImageTopics]
+    beside: Sequence[Series | CameraTopics]
     choices: Sequence[str]
     notes: Sequence[str]
 
@@ -191,35 +193,41 @@ def choose(
         notes.append(f"{imu.topic.name}: its angular velocities are all 0 or no numbers; not used")
     frames: CameraTopics | StereoTopics | Series
     cameras: list[ImageTopics] = []
-    if color is not None and depth is not None and config.points is None:
-        infos = pick.all(CAMERAS)
-        info = pick.one("camera_info", config.camera_info, CAMERAS, plain_rank, where=set().__contains__)
-        own = _info_of(color, _without_those_of_depth(infos, color, depth), firsts)
-        depth_info = next((one for one in _beside(depth, infos) if one is not own), None)
-        frames = CameraTopics(color, depth, info or own, own, depth_info)
+    beside: list[Series | CameraTopics] = []
+    info = pick.one("camera_info", config.camera_info, CAMERAS, plain_rank, where=set().__contains__)
+    camera = (
+        None if color is None or depth is None else _camera(color, depth, info, pick.all(CAMERAS), firsts)
+    )
+    if camera is not None and config.points is None:
+        frames, own = camera, camera.own_info
         others = len(colors) * len(depth_images) > 1
-        chosen = f"colour {color.topic.name}, depth {depth.topic.name}"
+        chosen = f"colour {camera.color.topic.name}, depth {camera.depth.topic.name}"
         choices = [_choice_note(chosen, "color=… and source.topics.depth", others=others)]
         if info is not None and own not in (None, info):
             notes.append(f"camera info {info.topic.name} was chosen; that of the images is {own.topic.name}")
-        if points is not None:
-            choices.append(
-                f"there are point clouds too: to map those, source.topics.points={points.topic.name}"
-            )
         used, image_reason = [color, depth, points], "one camera is mapped"
+        of_camera = [frame_of(firsts.get(one.topic.name)) for one in (camera.color, camera.depth)]
+        beside += _clouds_beside(pick.all(CLOUDS), firsts, frames=of_camera)
+        if points is not None:
+            what = "there are" if points in beside and config.others == "fused" else "not used are the"
+            choices.append(
+                f"{what} point clouds {points.topic.name}: to track those, "
+                f"source.topics.points={points.topic.name}"
+            )
     elif points is not None:
         frames = points
         kind = "laser scans" if points.topic.type in LASERS else "point clouds"
         choices = [_choice_note(f"{kind} {points.topic.name}", "points", others=len(clouds) > 1)]
-        both = color is not None and depth is not None
-        image_reason = "point clouds are mapped" if both else "colour has no depth, or depth no colour"
+        image_reason = "point clouds are mapped" if camera else "colour has no depth, or depth no colour"
+        beside += _clouds_beside(pick.all(CLOUDS), firsts, frames=[frame_of(firsts.get(points.topic.name))])
+        beside += [camera] if camera else []
         if points.topic.type not in LASERS:
             cameras = _cameras(colors, pick.all(CAMERAS), firsts)
         used = [points, *(camera.images for camera in cameras)]
     elif pairs := _stereo_pairs(colors, pick.all(IMAGES)):
         left, right = pairs[0]
         infos = pick.all(CAMERAS)
-        left_info, right_info = (next(iter(_beside(one, infos)), None) for one in (left, right))
+        left_info, right_info = (next(iter(infos_beside(one, infos)), None) for one in (left, right))
         frames = StereoTopics(left, right, left_info, right_info)
         chosen = f"stereo pairs {left.topic.name} and {right.topic.name}"
         choices = [_choice_note(chosen, "color", others=len(pairs) > 1 and config.color is None)]
@@ -238,13 +246,17 @@ def choose(
         choices.append(
             _choice_note(f"wheel odometry {wheels.topic.name}", "wheels", others=config.wheels is None)
         )
+    if config.others == "unused":
+        beside = []
+    for one in beside:
+        used += [one.color, one.depth] if isinstance(one, CameraTopics) else [one]
     is_chosen = bool(config.points or config.color or config.depth)
     used = [*used, imu, gnss, truth, wheels]
     if gyroscope is not None and (feels_gravity(gyroscope) or not usual_acceleration(gyroscope) > 0.0):
         used.append(gyroscope)
     unused = [one for one in series.values() if one not in used]
     notes += unused_notes(unused, firsts, image_reason=None if is_chosen else image_reason)
-    return Choice(frames, imu, gyroscope, gnss, truth, wheels, cameras, choices, notes)
+    return Choice(frames, imu, gyroscope, gnss, truth, wheels, cameras, beside, choices, notes)
 
 
 class _Picker:
@@ -316,6 +328,37 @@ def _of_one_camera(
     return _best(colors, color_rank), min(depths, key=lambda one: one.topic.name, default=None)
 
 
+def _camera(
+    color: Series,
+    depth: Series,
+    info: Series | None,
+    infos: Sequence[Series],
+    firsts: Mapping[str, Message],
+) -> CameraTopics:
+    """Return the topics of an RGB-D camera; ``info`` is the calibration that the user chose."""
+    own = info_of(color, without_those_of_depth(infos, color, depth), firsts)
+    depth_info = next((one for one in infos_beside(depth, infos) if one is not own), None)
+    return CameraTopics(color, depth, info or own, own, depth_info)
+
+
+def _clouds_beside(
+    clouds: Sequence[Series], firsts: Mapping[str, Message], *, frames: Collection[str]
+) -> list[Series]:
+    """Return the clouds of LiDARs in other coordinate frames, of each the topic that ranks first.
+
+    Args:
+        clouds: All topics of clouds and laser scans; those that were computed from others are left out.
+        firsts: First messages.
+        frames: Coordinate frames of the sensor that is tracked.
+    """
+    found: dict[str, Series] = {}
+    for one in sorted(clouds, key=lambda one: (cloud_rank(one.topic.name), one.topic.name)):
+        frame, (is_made, *_) = frame_of(firsts.get(one.topic.name)), cloud_rank(one.topic.name)
+        if len(one) > 1 and frame and frame not in frames and not (is_made or is_fixed(frame)):
+            found.setdefault(frame, one)
+    return list(found.values())
+
+
 def _stereo_pairs(lefts: Sequence[Series], images: Sequence[Series]) -> list[tuple[Series, Series]]:
     """Return the topics of left images with those of the right ones, by their names; rectified ones first."""
     by_name = {one.topic.name: one for one in images}
@@ -340,56 +383,16 @@ def _choice_note(choice: str, option: str, *, others: bool) -> str:
     return f"{choice}; choose others with source.topics.{option}=…" if others else choice
 
 
-def _beside(image: Series, infos: Sequence[Series]) -> list[Series]:
-    """Return the calibrations in an image topic's own namespace, or in the one that it shares most with.
-
-    realsense-viewer has /device_0/sensor_1/Color_0/info/camera_info beside …/Color_0/image/data.
-    """
-    name = image.topic.name
-    for transport in TRANSPORTS:
-        name = name.removesuffix(transport)
-    own = [one for one in infos if one.topic.name.rpartition("/")[0] == name.rpartition("/")[0]]
-    if own:
-        return own
-    shared = [shared_namespaces(name, one.topic.name) for one in infos]
-    most = max(shared, default=0)
-    return [infos[shared.index(most)]] if most and shared.count(most) == 1 else []
-
-
-def _info_of(image: Series, infos: Sequence[Series], firsts: Mapping[str, Message]) -> Series | None:
-    """Return the calibration of an image topic, by its namespace or frame, or as there is no other."""
-    only = infos if len(infos) == 1 else []
-    return next(iter([*_beside(image, infos), *_of_frame(image, infos, firsts), *only]), None)
-
-
 def _cameras(
     colors: Sequence[Series], infos: Sequence[Series], firsts: Mapping[str, Message]
 ) -> list[ImageTopics]:
     """Return the calibrated cameras of some images, of each coordinate frame the one that ranks first."""
     found: dict[str, ImageTopics] = {}
     for one in sorted(colors, key=lambda one: (color_rank(one.topic.name), one.topic.name)):
-        frame, info = frame_of(firsts.get(one.topic.name)), _info_of(one, infos, firsts)
+        frame, info = frame_of(firsts.get(one.topic.name)), info_of(one, infos, firsts)
         if frame and info is not None:
             found.setdefault(frame, ImageTopics(one, info))
     return list(found.values())
-
-
-def _without_those_of_depth(infos: Sequence[Series], color: Series, depth: Series) -> list[Series]:
-    """Return the calibrations that are not the depth camera's own, by the namespaces that they share."""
-    if is_called_registered(depth.topic.name):
-        return list(infos)
-
-    def nearness(one: Series, image: Series) -> int:
-        return shared_namespaces(image.topic.name, one.topic.name)
-
-    return [one for one in infos if nearness(one, color) >= nearness(one, depth)]
-
-
-def _of_frame(image: Series, infos: Sequence[Series], firsts: Mapping[str, Message]) -> list[Series]:
-    """Return the calibration of an image's coordinate frame; none where several cameras name the same."""
-    frame = frame_of(firsts.get(image.topic.name))
-    found = [one for one in infos if frame and frame_of(firsts.get(one.topic.name)) == frame]
-    return found if len(found) == 1 else []
 
 
 def _turns(series: Series) -> bool:
