@@ -76,6 +76,7 @@ def _as_gtsam_takes(information: Array) -> tuple[Array, NDArray[np.bool_]]:
 _ORIGINS: tuple[Origin, ...] = get_args(Origin)
 _PARAMETERS = "PARAMS_"
 """Begins tags of sensors' mountings, which the g2o library writes; no edge that is read here uses one."""
+_LARGEST_ID = np.iinfo(np.int64).max
 _SHORTEST = 1e-9
 """A quaternion shorter than this has no direction."""
 
@@ -275,6 +276,11 @@ def _tables(path: Path, progress: Progress) -> dict[str, _Table]:
         progress.note(f"{path}: {uninformed} edges have no information; it is taken as identity")
     for table in tables.values():
         table.refuse(path, np.array([min(ids, default=0) < 0 for ids in table.ids]), "an id is negative")
+        too_large = np.array([max(ids, default=0) > _LARGEST_ID for ids in table.ids])
+        table.refuse(path, too_large, f"an id is more than {_LARGEST_ID}")
+    if (planar := tables.get("EDGE_SE2")) is not None:
+        turns = np.array([abs(numbers[2]) > 2.0 * np.pi for numbers in planar.numbers])
+        planar.refuse(path, turns, "it turns by more than 2π; is the angle in degrees? want radians")
     return tables
 
 

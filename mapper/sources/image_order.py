@@ -12,6 +12,10 @@ from mapper.core.timebase import NS_PER_S
 from mapper.sources.base import Log
 
 _MAX_RATE_HZ = 1000.0
+_MAX_INTERVAL_S = 15.0
+"""Milliseconds taken for seconds are more, up to 66 frames a second."""
+_STATIC = frozenset({"e57"})
+"""Formats of scanners on a tripod, which scan for minutes."""
 _PLACES, _ALL_PLACES = 6, 100
 """Places of half a log at which two consecutive images are compared; more where these are unlike."""
 _LEAST_FRAMES = 4 * _PLACES
@@ -29,13 +33,18 @@ def time_warnings(log: Log) -> list[str]:
 
 
 def _rate_warnings(log: Log) -> list[str]:
-    usual_ns = float(np.median(np.diff(log.stamps_ns))) if len(log) > 1 else np.inf
-    if usual_ns * _MAX_RATE_HZ >= NS_PER_S:
-        return []
-    return [
-        f"stamps: frames come every {usual_ns / NS_PER_S:.2g} s, which no camera or LiDAR does; are they of "
-        "another unit, or those of the file system?"
-    ]
+    usual_s = float(np.median(np.diff(log.stamps_ns))) / NS_PER_S if len(log) > 1 else 1.0
+    if usual_s * _MAX_RATE_HZ < 1.0:
+        return [
+            f"stamps: frames come every {usual_s:.2g} s, which no camera or LiDAR does; are they of another "
+            "unit, or those of the file system?"
+        ]
+    if usual_s > _MAX_INTERVAL_S and log.kind not in _STATIC:
+        return [
+            f"stamps: frames come every {usual_s:.3g} s, in which a moving sensor sees nothing again; are "
+            "they milliseconds, microseconds or nanoseconds? want seconds"
+        ]
+    return []
 
 
 def _order_warnings(log: Log) -> list[str]:

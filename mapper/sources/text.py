@@ -1,5 +1,6 @@
 """Line-by-line text files of a log, with errors that name the line, and rows put in time order."""
 
+import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -41,11 +42,17 @@ def rows(path: Path, *, separator: str | None = None) -> Iterator[tuple[int, lis
 def table(path: Path, *columns: str) -> Iterator[tuple[str, list[str]]]:
     """Yield place and words of every row of a file that has these columns; the place is for messages.
 
+    Columns may be separated by commas, and a first row of letters alone is a header.
+
     Raises:
         SourceError: As :func:`read_lines`, or a row has another number of columns.
     """
-    for number, words in rows(path):
+    for k, (number, words) in enumerate(rows(path)):
         where = f"{path}:{number}"
+        if k == 0 and re.fullmatch("[A-Za-z_,]+", "".join(words)):
+            continue
+        if len(words) != len(columns) or any(word.endswith(",") for word in words):
+            words = " ".join(words).replace(",", " ").split()
         if len(words) != len(columns):
             raise SourceError(f"{where}: {len(words)} columns, want {len(columns)}: {' '.join(columns)}")
         yield where, words

@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +19,7 @@ from mapper.sources.text import ROUNDING, poses_from_numbers
 _EUROC = re.compile(r"\s*\d{16,19}\s*,")
 _W_FIRST = re.compile(r"\bq\w*w\b.*\bq\w*x\b")
 _MULRAN_COLUMNS = 13
+_LAST_ROW = [0.0, 0.0, 0.0, 1.0]
 _NUMBER = re.compile(r"[-+.]?\d|nan|inf", re.IGNORECASE)
 
 
@@ -37,7 +38,7 @@ def read_tum(path: Path) -> Trajectory:
     stamps_ns: list[int] = []
     numbers: list[list[float]] = []
     places: list[str] = []
-    for number, words in _tum_rows(path):
+    for number, words in tum_rows(path):
         place = f"{path}:{number}"
         if len(words) != 8:
             raise DataError(f"{place}: {len(words)} columns, want 8: stamp tx ty tz qx qy qz qw")
@@ -73,7 +74,7 @@ def write_tum(path: Path, trajectory: Trajectory) -> None:
 
 
 def read_kitti(path: Path, stamps_ns: Stamps | None = None) -> Trajectory:
-    """Read one row-major 3×4 matrix a line (Geiger et al. 2012).
+    """Read one row-major 3×4 matrix a line (Geiger et al. 2012), or 4×4.
 
     Args:
         path: Pose file.
@@ -93,6 +94,8 @@ def _matrices(path: Path, lines: Iterable[tuple[int, list[str]]], stamps_ns: Sta
             row = [float(word) for word in words]
         except ValueError as error:
             raise DataError(f"{path}:{number}: {error}") from None
+        if len(row) == 16 and row[12:] == _LAST_ROW:
+            row = row[:12]
         if len(row) != 12 or not all(map(math.isfinite, row)):
             raise DataError(f"{path}:{number}: want 12 finite numbers, a row-major 3×4 pose")
         numbers.append(row)
@@ -143,8 +146,12 @@ def write_kitti(path: Path, trajectory: Trajectory) -> None:
     write_text(path, "\n".join(rows) + "\n")
 
 
-def _tum_rows(path: Path) -> Iterable[tuple[int, list[str]]]:
-    """Yield the number and the words of each line, in TUM's units and order."""
+def tum_rows(path: Path) -> Iterator[tuple[int, list[str]]]:
+    """Yield the number and the words of each line with a pose, in TUM's units and order; see `read_tum`.
+
+    Raises:
+        DataError: The file cannot be read, or a line begins as EuRoC's and has no unit quaternion.
+    """
     is_w_first = has_begun = False
     for number, line in enumerate(read_text(path, may_be_pipe=True).splitlines(), start=1):
         words = line.replace(",", " ").split()

@@ -22,6 +22,8 @@ LINE = "line"
 """Word of ``tests.fuzz.child`` before the folder that a command line is run in, and before the line."""
 
 _RESULTS = ("--out", "--plot", "--rrd")
+_LOG_FILE = "--log-file"
+"""Option that appends to a file whatever comes of the line."""
 _UNUSED = ("--page", "--spawn", "--connect", "--step", "--scheduler", "--rerun", "--warm")
 """Options that open viewers, wait for a person or for another machine, or compile all kernels."""
 _BRIEF = {
@@ -100,8 +102,15 @@ class Line:
     @property
     def results(self) -> tuple[str, ...]:
         """What it says is to be written."""
-        named = [word for option, word in zip(self.words, self.words[1:], strict=False) if option in _RESULTS]
-        return (*named, *(self.words if self.verb == ("synth",) else ()))
+        return (*self._after(*_RESULTS), *(self.words if self.verb == ("synth",) else ()))
+
+    @property
+    def log_files(self) -> list[str]:
+        """What it says is to be appended to."""
+        return self._after(_LOG_FILE)
+
+    def _after(self, *options: str) -> list[str]:
+        return [word for one, word in zip(self.words, self.words[1:], strict=False) if one in options]
 
 
 def lines(*, brief: bool = False) -> st.SearchStrategy[Line]:
@@ -201,8 +210,9 @@ class Sandbox:
     def _broken_rule(self, line: Line, reading: Reading, before: Mapping[str, str]) -> str:
         """Return what a line has changed that it must not; empty if there is nothing."""
         after = _content(self._folder)
+        logs = [*map(_within(self._folder), line.log_files)]
         lost = [name for name, what in before.items() if after.get(name) != what]
-        new = [name for name in after if name not in before]
+        new = [name for name in after if name not in before and name not in logs]
         if reading.outcome == "refused":
             # A folder that is not whole stays for inspection, or to be resumed.
             left = [name for name in new if ".partial" in name or _LEFT.get(line.verb[0], ".partial") in name]

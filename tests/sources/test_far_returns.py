@@ -80,6 +80,19 @@ def test_far_returns_of_a_message_are_left_out_and_counted():
     np.testing.assert_array_equal(scan.points_body, np.delete(points, [5, 6, 7], axis=0))
 
 
+def test_a_cloud_of_the_other_order_of_bytes_is_refused(tmp_path):
+    points = sweep().byteswap()
+    np.save(tmp_path / "1.npy", points)
+    with pytest.raises(FrameError, match="points are farther than 5000 m"):
+        ScanEntry(0, tmp_path / "1.npy", scale=1.0).load()
+    data = memoryview(
+        cloud_message("/points", Scan(0, points[np.isfinite(points).all(axis=1)]), frame="a").cdr
+    )
+    message = decode_ros(Topic("/points", "sensor_msgs/msg/PointCloud2", "cdr"), data)
+    with pytest.raises(FrameError, match="is_bigendian"):
+        scan_from(message, T_body_frame=np.eye(4), with_colours=False, where="m", scale=1.0)
+
+
 @pytest.fixture(scope="module")
 def street(tmp_path_factory) -> Path:
     """A short drive whose scan 3 has a return at 6 km, and scan 4 one at 4 km."""

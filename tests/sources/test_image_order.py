@@ -47,3 +47,8 @@ def test_a_camera_that_stands_and_one_that_goes_round_with_few_images_are_in_ord
 
 def test_frames_that_come_every_few_microseconds_are_told():
     assert len(time_warnings(passing(np.arange(60), period_ns=28_000))) == 1
+
+
+@pytest.mark.parametrize(("period_s", "told"), [(67, 1), (10, 0)])
+def test_frames_that_come_every_minute_are_told(period_s, told):
+    assert len(time_warnings(passing(np.arange(60), period_ns=period_s * 10**9))) == told

@@ -3,6 +3,7 @@ import pytest
 
 from mapper.core.errors import DataError, SourceError
 from mapper.core.geometry import apply, exp, inverse
+from mapper.core.rotations import row_of_pose
 from mapper.core.timebase import NS_PER_S
 from mapper.core.trajectory import Trajectory
 from mapper.sources import open_source
@@ -166,6 +167,16 @@ def test_a_malformed_calibration_is_refused(tmp_path, line, says):
     (scans(tmp_path) / "calib.txt").write_text(line)
     with pytest.raises(SourceError, match=says):
         open_source(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["poses.txt", "groundtruth.txt"])
+def test_poses_of_other_programs_are_the_truth(tmp_path, name):
+    T = T_WORLD_LIDAR
+    quaternions = [" ".join(map(repr, row.tolist())) for row in row_of_pose(T)]
+    tum = [f"{0.1 * i:.1f} {row}" for i, row in enumerate(quaternions)]
+    whole = [" ".join(map(repr, one.ravel().tolist())) for one in T]
+    (scans(tmp_path) / name).write_text("\n".join(whole if name == "poses.txt" else tum))
+    np.testing.assert_allclose(open_source(tmp_path).truth.T_world_body, T, atol=1e-9)
 
 
 def test_malformed_poses_are_refused(tmp_path):

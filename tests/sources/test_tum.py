@@ -271,3 +271,26 @@ def test_fractions_of_listed_stamps_without_leading_zeros_are_whole_numbers(tiny
     log = open_source(folder)
     assert log.stamps_ns.tolist() == expected_ns
     assert sum("leading zeros" in note for note in log.notes) == 2
+
+
+@pytest.mark.parametrize(
+    ("header", "separator", "slash"),
+    [("", ",", "/"), ("timestamp,filename\n", ", ", "/"), ("timestamp filename\n", "\t", "\\")],
+)
+def test_lists_of_other_programs_are_read(tiny_tum_log, header, separator, slash):
+    log = tiny_tum_log(3)
+    expected = stamps_of(open_source(log))
+    for name in ("rgb.txt", "depth.txt"):
+        lines = [line.split() for line in (log / name).read_text().splitlines() if line[0] != "#"]
+        rows = [f"{stamp}{separator}{file.replace('/', slash)}" for stamp, file in lines]
+        (log / name).write_text(header + "\n".join(rows))
+    assert stamps_of(open_source(log)) == expected
+
+
+def test_a_header_names_the_order_of_the_truths_columns(tiny_tum_log):
+    log = tiny_tum_log(3)
+    expected = open_source(log).truth.T_world_body
+    rows = [line.split() for line in (log / "groundtruth.txt").read_text().splitlines() if line[0] != "#"]
+    turned = ["timestamp,tx,ty,tz,qw,qx,qy,qz", *(",".join([*row[:4], row[7], *row[4:7]]) for row in rows)]
+    (log / "groundtruth.txt").write_text("\n".join(turned))
+    np.testing.assert_allclose(open_source(log).truth.T_world_body, expected, atol=1e-12)

@@ -5,6 +5,7 @@ from io import StringIO
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mapper.core.errors import FrameError
 from mapper.runtime.regular_files import HEAD_BYTES
@@ -22,6 +23,7 @@ _FLOAT32 = np.dtype("<f4")
 _MAX_CLASS = 1000
 _WITH_INTENSITY = (KITTIS, 5)
 """Widths of records whose fourth number is an intensity: KITTI's, and nuScenes' with a ring after it."""
+_WIDE_M = 10.0
 EMPTY = "the file is empty"
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*([eE][-+]?\d+)?|\.\d+([eE][-+]?\d+)?|nan|inf)", re.IGNORECASE)
 
@@ -58,8 +60,18 @@ def read_bin(path: Path, columns: int | None = None) -> Columns:
             "else --set source.bin_columns to the numbers of a record"
         )
     records = numbers.reshape(-1, columns or KITTIS)
+    if columns is None and _begin_with_intensity(records):
+        raise FrameError(
+            f"{path}: the first number of every record is 0 to 1 as an intensity is, and no coordinate; "
+            "want x y z intensity"
+        )
     names = ("x", "y", "z", "intensity") if records.shape[1] in _WITH_INTENSITY else ("x", "y", "z")
     return {name: records[:, column] for column, name in enumerate(names)}
+
+
+def _begin_with_intensity(records: NDArray[np.float32]) -> bool:
+    least, largest = (edge(records, axis=0, initial=0.0) for edge in (np.min, np.max))
+    return bool(least[0] == 0.0 < largest[0] <= 1.0 and (largest - least)[1:3].min() > _WIDE_M)
 
 
 def read_npy(path: Path) -> Columns:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mapper.core.errors import SourceError
+from mapper.core.errors import DataError, SourceError
 from mapper.core.trajectory import Trajectory
 from mapper.core.units import MM_PER_M
 from mapper.sources.base import Log
@@ -32,6 +32,7 @@ from mapper.sources.text import (
     time_order,
     truth_from,
 )
+from mapper.sources.trajectory_files import tum_rows
 
 DEVICE_POSES = "device_poses.txt"
 """File of a phone's own poses in a converted log, as its groundtruth.txt."""
@@ -119,13 +120,22 @@ def log_of_images(
 def read_truth(path: Path) -> tuple[Trajectory | None, list[str]]:
     """Return the truth in lines of ``stamp tx ty tz qx qy qz qw``, if any, and notes on dropped lines.
 
+    Separators and order of the columns may be others, as of :func:`mapper.sources.trajectory_files.read_tum`.
+
     Raises:
         SourceError: A line is not eight numbers.
     """
     if not path.is_file():
         return None, []
     stamps_ns, numbers = [], []
-    for where, words in table(path, "stamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw"):
+    try:
+        lines = list(tum_rows(path))
+    except DataError as error:
+        raise SourceError(f"{error}") from None
+    for number, words in lines:
+        where = f"{path}:{number}"
+        if len(words) != 8:
+            raise SourceError(f"{where}: {len(words)} columns, want 8: stamp tx ty tz qx qy qz qw")
         row = parse_numbers(words, where=where)
         has_stamp = math.isfinite(row[0])
         stamps_ns.append(parse_stamp(words[0], where=where) if has_stamp else 0)

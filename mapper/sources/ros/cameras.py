@@ -24,7 +24,7 @@ from mapper.sources.ros.message_index import Series
 from mapper.sources.ros.message_order import ordered
 from mapper.sources.ros.messages import CAMERAS, EXTRINSICS, CameraMessage, ImageMessage, Window, frame_of
 from mapper.sources.ros.reader import RecordingReader
-from mapper.sources.ros.topic_ranks import is_called_registered, shared_namespaces
+from mapper.sources.ros.topic_ranks import is_called_rectified, is_called_registered, shared_namespaces
 from mapper.sources.ros.topics import CameraTopics, ImageTopics
 from mapper.sources.text import pose_from_numbers
 
@@ -114,7 +114,9 @@ def images_beside(reader: RecordingReader, topics: ImageTopics, *, body: str) ->
         return f"{name}: colours no points, as tf does not say where {frame_of(first)} is on {body}"
     try:
         size_px = size_of(first, where=name)
-        calibration = calibration_of(info, size_px, is_rectified="rect" in name, name=topics.info.topic.name)
+        calibration = calibration_of(
+            info, size_px, is_rectified=is_called_rectified(name), name=topics.info.topic.name
+        )
         recorded = recorded_camera(calibration, colour_px=size_px, depth_px=size_px, where=name)
     except (SourceError, FrameError) as error:
         return f"{name}: colours no points: {error}"
@@ -147,7 +149,7 @@ def _colour_calibration(
             f"{reader.recording.path}: no camera info for {name}; choose one{others} with "
             "source.topics.camera_info=… or --set source.camera.fx_px=… and so on"
         )
-    return calibration_of(info, colour_px, is_rectified="rect" in name, name=series.topic.name)
+    return calibration_of(info, colour_px, is_rectified=is_called_rectified(name), name=series.topic.name)
 
 
 def _depth_camera(
@@ -179,7 +181,9 @@ def _depth_camera(
     if not (is_apart or is_other_view):
         return None, []
     if intrinsics is None and info is not None and topics.depth_info is not None:
-        intrinsics = _calibration(info, is_rectified="rect" in name, name=topics.depth_info.topic.name)
+        intrinsics = _calibration(
+            info, is_rectified=is_called_rectified(name), name=topics.depth_info.topic.name
+        )
     if intrinsics is None:
         missing = "its intrinsics are not in the log: --set source.camera.depth_intrinsics_px=[fx,fy,cx,cy]"
     elif T_color_depth is None:
@@ -270,7 +274,11 @@ def _turned_deg(T_a: Transform, T_b: Transform) -> float:
 
 def _first_info(reader: RecordingReader, series: Series | None) -> CameraMessage | None:
     info = series and reader.firsts.get(series.topic.name)
-    return info if isinstance(info, CameraMessage) else None
+    if not isinstance(info, CameraMessage):
+        return None
+    if info.K.size == 9 and not info.K.any() and info.P.size == 12 and not info.D.any():
+        return replace(info, K=info.P.reshape(3, 4)[:, :3].ravel())  # of drivers of rectified images
+    return info
 
 
 def _windowed(info: CameraMessage, image_px: Size) -> CameraMessage:

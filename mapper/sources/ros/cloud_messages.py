@@ -12,7 +12,7 @@ from mapper.core.geometry import Transform, apply
 from mapper.sources.cloud_files.raw import check_range, intensities_of, intensity_field
 from mapper.sources.point_times import relative_times_s, time_field, without_untimed
 from mapper.sources.ros.messages import CloudMessage
-from mapper.sources.valid_returns import valid_returns
+from mapper.sources.valid_returns import FARTHEST_M, valid_returns
 
 Field = tuple[str, int, str, int]
 """Name, offset in a point in bytes, numpy's name of the type with its byte order, and number of values."""
@@ -149,6 +149,11 @@ def scan_from(
     coordinates = _coordinates(points) if scale is None else _coordinates(points) * np.float32(scale)
     points_body, rows, far = valid_returns(coordinates)
     check_range(points_body, where=where, is_scaled=scale is not None)
+    if far > len(points_body) > 0:
+        raise FrameError(
+            f"{where}: {far} of {far + len(points_body)} returns are farther than {FARTHEST_M:g} m, which no "
+            "sensor reaches; is is_bigendian right, and are they metres around the sensor?"
+        )
     kept = slice(None) if rows is None else rows
     T_body_points = T_body_frame @ message.T_frame_points
     if not np.array_equal(T_body_points, np.eye(4)):

@@ -1,10 +1,11 @@
 """Recordings recognised by their names, and opened by the reader of their format."""
 
 import re
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from mapper.core.errors import SourceError
+from mapper.core.errors import SourceError, listed
 from mapper.runtime.regular_files import read_text
 from mapper.sources.base import Log
 from mapper.sources.config import SourceConfig
@@ -19,6 +20,7 @@ _UNFINISHED = ".active"
 """What rosbag appends to the name while it records, and leaves where it is killed."""
 _PACKED = ".zstd"
 _NAMED = re.compile(r"^\s*-\s*([^:\n]+\.(?:mcap|db3)(?:\.zstd)?)\s*$", re.MULTILINE)
+_PART = re.compile(r"_(\d{1,4})$")
 _IN_FOLDERS = (".mcap", ".db3", _PACKED, ".bag")
 
 
@@ -64,6 +66,9 @@ def open_recording(path: Path) -> Recording:
         for name in _named_by_rosbag2(path)
         if not (path / name).exists()
     ]
+    missing = [] if _named_by_rosbag2(path) else _missing_numbers(files)
+    if missing:
+        lost.append(f"no part {listed(missing)} between those of {files[0].name} and {files[-1].name}")
     others = [one.name for one in path.glob("*") if one.suffix in _ENDINGS and one not in files]
     lost += [f"{name}: another recording, which is not read; open it alone" for name in sorted(others)]
     return OusterRecording(JoinedRecording(path, sorted(parts, key=_begin_ns), lost=lost))
@@ -73,6 +78,14 @@ def _begin_ns(part: Recording) -> int:
     """Return when a recording begins: parts may be numbered in another order, or anew."""
     first = next(part.messages(), None)
     return 0 if first is None else first.log_ns
+
+
+def _missing_numbers(files: Sequence[Path]) -> list[str]:
+    """Return the numbers between those of LOG_0 and LOG_2 that no part has; times go in larger steps."""
+    found = [_PART.search(path.name.partition(".")[0]) for path in files]
+    numbers = {int(one[1]) for one in found if one is not None}
+    missing = sorted({*range(min(numbers, default=0), max(numbers, default=0))} - numbers)
+    return [str(one) for one in missing] if len(missing) < len(numbers) == len(files) else []
 
 
 def _named_by_rosbag2(folder: Path) -> list[str]:

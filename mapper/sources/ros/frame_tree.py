@@ -35,14 +35,20 @@ class FrameTree:
 
     Attributes:
         damaged: Parents and children, "parent → child", between which no pose is finite and rigid.
+        contradicted: What is told twice and differently, of which the first counts: "parent → child", or
+            "child in parent, not in another".
     """
 
     def __init__(self, poses: Iterable[PoseMessage]) -> None:
         """Keep the poses of every frame in its first parent; of several with one stamp the first."""
         links: dict[tuple[str, str], dict[int, Sequence[float]]] = {}
+        contradicted: dict[str, None] = {}
         for pose in poses:
-            link = links.setdefault((pose.child.lstrip("/"), pose.parent.lstrip("/")), {})
-            link.setdefault(min(max(pose.stamp_ns, 0), LATEST_NS), pose.numbers)
+            child, parent = pose.child.lstrip("/"), pose.parent.lstrip("/")
+            link = links.setdefault((child, parent), {})
+            first = link.setdefault(min(max(pose.stamp_ns, 0), LATEST_NS), pose.numbers)
+            if not _are_same(first, pose.numbers):
+                contradicted[f"{parent} → {child}"] = None
         self._parents: dict[str, tuple[str, Trajectory]] = {}
         self.damaged: list[str] = []
         for (child, parent), numbers in links.items():
@@ -56,6 +62,9 @@ class FrameTree:
                     parent,
                     trajectory_from(path[:1] if stays else sorted(path, key=itemgetter(0))),
                 )
+            else:
+                contradicted[f"{child} in {self._parents[child][0]}, not in {parent}"] = None
+        self.contradicted = list(contradicted)
 
     @property
     def frames(self) -> Sequence[str]:
@@ -128,3 +137,11 @@ class FrameTree:
             T = T_parent_frame @ T
             found[frame] = T
         return found
+
+
+def _are_same(one: Sequence[float], other: Sequence[float]) -> bool:
+    """Return whether x y z qx qy qz qw are the same pose; −q turns as q does."""
+    if one is other or tuple(one) == tuple(other):
+        return True
+    opposite = [*other[:3], *(-number for number in other[3:])]
+    return any(np.allclose(one, numbers, atol=_SAME_POSE, equal_nan=True) for numbers in (other, opposite))

@@ -41,8 +41,8 @@ _COLOUR = {
     "8UC4": _Encoding(4, cv2.COLOR_BGRA2RGB, cv2.COLOR_BGRA2GRAY),
     "mono8": _Encoding(1, None, None),
     "8UC1": _Encoding(1, None, None),
-    "yuv422": _Encoding(2, cv2.COLOR_YUV2RGB_UYVY, cv2.COLOR_YUV2GRAY_UYVY),
-    "yuv422_yuy2": _Encoding(2, cv2.COLOR_YUV2RGB_YUY2, cv2.COLOR_YUV2GRAY_YUY2),
+    **dict.fromkeys(("yuv422", "uyvy"), _Encoding(2, cv2.COLOR_YUV2RGB_UYVY, cv2.COLOR_YUV2GRAY_UYVY)),
+    **dict.fromkeys(("yuv422_yuy2", "yuyv"), _Encoding(2, cv2.COLOR_YUV2RGB_YUY2, cv2.COLOR_YUV2GRAY_YUY2)),
     # ROS names a Bayer pattern by its first two pixels, OpenCV by those of the second row and column.
     "bayer_rggb8": _Encoding(1, cv2.COLOR_BayerBG2RGB, cv2.COLOR_BayerBG2GRAY),
     "bayer_bggr8": _Encoding(1, cv2.COLOR_BayerRG2RGB, cv2.COLOR_BayerRG2GRAY),
@@ -66,8 +66,12 @@ def is_depth(message: ImageMessage) -> bool:
 
 def is_mono16(message: ImageMessage) -> bool:
     """Return whether an image is called grey of 16 bits, as infrared ones are, and some of depth."""
-    stated = message.encoding if isinstance(message, PixelsMessage) else message.format
-    return stated.startswith("mono16")
+    return encoding_of(message).startswith("mono16")
+
+
+def encoding_of(message: ImageMessage) -> str:
+    """Return what an image is called to be encoded as."""
+    return message.encoding if isinstance(message, PixelsMessage) else message.format
 
 
 def size_of(message: ImageMessage, *, where: str) -> tuple[int, int]:

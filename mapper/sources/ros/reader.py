@@ -230,6 +230,7 @@ class RecordingReader:
         """Yield the transforms of tf, the static first; of many, enough to name every frame."""
         series = [one for one in self.series.values() if one.topic.type in TRANSFORMS]
         for one in sorted(series, key=lambda one: "static" not in one.topic.name):
+            is_static = "static" in one.topic.name
             for recorded_ns, message in self._messages(
                 one, _spread(np.arange(len(one)), most=most or len(one))
             ):
@@ -237,7 +238,8 @@ class RecordingReader:
                     followed_ns = recorded_ns + self._clock_ns
                     for pose in message:
                         is_near = abs(pose.stamp_ns - followed_ns) <= SAME_CLOCK_NS
-                        yield pose if is_near else replace(pose, stamp_ns=followed_ns)
+                        stamp_ns = 0 if is_static else pose.stamp_ns if is_near else followed_ns
+                        yield replace(pose, stamp_ns=stamp_ns)
 
     def _poses(self, series: Series, indices: NDArray[np.intp]) -> Iterator[PoseMessage]:
         for stamp_ns, message in self._messages(series, indices):

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from mapper.core.errors import SourceError
+from mapper.core.errors import SourceError, listed
 from mapper.core.timebase import NS_PER_S
 from mapper.sources.base import CameraImages, Log
 from mapper.sources.config import SourceConfig
@@ -73,6 +73,9 @@ def recording_log(reader: RecordingReader, config: SourceConfig) -> Log:
     tf_notes = [
         f"tf {link}: its poses are not finite or have no direction; left out" for link in reader.tree.damaged
     ]
+    if reader.tree.contradicted:
+        told = listed(reader.tree.contradicted)
+        tf_notes.append(f"tf contradicts itself, and what it says first is used: {told}")
     cameras = [images_beside(reader, camera, body=frames.body) for camera in choice.cameras]
     images = [one for one in cameras if isinstance(one, CameraImages)]
     beside, beside_choices = sensors_beside(reader, choice.beside, frames, config)

@@ -9,6 +9,7 @@ from mapper.sources.ros.cameras import calibration_of
 from mapper.sources.ros.message_index import Series
 from mapper.sources.ros.messages import CameraMessage, frame_of
 from mapper.sources.ros.reader import RecordingReader
+from mapper.sources.ros.topic_ranks import is_called_rectified
 from mapper.sources.ros.topics import StereoTopics
 from mapper.sources.stereo import StereoCamera, rectified_pair, rectify
 
@@ -30,7 +31,7 @@ def stereo_camera(reader: RecordingReader, topics: StereoTopics, *, size_px: Siz
             f"{where}: stereo images {name} and {topics.right.topic.name}: no camera info for "
             f"{missing.topic.name}; record both, or depth images"
         )
-    is_rectified = "rect" in name
+    is_rectified = is_called_rectified(name)
     left_camera, right_camera = (
         calibration_of(info, size_px, is_rectified=is_rectified, name=series.topic.name)
         for info, series in ((left, topics.left_info), (right, topics.right_info))

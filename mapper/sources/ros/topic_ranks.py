@@ -32,6 +32,11 @@ def is_infrared(name: str) -> bool:
     return re.search(r"infra|fisheye|[/_]ir(?![a-z])", name.lower()) is not None
 
 
+def is_called_rectified(name: str) -> bool:
+    """Return whether the name of a topic says that its images are rectified: image_rect, not unrectified."""
+    return re.search("(?<![a-z])rect", name) is not None
+
+
 def is_called_registered(name: str) -> bool:
     """Return whether the name of a depth topic says that it is registered to colour."""
     return any(word in name.lower() for word in ("aligned", "registered", "to_rgb", "to_color"))

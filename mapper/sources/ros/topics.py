@@ -12,7 +12,7 @@ from mapper.core.errors import SourceError
 from mapper.sources.config import TopicsConfig
 from mapper.sources.ros.camera_infos import info_of, infos_beside, without_those_of_depth
 from mapper.sources.ros.frame_tree import is_fixed
-from mapper.sources.ros.image_messages import is_depth, is_mono16
+from mapper.sources.ros.image_messages import encoding_of, is_depth, is_mono16
 from mapper.sources.ros.message_index import Series
 from mapper.sources.ros.messages import (
     CAMERAS,
@@ -33,6 +33,7 @@ from mapper.sources.ros.topic_ranks import (
     color_rank,
     depth_rank,
     fix_rank,
+    is_called_rectified,
     is_infrared,
     plain_rank,
     shared_namespaces,
@@ -234,7 +235,14 @@ def choose(
         used, image_reason = [left, right], "one pair is mapped"
     else:
         strange = [one for one in series.values() if one.topic.type not in READ]
-        unread = unused_notes(strange, firsts, image_reason=None)
+        unread = [
+            *unused_notes(strange, firsts, image_reason=None),
+            *(
+                f"{name} is {encoding_of(first)!r}, not depth of 16 bits or 32-bit numbers (16UC1, 32FC1)"
+                for name, first in firsts.items()
+                if isinstance(first, ImageMessage) and "depth" in name.lower() and name not in depths
+            ),
+        ]
         found = what_there_is(color, depth, series.values())
         raise SourceError("; ".join([f"{path}: nothing to map: {found}", *unread]))
     if imu is not None and len(imus) > 1:
@@ -367,7 +375,7 @@ def _stereo_pairs(lefts: Sequence[Series], images: Sequence[Series]) -> list[tup
         for left in lefts
         if (other := _SIDES.sub(_other_side, name := left.topic.name)) != name and other in by_name
     ]
-    return sorted(found, key=lambda pair: ("rect" not in pair[0].topic.name, pair[0].topic.name))
+    return sorted(found, key=lambda pair: (not is_called_rectified(pair[0].topic.name), pair[0].topic.name))
 
 
 def _other_side(side: re.Match[str]) -> str:

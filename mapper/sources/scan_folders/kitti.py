@@ -55,7 +55,9 @@ def read_log(path: Path, config: SourceConfig) -> Log:
         files,
         kind="kitti",
         stamps_file=first_of([sequence, scans.parent], STAMP_FILES),
-        truth_file=first_of([sequence, at.parent.parent / "poses"], ["poses.txt", f"{at.name}.txt"]),
+        truth_file=first_of(
+            [sequence, at.parent.parent / "poses"], ["poses.txt", f"{at.name}.txt", "groundtruth.txt"]
+        ),
         config=config,
         T_posed_lidar=T_camera_lidar,
         notes=notes,

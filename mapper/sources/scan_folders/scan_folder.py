@@ -18,8 +18,8 @@ from mapper.sources.image_folders.tum import read_truth
 from mapper.sources.listed_files import refuse_links_out
 from mapper.sources.scan_folders.scans import ScanEntry
 from mapper.sources.scan_stamps import in_order, line_of_each, scan_stamps
-from mapper.sources.text import rows, time_order, truth_from
-from mapper.sources.trajectory_files import read_kitti
+from mapper.sources.text import time_order, truth_from
+from mapper.sources.trajectory_files import read_kitti, tum_rows
 
 STAMP_FILES = ("times.txt", "stamps.txt", "timestamps.txt")
 
@@ -168,7 +168,7 @@ def _read_truth(
 ) -> tuple[Trajectory | None, list[str]]:
     if path is None:
         return None, []
-    if len(next(rows(path), (0, []))[1]) == 8:
+    if len(next(tum_rows(path), (0, []))[1]) == 8:
         return read_truth(path)
     T_world_posed = read_kitti(path).T_world_body
     lines = line_of_each(files, len(T_world_posed))

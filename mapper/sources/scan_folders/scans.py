@@ -32,7 +32,7 @@ class ScanEntry:
         """
         cloud = read_cloud(self.path, scale=self.scale, bin_columns=self.bin_columns)
         points_body, rows, far = valid_returns(cloud.points)
-        if len(points_body) < MIN_POINTS:
+        if len(points_body) < max(MIN_POINTS, far):
             raise FrameError(
                 f"{self.path}: {far} of {len(cloud.points)} points are farther than {FARTHEST_M:g} m, which "
                 "no sensor reaches"

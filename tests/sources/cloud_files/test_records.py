@@ -109,3 +109,10 @@ def test_scans_of_nuscenes_have_their_stamps_and_a_setting_reads_them(tmp_path):
     log = open_source(tmp_path, SourceConfig(bin_columns=5))
     assert log.stamps_ns.tolist() == stamps_ns
     assert len(log.entry_at(0).load().points_body) == N
+
+
+def test_records_that_begin_with_an_intensity_are_refused(tmp_path):
+    xyz = sweep()
+    path = written(tmp_path / "a.bin", INTENSITIES["share"], xyz)
+    with pytest.raises(FrameError, match="0 to 1 as an intensity"):
+        read_cloud(path)

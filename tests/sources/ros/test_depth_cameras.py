@@ -1,6 +1,7 @@
 """Recordings whose depth comes from a camera of its own: registered as they are read, or refused."""
 
 import struct
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -17,7 +18,8 @@ from mapper.sources.inspection import inspect_log
 from mapper.sources.ros.decode import decode
 from mapper.sources.ros.encode_ros import SerializedMessage
 from mapper.sources.ros.recording import Topic
-from mapper.sources.ros.typestore import make_message, serialize
+from mapper.sources.ros.topic_ranks import is_called_rectified
+from mapper.sources.ros.typestore import make_message, serialize, typestore
 from mapper.sources.writers import write_log
 from tests.support.depth_cameras import BESIDE, write_unregistered
 from tests.support.recordings import CAMERA, COLOR, add_messages, camera_info, image, shots, transforms, write
@@ -242,3 +244,25 @@ def test_calibrations_that_are_not_set_yet_are_passed_over_and_changes_are_noted
     assert log[0].camera == CAMERA
     assert sum("intrinsics change" in note for note in log.notes) == 1
     assert not any("intrinsics" in note for note in open_source(write(tmp_path / "b.mcap", shots(6))).notes)
+
+
+def test_a_calibration_of_p_alone_tells_the_depth_camera_from_colours(tmp_path):
+    store, type_ = typestore("cdr"), "sensor_msgs/msg/CameraInfo"
+
+    def without_k(message):
+        info = store.deserialize_cdr(message.cdr, type_)
+        return message._replace(cdr=bytes(store.serialize_cdr(replace(info, k=np.zeros(9)), type_)))
+
+    of_depth = [one.type == type_ and "depth" in one.topic for one in unregistered(T=None)]
+    messages = [
+        without_k(one) if is_of_depth else one
+        for one, is_of_depth in zip(unregistered(T=None), of_depth, strict=True)
+    ]
+    assert any(of_depth)
+    with pytest.raises(SourceError, match=r"focal length 53\.0 px\) is not registered"):
+        open_source(write(tmp_path / "a.mcap", messages))
+
+
+@pytest.mark.parametrize(("name", "is_rectified"), [("image_rect_color", True), ("image_unrectified", False)])
+def test_rectified_images_are_known_by_their_name(name, is_rectified):
+    assert is_called_rectified(f"/camera/color/{name}") == is_rectified

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 
 from mapper.core.geometry import Transform, exp, inverse
@@ -35,6 +37,17 @@ def test_frames_are_found_up_down_and_across():
 
 def test_links_without_a_rigid_pose_are_named():
     assert TREE.damaged == ["base → broken"]
+
+
+def test_what_contradicts_itself_is_named_once():
+    turned = told("base", "mast", T_BASE_MAST)
+    turned = replace(turned, numbers=[*turned.numbers[:3], *(-q for q in turned.numbers[3:])])
+    again = [turned, told("base", "imu", T_BASE_MAST), told("base", "imu", np.eye(4))]
+    tree = FrameTree([told("base", "mast", T_BASE_MAST), told("base", "imu", T_BASE_IMU), *again])
+    assert tree.contradicted == ["base → imu"]
+    np.testing.assert_allclose(tree.find("base", "imu"), T_BASE_IMU, atol=1e-12)
+    two_parents = FrameTree([told("base", "imu", T_BASE_IMU), told("mast", "imu", T_BASE_IMU)])
+    assert two_parents.contradicted == ["imu in base, not in mast"]
 
 
 def test_a_frame_is_itself_even_if_nobody_tells_of_it():

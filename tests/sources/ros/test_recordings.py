@@ -113,6 +113,14 @@ def test_files_of_the_same_time_and_topics_are_noted(tmp_path, begin, noted):
     assert sum("drive_1.bag" in note for note in notes) == noted
 
 
+def test_a_part_between_others_that_is_missing_is_named(tmp_path):
+    for number, part in enumerate((shots(9)[:9], shots(9)[9:18], shots(9)[18:])):
+        write(tmp_path / f"drive/drive_{number}.bag", part)
+    assert not [note for note in open_source(tmp_path / "drive").notes if "part" in note]
+    (tmp_path / "drive/drive_1.bag").unlink()
+    assert [note for note in open_source(tmp_path / "drive").notes if "no part 1 " in note]
+
+
 def test_the_part_that_a_killed_rosbag_left_is_read(tmp_path):
     write(tmp_path / "drive/drive_0.bag", shots(6)[:9])
     write(tmp_path / "drive/drive_1.bag", shots(6)[9:]).rename(tmp_path / "drive/drive_1.bag.active")

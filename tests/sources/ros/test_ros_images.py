@@ -82,7 +82,10 @@ def test_bayer_patterns_are_named_by_their_first_pixels(encoding):
 def test_yuv_is_read_in_both_orders_of_bytes():
     yuyv = np.zeros((48, 64, 2), np.uint8)
     yuyv[:, :, 0], yuyv[:, :, 1] = 126, 128
-    for message in (pixels(yuyv, "yuv422_yuy2"), pixels(yuyv[:, :, ::-1], "yuv422")):
+    for message in (
+        *(pixels(yuyv, name) for name in ("yuv422_yuy2", "yuyv")),
+        *(pixels(yuyv[:, :, ::-1], name) for name in ("yuv422", "uyvy")),
+    ):
         image = image_of(message, colour=True, where="m")
         assert np.abs(image.astype(int) - 128).max() <= 1
         assert image_of(message, colour=False, where="m").shape == (48, 64)

@@ -7,7 +7,7 @@ from mapper.core.errors import SourceError
 from mapper.core.frames import Scan
 from mapper.sources import open_source
 from mapper.sources.ros.encode_ros import cloud_message, imu_message
-from tests.support.recordings import COLOR, DEPTH, shots, transforms, write
+from tests.support.recordings import COLOR, DEPTH, image, shots, transforms, write
 from tests.support.tum_logs import FIRST_NS, PERIOD_NS
 
 STAMPS_NS = [FIRST_NS + i * PERIOD_NS for i in range(4)]
@@ -46,6 +46,15 @@ def test_topics_that_cannot_be_read_are_named_where_nothing_can_be_mapped(tmp_pa
     ]
     with pytest.raises(SourceError, match=f"{COLOR}/h264 .{type_}"):
         opened(tmp_path / "a.mcap", packets)
+
+
+def test_depth_of_8_bits_is_named_where_nothing_can_be_mapped(tmp_path):
+    shallow = [
+        image(one.stamp_ns, DEPTH, np.zeros((48, 64), np.uint8), "mono8") if one.topic == DEPTH else one
+        for one in shots(2)
+    ]
+    with pytest.raises(SourceError, match=f"{DEPTH} is 'mono8', not depth"):
+        opened(tmp_path / "a.mcap", shallow)
 
 
 def test_accelerations_that_are_not_used_beside_their_gyroscope_are_named(tmp_path):
