@@ -30,6 +30,7 @@ FORMATS = (
     "image_folders.stamped_images",
     "image_folders.numbered",
     "scan_folders.kitti",
+    "image_folders.kitti_stereo",
     "image_folders.stereo_pairs",
     RECORDING,
     "scan_folders.ouster_pcap",

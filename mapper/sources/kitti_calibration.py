@@ -32,6 +32,48 @@ def read_matrix(path: Path, name: str, *shape: int) -> Array | None:
     return None
 
 
+def matrix_of(path: Path, name: str, *shape: int) -> Array:
+    """Return the matrix of a line, which has to be there; arguments as of :func:`read_matrix`.
+
+    Raises:
+        SourceError: As ``read_matrix``, or there is no such file or line.
+    """
+    matrix = read_matrix(path, name, *shape)
+    if matrix is None:
+        missing = f"line {name}:" if path.is_file() else "such file"
+        raise SourceError(f"{path}: no {missing}; want the calibration that comes with KITTI's recordings")
+    return matrix
+
+
+def offset_of(projection: Array) -> Transform:
+    """Return T_camera_first of a rectified camera, whose 3×4 projection is of the first one's points."""
+    offset = np.linalg.solve(projection[:, :3], projection[:, 3])
+    return transform(np.eye(3), offset.astype(np.float64))
+
+
+def rectification(path: Path) -> Transform:
+    """Return the rotation R_rect_00 of a raw recording's cameras; the identity where it is not stated.
+
+    Raises:
+        SourceError: It is no rotation.
+    """
+    R = read_matrix(path, "R_rect_00", 3, 3)
+    return np.eye(4) if R is None else rigid_motion(np.column_stack([R, np.zeros(3)]), f"{path}: R_rect_00")
+
+
+def lidar_in_first_camera(drive: Path) -> Transform | None:
+    """Return T_first_lidar of a raw drive, by ``calib_velo_to_cam.txt`` beside it; None without the file.
+
+    Raises:
+        SourceError: It lacks R or T, or they are no rigid motion.
+    """
+    path = drive.resolve().parent / "calib_velo_to_cam.txt"
+    if not path.is_file():
+        return None
+    pose = np.column_stack([matrix_of(path, "R", 3, 3), matrix_of(path, "T", 3)])
+    return rigid_motion(pose, f"{path}")
+
+
 def rigid_motion(matrix: Array, where: str) -> Transform:
     """Return the rigid motion that a 3×4 matrix is.
 
@@ -40,5 +82,5 @@ def rigid_motion(matrix: Array, where: str) -> Transform:
     """
     R = nearest_rotation(matrix[:, :3]) if np.isfinite(matrix).all() else np.full((3, 3), np.nan)
     if not np.abs(R - matrix[:, :3]).max() < ROUNDING:
-        raise SourceError(f"{where}: not a rigid motion; want the LiDAR's 3×4 pose in the camera")
+        raise SourceError(f"{where}: not a rigid motion; want the 3×4 pose of the LiDAR or a camera")
     return transform(R, matrix[:, 3])

@@ -20,6 +20,8 @@ from tests.support.stereo_rig import (
     write_euroc,
     write_imu,
     write_kitti,
+    write_kitti_drive,
+    write_kitti_navigation,
 )
 
 
@@ -50,6 +52,11 @@ def _euroc(folder: Path) -> Path:
     return folder / "log"
 
 
+def _kitti_drive(folder: Path) -> Path:
+    write_kitti_navigation(write_kitti_drive(folder / "log", BARREL, is_rectified=False))
+    return folder / "log"
+
+
 def _e57(folder: Path) -> Path:
     return write_e57(folder / "log.e57", *(e57_fields(seed)[1] for seed in range(3)))
 
@@ -68,6 +75,7 @@ SENSOR_LOGS: Mapping[str, Callable[[Path], Path]] = {
     "euroc": _euroc,
     "euroc, kalibr": lambda folder: write_euroc(folder / "log", FISHEYE, kalibr=True),
     "kitti, stereo": lambda folder: write_kitti(folder / "log"),
+    "kitti, stereo drive": _kitti_drive,
     "e57": _e57,
     "bag, laser": lambda folder: write_ros(folder / "log.bag", _laser()),
     "carmen": lambda folder: write_carmen(folder / "log.log", _laser()),

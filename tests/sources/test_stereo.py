@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from mapper.core.errors import SourceError
-from mapper.core.geometry import angle_between, apply, inverse
+from mapper.core.geometry import angle_between, apply, inverse, transform
 from mapper.sensing.stereo import stereo_depth_m
 from mapper.sources import open_source
 from mapper.sources.config import CameraConfig, SourceConfig
@@ -25,6 +25,8 @@ from tests.support.stereo_rig import (
     write_euroc,
     write_imu,
     write_kitti,
+    write_kitti_drive,
+    write_kitti_navigation,
 )
 
 RECT = ("/stereo/left/image_rect", "/stereo/right/image_rect")
@@ -47,6 +49,21 @@ def assert_shows_wall(log, poses=None):
         assert np.percentile(np.abs(off_m), 90) < 1.5 * sigma_m
 
 
+def rectification(cameras):
+    """Return both rotations and both projections of OpenCV's rectification."""
+    left, right = cameras
+    T_right_left = inverse(right.T_left_camera)
+    return cv2.stereoRectify(
+        *(left.matrix, np.array(left.distortion), right.matrix, np.array(right.distortion)),
+        *(SIZE_PX, T_right_left[:3, :3].copy(), T_right_left[:3, 3:].copy()),
+    )[:4]
+
+
+def turned_by_rectifying(cameras):
+    """Return T_left_rectified."""
+    return transform(rectification(cameras)[0].T, np.zeros(3))
+
+
 @pytest.mark.parametrize(("cameras", "kalibr"), [(BARREL, False), (FISHEYE, True)])
 def test_euroc_folder_shows_the_wall_from_the_true_poses(tmp_path, cameras, kalibr):
     log = open_source(write_euroc(tmp_path / "log", cameras, kalibr=kalibr))
@@ -56,6 +73,15 @@ def test_euroc_folder_shows_the_wall_from_the_true_poses(tmp_path, cameras, kali
     assert camera.fx_px == camera.fy_px
     baseline_m = np.linalg.norm(cameras[1].T_left_camera[:3, 3])
     assert log.depth_noise.quadratic_per_m == pytest.approx(0.3 / (camera.fx_px * baseline_m), rel=1e-3)
+
+
+def test_fisheyes_of_sixteen_bits_show_the_wall_by_their_own_sensor_yaml(tmp_path):
+    folder = write_euroc(tmp_path / "log", FISHEYE)
+    for path in folder.glob("mav0/cam*/sensor.yaml"):
+        path.write_text(path.read_text().replace("radial-tangential", "equidistant"))
+    for path in folder.glob("mav0/cam*/data/*.png"):
+        cv2.imwrite(f"{path}", cv2.imread(f"{path}", cv2.IMREAD_GRAYSCALE).astype(np.uint16) << 8)
+    assert_shows_wall(open_source(folder))
 
 
 def test_euroc_readings_come_with_their_mounting(tmp_path):
@@ -78,6 +104,45 @@ def test_kitti_folder_shows_the_wall_from_the_true_poses(tmp_path):
     np.testing.assert_array_equal(log[0].gray, cv2.imread(str(tmp_path / "00/image_0/000000.png"), 0))
 
 
+def test_kitti_s_folder_of_sequences_shows_the_wall_from_the_poses_beside(tmp_path):
+    sequence = write_kitti(tmp_path / "dataset/sequences/03")
+    (tmp_path / "dataset/poses").mkdir()
+    (sequence / "poses.txt").rename(tmp_path / "dataset/poses/03.txt")
+    log = open_source(tmp_path / "dataset")
+    assert (log.kind, log.name, len(log)) == ("kitti-stereo", "03", 2)
+    assert_shows_wall(log)
+    write_kitti(tmp_path / "dataset/sequences/04")
+    with pytest.raises(SourceError, match="sequences/03"):
+        open_source(tmp_path / "dataset")
+
+
+@pytest.mark.parametrize("numbers", [(0, 1), (2, 3)])
+def test_kitti_drive_without_scans_shows_the_wall(tmp_path, numbers):
+    drive = write_kitti_drive(tmp_path / "2011_09_26", numbers=numbers)
+    antenna = write_kitti_navigation(drive)
+    for opened in (drive, drive.parent):
+        log = open_source(opened)
+        assert (log.kind, log.name) == ("kitti-stereo", "2011_09_26_drive_0001_sync")
+        assert log.stamps_ns.tolist() == [1317042145050360375, 1317042145150360375]
+        assert_shows_wall(log, poses_world(2))
+        assert [frame.depth_delay_s for frame in log] == [0.0, 0.0]
+        np.testing.assert_allclose(log.gnss.antenna_body, antenna, atol=1e-6)
+    (drive.parent / "calib_velo_to_cam.txt").unlink()
+    assert open_source(drive).gnss.antenna_body is None
+    (drive.parent / "calib_cam_to_cam.txt").unlink()
+    with pytest.raises(SourceError, match=r"calib_cam_to_cam\.txt"):
+        open_source(drive)
+
+
+def test_kitti_drive_that_is_not_rectified_is_by_its_calibration(tmp_path):
+    drive = write_kitti_drive(tmp_path / "2011_09_26", BARREL, is_rectified=False)
+    log = open_source(drive)
+    assert log.stamps_ns.tolist() == [1317042145050360375, 1317042145150360375]
+    assert_shows_wall(log, [T @ turned_by_rectifying(BARREL) for T in poses_world(2)])
+    (drive / "image_00/data/0000000000.png").write_bytes(b"no image")
+    assert_shows_wall(open_source(drive)[1:], [poses_world(2)[1] @ turned_by_rectifying(BARREL)])
+
+
 def test_converted_log_has_the_same_depth(tmp_path):
     log = open_source(write_kitti(tmp_path / "00"))
     write_log(log, tmp_path / "tum", kind="tum")
@@ -94,17 +159,10 @@ def test_rectified_topics_have_the_baseline_in_their_projections(tmp_path):
 
 
 def test_raw_topics_are_rectified_by_their_calibrations(tmp_path):
-    left, right = BARREL
-    T_right_left = inverse(right.T_left_camera)
-    R_left, R_right, P_left, P_right, *_ = cv2.stereoRectify(
-        *(left.matrix, np.array(left.distortion), right.matrix, np.array(right.distortion)),
-        *(SIZE_PX, T_right_left[:3, :3].copy(), T_right_left[:3, 3:].copy()),
-    )
+    R_left, R_right, P_left, P_right = rectification(BARREL)
     messages = recorded(BARREL, RAW, projections=(P_left, P_right), rotations=(R_left, R_right))
     log = open_source(write(tmp_path / "raw.bag", messages))
-    T_left_rectified = np.eye(4)
-    T_left_rectified[:3, :3] = R_left.T
-    assert_shows_wall(log, [T @ T_left_rectified for T in poses_world(2)])
+    assert_shows_wall(log, [T @ turned_by_rectifying(BARREL) for T in poses_world(2)])
 
 
 def test_tf_says_where_the_right_camera_is(tmp_path):

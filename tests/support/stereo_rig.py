@@ -86,6 +86,8 @@ RECTIFIED = tuple(
     RigCamera(matrix(280.0, 280.0, 160.0, 119.0), (0.0,) * 4, exp(np.zeros(3), np.array([x, 0.0, 0.0])))
     for x in (0.0, 0.12)
 )
+T_RECTIFIED_FIRST = exp(np.array([0.01, -0.02, 0.005]), np.zeros(3))
+"""Rotation that rectifies the first camera of KITTI's raw drives."""
 
 
 def poses_world(count: int) -> list[Transform]:
@@ -170,6 +172,63 @@ def write_kitti(folder: Path, count: int = 2) -> Path:
     poses = (" ".join(f"{v:.9e}" for v in T[:3].ravel()) for T in poses_world(count))
     (folder / "poses.txt").write_text("\n".join(poses) + "\n")
     return folder
+
+
+def write_kitti_drive(
+    day: Path,
+    cameras: tuple[RigCamera, ...] = RECTIFIED,
+    *,
+    numbers: tuple[int, int] = (0, 1),
+    is_rectified: bool = True,
+) -> Path:
+    """Write a raw drive of two pairs into the folder of a day; the cameras are described in the latter.
+
+    The first camera is the left one, turned by ``T_RECTIFIED_FIRST`` where pairs are rectified. Camera 3
+    began an image earlier where they are not.
+    """
+    drive = day / f"{day.name}_drive_0001_{'sync' if is_rectified else 'extract'}"
+    lines = [("R_rect_00", T_RECTIFIED_FIRST[:3, :3])]
+    for side, (number, camera) in enumerate(zip(numbers, cameras, strict=True)):
+        name, early = f"{number:02d}", 0 if is_rectified else side
+        folder = drive / f"image_{name}" / "data"
+        folder.mkdir(parents=True)
+        for k, T_world_left in enumerate(poses_world(2)):
+            cv2.imwrite(str(folder / f"{k + early:010d}.png"), camera.render(T_world_left))
+        times = [f"2011-09-26 13:02:2{5 + k // 10}.{k % 10}5{side}360375" for k in range(2 + early)]
+        if early:
+            times.insert(0, "2011-09-26 13:02:24.950360375")
+        (folder.parent / "timestamps.txt").write_text("\n".join(times) + "\n")
+        T_camera_left = inverse(camera.T_left_camera)
+        lines += [
+            (f"S_{name}", np.array(SIZE_PX)),
+            (f"K_{name}", camera.matrix),
+            (f"D_{name}", np.array([*camera.distortion, 0.0])),
+            (f"R_{name}", T_camera_left[:3, :3]),
+            (f"T_{name}", T_camera_left[:3, 3]),
+            (f"S_rect_{name}", np.array(SIZE_PX) if is_rectified else np.array([310, 230])),
+            (f"P_rect_{name}", np.column_stack([camera.matrix, camera.matrix @ T_camera_left[:3, 3]])),
+        ]
+    (day / "calib_cam_to_cam.txt").write_text("calib_time: 09-Jan-2012 13:57:47\n" + _kitti_text(lines))
+    return drive
+
+
+def write_kitti_navigation(drive: Path) -> np.ndarray:
+    """Write ``oxts`` of a drive and its mounting, and return its place in the rectified left camera."""
+    packets, day = drive / "oxts" / "data", drive.parent
+    packets.mkdir(parents=True)
+    words = [*("49.0", "8.4", "116.0"), *["0.0"] * 20, "0.05", "0.0", "4", "10", "4", "4", "0"]
+    (packets / "0000000000.txt").write_text(" ".join(words))
+    (drive / "oxts/timestamps.txt").write_text("2011-09-26 13:02:25.050360375\n")
+    place_lidar, T_first_lidar = np.array([-0.81, 0.32, -0.8]), exp(np.array([1.2, -1.2, 1.1]), np.ones(3))
+    mounted = [("R", np.eye(3)), ("T", place_lidar)]
+    (day / "calib_imu_to_velo.txt").write_text("calib_time: 25-May-2012 16:47:16\n" + _kitti_text(mounted))
+    mounted = [("R", T_first_lidar[:3, :3]), ("T", T_first_lidar[:3, 3])]
+    (day / "calib_velo_to_cam.txt").write_text("calib_time: 15-Mar-2012 11:37:16\n" + _kitti_text(mounted))
+    return (T_RECTIFIED_FIRST @ T_first_lidar @ [*place_lidar, 1.0])[:3]
+
+
+def _kitti_text(lines: list[tuple[str, np.ndarray]]) -> str:
+    return "".join(f"{name}: {' '.join(f'{v:.9e}' for v in m.ravel())}\n" for name, m in lines)
 
 
 def recorded(

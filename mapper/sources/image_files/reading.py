@@ -76,6 +76,23 @@ def decode_grey(data: bytes, where: str) -> Image:
     return image
 
 
+def read_view(path: ImageFile, in_colour: bool) -> Image:
+    """Return the image of a file as ``read_colour`` or ``read_grey``, but of 16 bits the upper 8 (TUM-VI's).
+
+    It is for logs without depth images, for which an image of 16 bits may be taken otherwise.
+
+    Raises:
+        FrameError: As :func:`read_colour`.
+    """
+    if isinstance(path, DecodedColour):
+        return path.decode(in_colour)
+    data, where = bytes_of(path), f"{path}"
+    if not (png.is_plain(data) and png.is_grey16(data)):  # OpenCV takes the upper bits itself
+        return decode_colour(data, where) if in_colour else decode_grey(data, where)
+    upper = (_decoded(data, _GREY, where) >> 8).astype(np.uint8)
+    return np.asarray(cv2.cvtColor(upper, cv2.COLOR_GRAY2RGB), np.uint8) if in_colour else upper
+
+
 def read_depth_m(path: ImageFile, units_per_m: float) -> DepthImage:
     """Return the (H, W) float32 depth in metres of a 16-bit image; 0 is no measurement.
 

@@ -1,8 +1,7 @@
-"""Folders of stereo pairs: EuRoC's (Burri et al. 2016), as of TUM-VI too, and KITTI's (Geiger et al. 2012).
+"""Folders of EuRoC's stereo pairs (Burri et al. 2016), as of TUM-VI too; and logs of pairs of any layout.
 
-EuRoC keeps ``cam0`` and ``cam1`` with lists of images, ``imu0`` and the truth, maybe in ``mav0``; cameras are
-described by ``sensor.yaml`` in each or by Kalibr's ``*camchain*.yaml``. KITTI's pairs are rectified, in
-``image_2`` and ``image_3`` or grey in ``image_0`` and ``image_1``, with ``calib.txt``.
+``cam0`` and ``cam1`` with lists of images, ``imu0`` and the truth, maybe in ``mav0``; cameras are described
+by ``sensor.yaml`` in each or by Kalibr's ``*camchain*.yaml``.
 """
 
 import re
@@ -14,35 +13,31 @@ from pathlib import Path
 import numpy as np
 
 from mapper.core.errors import SourceError
-from mapper.core.frames import Image
-from mapper.core.geometry import Array, Transform, inverse, transform
+from mapper.core.geometry import Transform, inverse
 from mapper.core.trajectory import Trajectory
 from mapper.runtime.regular_files import read_text
-from mapper.sources.base import Accelerations, ImageFile, Log
+from mapper.sources.base import Accelerations, Log
 from mapper.sources.calibration import Calibration
 from mapper.sources.calibration_file import read_yaml
 from mapper.sources.config import SourceConfig
-from mapper.sources.image_files.reading import read_colour, read_grey
+from mapper.sources.image_files.reading import read_view
 from mapper.sources.image_folders.pairing import ImageList, pair_images
 from mapper.sources.image_folders.rgbd import FramePair, first_size, rgbd_log
 from mapper.sources.imu_files import read_euroc_imu
-from mapper.sources.kitti_calibration import read_matrix
 from mapper.sources.listed_files import within
-from mapper.sources.scan_stamps import Wording, in_order, scan_stamps
-from mapper.sources.stereo import StereoCamera, rectified_pair, rectify, refuse_settings
-from mapper.sources.text import parse_stamp, pose_from_matrix, rows, time_order, truth_from
-from mapper.sources.trajectory_files import read_kitti, read_tum
+from mapper.sources.stereo import StereoCamera, rectify, refuse_settings
+from mapper.sources.text import parse_stamp, pose_from_matrix, rows, time_order
+from mapper.sources.trajectory_files import read_tum
 
 _TRUTH = ("state_groundtruth_estimate0", "mocap0")
-_KITTI = (("image_2", "image_3"), ("image_0", "image_1"))
 _CAMERA_SECTION = re.compile(r"^cam(\d):[ \t]*\n((?:[ \t]+.*\n?|\s*\n)+)", re.MULTILINE)
 _POSES = {"T_BS": False, "T_cam_imu": True}
 """Keys of a camera's pose in the unit's body, and whether it is the inverse."""
 
 
 def recognise(path: Path) -> bool:
-    """Return whether a path is a folder of one of the two layouts."""
-    return _euroc(path) is not None or _kitti(path) is not None
+    """Return whether a path is a folder of the layout."""
+    return _euroc(path) is not None
 
 
 def read_log(path: Path, config: SourceConfig) -> Log:
@@ -54,7 +49,9 @@ def read_log(path: Path, config: SourceConfig) -> Log:
     """
     refuse_settings(config.camera)
     folder = _euroc(path)
-    return _kitti_log(path, config) if folder is None else _euroc_log(path, folder, config)
+    if folder is None:
+        raise SourceError(f"{path}: no cam0 and cam1 with data.csv each")
+    return _euroc_log(path, folder, config)
 
 
 def stereo_log(
@@ -87,16 +84,12 @@ def stereo_log(
 
 def _frame(pair: FramePair, camera: StereoCamera) -> FramePair:
     """Return the pair of an image and its depth that a pair of a left and a right image becomes."""
-    left, right = partial(_read, pair.colour), partial(_read, pair.depth)
+    left, right = partial(read_view, pair.colour), partial(read_view, pair.depth)
     return replace(
         pair,
         colour=pair.colour if camera.maps is None else camera.image_of(left, pair.colour),
         depth=camera.depth_of(left, right, pair.depth),
     )
-
-
-def _read(file: ImageFile, in_colour: bool) -> Image:
-    return read_colour(file) if in_colour else read_grey(file)
 
 
 def _euroc(path: Path) -> Path | None:
@@ -109,7 +102,7 @@ def _euroc(path: Path) -> Path | None:
 def _euroc_log(path: Path, folder: Path, config: SourceConfig) -> Log:
     notes: list[str] = []
     left, right = (_listed(folder / name, notes) for name in ("cam0", "cam1"))
-    size_px, reason = first_size(left.paths, read_grey)
+    size_px, reason = first_size(left.paths, partial(read_view, in_colour=False))
     if size_px is None:
         raise SourceError(
             f"{folder / 'cam0'}: none of {len(left.paths)} images can be read; the first: {reason}"
@@ -199,65 +192,3 @@ def _euroc_truth(folder: Path, T_imu_body: Transform) -> tuple[Trajectory | None
         return None, []
     truth = read_tum(path)
     return replace(truth, T_world_body=truth.T_world_body @ T_imu_body), []
-
-
-def _kitti(path: Path) -> tuple[Path, Path] | None:
-    """Return the folders of a sequence's left and right images; None if there are none."""
-    if not (path / "calib.txt").is_file():
-        return None
-    pairs = ((path / left, path / right) for left, right in _KITTI)
-    return next((pair for pair in pairs if all(any(folder.glob("*.png")) for folder in pair)), None)
-
-
-def _kitti_log(path: Path, config: SourceConfig) -> Log:
-    folders = _kitti(path)
-    if folders is None:
-        raise SourceError(f"{path}: neither EuRoC's nor KITTI's stereo pairs")
-    left, right = (in_order(folder.glob("*.png")) for folder in folders)
-    if [file.name for file in left] != [file.name for file in right]:
-        raise SourceError(
-            f"{folders[0]}, {folders[1]}: not the same names; {len(left)} and {len(right)} images"
-        )
-    times, truth_file = path / "times.txt", path / "poses.txt"
-    stamps_ns, notes = scan_stamps(
-        left,
-        chosen=None,
-        beside=times if times.is_file() else None,
-        rate_hz=config.rate_hz,
-        wording=Wording("pairs", stamps_file="times.txt"),
-    )
-    size_px, reason = first_size(left, read_grey)
-    if size_px is None:
-        raise SourceError(f"{folders[0]}: none of {len(left)} images can be read; the first: {reason}")
-    P_left, P_right = (_projection(path / "calib.txt", f"P{folder.name[-1]}") for folder in folders)
-    calibration = Calibration(
-        f"{path / 'calib.txt'}", P_left[0, 0], P_left[1, 1], P_left[0, 2], P_left[1, 2], size_px=size_px
-    )
-    camera = rectified_pair(calibration, (P_left[0, 3] - P_right[0, 3]) / P_left[0, 0], size_px)
-    order, order_notes = time_order(stamps_ns, what="pairs")
-    truth, truth_notes = None, list[str]()
-    if truth_file.is_file():
-        poses = read_kitti(truth_file).T_world_body
-        if len(poses) != len(left):
-            raise SourceError(f"{truth_file}: {len(poses)} poses for {len(left)} pairs of images")
-        t_left_camera0 = np.linalg.solve(P_left[:, :3], P_left[:, 3]).astype(np.float64)
-        T_camera0_left = transform(np.eye(3), -t_left_camera0)
-        posed = zip(stamps_ns.tolist(), poses @ T_camera0_left, strict=True)
-        truth, truth_notes = truth_from(list(posed), what=truth_file.name)
-    return stereo_log(
-        ImageList(stamps_ns[order], [left[i] for i in order]),
-        ImageList(stamps_ns[order], [right[i] for i in order]),
-        camera,
-        config,
-        path=path,
-        kind="kitti-stereo",
-        truth=(truth, truth_notes),
-        notes=[*notes, *order_notes],
-    )
-
-
-def _projection(path: Path, name: str) -> Array:
-    projection = read_matrix(path, name, 3, 4)
-    if projection is None:
-        raise SourceError(f"{path}: no line {name}:, the projection of a camera")
-    return projection

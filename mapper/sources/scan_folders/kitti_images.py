@@ -7,13 +7,19 @@ import numpy as np
 
 from mapper.core.errors import SourceError
 from mapper.core.frames import Image
-from mapper.core.geometry import Array, Transform, inverse, transform
+from mapper.core.geometry import Array, Transform, inverse
 from mapper.sources.base import CameraImages, Log
 from mapper.sources.calibration import Calibration
 from mapper.sources.image_files.image_sizes import recorded_camera
 from mapper.sources.image_files.reading import read_colour, read_grey
 from mapper.sources.image_folders.rgbd import first_size
-from mapper.sources.kitti_calibration import read_matrix, rigid_motion
+from mapper.sources.kitti_calibration import (
+    lidar_in_first_camera,
+    matrix_of,
+    offset_of,
+    rectification,
+    rigid_motion,
+)
 from mapper.sources.listed_files import refuse_links_out
 from mapper.sources.scan_folders.scans import ScanEntry
 
@@ -69,23 +75,13 @@ def _camera(sequence: Path, *, is_raw: bool) -> tuple[Array, Transform]:
         SourceError: They are not there, or malformed.
     """
     if is_raw:
-        folder = sequence.resolve().parent
-        cameras, lidar = folder / "calib_cam_to_cam.txt", folder / "calib_velo_to_cam.txt"
-        projection = read_matrix(cameras, "P_rect_02", 3, 4)
-        R_rectified = read_matrix(cameras, "R_rect_00", 3, 3)
-        R, t = read_matrix(lidar, "R", 3, 3), read_matrix(lidar, "T", 3, 1)
-        if projection is None or R_rectified is None or R is None or t is None:
-            raise SourceError(
-                f"{folder}: want P_rect_02 and R_rect_00 in {cameras.name}, R and T in {lidar.name}"
-            )
-        mounting, where = R_rectified @ np.hstack([R, t]), f"{lidar}"
+        cameras = sequence.resolve().parent / "calib_cam_to_cam.txt"
+        projection, mounted = matrix_of(cameras, "P_rect_02", 3, 4), lidar_in_first_camera(sequence)
+        if mounted is None:
+            raise SourceError(f"{cameras.parent}: no calib_velo_to_cam.txt, the LiDAR's pose")
+        T_first_lidar = rectification(cameras) @ mounted
     else:
         path = sequence / "calib.txt"
-        projection, mounted = read_matrix(path, "P2", 3, 4), read_matrix(path, "Tr", 3, 4)
-        if projection is None or mounted is None:
-            raise SourceError(f"{path}: want P2, the camera's projection, and Tr, the LiDAR's pose")
-        mounting, where = mounted, f"{path}: Tr"
-    T_camera_first = transform(
-        np.eye(3), np.linalg.solve(projection[:, :3], projection[:, 3]).astype(np.float64)
-    )
-    return projection, T_camera_first @ rigid_motion(mounting, where)
+        projection, mounting = matrix_of(path, "P2", 3, 4), matrix_of(path, "Tr", 3, 4)
+        T_first_lidar = rigid_motion(mounting, f"{path}: Tr")
+    return projection, offset_of(projection) @ T_first_lidar
