@@ -271,6 +271,7 @@ class RgbdFrame:
         camera: Intrinsics that hold for both images.
         T_body_camera: (4, 4) pose of the camera in the body frame.
         depth_delay_s: Time from the image's stamp to the depth image's.
+        is_depth_moved: The depth image is another camera's, registered, and lacks some of its returns.
     """
 
     stamp_ns: int
@@ -279,6 +280,7 @@ class RgbdFrame:
     camera: PinholeCamera
     T_body_camera: Transform = field(default_factory=lambda: np.eye(4))
     depth_delay_s: float = 0.0
+    is_depth_moved: bool = False
 
     def __post_init__(self) -> None:
         want = (self.camera.height_px, self.camera.width_px)

@@ -341,11 +341,12 @@ def _prepared(job: _Job, config: FuseSettings, casters: _Casters) -> _Prepared |
     frame, scan, snapshot = job.frame, None, None
     caster = casters.of(frame.sensor)
     try:
-        if job.is_logged or config.octree.attributes:
-            loaded = frame.entry.load()
+        loaded = frame.entry.load() if job.is_logged or config.octree.attributes else None
+        if loaded is not None:
             scan = frame.scan_of(loaded)
             snapshot = _snapshot(loaded, scan, config.mcap) if job.is_logged else None
-        elif job.cached is None:
+        is_moved = isinstance(loaded, RgbdFrame) and loaded.is_depth_moved
+        if job.cached is None and not config.octree.attributes and (loaded is None or is_moved):
             scan = frame.scan_of(frame.entry.scan())
     except FrameError as error:  # readable in the first pass: the log has changed since
         return Skipped(frame.entry.stamp_ns, str(error))

@@ -88,7 +88,10 @@ class FrameRef(Protocol):
         ...
 
     def scan(self) -> Scan:
-        """Read the returns alone: the same points as ``load().scan()``, without the cost of an image.
+        """Read the returns alone, without the cost of an image.
+
+        They are the points of ``load().scan()``; of a depth camera beside the colour camera, all of its
+        returns along its own rays.
 
         Raises:
             FrameError: As ``load``.

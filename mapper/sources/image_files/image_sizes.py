@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.errors import FrameError, SourceError
-from mapper.core.frames import DepthImage, Image, PinholeCamera, ray_table
+from mapper.core.frames import DepthImage, Image, PinholeCamera, RgbdFrame, Scan, ray_table
 from mapper.sensing.depth_registration import DepthRegistration
 from mapper.sources.calibration import Calibration, DepthCamera
 
@@ -90,6 +90,25 @@ class RecordedCamera:
         if self.undistortion is not None:
             depth_m = cv2.remap(depth_m, *self.undistortion, cv2.INTER_NEAREST)
         return depth_m
+
+    def scan(self, recorded: DepthImage, where: str, *, stamp_ns: int) -> Scan:
+        """Return a depth image's returns in the camera's frame; a depth camera's own along its own rays.
+
+        Args:
+            recorded: (H, W) depth as recorded.
+            where: Name of the image in an error.
+            stamp_ns: Time of the frame.
+
+        Raises:
+            FrameError: As ``image``.
+        """
+        if self.registration is None:
+            depth_m = self.depth_m(recorded, where)
+            no_image = np.broadcast_to(np.uint8(0), depth_m.shape)
+            return RgbdFrame(stamp_ns, no_image, depth_m, self.camera).scan()
+        _check_size(recorded, self.depth_px, where)
+        points, origin = self.registration.back_project(recorded)
+        return Scan(stamp_ns, points, origin)
 
     def notes(self) -> list[str]:
         """Return a sentence on what is resized, if anything is."""

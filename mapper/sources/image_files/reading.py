@@ -12,7 +12,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from mapper.core.errors import DataError, FrameError
-from mapper.core.frames import DepthImage, Image, PinholeCamera, RgbdFrame, Scan
+from mapper.core.frames import DepthImage, Image
 from mapper.core.units import MM_PER_M
 from mapper.runtime.regular_files import MOST_BYTES, read_regular
 from mapper.sources.base import ImageFile
@@ -202,12 +202,6 @@ def valid_depth(depth: NDArray[np.number], units_per_m: float, *, where: str) ->
         )
     np.copyto(valid, 0.0, where=~is_near)
     return valid
-
-
-def scan_of(depth_m: DepthImage, camera: PinholeCamera, *, stamp_ns: int) -> Scan:
-    """Return the measured pixels of (H, W) depth as a scan in the camera's frame, without a colour image."""
-    no_image = np.broadcast_to(np.uint8(0), depth_m.shape)
-    return RgbdFrame(stamp_ns, no_image, depth_m, camera).scan()
 
 
 def bytes_of(path: ImageFile) -> bytes:

@@ -33,7 +33,6 @@ from mapper.sources.image_files.reading import (
     read_colour,
     read_depth_m,
     read_grey,
-    scan_of,
 )
 from mapper.sources.listed_files import refuse_links_out
 from mapper.sources.text import parse_numbers, parse_stamp, table, time_order
@@ -68,8 +67,14 @@ class RgbdEntry:
         """
         read_image = read_colour if colour else read_grey
         image = self.recorded.image(read_image(self.encoded.colour), f"{self.encoded.colour}")
-        delay_s = (self.encoded.depth_stamp_ns - self.stamp_ns) / NS_PER_S
-        return RgbdFrame(self.stamp_ns, image, self._depth_m(), self.recorded.camera, depth_delay_s=delay_s)
+        return RgbdFrame(
+            self.stamp_ns,
+            image,
+            self.recorded.depth_m(self._depth_m(), f"{self.encoded.depth}"),
+            self.recorded.camera,
+            depth_delay_s=(self.encoded.depth_stamp_ns - self.stamp_ns) / NS_PER_S,
+            is_depth_moved=self.recorded.registration is not None,
+        )
 
     def scan(self) -> Scan:
         """Read and decode the depth image alone.
@@ -77,11 +82,10 @@ class RgbdEntry:
         Raises:
             FrameError: As ``load``.
         """
-        return scan_of(self._depth_m(), self.recorded.camera, stamp_ns=self.stamp_ns)
+        return self.recorded.scan(self._depth_m(), f"{self.encoded.depth}", stamp_ns=self.stamp_ns)
 
     def _depth_m(self) -> DepthImage:
-        depth_m = read_depth_m(self.encoded.depth, self.encoded.depth_units_per_m)
-        return self.recorded.depth_m(depth_m, f"{self.encoded.depth}")
+        return read_depth_m(self.encoded.depth, self.encoded.depth_units_per_m)
 
 
 @dataclass(frozen=True, slots=True)
