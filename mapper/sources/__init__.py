@@ -124,6 +124,12 @@ def _other_data(path: Path) -> str:
     endings = {inner.suffix.lower() for inner in path.iterdir() if inner.is_file()}
     if endings and endings <= _IMAGES:
         return "images alone; depth images belong beside them, as in rgb/ and depth/"
+    from mapper.sources.image_folders.numbered import image_places
+
+    colour, depth, _ = image_places(path)
+    if any(place.numbered for place in colour) and any(place.numbered for place in depth):
+        names = listed([f"{place.name}/" for place in (*colour, *depth)])
+        return f"the names of its images in {names} have no number in common, which pairs colour with depth"
     return ""
 
 

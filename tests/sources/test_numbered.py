@@ -242,3 +242,11 @@ def test_depth_of_no_camera_names_the_units_that_were_assumed(tmp_path, ending, 
         )
         path.unlink()
     assert f"depth_factor={assumed} right" in why_no_depth(open_source(folder))
+
+
+def test_folders_whose_numbers_do_not_meet_are_named(tmp_path):
+    folder = redwood(tmp_path, ["000000", "000001"])
+    for path in (folder / "depth").iterdir():
+        path.rename(path.with_name(f"1{path.name}"))
+    with pytest.raises(SourceError, match=r"rgb/, depth/ have no number in common"):
+        open_source(folder)

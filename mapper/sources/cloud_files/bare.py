@@ -5,7 +5,6 @@ from io import StringIO
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mapper.core.errors import FrameError
 from mapper.runtime.regular_files import HEAD_BYTES
@@ -60,18 +59,19 @@ def read_bin(path: Path, columns: int | None = None) -> Columns:
             "else --set source.bin_columns to the numbers of a record"
         )
     records = numbers.reshape(-1, columns or KITTIS)
-    if columns is None and _begin_with_intensity(records):
-        raise FrameError(
-            f"{path}: the first number of every record is 0 to 1 as an intensity is, and no coordinate; "
-            "want x y z intensity"
-        )
+    _refuse_others_first(records, path)
     names = ("x", "y", "z", "intensity") if records.shape[1] in _WITH_INTENSITY else ("x", "y", "z")
     return {name: records[:, column] for column, name in enumerate(names)}
 
 
-def _begin_with_intensity(records: NDArray[np.float32]) -> bool:
-    least, largest = (edge(records, axis=0, initial=0.0) for edge in (np.min, np.max))
-    return bool(least[0] == 0.0 < largest[0] <= 1.0 and (largest - least)[1:3].min() > _WIDE_M)
+def _refuse_others_first(table: Column, path: Path) -> None:
+    """Refuse (N, ≥ 3) numbers of which the first are in a narrow range above 0, and the next two are not."""
+    least, largest = (edge(table[:, :3], axis=0, initial=0.0) for edge in (np.min, np.max))
+    if least[0] == 0.0 < largest[0] <= 1.0 and (largest - least)[1:].min() > _WIDE_M:
+        raise FrameError(
+            f"{path}: the first number of every point is 0 to 1 as an intensity or a time is, and no "
+            "coordinate; want x y z first, or a header with the columns' names in a text file"
+        )
 
 
 def read_npy(path: Path) -> Columns:
@@ -86,7 +86,7 @@ def read_npy(path: Path) -> Columns:
         return {name: array[name].ravel() for name in array.dtype.names if array[name].shape == array.shape}
     if array.ndim < 2 or array.shape[-1] < 3 or array.dtype.kind not in "fiu":
         raise FrameError(f"{path}: {array.dtype} of shape {array.shape}, want numbers, (N, 3) or wider")
-    return _xyz(array.reshape(-1, array.shape[-1]))
+    return _xyz(array.reshape(-1, array.shape[-1]), path)
 
 
 def read_text(path: Path) -> Columns:
@@ -108,7 +108,7 @@ def read_text(path: Path) -> Columns:
         values = np.loadtxt(StringIO(text), skiprows=skipped, ndmin=2)
     if len(names) == values.shape[1]:
         return {name: values[:, column] for column, name in enumerate(names)}
-    return _xyz(values)
+    return _xyz(values, path)
 
 
 def _in_blanks(text: str) -> str:
@@ -162,5 +162,6 @@ def _header(text: str) -> tuple[list[str], int | None]:
     return names, None
 
 
-def _xyz(table: Column) -> Columns:
+def _xyz(table: Column, path: Path) -> Columns:
+    _refuse_others_first(table, path)
     return {name: table[:, column] for column, name in enumerate("xyz")}

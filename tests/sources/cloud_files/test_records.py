@@ -114,5 +114,17 @@ def test_scans_of_nuscenes_have_their_stamps_and_a_setting_reads_them(tmp_path):
 def test_records_that_begin_with_an_intensity_are_refused(tmp_path):
     xyz = sweep()
     path = written(tmp_path / "a.bin", INTENSITIES["share"], xyz)
-    with pytest.raises(FrameError, match="0 to 1 as an intensity"):
+    with pytest.raises(FrameError, match="no coordinate"):
         read_cloud(path)
+
+
+@pytest.mark.parametrize("ending", [".npy", ".txt"])
+def test_points_that_begin_with_their_time_are_refused(tmp_path, ending):
+    table = np.column_stack([np.linspace(0.0, 0.1, N), sweep()])
+    path = tmp_path / f"a{ending}"
+    np.save(path, table) if ending == ".npy" else np.savetxt(path, table, fmt="%.4f")
+    with pytest.raises(FrameError, match="no coordinate"):
+        read_cloud(path)
+    if ending == ".txt":
+        path.write_text(f"t x y z\n{path.read_text()}")
+        assert len(read_cloud(path).points) == N
