@@ -27,10 +27,16 @@ HEAD_BYTES = 44
 _HEADER_BYTES, _FOOTER_BYTES = 32, 32
 _IMU_BYTES, _IMU_TYPE = 48, 2
 _IMU = np.dtype(
-    [("system_ns", "<u8"), ("felt_ns", "<u8"), ("ns", "<u8"), ("felt", "<f4", 3), ("turned", "<f4", 3)]
+    [
+        ("system_ns", "<u8"),
+        ("acceleration_ns", "<u8"),
+        ("ns", "<u8"),
+        ("acceleration", "<f4", 3),
+        ("rate", "<f4", 3),
+    ]
 )
 _IMU_SAMPLE = np.dtype(
-    [("ns", "<u8"), ("number", "<u2"), ("status", "<u2"), ("felt", "<f4", 3), ("turned", "<f4", 3)]
+    [("ns", "<u8"), ("number", "<u2"), ("status", "<u2"), ("acceleration", "<f4", 3), ("rate", "<f4", 3)]
 )
 _NMEA_BYTES = 100
 _KEY = "beam_altitude_angles"
@@ -248,15 +254,18 @@ def imu_readings(packet: memoryview) -> Iterator[tuple[int, Array, Array]]:
     """
     if len(packet) == _IMU_BYTES:
         reading = np.frombuffer(packet, _IMU)[0]
-        turned = np.radians(reading["turned"].astype(np.float64))
-        yield int(reading["ns"]), turned, reading["felt"].astype(np.float64) * GRAVITY_MPS2
+        rates_radps = np.radians(reading["rate"].astype(np.float64))
+        yield int(reading["ns"]), rates_radps, reading["acceleration"].astype(np.float64) * GRAVITY_MPS2
         return
     for reading in np.frombuffer(packet[_HEADER_BYTES + _NMEA_BYTES : -_FOOTER_BYTES], _IMU_SAMPLE):
         if reading["status"] & 1:
-            yield int(reading["ns"]), reading["turned"].astype(np.float64), reading["felt"].astype(np.float64)
+            rates_radps, acceleration_mps2 = (
+                reading[name].astype(np.float64) for name in ("rate", "acceleration")
+            )
+            yield int(reading["ns"]), rates_radps, acceleration_mps2
 
 
-def sensors_beside(log: Path) -> tuple[list[OusterSensor], list[str]]:
+def metadata_beside(log: Path) -> tuple[list[OusterSensor], list[str]]:
     """Return the sensors of the metadata files beside a log or in it, those of its name first; problems."""
     stem = log.resolve().stem
     folders = [log, log.parent] if log.is_dir() else [log.parent]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from mapper.core.errors import DataError, FrameError, SourceError
 from mapper.core.geometry import Array
 from mapper.core.timebase import NS_PER_S, Stamps
-from mapper.sources.ouster_packets import HEAD_BYTES, OusterSensor, imu_readings, is_imu, sensors_beside
+from mapper.sources.ouster_packets import HEAD_BYTES, OusterSensor, imu_readings, is_imu, metadata_beside
 from mapper.sources.point_times import MAX_SWEEP_S
 from mapper.sources.ros.decode import decompressed
 from mapper.sources.ros.encode_ros import cloud_message, transforms_message
@@ -194,7 +194,7 @@ class OusterRecording:
         """Return the sensor that fits the packets: by metadata of their namespace first, by files last."""
         name, size = stream.topic.name, int(np.bincount(sizes).argmax())
         found = sorted(sensors.items(), key=lambda one: -shared_namespaces(one[0], name))
-        beside, problems = sensors_beside(self.path)
+        beside, problems = metadata_beside(self.path)
         candidates = [*(sensor for _, sensor in found), *beside]
         for sensor in candidates:
             _, _, serials = sensor.heads(stream.heads)

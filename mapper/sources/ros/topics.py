@@ -207,8 +207,7 @@ def choose(
         if info is not None and own not in (None, info):
             notes.append(f"camera info {info.topic.name} was chosen; that of the images is {own.topic.name}")
         used, image_reason = [color, depth, points], "one camera is mapped"
-        of_camera = [frame_of(firsts.get(one.topic.name)) for one in (camera.color, camera.depth)]
-        beside += _clouds_beside(pick.all(CLOUDS), firsts, frames=of_camera)
+        beside += _clouds_beside(pick.all(CLOUDS), firsts, tracked=[camera.color, camera.depth])
         if points is not None:
             what = "there are" if points in beside and config.others == "fused" else "not used are the"
             choices.append(
@@ -220,7 +219,7 @@ def choose(
         kind = "laser scans" if points.topic.type in LASERS else "point clouds"
         choices = [_choice_note(f"{kind} {points.topic.name}", "points", others=len(clouds) > 1)]
         image_reason = "point clouds are mapped" if camera else "colour has no depth, or depth no colour"
-        beside += _clouds_beside(pick.all(CLOUDS), firsts, frames=[frame_of(firsts.get(points.topic.name))])
+        beside += _clouds_beside(pick.all(CLOUDS), firsts, tracked=[points])
         beside += [camera] if camera else []
         if points.topic.type not in LASERS:
             cameras = _cameras(colors, pick.all(CAMERAS), firsts)
@@ -350,21 +349,29 @@ def _camera(
 
 
 def _clouds_beside(
-    clouds: Sequence[Series], firsts: Mapping[str, Message], *, frames: Collection[str]
+    clouds: Sequence[Series], firsts: Mapping[str, Message], *, tracked: Sequence[Series]
 ) -> list[Series]:
     """Return the clouds of LiDARs in other coordinate frames, of each the topic that ranks first.
 
     Args:
         clouds: All topics of clouds and laser scans; those that were computed from others are left out.
         firsts: First messages.
-        frames: Coordinate frames of the sensor that is tracked.
+        tracked: Topics of the sensor that is tracked.
     """
-    found: dict[str, Series] = {}
+    found = list(tracked)
     for one in sorted(clouds, key=lambda one: (cloud_rank(one.topic.name), one.topic.name)):
-        frame, (is_made, *_) = frame_of(firsts.get(one.topic.name)), cloud_rank(one.topic.name)
-        if len(one) > 1 and frame and frame not in frames and not (is_made or is_fixed(frame)):
-            found.setdefault(frame, one)
-    return list(found.values())
+        frame, (is_made, _, is_packed) = frame_of(firsts.get(one.topic.name)), cloud_rank(one.topic.name)
+        # A driver may publish packets in another frame than the clouds that it makes of them.
+        is_known = frame in [frame_of(firsts.get(other.topic.name)) for other in found] or (
+            is_packed and _namespace(one) in map(_namespace, found)
+        )
+        if len(one) > 1 and frame and not (is_known or is_made or is_fixed(frame)):
+            found.append(one)
+    return found[len(tracked) :]
+
+
+def _namespace(one: Series) -> str:
+    return one.topic.name.rpartition("/")[0]
 
 
 def _stereo_pairs(lefts: Sequence[Series], images: Sequence[Series]) -> list[tuple[Series, Series]]:

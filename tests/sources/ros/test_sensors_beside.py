@@ -75,6 +75,13 @@ def test_what_is_no_other_sensor_or_of_unknown_pose_is_not_fused_but_named(tmp_p
     assert any("/lidar/points" in sentence and "not" in sentence for sentence in log.sentences)
 
 
+def test_packets_of_a_driver_whose_clouds_are_used_are_not_fused_again(tmp_path):
+    mounted = transforms(*(("optical", frame, T_OPTICAL_LIDAR) for frame in ("lidar", "sensor", "rear")))
+    packets = [*clouds("/lidar/packets", "sensor"), *clouds("/rear/packets", "rear")]
+    log = opened(tmp_path / "a.mcap", [mounted, *shots(), *clouds(), *packets])
+    assert [one.log.name for one in log.beside] == ["/lidar/points", "/rear/packets"]
+
+
 def test_the_user_leaves_them_out(tmp_path):
     log = opened(tmp_path / "a.mcap", [MOUNTED, *shots(), *clouds()], others="unused")
     assert log.beside == []
