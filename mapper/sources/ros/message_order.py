@@ -17,6 +17,8 @@ _Indices = NDArray[np.intp]
 _NEIGHBOURS = 5
 _MAX_STRAY_NS = NS_PER_S
 """A stamp further from the median of itself and its neighbours is damaged: even where frames are lost."""
+_SAME_DELAY_S = 0.25
+"""Times of recording are later than stamps by what drivers take, of one camera's images about the same."""
 _STOPPED_S = 1.0
 _MAX_OVERTAKEN = 4
 """Messages that may follow one they should have preceded; more say that the clock was set back."""
@@ -67,10 +69,10 @@ def paired(
         raise SourceError(
             f"{where}: no image of {color.topic.name} has one of {depth.topic.name} within "
             f"{max_gap_s * 1e3:g} ms; the closest are {min(closest_ns) / NS_PER_S:g} s apart "
-            "(source.max_pair_gap_s)"
+            f"({'; '.join(['source.max_pair_gap_s', *_clock_note(color, depth)])})"
         )
     notes += unpaired_note(len(sound_color) - len(i), len(sound_color), max_gap_s=max_gap_s)
-    notes += _end_note(color, depth)
+    notes += [*_end_note(color, depth), *_clock_note(color, depth)]
     kept = _without_overlap(color.stamps_ns[i], _epochs(color.stamps_ns[i]))
     notes += _overlap_note(color.topic.name, int((~kept).sum()), len(kept))
     i, j = i[kept], j[kept]
@@ -142,3 +144,14 @@ def _end_note(color: Series, depth: Series) -> Sequence[str]:
     if early_s <= _STOPPED_S:
         return []
     return [f"{first.topic.name} stops {early_s:.1f} s before {last.topic.name}"]
+
+
+def _clock_note(color: Series, depth: Series) -> Sequence[str]:
+    """Return a note if the stamps of two topics differ from the recorder's clock by different times."""
+    late_s = (color.clock_ns - depth.clock_ns) / NS_PER_S
+    if abs(late_s) <= _SAME_DELAY_S:
+        return []
+    return [
+        f"by the times of recording {depth.topic.name} is {late_s:.3g} s later than its stamps, if "
+        f"{color.topic.name} is not; source.depth_offset_s={late_s:.3g} moves depth"
+    ]

@@ -157,7 +157,7 @@ def lidar_frames(reader: RecordingReader, clouds: Series, config: SourceConfig) 
         notes.append(f"{clouds.topic.name}: field {times} of the first cloud holds no times; not deskewed")
     elif values is not None and counted_on(values) is not values:
         notes.append(f"{clouds.topic.name}: field {times} begins anew during a sweep; counted on")
-    frame, is_planar = frame_of(first), clouds.topic.type in LASERS
+    frame, is_planar = _usual_frame(reader, clouds, frame_of(first)), clouds.topic.type in LASERS
     if is_planar and config.body_frame is None:
         config = config.model_copy(update={"body_frame": reader.base_of(frame)})
     body, body_notes = _body_of(reader, frame, config, name=clouds.topic.name)
@@ -173,7 +173,9 @@ def lidar_frames(reader: RecordingReader, clouds: Series, config: SourceConfig) 
     is_apart = np.array([reader.tree.find(body, one) is None for one in clouds.frames], np.bool_)
     if is_apart.any():
         left_out = is_apart[clouds.frame_numbers]
-        names = listed([one for one, apart in zip(clouds.frames, is_apart, strict=True) if apart])
+        names = listed(
+            [one or "(no name)" for one, apart in zip(clouds.frames, is_apart, strict=True) if apart]
+        )
         notes.append(
             f"{clouds.topic.name}: {left_out.sum()} of {len(clouds)} clouds are in frames that tf does not "
             f"connect to {body}; left out: {names}; record /tf_static too"
@@ -181,6 +183,14 @@ def lidar_frames(reader: RecordingReader, clouds: Series, config: SourceConfig) 
         i = i[~left_out[i]]
     tree = reader.tree_of(body, frame)
     return RecordedFrames("lidar-2d" if is_planar else "lidar", body, clouds.stamps_ns[i], entry_at, notes)
+
+
+def _usual_frame(reader: RecordingReader, clouds: Series, first: str) -> str:
+    """Return the frame of the first cloud, or of most clouds where tf does not connect the two."""
+    if not clouds.frames:
+        return first
+    usual = clouds.frames[int(np.bincount(clouds.frame_numbers).argmax())]
+    return first if reader.tree.find(usual, first) is not None else usual
 
 
 def _planar_notes(reader: RecordingReader, frame: str, body: str, *, name: str) -> list[str]:

@@ -111,3 +111,10 @@ def test_nothing_that_pairs_is_an_error():
 def test_gaps_are_given_in_seconds():
     assert pairs([0, 100], [50, 150], max_gap_s=0.05)[0] == [(0, 0), (1, 0)]
     assert NS_PER_S == 1000 * MS
+
+
+@pytest.mark.parametrize(("early_ms", "noted"), [(500, 1), (200, 0)])
+def test_depth_whose_stamps_are_off_by_the_times_of_recording_is_told(early_ms, noted):
+    found, notes = pairs(range(1000, 5000, 100), range(1000 - early_ms, 5000 - early_ms, 100))
+    assert len(found) == 40 - early_ms // 100
+    assert sum(f"source.depth_offset_s={early_ms / 1e3:g}" in note for note in notes) == noted

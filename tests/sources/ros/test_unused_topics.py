@@ -115,3 +115,10 @@ def test_of_two_imus_one_whose_frame_is_in_tf_is_chosen_and_named_with_the_setti
     log = opened(tmp_path / "a.mcap", [*messages, *tied])
     assert len(log.accelerations.stamps_ns) == (len(STAMPS_NS) if is_in_tf else 1)
     assert sum(expected in one and "source.topics.imu=" in one for one in log.choices) == 1
+
+
+def test_a_first_cloud_in_a_frame_of_its_own_does_not_leave_out_the_others(tmp_path):
+    astray = cloud_message("/points", Scan(FIRST_NS - PERIOD_NS, POINTS), frame="")
+    log = opened(tmp_path / "a.mcap", [astray, *(cloud(t) for t in STAMPS_NS)])
+    assert (len(log), log.body_frame) == (len(STAMPS_NS), "lidar")
+    assert sum("1 of 5 clouds" in note for note in log.notes) == 1
