@@ -1,4 +1,4 @@
-"""Pose graphs as g2o text (Kümmerle et al. 2011), as GTSAM, g2o and SE-Sync read it."""
+"""Pose graphs as g2o text (Kümmerle et al. 2011), as GTSAM, g2o and SE-Sync read it, and TORO's in 2D."""
 
 from collections.abc import Callable, Container, Sequence
 from contextlib import suppress
@@ -231,6 +231,10 @@ def _poses_2d(numbers: Array) -> Array:
 _VERTICES = {"VERTEX_SE3:QUAT": _Form(1, 7, pose_of_row), "VERTEX_SE2": _Form(1, 3, _poses_2d)}
 _EDGES = {"EDGE_SE3:QUAT": _Form(2, 7, pose_of_row, 6), "EDGE_SE2": _Form(2, 3, _poses_2d, 3)}
 _FORMS = _VERTICES | _EDGES
+_TORO = {"VERTEX2": "VERTEX_SE2", "EDGE2": "EDGE_SE2"}
+"""Tags of TORO (Grisetti et al. 2007), and those of g2o with the same numbers, but for their order."""
+_TORO_EDGE = [0, 1, 2, 3, 4, 5, 6, 9, 7, 10, 8]
+"""Of ids, motion and I₁₁ I₁₂ I₂₂ I₃₃ I₁₃ I₂₃ the order that g2o has."""
 _FIX = "FIX"
 _PRIORS = frozenset({"EDGE_SE3_PRIOR", "EDGE_PRIOR_SE2", "EDGE_PRIOR_SE2_XY", "EDGE_SE2_PRIOR"})
 _FORTRAN = str.maketrans("Dd", "ee")
@@ -252,9 +256,12 @@ def _tables(path: Path, progress: Progress) -> dict[str, _Table]:
         if tag in _PRIORS:
             priors += 1
             continue
+        if tag in _TORO:
+            words = [words[k] for k in _TORO_EDGE] if len(words) == len(_TORO_EDGE) else words
+            tag = _TORO[tag]
         form = _Form(len(words), 0, _no_poses) if tag == _FIX else _FORMS.get(tag)
         if form is None:
-            known = ", ".join((*_FORMS, _FIX))
+            known = ", ".join((*_FORMS, *_TORO, _FIX))
             raise GraphError(f"{path}:{line}: unknown tag {tag!r}; want one of {known}")
         if len(words) == form.ids + form.pose_numbers and form.information_rows:
             words += _IDENTITY_INFORMATION[form.information_rows]

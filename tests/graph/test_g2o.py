@@ -204,6 +204,19 @@ def test_files_of_others_need_no_notes(tmp_path):
     np.testing.assert_array_equal(graph.factors[0].information, np.eye(6))
 
 
+def test_gtsam_reads_a_graph_of_toro_alike(tmp_path):
+    path = tmp_path / "toro.graph"
+    lines = ["VERTEX2 0 0 0 0", "VERTEX2 1 1 0.5 0.25", "EDGE2 0 1 1.1 0.4 0.3 9 1 8 50 2 3"]
+    path.write_text("\n".join(lines) + "\n")
+    (factor,) = read_g2o(path).factors
+    gtsam_graph, initial = gtsam.load2D(f"{path}", None, 0, False, False, gtsam.NoiseFormat.NoiseFormatTORO)
+    planar = factor.information[np.ix_([3, 4, 2], [3, 4, 2])]
+    np.testing.assert_allclose(gtsam_graph.at(0).noiseModel().information(), planar, rtol=1e-12)
+    measured = gtsam_graph.at(0).measured()
+    np.testing.assert_allclose(measured.matrix()[:2, 2], factor.T_i_j[:2, 3], atol=1e-12)
+    assert initial.size() == 2
+
+
 def test_exponents_of_fortran_are_read(tmp_path):
     (tmp_path / "e.g2o").write_text(VERTICES.replace(" 1 1 0", " 1 1.25e+01 0") + EDGE)
     (tmp_path / "D.g2o").write_text(VERTICES.replace(" 1 1 0", " 1 1.25D+01 0") + EDGE)
