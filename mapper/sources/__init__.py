@@ -23,6 +23,7 @@ RECORDING = "ros.files"
 FORMATS = (
     "image_folders.posed_layouts",
     "image_folders.azure_kinect",
+    "image_folders.hololens",
     "image_folders.icl_nuim",
     "image_folders.tum",
     "image_folders.mbag",
@@ -61,8 +62,8 @@ def open_source(path: Path, config: SourceConfig = _DEFAULTS) -> "Log":
 
     Args:
         path: Folder of a TUM, ICL-NUIM, Poznań, 7-Scenes, Redwood, ScanNet, Replica, EuRoC or KITTI log,
-            of an app's export (Stray Scanner, Record3D, Polycam, nerfstudio) or of clouds; an mbag, .sens,
-            .r3d, .mkv (Azure Kinect), .e57, .pcap or MCAP file, a CARMEN log, or a ROS bag.
+            of an app's export (Stray Scanner, Record3D, Polycam, nerfstudio), of a HoloLens 2 or of clouds;
+            an mbag, .sens, .r3d, .mkv (Azure Kinect), .e57, .pcap or MCAP file, a CARMEN log, or a ROS bag.
         config: Selection, pairing, camera, and what the files of a log do not state.
 
     Raises:

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mapper.core.errors import SourceError, listed
 from mapper.core.frames import NO_DISTORTION, PinholeCamera
@@ -124,11 +125,14 @@ class DepthCamera:
         calibration: Its intrinsics.
         T_color_depth: (4, 4) its pose in the colour camera's frame.
         origin: Source of the pose, for messages.
+        tangents: (H, W, 2) x/z and y/z of every pixel's ray where the log states these, and the intrinsics
+            are about theirs.
     """
 
     calibration: Calibration
     T_color_depth: Transform
     origin: str
+    tangents: NDArray[np.float32] | None = None
 
     @property
     def note(self) -> str:

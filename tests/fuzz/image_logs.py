@@ -10,6 +10,7 @@ from mapper.core.frames import PinholeCamera
 from mapper.core.timebase import NS_PER_S
 from mapper.sources.calibration_file import calibration_text
 from tests.support.azure_kinect import Capture, write_azure_kinect
+from tests.support.hololens import write_hololens
 from tests.support.recordings import CAMERA
 from tests.support.tum_logs import FIRST_NS, picture
 
@@ -113,5 +114,6 @@ IMAGE_LOGS: Mapping[str, Callable[[Path], Path]] = {
     "icl-nuim": _icl_nuim,
     "stamped images": _stamped,
     "azure-kinect": _azure_kinect,
+    "hololens": lambda folder: write_hololens(folder / "log", is_raw=True),
 }
 """Makers of these inputs."""

@@ -165,6 +165,8 @@ def is_same_view(colour_px: Size, depth_px: Size) -> bool:
 
 
 def _registration(depth: DepthCamera, depth_px: Size, camera: PinholeCamera) -> DepthRegistration:
+    if depth.tangents is not None:
+        return DepthRegistration(depth.tangents, camera, depth.T_color_depth)
     width_px, height_px = depth_px
     own, lens = depth.calibration.camera(width_px=width_px, height_px=height_px), depth.calibration.lens
     rays = ray_table(own) if lens is None else lens.rays(own)

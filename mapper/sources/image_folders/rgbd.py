@@ -23,7 +23,7 @@ from mapper.sources.calibration import (
 )
 from mapper.sources.calibration_file import calibration_files, read_calibration
 from mapper.sources.config import CameraConfig
-from mapper.sources.image_files.decoded import DecodedDepth
+from mapper.sources.image_files.decoded import DecodedColour, DecodedDepth
 from mapper.sources.image_files.image_sizes import RecordedCamera, Size, recorded_camera
 from mapper.sources.image_files.reading import (
     ARRAYS,
@@ -135,7 +135,7 @@ def rgbd_log(
         notes = [*notes, "fy < 0: the camera's y axis points up; y of camera and truth is mirrored"]
     folder = path if path.is_dir() else path.parent
     images = (image for pair in pairs for image in (pair.colour, pair.depth))
-    files = (image.where if isinstance(image, DecodedDepth) else image for image in images)
+    files = (image.where if isinstance(image, DecodedColour | DecodedDepth) else image for image in images)
     refuse_links_out((file for file in files if isinstance(file, Path)), log=folder)
     units_per_m = calibration.depth_units_per_m or depth_units_per_m
     float_units_per_m = calibration.depth_units_per_m or 1.0
@@ -220,14 +220,16 @@ def _depth_camera(stated: DepthCamera | None, config: CameraConfig | None) -> De
     intrinsics, T_color_depth = configured_depth_intrinsics(config), configured_depth_pose(config)
     if intrinsics is None and T_color_depth is None:
         return stated
+    tangents = None
     if stated is not None:
+        tangents = stated.tangents if intrinsics is None else None
         intrinsics = intrinsics or stated.calibration
         T_color_depth = stated.T_color_depth if T_color_depth is None else T_color_depth
     if intrinsics is None or T_color_depth is None:
         raise SourceError(
             "source.camera: want depth_intrinsics_px and depth_in_color: the log's files state neither"
         )
-    return DepthCamera(intrinsics, T_color_depth, "source.camera")
+    return DepthCamera(intrinsics, T_color_depth, "source.camera", tangents)
 
 
 def assumed_camera_note(camera: Calibration) -> str:
