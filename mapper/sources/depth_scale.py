@@ -60,6 +60,8 @@ class _Features:
 
 def why_no_depth(log: Log) -> str | None:
     """Return why an RGB-D log's depth is none that a camera measures, by a few frames; None if it may be."""
+    if log.sensor != "rgbd":
+        return None
     frames = [frame for entry in log.spread_entries(LOOKED_AT) if (frame := read_depth(entry)) is not None]
     medians_m = [_median_m(frame) for frame in frames if frame.depth_m.any()]
     if frames and not medians_m:

@@ -66,8 +66,9 @@ def read_bin(path: Path, columns: int | None = None) -> Columns:
 
 def _refuse_others_first(table: Column, path: Path) -> None:
     """Refuse (N, ≥ 3) numbers of which the first are in a narrow range above 0, and the next two are not."""
-    least, largest = (edge(table[:, :3], axis=0, initial=0.0) for edge in (np.min, np.max))
-    if least[0] == 0.0 < largest[0] <= 1.0 and (largest - least)[1:].min() > _WIDE_M:
+    first, others = table[:, 0], table[:, 1:3]
+    is_narrow = len(first) > 0 and first.min() >= 0.0 and 0.0 < first.max() <= 1.0
+    if is_narrow and np.ptp(others, axis=0).min() > _WIDE_M:
         raise FrameError(
             f"{path}: the first number of every point is 0 to 1 as an intensity or a time is, and no "
             "coordinate; want x y z first, or a header with the columns' names in a text file"
