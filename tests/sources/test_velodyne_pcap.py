@@ -1,6 +1,7 @@
 """Captures of a Velodyne's packets become scans, a turn each."""
 
 import os
+import sys
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from mapper.core.trajectory import Trajectory
 from mapper.evaluators.metrics.evaluate import evaluate
 from mapper.pipeline.build import build
 from mapper.sources import open_source
-from tests.support.driver_recordings import FIRST_NS, TURN, street, write_pcap
+from tests.support.driver_recordings import FIRST_NS, TURN, street, write_datagrams, write_pcap
 
 
 @pytest.fixture(scope="module")
@@ -56,4 +57,18 @@ def test_what_is_no_capture_is_refused(tmp_path, data):
 def test_a_capture_without_packets_of_a_velodyne_is_refused(tmp_path, simulator):
     path = write_pcap(tmp_path / "a.pcap", simulator, packets=0)
     with pytest.raises(SourceError, match="no packets of a Velodyne"):
+        open_source(path)
+
+
+@pytest.mark.parametrize(
+    ("begins", "size", "port", "maker"),
+    [("eeff0601", 1080, 2368, "Hesai"), ("55aa050a", 1248, 6699, "RoboSense"), ("0102", 900, 3000, "")],
+)
+def test_packets_of_another_maker_are_refused_by_what_they_are(
+    tmp_path, monkeypatch, begins, size, port, maker
+):
+    monkeypatch.setitem(sys.modules, "velodyne_decoder", None)  # not to be installed for this
+    payload = bytes.fromhex(begins).ljust(size, b"\0")
+    path = write_datagrams(tmp_path / "a.pcap", [payload] * 40, port=port)
+    with pytest.raises(SourceError, match=rf"{maker}.*{size} bytes to port {port}.*PointCloud2"):
         open_source(path)

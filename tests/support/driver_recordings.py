@@ -169,6 +169,15 @@ def write_pcap(path: Path, simulator: LidarSimulator, *, packets: int) -> Path:
     return path
 
 
+def write_datagrams(path: Path, payloads: Iterable[bytes], *, port: int) -> Path:
+    """Write a capture of datagrams to a port, a millisecond apart."""
+    with path.open("wb") as file:
+        writer = dpkt.pcap.Writer(file)
+        for number, payload in enumerate(payloads):
+            writer.writepkt(_ethernet(payload, port=port), ts=FIRST_NS / 1e9 + 1e-3 * number)
+    return path
+
+
 def _ethernet(payload: bytes, *, port: int) -> bytes:
     udp = dpkt.udp.UDP(sport=443, dport=port, ulen=8 + len(payload), data=payload)
     ip = dpkt.ip.IP(src=bytes([192, 168, 1, 201]), dst=bytes([255] * 4), p=dpkt.ip.IP_PROTO_UDP, data=udp)

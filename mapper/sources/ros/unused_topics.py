@@ -18,6 +18,10 @@ _BOOKKEEPING = re.compile(
 """Beginnings of types of messages about programs, plans and pictures, which no sensor measured."""
 _PACKED = re.compile("video|ffmpeg|theora|compressed", re.IGNORECASE)
 """Words in types of videos and of packed clouds."""
+_PACKETS = re.compile(
+    r"(?:UdpFrame|(?:Udp|Pandar|Rslidar|Robosense)(?:Scan|Packet)|NebulaPackets?)$", re.IGNORECASE
+)
+"""Ends of types of a LiDAR's packets of which nothing makes points here: Hesai's, RoboSense's, Nebula's."""
 
 
 def unused_notes(
@@ -53,7 +57,9 @@ def unused_notes(
             kind = None
         else:
             name, kind = f"{name} ({type_})", "topics of types that are not read"
-            if _PACKED.search(type_):
+            if _PACKETS.search(type_):
+                kind = "packets that are not read (play them through the LiDAR's driver, record PointCloud2)"
+            elif _PACKED.search(type_):
                 kind = "packed topics that are not read (record raw images, JPEG or PNG; PointCloud2)"
         if kind is not None:
             kinds.setdefault(kind, []).append(name)

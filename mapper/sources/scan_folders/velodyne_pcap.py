@@ -1,5 +1,6 @@
 """Captures of a Velodyne's packets (.pcap, .pcapng), as VeloView, tcpdump and Wireshark write them."""
 
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from ipaddress import ip_address
@@ -21,6 +22,9 @@ from mapper.sources.velodyne_packets import PACKET_BYTES, decode_packets, requir
 
 _LEAST_SHARE = 0.5
 """Share of the usual number of packets that a turn must have: the first and the last one are cut."""
+_MAKERS = {b"\xee\xff": "a Hesai's", b"\x55\xaa": "a RoboSense's"}
+"""Whose packets begin with these bytes."""
+_TRIED = 2000
 
 
 class _Turn(NamedTuple):
@@ -44,14 +48,14 @@ def read_log(path: Path, config: SourceConfig) -> Log:
         SourceError: It is no capture, or has no packets of a Velodyne.
         DependencyError: The library that decodes packets is not installed.
     """
-    require_decoder()
     by_sender = _turns(path)
     if not by_sender:
         raise SourceError(
             f"{path}: no packets of a Velodyne in it (UDP, {PACKET_BYTES} bytes), nor whole ones of an "
-            "Ouster (a filter by port keeps the first fragments alone); play those of another LiDAR through "
-            "its driver and record the clouds"
+            f"Ouster (a filter by port keeps the first fragments alone){_most_sent(path)}; play those of "
+            "another LiDAR through its driver and record its PointCloud2"
         )
+    require_decoder()
     sender = max(by_sender, key=lambda one: sum(turn.packets for turn in by_sender[one]))
     turns, notes = by_sender[sender], []
     if len(by_sender) > 1:
@@ -114,6 +118,16 @@ class _TurnEntry:
             FrameError: As ``load``.
         """
         return self.load()
+
+
+def _most_sent(path: Path) -> str:
+    """Return what most datagrams are, as the end of a clause; empty without any."""
+    found = (one for _, one in islice(captured(path), _TRIED) if one is not None)
+    kinds = Counter((len(one.payload), one.port, _MAKERS.get(one.payload[:2], "")) for one in found)
+    if not kinds:
+        return ""
+    (size, port, maker), _ = kinds.most_common(1)[0]
+    return f", but {f'{maker}, ' if maker else ''}{size} bytes to port {port}"
 
 
 def _turns(path: Path) -> dict[bytes, list[_Turn]]:

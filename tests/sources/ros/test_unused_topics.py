@@ -2,12 +2,13 @@
 
 import numpy as np
 import pytest
+from mcap.writer import Writer
 
 from mapper.core.errors import SourceError
 from mapper.core.frames import Scan
 from mapper.sources import open_source
 from mapper.sources.ros.encode_ros import cloud_message, imu_message
-from tests.support.recordings import COLOR, DEPTH, image, shots, transforms, write
+from tests.support.recordings import COLOR, DEPTH, add_messages, image, shots, transforms, write
 from tests.support.tum_logs import FIRST_NS, PERIOD_NS
 
 STAMPS_NS = [FIRST_NS + i * PERIOD_NS for i in range(4)]
@@ -22,6 +23,16 @@ def imu(stamp_ns, length, *, rate=0.1):
     up = np.array([0.0, 0.0, length])
     rates = np.array([rate, 0.0, 0.0])
     return imu_message(stamp_ns, "/imu", rates_radps=rates, acceleration_mps2=up, frame="imu")
+
+
+def write_mcap(path, messages):
+    """Write messages of any types, without their definitions."""
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        add_messages(writer, messages)
+        writer.finish()
+    return path
 
 
 def opened(path, messages):
@@ -46,6 +57,24 @@ def test_topics_that_cannot_be_read_are_named_where_nothing_can_be_mapped(tmp_pa
     ]
     with pytest.raises(SourceError, match=f"{COLOR}/h264 .{type_}"):
         opened(tmp_path / "a.mcap", packets)
+
+
+@pytest.mark.parametrize(
+    "type_",
+    [
+        "hesai_ros_driver/msg/UdpFrame",
+        "pandar_msgs/msg/PandarScan",
+        "rslidar_msgs/msg/rslidarScan",
+        "rslidar_msg/msg/RslidarPacket",
+        "nebula_msgs/msg/NebulaPackets",
+    ],
+)
+def test_packets_that_are_not_decoded_are_named_with_the_remedy(tmp_path, type_):
+    packets = [cloud(t)._replace(topic="/lidar_packets", type=type_) for t in STAMPS_NS]
+    with pytest.raises(SourceError, match=rf"driver .*PointCloud2.*/lidar_packets \({type_}\)"):
+        open_source(write_mcap(tmp_path / "a.mcap", packets))
+    log = open_source(write_mcap(tmp_path / "b.mcap", [*packets, *(cloud(t) for t in STAMPS_NS)]))
+    assert sum(type_ in note and "driver" in note for note in log.notes) == 1
 
 
 def test_depth_of_8_bits_is_named_where_nothing_can_be_mapped(tmp_path):
