@@ -71,7 +71,7 @@ def test_topics_that_cannot_be_read_are_named_where_nothing_can_be_mapped(tmp_pa
 )
 def test_packets_that_are_not_decoded_are_named_with_the_remedy(tmp_path, type_):
     packets = [cloud(t)._replace(topic="/lidar_packets", type=type_) for t in STAMPS_NS]
-    with pytest.raises(SourceError, match=rf"driver .*PointCloud2.*/lidar_packets \({type_}\)"):
+    with pytest.raises(SourceError, match=rf"driver.*PointCloud2.*/lidar_packets \({type_}\)"):
         open_source(write_mcap(tmp_path / "a.mcap", packets))
     log = open_source(write_mcap(tmp_path / "b.mcap", [*packets, *(cloud(t) for t in STAMPS_NS)]))
     assert sum(type_ in note and "driver" in note for note in log.notes) == 1
