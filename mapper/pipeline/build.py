@@ -168,7 +168,7 @@ class _Steps:
         with self.writer.clock.stage("solve"):
             tracking, planes = adjust_tracking(self.source, tracking, self.config, progress=self.progress)
         with self.writer.clock.stage("level"):
-            source, _ = check_accelerations(self.source, tracking)
+            source, *_ = check_accelerations(self.source, tracking)
             level = level_of(with_body_rates(source, tracking.gyroscope), tracking, self.config)
             tracking = replace(tracking, graph=tracking.graph.moved(level.T_level_world))
             placed = georeference(tracking, self.source.gnss, self.config.graph)

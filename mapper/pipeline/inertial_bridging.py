@@ -37,9 +37,9 @@ def bridge(source: Log, tracking: TrackingResult, *, progress: Progress) -> Trac
     """Return the result with what the log's inertial readings say where its frames say too little.
 
     Frames that were lost are placed, doubtful as nothing of them is seen, and the parts of the path on both
-    sides of them are connected. Where surfaces leave a motion open, or the readings contradict the odometry,
-    keyframes' factors and frames' poses become the smoothed ones; these are no longer doubtful where the
-    velocity is known. All else stays as it is.
+    sides of them are connected. Where surfaces leave a motion open, or readings that explain the rest of the
+    path contradict the odometry, keyframes' factors and frames' poses become the smoothed ones; these are no
+    longer doubtful where the velocity is known. All else stays as it is.
 
     Args:
         source: The log.
@@ -51,7 +51,7 @@ def bridge(source: Log, tracking: TrackingResult, *, progress: Progress) -> Trac
     calibration = tracking.gyroscope
     if calibration is None or source.accelerations is None:
         return tracking
-    source, warnings = check_accelerations(source, tracking)
+    source, warnings, explain_path = check_accelerations(source, tracking)
     if warnings:
         tracking = replace(tracking, warnings=(*tracking.warnings, *warnings))
     readings = body_readings(source, calibration)
@@ -66,17 +66,17 @@ def bridge(source: Log, tracking: TrackingResult, *, progress: Progress) -> Trac
     for begin, end in pairwise([0, *unreached, len(tracks)]):
         known = [k for k in range(begin, end) if tracks[k].node is not None]
         if len(known) > 1:
-            tracking = _bridge_window(tracking, readings, known[0], end - 1)
+            tracking = _bridge_window(tracking, readings, known[0], end - 1, may_contradict=explain_path)
     for warning in tracking.warnings[before:]:
         progress.note(warning.text)
     return tracking
 
 
-def check_accelerations(source: Log, tracking: TrackingResult) -> tuple[Log, tuple[RunWarning, ...]]:
-    """Return the log with accelerations that point up at rest, and warnings of their sign and of lengths.
+def check_accelerations(source: Log, tracking: TrackingResult) -> tuple[Log, tuple[RunWarning, ...], bool]:
+    """Return the log with accelerations that point up at rest, warnings, and whether they explain the path.
 
     The path's changes of velocity tell the sign, which gravity alone does not, and whether the frames'
-    lengths are metres.
+    lengths are metres; where accelerations do not explain these changes, the sign is not known.
 
     Args:
         source: The log.
@@ -86,12 +86,12 @@ def check_accelerations(source: Log, tracking: TrackingResult) -> tuple[Log, tup
     sure = tuple(track for track in whole.tracked if not track.diagnostics.unobservable)
     felt = source.accelerations
     if tracking.gyroscope is None or felt is None or not sure:
-        return source, ()
+        return source, (), False
     readings = body_readings(source, tracking.gyroscope)
     trajectory = replace(whole, tracks=sure).tracked_trajectory()
     found = readings and readings.path_scale(trajectory.stamps_ns, trajectory.T_world_body)
     if not found:
-        return source, ()
+        return source, (), False
     scale, sigma = found
     warnings = []
     if scale < -_CERTAIN * sigma:
@@ -109,7 +109,7 @@ def check_accelerations(source: Log, tracking: TrackingResult) -> tuple[Log, tup
                 weight="doubt",
             )
         )
-    return source, tuple(warnings)
+    return source, tuple(warnings), True
 
 
 def _is_weak(track: FrameResult) -> bool:
@@ -166,7 +166,7 @@ def _window_of(tracks: Sequence[FrameResult], graph: PoseGraph, part_of_node: Ma
 
 
 def _bridge_window(
-    tracking: TrackingResult, readings: InertialReadings, first: int, last: int
+    tracking: TrackingResult, readings: InertialReadings, first: int, last: int, *, may_contradict: bool
 ) -> TrackingResult:
     """Return the result with the smoothed poses of the weak frames first … last."""
     graph, part_of_node = tracking.graph, component_numbers(tracking.graph.without_loops())
@@ -187,7 +187,7 @@ def _bridge_window(
     inside = {node: index for node, index in window.index_of.items() if index < len(tracks)}
     for factor in factors:
         later = max(factor.i, factor.j)
-        if later < len(tracks) and path.contradicts(factor):
+        if may_contradict and later < len(tracks) and path.contradicts(factor):
             weak[later] = True
     changed = _place_frames(tracks, weak, path, inside)
     replaced = _replace_factors(graph, weak, path, inside)

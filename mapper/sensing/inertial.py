@@ -153,6 +153,8 @@ class InertialReadings:
             before_s, after_s = poses_s[k] - poses_s[begin], poses_s[end] - poses_s[k]
             if min(before_s, after_s) < 0.5 * _HALF_S or max(before_s, after_s) > 2.0 * _HALF_S:
                 continue
+            if not self.covers(int(stamps_ns[begin]), int(stamps_ns[end])):
+                continue
             s = slice(*np.searchsorted(times_s, [poses_s[begin], poses_s[end]]))
             rising, falling = (times_s[s] - poses_s[begin]) / before_s, (poses_s[end] - times_s[s]) / after_s
             weights = np.minimum(rising, falling) * np.gradient(times_s[s])

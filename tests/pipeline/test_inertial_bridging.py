@@ -176,6 +176,16 @@ def test_a_pose_that_the_readings_contradict_is_replaced(sigma_m):
     assert [k for k, one in enumerate(found.graph.factors) if one is not factors[k]] == [wrong]
 
 
+def test_readings_that_do_not_explain_the_path_replace_no_measured_pose():
+    """A path too short for its changes of velocity to tell the sign of accelerations."""
+    log_, tracking, _ = made(4, seconds=2.2)
+    factors = list(tracking.graph.factors)
+    factors[1] = replace(factors[1], T_i_j=factors[1].T_i_j @ exp(np.zeros(3), 0.3 * np.eye(3)[0]))
+    tracking = replace(tracking, graph=tracking.graph.with_factors(factors))
+    assert not check_accelerations(log_, tracking)[2]
+    assert list(bridge(log_, tracking, progress=SILENT).graph.factors) == factors
+
+
 @pytest.mark.parametrize("seed", [9, 10])
 def test_a_unit_beside_the_body_bridges_as_well(seed):
     """Its mounting is a rotation alone: 0.1 m of lever arm, unknown, are errors of the accelerations."""
@@ -238,7 +248,7 @@ def test_accelerations_of_either_sign_point_up_at_rest(seed, sign):
     log_, tracking, _ = made(seed)
     felt = log_.accelerations
     given = replace(log_, accelerations=replace(felt, acceleration_mps2=sign * felt.acceleration_mps2))
-    checked, warnings = check_accelerations(given, tracking)
+    checked, warnings, _ = check_accelerations(given, tracking)
     assert np.array_equal(checked.accelerations.acceleration_mps2, felt.acceleration_mps2)
     assert [(warning.kind, warning.weight) for warning in warnings] == [("imu", "note")] * (sign < 0.0)
 
@@ -263,6 +273,21 @@ def test_no_scale_is_found_where_nothing_moved(is_exact):
     assert readings.path_scale(100_000_000 * np.arange(1, 180), np.tile(np.eye(4), (179, 1, 1))) is None
 
 
+def test_the_path_is_compared_with_readings_where_there_are_any():
+    log_, tracking, _ = made(1)
+    felt, rates = log_.accelerations, log_.gyroscope
+    since_s = (felt.stamps_ns - felt.stamps_ns[0]) / NS_PER_S
+    kept = (since_s < 5.0) | (since_s > 7.0)
+    given = replace(
+        log_,
+        accelerations=replace(
+            felt, stamps_ns=felt.stamps_ns[kept], acceleration_mps2=felt.acceleration_mps2[kept]
+        ),
+        gyroscope=replace(rates, stamps_ns=rates.stamps_ns[kept], rates_radps=rates.rates_radps[kept]),
+    )
+    assert check_accelerations(given, tracking) == (given, (), True)
+
+
 @pytest.mark.parametrize("unit", [0.3048, 1.0, 5.0])
 def test_lengths_that_are_no_metres_are_doubted(unit):
     log_, tracking, _ = made(1)
@@ -270,7 +295,7 @@ def test_lengths_that_are_no_metres_are_doubted(unit):
         {node: enlarged(T, 1.0 / unit) for node, T in tracking.graph.T_world_node.items()}
     )
     tracks = [replace(t, T_node_body=enlarged(t.T_node_body, 1.0 / unit)) for t in tracking.tracks]
-    _, warnings = check_accelerations(log_, replace(tracking, graph=graph, tracks=tuple(tracks)))
+    _, warnings, _ = check_accelerations(log_, replace(tracking, graph=graph, tracks=tuple(tracks)))
     assert [warning.weight for warning in warnings] == ["doubt"] * (unit != 1.0)
     if warnings:
         times = float(re.search(r"is ([\d.]+) times", warnings[0].sentence)[1])
@@ -289,7 +314,7 @@ def test_frames_that_surfaces_do_not_place_tell_nothing_of_accelerations():
     tracks = tuple(replace(track, diagnostics=unseen) for track in tracking.tracks)
     negated = replace(log_.accelerations, acceleration_mps2=-log_.accelerations.acceleration_mps2)
     given = replace(log_, accelerations=negated)
-    assert check_accelerations(given, replace(tracking, tracks=tracks)) == (given, ())
+    assert check_accelerations(given, replace(tracking, tracks=tracks)) == (given, (), False)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -305,7 +330,7 @@ def test_a_sensor_that_stands_tells_nothing_of_accelerations(seed):
     ]
     rates = replace(log_.gyroscope, rates_radps=rng.normal(0.0, 1e-3, log_.gyroscope.rates_radps.shape))
     given = replace(log_, gyroscope=rates, accelerations=replace(log_.accelerations, acceleration_mps2=-felt))
-    checked, warnings = check_accelerations(given, replace(tracking, tracks=tuple(tracks), graph=standing))
+    checked, warnings, _ = check_accelerations(given, replace(tracking, tracks=tuple(tracks), graph=standing))
     assert (checked, warnings) == (given, ())
 
 
