@@ -37,9 +37,9 @@ def bridge(source: Log, tracking: TrackingResult, *, progress: Progress) -> Trac
     """Return the result with what the log's inertial readings say where its frames say too little.
 
     Frames that were lost are placed, doubtful as nothing of them is seen, and the parts of the path on both
-    sides of them are connected. Where surfaces leave a motion open, or readings that explain the rest of the
-    path contradict the odometry, keyframes' factors and frames' poses become the smoothed ones; these are no
-    longer doubtful where the velocity is known. All else stays as it is.
+    sides of them are connected. Where surfaces leave a motion open, or the readings contradict the odometry,
+    keyframes' factors and frames' poses become the smoothed ones; these are no longer doubtful where the
+    velocity is known. All else stays as it is.
 
     Args:
         source: The log.
@@ -51,7 +51,7 @@ def bridge(source: Log, tracking: TrackingResult, *, progress: Progress) -> Trac
     calibration = tracking.gyroscope
     if calibration is None or source.accelerations is None:
         return tracking
-    source, warnings, explain_path = check_accelerations(source, tracking)
+    source, warnings, is_sign_known = check_accelerations(source, tracking)
     if warnings:
         tracking = replace(tracking, warnings=(*tracking.warnings, *warnings))
     readings = body_readings(source, calibration)
@@ -66,17 +66,17 @@ def bridge(source: Log, tracking: TrackingResult, *, progress: Progress) -> Trac
     for begin, end in pairwise([0, *unreached, len(tracks)]):
         known = [k for k in range(begin, end) if tracks[k].node is not None]
         if len(known) > 1:
-            tracking = _bridge_window(tracking, readings, known[0], end - 1, may_contradict=explain_path)
+            tracking = _bridge_window(tracking, readings, known[0], end - 1, is_sign_known=is_sign_known)
     for warning in tracking.warnings[before:]:
         progress.note(warning.text)
     return tracking
 
 
 def check_accelerations(source: Log, tracking: TrackingResult) -> tuple[Log, tuple[RunWarning, ...], bool]:
-    """Return the log with accelerations that point up at rest, warnings, and whether they explain the path.
+    """Return the log with accelerations that point up at rest, warnings, and whether that is known.
 
     The path's changes of velocity tell the sign, which gravity alone does not, and whether the frames'
-    lengths are metres; where accelerations do not explain these changes, the sign is not known.
+    lengths are metres; where accelerations explain too little of these changes, neither is known.
 
     Args:
         source: The log.
@@ -166,7 +166,7 @@ def _window_of(tracks: Sequence[FrameResult], graph: PoseGraph, part_of_node: Ma
 
 
 def _bridge_window(
-    tracking: TrackingResult, readings: InertialReadings, first: int, last: int, *, may_contradict: bool
+    tracking: TrackingResult, readings: InertialReadings, first: int, last: int, *, is_sign_known: bool
 ) -> TrackingResult:
     """Return the result with the smoothed poses of the weak frames first … last."""
     graph, part_of_node = tracking.graph, component_numbers(tracking.graph.without_loops())
@@ -176,6 +176,10 @@ def _bridge_window(
     stamps_ns = np.array([track.stamp_ns for track in tracks], np.int64)
     try:
         path = smooth_path(stamps_ns, window.poses, window.part_of, factors, readings)
+        if not is_sign_known:
+            reversed_ = replace(readings, accelerations_mps2=-readings.accelerations_mps2)
+            other = smooth_path(stamps_ns, window.poses, window.part_of, factors, reversed_)
+            path = min(path, other, key=lambda one: one.variance_factor)
     except GraphError as error:
         return _with_note(tracking, f"accelerations are not used: {error}") if weak.any() else tracking
     if path.variance_factor > _CONTRADICTION:
@@ -187,7 +191,7 @@ def _bridge_window(
     inside = {node: index for node, index in window.index_of.items() if index < len(tracks)}
     for factor in factors:
         later = max(factor.i, factor.j)
-        if may_contradict and later < len(tracks) and path.contradicts(factor):
+        if later < len(tracks) and path.contradicts(factor):
             weak[later] = True
     changed = _place_frames(tracks, weak, path, inside)
     replaced = _replace_factors(graph, weak, path, inside)
