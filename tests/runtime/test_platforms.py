@@ -39,10 +39,10 @@ import builtins
 is_imported = builtins.__import__
 
 
-def without(name, globals=None, *rest):
+def without(name, globals=None, *rest, **named):
     if name in {"fcntl", "resource"} and (globals or {}).get("__name__", "").startswith("mapper."):
         raise ModuleNotFoundError(name)
-    return is_imported(name, globals, *rest)
+    return is_imported(name, globals, *rest, **named)
 
 
 builtins.__import__ = without

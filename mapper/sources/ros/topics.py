@@ -10,7 +10,6 @@ import numpy as np
 
 from mapper.core.errors import SourceError
 from mapper.sources.config import TopicsConfig
-from mapper.sources.ros.camera_infos import info_of, infos_beside, without_those_of_depth
 from mapper.sources.ros.frame_tree import is_fixed
 from mapper.sources.ros.image_messages import encoding_of, is_depth, is_mono16
 from mapper.sources.ros.message_index import Series
@@ -33,10 +32,13 @@ from mapper.sources.ros.topic_ranks import (
     color_rank,
     depth_rank,
     fix_rank,
+    info_of,
+    infos_beside,
     is_called_rectified,
     is_infrared,
     plain_rank,
     shared_namespaces,
+    without_those_of_depth,
 )
 from mapper.sources.ros.unused_topics import feels_gravity, unused_notes, usual_acceleration, what_there_is
 
