@@ -29,6 +29,7 @@ from mapper.runtime.ordered_map import ordered_map
 from mapper.runtime.progress import Progress
 from mapper.sources.base import FrameRef, Log, Skipped
 from mapper.sources.depth_scale import depth_warnings, why_no_depth
+from mapper.sources.depth_shift import shift_warnings
 from mapper.sources.image_order import time_warnings
 from mapper.sources.reading_checks import ReadingChecks
 from mapper.sources.scan_frame import scan_frame_warnings
@@ -316,6 +317,7 @@ def noted_log_warnings(source: Log, progress: Progress) -> list[RunWarning]:
     warnings = [
         *(RunWarning(kind="stamps", sentence=text, weight="doubt") for text in time_warnings(source)),
         *(RunWarning(kind="depth", sentence=text, weight="doubt") for text in depth_warnings(source)),
+        *(RunWarning(kind="depth", sentence=text, weight="doubt") for text in shift_warnings(source)),
         *(RunWarning(kind="frame", sentence=text, weight="doubt") for text in scan_frame_warnings(source)),
     ]
     for warning in warnings:

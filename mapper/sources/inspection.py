@@ -15,6 +15,7 @@ from mapper.sources import RECORDING, format_of, open_source
 from mapper.sources.base import Log
 from mapper.sources.config import SourceConfig
 from mapper.sources.depth_scale import depth_warnings, why_no_depth
+from mapper.sources.depth_shift import shift_warnings
 from mapper.sources.image_order import time_warnings
 from mapper.sources.reading_checks import ReadingChecks
 from mapper.sources.ros import files as recordings
@@ -194,7 +195,12 @@ def _inspected(
         gnss_status="" if source.gnss is None else source.gnss.status_text,
         gnss_sigma_m=None if source.gnss is None else source.gnss.median_sigma_m,
         notes=[*source.sentences, *damage, *checks.notes()],
-        warnings=[*time_warnings(source), *depth_warnings(source), *scan_frame_warnings(source)],
+        warnings=[
+            *time_warnings(source),
+            *depth_warnings(source),
+            *shift_warnings(source),
+            *scan_frame_warnings(source),
+        ],
         vehicle=vehicle_box(source),
     )
     why = problem or why_no_depth(source) or _unwritable(source) or check(source)
