@@ -7,6 +7,7 @@ from mapper.core.errors import SourceError
 from mapper.core.frames import PinholeCamera
 from mapper.core.geometry import exp
 from mapper.sources import open_source
+from mapper.sources.config import CameraConfig, SourceConfig
 from tests.support.azure_kinect import DATE_S, NFOV, Capture, calibration_json, write_azure_kinect
 
 COLOUR = PinholeCamera(320, 180, 150.0, 151.0, 158.0, 91.0, distortion=(0.05, -0.02, 0.001, -0.002, 0.01))
@@ -55,6 +56,13 @@ def test_depth_is_registered_by_the_calibration_of_both_cameras(tmp_path):
     x, y = (columns - COLOUR.cx_px) / COLOUR.fx_px, (rows - COLOUR.cy_px) / COLOUR.fy_px
     expected_m = offset_m / (normal[0] * x + normal[1] * y + normal[2])
     assert depth_m[60:120, 100:220] == pytest.approx(expected_m, abs=0.003)
+
+
+def test_a_user_s_place_of_the_depth_camera_goes_before_the_file_s(tmp_path):
+    path, place = recording(tmp_path), (0.0, 0.0, 0.25, 0.0, 0.0, 0.0, 1.0)
+    config = SourceConfig(camera=CameraConfig(depth_in_color=place))
+    depth_m = open_source(path, config).entry_at(0).load().depth_m
+    assert depth_m[60:120, 100:220] == pytest.approx(np.full((60, 120), 2.25), abs=1e-3)
 
 
 def test_samples_of_the_imu_are_read_with_their_own_times(tmp_path):

@@ -126,7 +126,7 @@ def read_log(path: Path, config: SourceConfig) -> Log:
         notes.append(f"{path.name}: cut off; what is whole is read")
     log = rgbd_log(
         pairs,
-        replace(camera_of(path, config, stated), depth=stated.depth),
+        camera_of(path, config, stated),
         depth_units_per_m=units_per_m,
         path=path,
         name=path.resolve().stem,

@@ -17,7 +17,7 @@ from mapper.sources.base import ImageFile, Log
 from mapper.sources.calibration import Calibration, configured
 from mapper.sources.config import SourceConfig
 from mapper.sources.image_folders.pairing import ordered_pairs
-from mapper.sources.image_folders.rgbd import FramePair, find_calibration, rgbd_log
+from mapper.sources.image_folders.rgbd import FramePair, depth_camera, find_calibration, rgbd_log
 from mapper.sources.listed_files import present
 from mapper.sources.text import pose_from_matrix, truth_from
 
@@ -122,7 +122,11 @@ def camera_of(path: Path, config: SourceConfig, stated: Calibration | None) -> C
         return find_calibration(path if path.is_dir() else path.parent, config.camera, known=stated)
     factor = None if config.camera is None else config.camera.depth_factor
     chosen = configured(config.camera) or stated
-    return replace(chosen, depth_units_per_m=factor or chosen.depth_units_per_m)
+    return replace(
+        chosen,
+        depth_units_per_m=factor or chosen.depth_units_per_m,
+        depth=depth_camera(stated.depth, config.camera),
+    )
 
 
 def pose_of_opengl(matrix: Sequence[Sequence[float]] | Array) -> Transform | None:

@@ -199,7 +199,7 @@ def find_calibration(folder: Path, config: CameraConfig | None, *, known: Calibr
         known = None
     stated = read_calibration(files[0]) if first_counts else known
     units_per_m = None if stated is None else stated.depth_units_per_m
-    depth = _depth_camera(None if stated is None else stated.depth, config)
+    depth = depth_camera(None if stated is None else stated.depth, config)
     if config is not None:
         units_per_m = config.depth_factor or units_per_m
     if chosen := configured(config):
@@ -215,8 +215,12 @@ def find_calibration(folder: Path, config: CameraConfig | None, *, known: Calibr
     return replace(stated, depth_units_per_m=units_per_m, depth=depth, unread=names[first_counts:])
 
 
-def _depth_camera(stated: DepthCamera | None, config: CameraConfig | None) -> DepthCamera | None:
-    """Return the depth camera that is not colour's: the user's numbers before those of a file."""
+def depth_camera(stated: DepthCamera | None, config: CameraConfig | None) -> DepthCamera | None:
+    """Return the depth camera that is not colour's: the user's numbers before those of a file.
+
+    Raises:
+        SourceError: Only a part of it is known.
+    """
     intrinsics, T_color_depth = configured_depth_intrinsics(config), configured_depth_pose(config)
     if intrinsics is None and T_color_depth is None:
         return stated
