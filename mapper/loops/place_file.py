@@ -96,7 +96,7 @@ def read_places(path: Path) -> dict[int, AnyPlace]:
             table = {name: columns[name] for name in columns.files}
         places = _images(table) if kind == _IMAGES else _scans(table)
         return dict(zip(table["node"].tolist(), places, strict=True))
-    except (KeyError, ValueError, IndexError, zipfile.BadZipFile) as error:
+    except (KeyError, ValueError, IndexError, NotImplementedError, zipfile.BadZipFile) as error:
         raise RunError(f"{path}: no file of places: {error}") from None
 
 

@@ -139,8 +139,8 @@ def _without_damage(
     values: NDArray[np.number], middle: np.number, units_per_s: int, stamp_ns: int
 ) -> NDArray[np.float32] | None:
     """Return the same times with NaN for those far from the middle; None where they are too many."""
-    after_middle = _signed_less(values, middle)
-    with np.errstate(invalid="ignore"):
+    with np.errstate(invalid="ignore"):  # of damaged numbers, which may be signalling NaN
+        after_middle = _signed_less(values, middle)
         sound = np.abs(after_middle) <= MAX_SWEEP_S * units_per_s
     if (~sound).mean() > _MAX_WRONG_SHARE:
         return None

@@ -72,6 +72,14 @@ def test_a_few_damaged_times_cost_their_points_alone(damaged):
     np.testing.assert_allclose(found[sound], np.linspace(0.0, 0.1, 1000)[sound], atol=1e-6)
 
 
+def test_a_signalling_nan_costs_its_point_alone():
+    times = np.linspace(0.0, 0.1, 1000, dtype=np.float32)
+    times.view(np.uint32)[10] = 0x7F800001
+    with np.errstate(all="raise"):
+        found = relative_times_s(times, stamp_ns=0)
+    assert np.flatnonzero(np.isnan(found)).tolist() == [10]
+
+
 def test_a_32_bit_counter_that_begins_anew_is_counted_on():
     ns = (np.arange(1000) * 100_000 + (2**32 - 30_000_000)) % 2**32
     found = relative_times_s(ns.astype(np.uint32), stamp_ns=0)

@@ -101,6 +101,15 @@ def test_a_record3d_recording_may_be_unpacked_and_without_confidence(shots, tmp_
     assert (log[0].depth_m[0] > 0.0).any()
 
 
+def test_a_record3d_archive_of_a_later_format_is_refused(shots, tmp_path):
+    path = write_record3d(tmp_path / "scan.r3d", Shots(shots.camera, shots.frames[:2]))
+    data = bytearray(path.read_bytes())
+    data[data.index(b"PK\1\2") + 6] = 255
+    path.write_bytes(data)
+    with pytest.raises(SourceError, match=r"scan\.r3d"):
+        open_source(path)
+
+
 def test_without_its_library_a_record3d_recording_is_refused(shots, tmp_path, monkeypatch):
     path = write_record3d(tmp_path / "scan.r3d", Shots(shots.camera, shots.frames[:2]))
     monkeypatch.setitem(sys.modules, "lzfse", None)

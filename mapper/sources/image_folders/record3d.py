@@ -70,7 +70,7 @@ class _Members:
             return
         try:
             self._archive = zipfile.ZipFile(path)
-        except (OSError, zipfile.BadZipFile) as error:
+        except (OSError, zipfile.BadZipFile, NotImplementedError) as error:
             raise SourceError(f"{path}: no Record3D recording: {error}") from None
 
     def names(self) -> list[str]:
