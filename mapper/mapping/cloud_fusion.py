@@ -10,7 +10,7 @@ from mapper.core.trajectory import Trajectory
 from mapper.mapping.cloud import CloudBuilder, height_colors
 from mapper.mapping.colouring import ScanColouring
 from mapper.mapping.config import FuseSettings
-from mapper.mapping.placed_frames import PlacedFrame, fused_frames, within_reach
+from mapper.mapping.placed_frames import PlacedFrame, fused_frames, sensor_paths, within_reach
 from mapper.octree.moving_objects import MovingObjects
 from mapper.octree.ray_casting import depth_limit_of
 from mapper.runtime.ordered_map import ordered_map
@@ -41,7 +41,8 @@ def fuse_clouds(
     """
     still, moving = CloudBuilder(config.cloud.voxel_m), CloudBuilder(config.cloud.voxel_m)
     stride = config.cloud.frame_stride
-    frames = [frame for frame in fused_frames(source, trajectory) if frame.index % stride == 0]
+    paths = sensor_paths(source, trajectory)
+    frames = [frame for frame in fused_frames(paths) if frame.index % stride == 0]
     depth_limit, begin_ns = depth_limit_of(config.octree), int(trajectory.stamps_ns[0])
 
     colouring = ScanColouring(source.images, trajectory) if source.images else None

@@ -1,7 +1,7 @@
 """Fusing: the second pass over a log, in which every tracked frame is added to the maps at its final pose."""
 
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -251,9 +251,10 @@ def _fuse_scans(
     if cached is not None and (config.octree.attributes or not cached.holds_for(config.octree)):
         cached = None  # updates have no colours
     log_stride = 0 if on_snapshot is None else config.mcap.image_stride
-    jobs = _jobs(source, trajectory, config, cached, log_stride=log_stride)
+    paths = sensor_paths(source, trajectory)
+    jobs = _jobs(paths, config, cached, log_stride=log_stride)
     casters, moved, unreached = _Casters(config.octree, source.sensor), 0, 0
-    total = sum(len(path) for _, path in sensor_paths(source, trajectory))
+    total = sum(len(path) for _, path in paths)
     T_world_camera: list[Transform | None] = []
     prepared = ordered_map(lambda job: _prepared(job, config, casters), jobs, workers=config.workers)
     with progress.stage("fuse") as report:
@@ -312,15 +313,15 @@ class _Casters(threading.local):
 
 
 def _jobs(
-    source: Log,
-    trajectory: Trajectory,
+    paths: Sequence[tuple[Log, Trajectory]],
     config: FuseSettings,
     cached: ScanUpdateFile | None,
     *,
     log_stride: int,
 ) -> Iterator[_Job]:
-    for frame in fused_frames(source, trajectory):
-        update, rays = None, _rays_of(config.octree, frame.sensor, source.sensor)
+    tracked = paths[0][0].sensor
+    for frame in fused_frames(paths):
+        update, rays = None, _rays_of(config.octree, frame.sensor, tracked)
         if cached is not None and (frame.sensor == "rgbd" or _neighbours_hold(cached, frame, rays)):
             update = cached.lookup(frame.entry.stamp_ns, frame.T_world_body, config=rays)
         yield _Job(frame, update, is_logged=log_stride > 0 and frame.index % log_stride == 0)

@@ -1,7 +1,7 @@
 """Frames of a log at their final poses, read as the maps take them."""
 
 import heapq
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -73,9 +73,9 @@ def sensor_paths(source: Log, trajectory: Trajectory) -> list[tuple[Log, Traject
     return paths
 
 
-def fused_frames(source: Log, trajectory: Trajectory) -> Iterator[PlacedFrame]:
-    """Yield the frames that have a pose, of a log and of the sensors beside it, in the order of time."""
-    frames = [placed_frames(log, path) for log, path in sensor_paths(source, trajectory)]
+def fused_frames(paths: Iterable[tuple[Log, Trajectory]]) -> Iterator[PlacedFrame]:
+    """Yield the frames that have a pose, of every sensor of ``sensor_paths``, in the order of time."""
+    frames = [placed_frames(log, path) for log, path in paths]
     return heapq.merge(*frames, key=lambda frame: frame.entry.stamp_ns)
 
 

@@ -17,6 +17,8 @@ _LINKS = {1: (12, 14), 113: (14, 16), 276: (0, 20)}
 others are taken for bare IP."""
 _VLANS = (0x8100, 0x88A8)
 _UDP, _FRAGMENT = 17, 44
+_TRIED = 2000
+"""Captured packets by which it is told whose they are: as many as come in a third of a second."""
 _MOST_PARTIAL = 64
 """Datagrams that are put together at a time: of older ones a fragment was lost."""
 
@@ -91,6 +93,15 @@ def captured(path: Path, offset: int | None = None) -> Iterator[tuple[int, Datag
                 yield place, _datagram(whole or b"", received_ns, sender, first, number - first_number + 1)
     except OSError as error:
         raise SourceError(f"{path}: cannot be read: {error.strerror}") from None
+
+
+def first_datagrams(path: Path) -> Iterator[Datagram]:
+    """Yield the datagrams among the first captured packets.
+
+    Raises:
+        SourceError: It is no capture.
+    """
+    return (one for _, one in islice(captured(path), _TRIED) if one is not None)
 
 
 def read_datagram(path: Path, offset: int, count: int) -> bytes | None:

@@ -100,7 +100,7 @@ class OusterRecording:
                 stream = self._stream_of(topic, clouds)
                 stream.add(log_ns, place)
                 stream.sizes.append(0 if packet is None else len(packet))
-                stream.heads += bytes(packet or b"")[:HEAD_BYTES].ljust(HEAD_BYTES, b"\0")
+                stream.heads += bytes((packet or b"")[:HEAD_BYTES]).ljust(HEAD_BYTES, b"\0")
                 continue
             stream = self._stream_of(topic, readings)
             number = len(stream.numbers) // 4

@@ -239,7 +239,7 @@ class RecordingReader:
                     for pose in message:
                         is_near = abs(pose.stamp_ns - followed_ns) <= SAME_CLOCK_NS
                         stamp_ns = 0 if is_static else pose.stamp_ns if is_near else followed_ns
-                        yield replace(pose, stamp_ns=stamp_ns)
+                        yield pose if stamp_ns == pose.stamp_ns else replace(pose, stamp_ns=stamp_ns)
 
     def _poses(self, series: Series, indices: NDArray[np.intp]) -> Iterator[PoseMessage]:
         for stamp_ns, message in self._messages(series, indices):

@@ -3,12 +3,11 @@
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from ipaddress import ip_address
-from itertools import islice
 from pathlib import Path
 
 from mapper.core.errors import FrameError, SourceError
 from mapper.sources.base import Log
-from mapper.sources.captures import ENDINGS, captured, read_datagram
+from mapper.sources.captures import ENDINGS, captured, first_datagrams, read_datagram
 from mapper.sources.config import SourceConfig
 from mapper.sources.ouster_packets import is_imu, packet_sizes
 from mapper.sources.ros.messages import OUSTER_PACKETS
@@ -17,9 +16,6 @@ from mapper.sources.ros.reader import RecordingReader
 from mapper.sources.ros.recording import Place, Recorded, Topic
 from mapper.sources.ros.source import recording_log
 
-_TRIED = 2000
-"""Captured packets that are looked at, to tell whose they are: as many as come in a third of a second."""
-
 
 def recognise(path: Path) -> bool:
     """Return whether a path is a capture whose first datagrams have the sizes of an Ouster's."""
@@ -27,8 +23,7 @@ def recognise(path: Path) -> bool:
         return False
     sizes = packet_sizes()
     with suppress(SourceError):
-        found = (one for _, one in islice(captured(path), _TRIED) if one is not None)
-        return any(len(one.payload) in sizes for one in found)
+        return any(len(one.payload) in sizes for one in first_datagrams(path))
     return False
 
 
@@ -56,12 +51,10 @@ class CaptureRecording:
 
     def messages(self) -> Iterator[Recorded]:
         """Yield every datagram that may be an Ouster's, in the order of the file."""
-        (type_,) = list(OUSTER_PACKETS)[:1]
+        type_, least_bytes = min(OUSTER_PACKETS), min(packet_sizes())
         topics: dict[tuple[bytes, int], Topic] = {}
         for _, one in captured(self.path):
-            if one is None or not (
-                is_imu(memoryview(one.payload)) or len(one.payload) >= min(packet_sizes())
-            ):
+            if one is None or not (len(one.payload) >= least_bytes or is_imu(memoryview(one.payload))):
                 continue
             key = one.sender, one.port
             if key not in topics:

@@ -13,7 +13,7 @@ import numpy as np
 from mapper.core.errors import DataError, FrameError, SourceError
 from mapper.core.frames import Scan
 from mapper.sources.base import ImageFiles, Log
-from mapper.sources.captures import ENDINGS, Datagram, captured
+from mapper.sources.captures import ENDINGS, Datagram, captured, first_datagrams
 from mapper.sources.config import SourceConfig
 from mapper.sources.ros.cloud_messages import scan_from
 from mapper.sources.ros.messages import CloudMessage
@@ -24,7 +24,6 @@ _LEAST_SHARE = 0.5
 """Share of the usual number of packets that a turn must have: the first and the last one are cut."""
 _MAKERS = {b"\xee\xff": "a Hesai's", b"\x55\xaa": "a RoboSense's"}
 """Whose packets begin with these bytes."""
-_TRIED = 2000
 
 
 class _Turn(NamedTuple):
@@ -122,7 +121,7 @@ class _TurnEntry:
 
 def _most_sent(path: Path) -> str:
     """Return what most datagrams are, as the end of a clause; empty without any."""
-    found = (one for _, one in islice(captured(path), _TRIED) if one is not None)
+    found = first_datagrams(path)
     kinds = Counter((len(one.payload), one.port, _MAKERS.get(one.payload[:2], "")) for one in found)
     if not kinds:
         return ""
