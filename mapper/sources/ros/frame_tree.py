@@ -35,35 +35,38 @@ class FrameTree:
 
     Attributes:
         damaged: Parents and children, "parent → child", between which no pose is finite and rigid.
-        contradicted: What is told twice and differently, of which the first counts: "parent → child", or
-            "child in parent, not in another".
+        contradicted: What is told twice and differently, "parent → child" or "child in parent, not in
+            another": of a static frame the last counts, as in tf2, of another the first.
     """
 
     def __init__(self, poses: Iterable[PoseMessage]) -> None:
-        """Keep the poses of every frame in its first parent; of several with one stamp the first."""
-        links: dict[tuple[str, str], dict[int, Sequence[float]]] = {}
+        """Keep the poses of every frame in one parent; static ones have stamp 0."""
+        told = list(poses)
+        numbers = np.array([pose.numbers for pose in told], np.float64).reshape(-1, 7)
+        links: dict[tuple[str, str], dict[int, Transform]] = {}
+        parents: dict[str, str] = {}
         contradicted: dict[str, None] = {}
-        for pose in poses:
+        for pose, T in zip(told, poses_from_numbers(numbers), strict=True):
             child, parent = pose.child.lstrip("/"), pose.parent.lstrip("/")
-            link = links.setdefault((child, parent), {})
-            first = link.setdefault(min(max(pose.stamp_ns, 0), LATEST_NS), pose.numbers)
-            if not _are_same(first, pose.numbers):
+            found = links.setdefault((child, parent), {})
+            if T is None:
+                continue
+            stamp_ns = min(max(pose.stamp_ns, 0), LATEST_NS)
+            first = found.setdefault(stamp_ns, T)
+            if first is not T and not np.allclose(first, T, atol=_SAME_POSE):
                 contradicted[f"{parent} → {child}"] = None
+            parents.setdefault(child, parent)
+            if stamp_ns == 0:
+                found[0], parents[child] = T, parent
+        self.damaged = [f"{parent} → {child}" for (child, parent), found in links.items() if not found]
         self._parents: dict[str, tuple[str, Trajectory]] = {}
-        self.damaged: list[str] = []
-        for (child, parent), numbers in links.items():
-            found = zip(numbers, poses_from_numbers(np.array(list(numbers.values()))), strict=True)
-            path = [(stamp_ns, T) for stamp_ns, T in found if T is not None]
-            if not path:
-                self.damaged.append(f"{parent} → {child}")
-            elif child not in self._parents:
-                stays = np.ptp([T for _, T in path], axis=0).max() < _SAME_POSE
-                self._parents[child] = (
-                    parent,
-                    trajectory_from(path[:1] if stays else sorted(path, key=itemgetter(0))),
-                )
-            else:
-                contradicted[f"{child} in {self._parents[child][0]}, not in {parent}"] = None
+        for (child, parent), found in links.items():
+            if found and parent != parents[child]:
+                contradicted[f"{child} in {parents[child]}, not in {parent}"] = None
+            elif found:
+                path, stays = [*found.items()], np.ptp([*found.values()], axis=0).max() < _SAME_POSE
+                kept = trajectory_from(path[:1] if stays else sorted(path, key=itemgetter(0)))
+                self._parents[child] = parent, kept
         self.contradicted = list(contradicted)
 
     @property
@@ -137,11 +140,3 @@ class FrameTree:
             T = T_parent_frame @ T
             found[frame] = T
         return found
-
-
-def _are_same(one: Sequence[float], other: Sequence[float]) -> bool:
-    """Return whether x y z qx qy qz qw are the same pose; −q turns as q does."""
-    if one is other or tuple(one) == tuple(other):
-        return True
-    opposite = [*other[:3], *(-number for number in other[3:])]
-    return any(np.allclose(one, numbers, atol=_SAME_POSE, equal_nan=True) for numbers in (other, opposite))

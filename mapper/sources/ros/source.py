@@ -75,7 +75,7 @@ def recording_log(reader: RecordingReader, config: SourceConfig) -> Log:
     ]
     if reader.tree.contradicted:
         told = listed(reader.tree.contradicted)
-        tf_notes.append(f"tf contradicts itself, and what it says first is used: {told}")
+        tf_notes.append(f"tf contradicts itself; of static frames the last is used, as in tf2: {told}")
     cameras = [images_beside(reader, camera, body=frames.body) for camera in choice.cameras]
     images = [one for one in cameras if isinstance(one, CameraImages)]
     beside, beside_choices = sensors_beside(reader, choice.beside, frames, config)

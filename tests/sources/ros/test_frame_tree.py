@@ -20,8 +20,8 @@ TREE = FrameTree(
     [
         told("base", "/mast", T_BASE_MAST),
         told("/mast", "lidar", T_MAST_LIDAR),
-        told("base", "imu", T_BASE_IMU),
-        told("base", "imu", np.eye(4)),  # the first counts
+        told("base", "imu", np.eye(4)),
+        told("base", "imu", T_BASE_IMU),  # the last counts
         PoseMessage(0, "base", "broken", (0.0,) * 7),
         told("elsewhere", "other", np.eye(4)),
     ]
@@ -39,15 +39,26 @@ def test_links_without_a_rigid_pose_are_named():
     assert TREE.damaged == ["base → broken"]
 
 
-def test_what_contradicts_itself_is_named_once():
+def test_of_static_frames_the_last_counts_and_contradictions_are_named_once():
     turned = told("base", "mast", T_BASE_MAST)
     turned = replace(turned, numbers=[*turned.numbers[:3], *(-q for q in turned.numbers[3:])])
-    again = [turned, told("base", "imu", T_BASE_MAST), told("base", "imu", np.eye(4))]
-    tree = FrameTree([told("base", "mast", T_BASE_MAST), told("base", "imu", T_BASE_IMU), *again])
-    assert tree.contradicted == ["base → imu"]
-    np.testing.assert_allclose(tree.find("base", "imu"), T_BASE_IMU, atol=1e-12)
-    two_parents = FrameTree([told("base", "imu", T_BASE_IMU), told("mast", "imu", T_BASE_IMU)])
-    assert two_parents.contradicted == ["imu in base, not in mast"]
+    again = [turned, told("base", "imu", T_BASE_MAST), told("base", "imu", T_MAST_LIDAR)]
+    no_pose = PoseMessage(0, "base", "imu", (0.0,) * 7)
+    tree = FrameTree([told("base", "mast", T_BASE_MAST), told("base", "imu", T_BASE_IMU), *again, no_pose])
+    assert (tree.contradicted, tree.damaged) == (["base → imu"], [])
+    np.testing.assert_allclose(tree.find("base", "imu"), T_MAST_LIDAR, atol=1e-12)
+    two_parents = FrameTree([told("base", "imu", T_BASE_IMU), told("mast", "imu", T_MAST_LIDAR)])
+    assert two_parents.contradicted == ["imu in mast, not in base"]
+    np.testing.assert_allclose(two_parents.find("mast", "imu"), T_MAST_LIDAR, atol=1e-12)
+
+
+def test_of_moving_frames_the_first_of_one_stamp_counts():
+    tree = FrameTree(
+        replace(told("base", "arm", T), stamp_ns=stamp_ns)
+        for stamp_ns, T in [(1, T_BASE_MAST), (2, T_BASE_IMU), (2, T_MAST_LIDAR)]
+    )
+    assert tree.contradicted == ["base → arm"]
+    np.testing.assert_allclose(tree.find("base", "arm", stamp_ns=2), T_BASE_IMU, atol=1e-12)
 
 
 def test_a_frame_is_itself_even_if_nobody_tells_of_it():
