@@ -13,8 +13,15 @@ def driven() -> Drive:
     return drive(flat(), SICK, speed_mps=0.8).part(30)
 
 
+def opened(path, readings, *, message="FLASER", poses="0 0 0 0 0 0"):
+    """Write four messages of the same readings, and open the log of them."""
+    head = f"{message} {len(readings)} {' '.join(readings)} {poses}"
+    path.write_text("\n".join(f"{head} {k}.0 host {k}.0" for k in range(1, 5)))
+    return open_source(path)
+
+
 @pytest.mark.parametrize("message", ["FLASER", "ROBOTLASER1"])
-def test_returns_lie_where_the_beams_met_walls(tmp_path, driven, message):
+def test_returns_lie_where_the_beams_met_walls_and_wheels_are_the_odometry(tmp_path, driven, message):
     log = open_source(write_carmen(tmp_path / "run.log", driven, message=message))
 
     assert (log.sensor, log.kind, len(log)) == ("lidar-2d", "carmen", 30)
@@ -26,13 +33,6 @@ def test_returns_lie_where_the_beams_met_walls(tmp_path, driven, message):
     assert scan.is_planar
     assert not scan.points_body[:, 2].any()
     assert scan.origin_body == pytest.approx([SICK.x_m, 0.0, 0.0], abs=1e-5)
-
-
-@pytest.mark.parametrize("message", ["FLASER", "ROBOTLASER1"])
-def test_wheels_are_the_robots_odometry(tmp_path, driven, message):
-    log = open_source(write_carmen(tmp_path / "run.clf", driven, message=message))
-
-    assert log.wheels is not None
     assert log.wheels.positions_world[:, :2] == pytest.approx(driven.wheels[:, :2], abs=1e-6)
     assert np.array_equal(log.wheels.stamps_ns, log.stamps_ns)
 
@@ -42,12 +42,7 @@ def test_wheels_are_the_robots_odometry(tmp_path, driven, message):
     [(180, -90.0, 1.0), (181, -90.0, 1.0), (360, -90.0, 0.5), (361, -90.0, 0.5)],
 )
 def test_number_of_readings_gives_the_directions(tmp_path, beams, first_deg, step_deg):
-    lines = [f"FLASER {beams} {' '.join(['2.00'] * beams)} 0 0 0 0 0 0 {k}.0 host {k}.0" for k in range(1, 4)]
-    path = tmp_path / "beams.log"
-    path.write_text("\n".join(lines))
-
-    x, y, _ = open_source(path)[0].points_body.T
-
+    x, y, _ = opened(tmp_path / "beams.clf", ["2.00"] * beams)[0].points_body.T
     angles_deg = np.degrees(np.arctan2(y, x))
     assert angles_deg == pytest.approx(first_deg + step_deg * np.arange(beams), abs=1e-3)
 
@@ -62,24 +57,15 @@ def test_mounting_is_the_poses_where_no_parameter_states_it(tmp_path, driven):
 
 
 def test_rear_laser_looks_back(tmp_path):
-    ranges = " ".join(["3.00"] * 181)
-    path = tmp_path / "rear.log"
-    lines = [f"RLASER 181 {ranges} -0.2 0 3.14159265 0 0 0 {k}.0 host {k}.0" for k in range(1, 5)]
-    path.write_text("\n".join(lines))
-
-    scan = open_source(path)[0]
-
+    log = opened(tmp_path / "a.log", ["3.00"] * 181, message="RLASER", poses="-0.2 0 3.14159265 0 0 0")
+    scan = log[0]
     assert scan.points_body[:, 0].max() < -0.19
     assert scan.points_body[:, 0].min() == pytest.approx(-3.2, abs=1e-3)
 
 
 def test_readings_of_the_largest_range_are_no_returns(tmp_path):
     readings = ["1.00"] * 100 + ["81.91"] * 50 + ["nan"] * 20 + ["inf"] * 10
-    lines = [f"FLASER 180 {' '.join(readings)} 0 0 0 0 0 0 {k}.0 host {k}.0" for k in range(1, 4)]
-    path = tmp_path / "far.log"
-    path.write_text("\n".join(lines))
-
-    assert len(open_source(path)[0].points_body) == 100
+    assert len(opened(tmp_path / "far.log", readings)[0].points_body) == 100
 
 
 @pytest.mark.parametrize(
@@ -121,11 +107,6 @@ def test_other_text_is_no_log_of_it(tmp_path):
 
 
 def test_odometry_that_stands_still_is_none(tmp_path):
-    ranges = " ".join(["3.00"] * 181)
-    path = tmp_path / "hand.log"
-    path.write_text("\n".join(f"FLASER 181 {ranges} 0 0 0 0 0 0 {k}.0 host {k}.0" for k in range(1, 5)))
-
-    log = open_source(path)
-
+    log = opened(tmp_path / "hand.log", ["3.00"] * 181)
     assert log.wheels is None
     assert any("stands still" in note for note in log.notes)

@@ -4,12 +4,13 @@ from pathlib import Path
 
 import numpy as np
 from rosbags.rosbag2 import StoragePlugin, Writer
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from mapper.core.frames import PinholeCamera, ray_table
 from mapper.core.geometry import Transform, exp, inverse
-from mapper.core.rotations import row_of_pose
 from mapper.sources.base import Log
+from mapper.sources.ros.encode_ros import SerializedMessage, camera_info_message
+from tests.support.recordings import image, transforms, write_folder
+from tests.support.tum_logs import FIRST_NS
 
 BESIDE = exp(np.array([0.004, -0.007, 0.005]), np.array([0.015, 0.0002, 0.0003]))
 """T_color_depth of a RealSense D435: 15 mm apart, turned by half a degree."""
@@ -17,7 +18,6 @@ D435 = PinholeCamera(848, 480, 425.0, 425.0, 423.7, 238.9)
 
 _SAMPLES = 2
 _SAME_SURFACE = 0.05
-_EXTRINSICS = "float64[9] rotation\nfloat64[3] translation\n"
 
 
 def seen_from(
@@ -71,6 +71,15 @@ def _dense_points(depth_m: np.ndarray, camera: PinholeCamera) -> np.ndarray:
     return np.concatenate(dense)
 
 
+def extrinsics(
+    T_color_depth: Transform, *, topic: str = "/camera/extrinsics/depth_to_color"
+) -> SerializedMessage:
+    """The RealSense driver's message of a pose, whose rotation is stored column by column."""
+    numbers = np.concatenate([T_color_depth[:3, :3].ravel(order="F"), T_color_depth[:3, 3]])
+    cdr = b"\0\1\0\0" + numbers.astype("<f8").tobytes()
+    return SerializedMessage(FIRST_NS, topic, "realsense2_camera_msgs/msg/Extrinsics", cdr)
+
+
 def write_unregistered(
     folder: Path,
     log: Log,
@@ -80,66 +89,25 @@ def write_unregistered(
     is_in_tf: bool = True,
     also_topic: Transform | None = None,
 ) -> None:
-    """Write a log as the RealSense driver records it without alignment: a ROS 2 bag, by rosbags alone.
+    """Write a log as the RealSense driver records it without alignment: a ROS 2 bag.
 
     Raw colour and depth in millimetres with a CameraInfo each, and the pose of the depth camera in
     /tf_static, or else in the driver's own /camera/extrinsics/depth_to_color; ``also_topic`` is another
     pose for that topic.
     """
-    store = get_typestore(Stores.ROS2_HUMBLE)
-    store.register(get_types_from_msg(_EXTRINSICS, "realsense2_camera_msgs/msg/Extrinsics"))
-    types = store.types
-
-    def header(stamp_ns: int, frame: str):
-        time = types["builtin_interfaces/msg/Time"](*divmod(stamp_ns, 10**9))
-        return types["std_msgs/msg/Header"](time, f"camera_{frame}_optical_frame")
-
-    def image(stamp_ns: int, frame: str, pixels: np.ndarray, encoding: str):
-        data = np.ascontiguousarray(pixels).view(np.uint8).ravel()
-        height, width = pixels.shape[:2]
-        return types["sensor_msgs/msg/Image"](
-            header(stamp_ns, frame), height, width, encoding, 0, len(data) // height, data
-        )
-
-    def info(stamp_ns: int, frame: str, camera: PinholeCamera):
-        K, no_roi = camera.matrix, types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
-        P = np.column_stack([K, np.zeros(3)]).ravel()
-        return types["sensor_msgs/msg/CameraInfo"](
-            header(stamp_ns, frame), camera.height_px, camera.width_px, "plumb_bob",
-            np.array(camera.distortion), K.ravel(), np.eye(3).ravel(), P, 0, 0, no_roi,
-        )  # fmt: skip
-
-    of_topic = also_topic if is_in_tf else T_color_depth
-    with Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-        connections = {}
-
-        def write(topic: str, log_ns: int, message) -> None:
-            if topic not in connections:
-                connections[topic] = writer.add_connection(topic, message.__msgtype__, typestore=store)
-            data = store.serialize_cdr(message, message.__msgtype__)
-            writer.write(connections[topic], log_ns, data)
-
-        first_ns = int(log.stamps_ns[0])
-        if is_in_tf:
-            x, y, z, *q = row_of_pose(T_color_depth).tolist()
-            pose = types["geometry_msgs/msg/Transform"](
-                types["geometry_msgs/msg/Vector3"](x, y, z), types["geometry_msgs/msg/Quaternion"](*q)
-            )
-            stamped = types["geometry_msgs/msg/TransformStamped"](
-                header(first_ns, "color"), "camera_depth_optical_frame", pose
-            )
-            write("/tf_static", first_ns, types["tf2_msgs/msg/TFMessage"]([stamped]))
-        if of_topic is not None:  # its rotation is stored column by column
-            R, t = of_topic[:3, :3], of_topic[:3, 3].copy()
-            extrinsics = types["realsense2_camera_msgs/msg/Extrinsics"](R.ravel(order="F"), t)
-            write("/camera/extrinsics/depth_to_color", first_ns, extrinsics)
-        for entry in log.entries():
-            frame = entry.load()
-            depth_m = seen_from(frame.depth_m, frame.camera, depth_camera, T_color_depth)
-            units = np.rint(depth_m * 1000.0).astype(np.uint16)
-            color_ns = entry.stamp_ns
-            depth_ns = color_ns + round(frame.depth_delay_s * 1e9)
-            write("/camera/color/image_raw", color_ns, image(color_ns, "color", frame.image, "rgb8"))
-            write("/camera/color/camera_info", color_ns, info(color_ns, "color", frame.camera))
-            write("/camera/depth/image_rect_raw", depth_ns, image(depth_ns, "depth", units, "16UC1"))
-            write("/camera/depth/camera_info", depth_ns, info(depth_ns, "depth", depth_camera))
+    color, depth = "camera_color_optical_frame", "camera_depth_optical_frame"
+    messages = [transforms((color, depth, T_color_depth))] if is_in_tf else [extrinsics(T_color_depth)]
+    messages += [extrinsics(also_topic)] if also_topic is not None else []
+    for entry in log.entries():
+        frame = entry.load()
+        depth_m = seen_from(frame.depth_m, frame.camera, depth_camera, T_color_depth)
+        units = np.rint(depth_m * 1000.0).astype(np.uint16)
+        color_ns = entry.stamp_ns
+        depth_ns = color_ns + round(frame.depth_delay_s * 1e9)
+        messages += [
+            image(color_ns, "/camera/color/image_raw", frame.image, "rgb8", frame=color),
+            camera_info_message(color_ns, "/camera/color/camera_info", frame.camera, frame=color),
+            image(depth_ns, "/camera/depth/image_rect_raw", units, "16UC1", frame=depth),
+            camera_info_message(depth_ns, "/camera/depth/camera_info", depth_camera, frame=depth),
+        ]
+    write_folder(Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP), messages)

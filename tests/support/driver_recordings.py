@@ -50,9 +50,6 @@ class DriverRecording:
             if not is_ros1:
                 text = text.replace("time stamp", "builtin_interfaces/Time stamp")
             self._store.register(get_types_from_msg(text, f"{package}/msg/{name}"))
-        if "tf2_msgs/msg/TFMessage" not in self._store.types:
-            text = "geometry_msgs/TransformStamped[] transforms"
-            self._store.register(get_types_from_msg(text, "tf2_msgs/msg/TFMessage"))
         writer = (
             Bag1Writer(path) if is_ros1 else Bag2Writer(path, version=9, storage_plugin=StoragePlugin.MCAP)
         )

@@ -10,7 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.support.driver_recordings import DriverRecording
+from mapper.core.geometry import rotation_exp, transform
+from mapper.sources.ros.encode_ros import SerializedMessage, odometry_message
+from mapper.sources.ros.typestore import make_header, make_message, serialize
+from tests.support.recordings import transforms, write
 
 FIRST_NS = 1_700_000_000_000_000_000
 Segments = np.ndarray
@@ -309,72 +312,34 @@ def write_ros(
 ) -> Path:
     """Write /scan, and /odom as a topic or as the transform odom → base_link, into a bag or a folder."""
     laser = drive.laser
-    with DriverRecording(path, "none") as bag:
-        make = bag.make
-
-        def quaternion(yaw: float) -> object:
-            x, y, z, w = 0.0, 0.0, float(np.sin(yaw / 2)), float(np.cos(yaw / 2))
-            return make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
-
-        def tf(stamp_ns: int, parent: str, child: str, xyz: tuple, yaw: float) -> object:
-            x, y, z = map(float, xyz)
-            moved = make(
-                "geometry_msgs/msg/Transform",
-                translation=make("geometry_msgs/msg/Vector3", x=x, y=y, z=z),
-                rotation=quaternion(yaw),
-            )
-            header = bag.header(stamp_ns, parent)
-            return make(
-                "geometry_msgs/msg/TransformStamped", header=header, child_frame_id=child, transform=moved
-            )
-
-        def transforms(*some: object) -> object:
-            return make("tf2_msgs/msg/TFMessage", transforms=list(some))
-
-        mount = tf(FIRST_NS, "base_link", "laser", (laser.x_m, 0.0, laser.z_m), yaw_mount)
-        if pitch_mount:
-            y, w = float(np.sin(pitch_mount / 2)), float(np.cos(pitch_mount / 2))
-            mount.transform.rotation = make("geometry_msgs/msg/Quaternion", x=0.0, y=y, z=0.0, w=w)
-        bag.write(FIRST_NS, "/tf_static", transforms(mount))
-        messages: list[tuple[int, str, object]] = []
-        for time_s, (x, y, yaw) in zip(drive.readings_s, drive.readings, strict=True):
-            stamp_ns = FIRST_NS + round(1e9 * time_s)
-            if odometry == "tf":
-                moved = tf(stamp_ns, "odom", "base_link", (x, y, 0.0), yaw)
-                messages.append((stamp_ns, "/tf", transforms(moved)))
-            else:
-                position = make("geometry_msgs/msg/Point", x=float(x), y=float(y), z=0.0)
-                pose = make("geometry_msgs/msg/Pose", position=position, orientation=quaternion(yaw))
-                zero = make("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0)
-                twist = make("geometry_msgs/msg/Twist", linear=zero, angular=zero)
-                none = np.zeros(36)
-                message = make(
-                    "nav_msgs/msg/Odometry",
-                    header=bag.header(stamp_ns, "odom"),
-                    child_frame_id="base_link",
-                    pose=make("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=none),
-                    twist=make("geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=none),
-                )
-                messages.append((stamp_ns, "/odom", message))
-        for time_s, ranges in zip(drive.times_s, drive.ranges_m, strict=True):
-            stamp_ns = FIRST_NS + round(1e9 * time_s)
-            message = make(
-                "sensor_msgs/msg/LaserScan",
-                header=bag.header(stamp_ns, "laser"),
-                angle_min=float(laser.angles_rad[0]) - yaw_mount,
-                angle_max=float(laser.angles_rad[-1]) - yaw_mount,
-                angle_increment=laser.step_rad,
-                time_increment=laser.beam_s,
-                scan_time=1.0 / laser.rate_hz,
-                range_min=0.05,
-                range_max=laser.max_m,
-                ranges=ranges.astype(np.float32),
-                intensities=np.full(laser.beams, 100.0, np.float32),
-            )
-            messages.append((stamp_ns, "/scan", message))
-        for stamp_ns, topic, message in sorted(messages, key=lambda one: one[0]):
-            bag.write(stamp_ns, topic, message)
-    return path
+    mounting = transform(rotation_exp(np.array([0.0, pitch_mount, yaw_mount])), [laser.x_m, 0.0, laser.z_m])
+    messages = [transforms(("base_link", "laser", mounting), stamp_ns=FIRST_NS)]
+    for time_s, (x, y, yaw) in zip(drive.readings_s, drive.readings, strict=True):
+        stamp_ns = FIRST_NS + round(1e9 * time_s)
+        T_odom_base = transform(rotation_exp(np.array([0.0, 0.0, yaw])), [x, y, 0.0])
+        if odometry == "tf":
+            message = transforms(("odom", "base_link", T_odom_base), topic="/tf", stamp_ns=stamp_ns)
+        else:
+            message = odometry_message(stamp_ns, "/odom", T_odom_base, frame="odom", child="base_link")
+        messages.append(message)
+    type_ = "sensor_msgs/msg/LaserScan"
+    for time_s, ranges in zip(drive.times_s, drive.ranges_m, strict=True):
+        stamp_ns = FIRST_NS + round(1e9 * time_s)
+        scan = make_message(
+            type_,
+            header=make_header(stamp_ns, "laser"),
+            angle_min=float(laser.angles_rad[0]) - yaw_mount,
+            angle_max=float(laser.angles_rad[-1]) - yaw_mount,
+            angle_increment=laser.step_rad,
+            time_increment=laser.beam_s,
+            scan_time=1.0 / laser.rate_hz,
+            range_min=0.05,
+            range_max=laser.max_m,
+            ranges=ranges.astype(np.float32),
+            intensities=np.full(laser.beams, 100.0, np.float32),
+        )
+        messages.append(SerializedMessage(stamp_ns, "/scan", type_, serialize(scan)))
+    return write(path, sorted(messages, key=lambda message: message.stamp_ns))
 
 
 def flat(seed: int = 3) -> tuple[Segments, np.ndarray]:

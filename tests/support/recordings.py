@@ -1,11 +1,13 @@
 """Recordings made message by message, for the tests of reading them."""
 
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from mcap.writer import Writer as McapWriter
 from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from mapper.core.frames import PinholeCamera
 from mapper.core.geometry import Transform
@@ -16,6 +18,7 @@ from mapper.sources.ros.encode_ros import (
     transforms_message,
 )
 from mapper.sources.ros.message_writers import message_writer
+from mapper.sources.ros.typestore import serialize, typestore
 from tests.support.tum_logs import FIRST_NS, PERIOD_NS, picture
 
 CAMERA = PinholeCamera(64, 48, 60.0, 61.0, 31.5, 23.5, (0.1, -0.2, 0.001, 0.002, 0.05))
@@ -66,6 +69,13 @@ def write(path: Path, messages: Iterable[SerializedMessage]) -> Path:
     return path
 
 
+def changed(message: SerializedMessage, **fields: object) -> SerializedMessage:
+    """The same message but for some fields."""
+    store = typestore("cdr")
+    made = replace(store.deserialize_cdr(message.cdr, message.type), **fields)
+    return message._replace(cdr=serialize(made))
+
+
 def add_messages(writer: McapWriter, messages: Iterable[SerializedMessage]) -> None:
     """Add messages to an MCAP file of other options than ours, with a channel for each topic."""
     channels: dict[str, int] = {}
@@ -78,9 +88,9 @@ def add_messages(writer: McapWriter, messages: Iterable[SerializedMessage]) -> N
 
 def write_folder(folder: Writer, messages: Iterable[SerializedMessage]) -> None:
     """Write messages as ROS 2 records them, a nanosecond apart."""
-    from rosbags.typesys import Stores, get_typestore
-
     store = get_typestore(Stores.ROS2_HUMBLE)
+    extrinsics = "float64[9] rotation\nfloat64[3] translation\n"
+    store.register(get_types_from_msg(extrinsics, "realsense2_camera_msgs/msg/Extrinsics"))
     connections = {}
     with folder as writer:
         for log_ns, message in enumerate(messages, start=FIRST_NS):

@@ -6,11 +6,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from mapper.core.frames import PinholeCamera
 from mapper.core.geometry import Transform, exp, inverse
 from mapper.core.rotations import row_of_pose
-from mapper.sources.ros.encode_ros import SerializedMessage
-from mapper.sources.ros.typestore import make_header, make_message, serialize
-from tests.support.recordings import image
+from mapper.sources.ros.encode_ros import SerializedMessage, camera_info_message
+from tests.support.recordings import changed, image
 from tests.support.tum_logs import FIRST_NS
 
 SIZE_PX = (320, 240)
@@ -245,29 +245,12 @@ def recorded(
         for i, T_world_left in enumerate(poses_world(2)):
             stamp_ns = FIRST_NS + i * PERIOD_NS
             messages.append(image(stamp_ns, topic, camera.render(T_world_left), "mono8", frame=f"optical{k}"))
-            info = make_message(
-                "sensor_msgs/msg/CameraInfo",
-                header=make_header(stamp_ns, f"optical{k}"),
-                height=SIZE_PX[1],
-                width=SIZE_PX[0],
-                distortion_model="plumb_bob",
-                d=np.array([*camera.distortion, 0.0]),
-                k=camera.matrix.ravel(),
-                r=R.ravel(),
-                p=projections[k].ravel(),
-                binning_x=0,
-                binning_y=0,
-                roi=make_message(
-                    "sensor_msgs/msg/RegionOfInterest",
-                    x_offset=0,
-                    y_offset=0,
-                    height=0,
-                    width=0,
-                    do_rectify=False,
-                ),
+            K, topic_of_info = camera.matrix, topic.rpartition("/")[0] + "/camera_info"
+            intrinsics = PinholeCamera(
+                *SIZE_PX, K[0, 0], K[1, 1], K[0, 2], K[1, 2], (*camera.distortion, 0.0)
             )
-            name = topic.rpartition("/")[0] + "/camera_info"
-            messages.append(SerializedMessage(stamp_ns, name, "sensor_msgs/msg/CameraInfo", serialize(info)))
+            info = camera_info_message(stamp_ns, topic_of_info, intrinsics, frame=f"optical{k}")
+            messages.append(changed(info, r=R.ravel(), p=projections[k].ravel()))
     return messages
 
 

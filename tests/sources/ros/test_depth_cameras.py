@@ -1,11 +1,9 @@
 """Recordings whose depth comes from a camera of its own: registered as they are read, or refused."""
 
 import struct
-from dataclasses import replace
 
 import numpy as np
 import pytest
-from mcap.writer import Writer as McapWriter
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from mapper.core.errors import DataError, SourceError
@@ -19,10 +17,10 @@ from mapper.sources.ros.decode import decode
 from mapper.sources.ros.encode_ros import SerializedMessage
 from mapper.sources.ros.recording import Topic
 from mapper.sources.ros.topic_ranks import is_called_rectified
-from mapper.sources.ros.typestore import make_message, serialize, typestore
+from mapper.sources.ros.typestore import make_message, serialize
 from mapper.sources.writers import write_log
-from tests.support.depth_cameras import BESIDE, write_unregistered
-from tests.support.recordings import CAMERA, COLOR, add_messages, camera_info, image, shots, transforms, write
+from tests.support.depth_cameras import BESIDE, extrinsics, write_unregistered
+from tests.support.recordings import CAMERA, COLOR, camera_info, changed, image, shots, transforms, write
 from tests.support.tum_logs import FIRST_NS, picture
 
 WIDE = PinholeCamera(106, 60, 53.0, 53.0, 52.4, 30.1)
@@ -232,17 +230,10 @@ def test_a_recording_of_realsense_viewer_states_the_pose_of_each_stream(tmp_path
 
 
 def test_depth_in_colour_s_frame_is_registered_whatever_the_driver_s_topic_says(tmp_path):
-    numbers = np.concatenate([BESIDE[:3, :3].ravel(order="F"), BESIDE[:3, 3]])
-    type_, cdr = "realsense2_camera_msgs/msg/Extrinsics", b"\0\1\0\0" + numbers.astype("<f8").tobytes()
-    extrinsics = SerializedMessage(FIRST_NS, "/cam/extrinsics/depth_to_color", type_, cdr)
+    of_driver = extrinsics(BESIDE, topic="/cam/extrinsics/depth_to_color")
     for frame, is_registered in (("optical", True), ("depth_optical", False)):
-        path = tmp_path / f"{frame}.mcap"
-        with path.open("wb") as file:
-            writer = McapWriter(file)
-            writer.start(profile="ros2")
-            add_messages(writer, [extrinsics, *unregistered(CAMERA, T=None, frame=frame)])
-            writer.finish()
-        notes = open_source(path).notes
+        messages = [of_driver, *unregistered(CAMERA, T=None, frame=frame)]
+        notes = opened(tmp_path / frame, messages).notes
         assert any("as it is read" in note for note in notes) != is_registered
 
 
@@ -258,20 +249,13 @@ def test_calibrations_that_are_not_set_yet_are_passed_over_and_changes_are_noted
 
 
 def test_a_calibration_of_p_alone_tells_the_depth_camera_from_colours(tmp_path):
-    store, type_ = typestore("cdr"), "sensor_msgs/msg/CameraInfo"
-
-    def without_k(message):
-        info = store.deserialize_cdr(message.cdr, type_)
-        return message._replace(cdr=bytes(store.serialize_cdr(replace(info, k=np.zeros(9)), type_)))
-
-    of_depth = [one.type == type_ and "depth" in one.topic for one in unregistered(T=None)]
-    messages = [
-        without_k(one) if is_of_depth else one
-        for one, is_of_depth in zip(unregistered(T=None), of_depth, strict=True)
+    without_k = [
+        changed(one, k=np.zeros(9)) if one.topic == "/cam/depth/camera_info" else one
+        for one in unregistered(T=None)
     ]
-    assert any(of_depth)
+    assert without_k != unregistered(T=None)
     with pytest.raises(SourceError, match=r"focal length 53\.0 px\) is not registered"):
-        open_source(write(tmp_path / "a.mcap", messages))
+        opened(tmp_path / "a.mcap", without_k)
 
 
 @pytest.mark.parametrize(("name", "is_rectified"), [("image_rect_color", True), ("image_unrectified", False)])

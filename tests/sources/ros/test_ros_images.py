@@ -101,61 +101,72 @@ def test_image_files_are_decoded_as_on_disk(ending, format_):
     assert not is_depth(message)
 
 
-@pytest.mark.parametrize("is_big_endian", [False, True])
-@pytest.mark.parametrize("encoding", ["16UC1", "mono16"])
-def test_depth_of_16_bits_is_millimetres(encoding, is_big_endian):
-    units = UNITS.copy()
-    units[5, 6] = 65535  # saturated
-    stored = units.astype(">u2" if is_big_endian else "<u2")
-    message = pixels(stored, encoding, padding=2, is_big_endian=is_big_endian)
-    depth_m = depth_m_of(message, units_per_m=1000.0, where="m")
-    expected = UNITS.astype(np.float32) / np.float32(1000)
-    expected[5, 6] = 0.0
-    np.testing.assert_array_equal(depth_m, expected)
-    assert depth_m.dtype == np.float32
+HEADER = struct.pack("<iff", 0, 0.0, 0.0)
+METRES = np.linspace(0.5, 4.0, 48 * 64, dtype=np.float32).reshape(48, 64)
+MILLIMETRES_M = UNITS.astype(np.float32) / np.float32(1000)
+"""UNITS as depth."""
+
+
+def spoilt(array, values, *, kind):
+    """Overwrite the first pixels with what is no depth."""
+    stored = array.astype(kind)
+    stored[0, : len(values)] = values
+    return stored
+
+
+def holed(depth_m, pixels):
+    depth_m = depth_m.copy()
+    depth_m[0, :pixels] = 0.0
+    return depth_m
+
+
+SATURATED = holed(MILLIMETRES_M, 1)
+WILD = [np.nan, np.inf, -np.inf, -1.0, 65504.0]
+HALF = (UNITS // 2).astype(np.int16)
+HALF_M = holed(HALF.astype(np.float32) / np.float32(1000), 5)
+
+
+@pytest.mark.parametrize(
+    ("message", "depth_m", "is_float"),
+    [
+        *(
+            (
+                pixels(spoilt(UNITS, [65535], kind=kind), name, padding=2, is_big_endian=kind == ">u2"),
+                SATURATED,
+                False,
+            )
+            for name in ("16UC1", "mono16")
+            for kind in ("<u2", ">u2")
+        ),
+        (pixels(spoilt(HALF, [-1] * 5, kind="<i2"), "16SC1"), HALF_M, False),
+        (pixels(METRES.astype(np.float64), "64FC1"), METRES, True),
+        *(
+            (
+                pixels(spoilt(METRES, WILD, kind=kind), "32FC1", is_big_endian=kind == ">f4"),
+                holed(METRES, 5),
+                True,
+            )
+            for kind in ("<f4", ">f4")
+        ),
+        (file(HEADER + encoded(UNITS, ".png"), "16UC1; compressedDepth png"), MILLIMETRES_M, False),
+        (file(encoded(UNITS, ".png"), "16UC1; png compressed "), MILLIMETRES_M, False),
+        # Known by their bytes, whatever the format says:
+        (file(HEADER + encoded(UNITS, ".png"), "png"), MILLIMETRES_M, False),
+        (file(HEADER + encoded(UNITS, ".png"), ""), MILLIMETRES_M, False),
+        (file(encoded(UNITS, ".png"), "16UC1; compressedDepth png"), MILLIMETRES_M, False),
+        (file(encoded(UNITS, ".png"), "jpeg"), MILLIMETRES_M, False),
+        (file(encoded(UNITS, ".tiff"), "16UC1; tiff"), MILLIMETRES_M, False),
+        (file(encoded(METRES, ".tiff"), "tiff"), METRES, True),
+    ],
+)
+def test_depth_is_millimetres_or_floats_of_metres_and_0_where_it_is_none(message, depth_m, is_float):
     assert is_depth(message)
-
-
-def test_depth_of_signed_numbers_is_that_of_unsigned_ones_and_none_where_negative():
-    stored = (UNITS // 2).astype(np.int16)
-    expected_m = depth_m_of(pixels(stored.astype(np.uint16), "16UC1"), units_per_m=1000.0, where="m")
-    stored[0, :5] = -1
-    expected_m[0, :5] = 0.0
-    message = pixels(stored, "16SC1")
-    np.testing.assert_array_equal(depth_m_of(message, units_per_m=1000.0, where="m"), expected_m)
-    assert is_depth(message)
-
-
-def test_depth_of_64_bits_is_metres():
-    depth_m = np.linspace(0.5, 4.0, 48 * 64).reshape(48, 64)
-    message = pixels(depth_m, "64FC1")
-    assert has_float_depth(message)
-    np.testing.assert_array_equal(
-        depth_m_of(message, units_per_m=1000.0, where="m"), depth_m.astype(np.float32)
-    )
-
-
-@pytest.mark.parametrize("kind", ["<f4", ">f4"])
-def test_depth_of_32_bits_is_metres_and_what_is_no_depth_is_zero(kind):
-    depth = np.linspace(0.5, 4.0, 48 * 64, dtype=np.float32).reshape(48, 64)
-    wild = depth.copy()
-    wild[0, :5] = [np.nan, np.inf, -np.inf, -1.0, 65504.0]
-    message = pixels(wild.astype(kind), "32FC1", is_big_endian=kind == ">f4")
-    depth[0, :5] = 0.0
+    assert has_float_depth(message) == is_float
     got = depth_m_of(message, units_per_m=1000.0, where="m")
     assert got.dtype == np.float32
-    np.testing.assert_array_equal(got, depth)
-
-
-def test_compressed_depth_of_16_bits_is_exact():
-    header = struct.pack("<iff", 0, 0.0, 0.0)
-    message = file(header + encoded(UNITS, ".png"), "16UC1; compressedDepth png")
-    expected = UNITS.astype(np.float32) / np.float32(1000)
-    np.testing.assert_array_equal(depth_m_of(message, units_per_m=1000.0, where="m"), expected)
-    bare = file(encoded(UNITS, ".png"), "16UC1; png compressed ")
-    np.testing.assert_array_equal(depth_m_of(bare, units_per_m=1000.0, where="m"), expected)
-    assert is_depth(message)
-    assert is_depth(bare)
+    np.testing.assert_array_equal(got, depth_m)
+    kept = depth_file_of(message)
+    assert kept is None or kept == encoded(UNITS, ".png")
 
 
 def test_compressed_depth_of_32_bits_is_inverse_depth():
@@ -169,36 +180,6 @@ def test_compressed_depth_of_32_bits_is_inverse_depth():
     got = depth_m_of(message, units_per_m=1000.0, where="m")
     assert got[0, 0] == 0.0
     np.testing.assert_allclose(got.ravel()[1:], depth.ravel()[1:], rtol=5e-4 * 9.0)
-
-
-HEADER = struct.pack("<iff", 0, 0.0, 0.0)
-
-
-@pytest.mark.parametrize(
-    "message",
-    [
-        file(HEADER + encoded(UNITS, ".png"), "png"),
-        file(HEADER + encoded(UNITS, ".png"), ""),
-        file(encoded(UNITS, ".png"), "16UC1; compressedDepth png"),
-        file(encoded(UNITS, ".png"), "jpeg"),
-        file(encoded(UNITS, ".tiff"), "16UC1; tiff"),
-    ],
-)
-def test_depth_of_16_bits_is_known_by_its_bytes_whatever_its_format_says(message):
-    assert is_depth(message)
-    assert not has_float_depth(message)
-    expected = UNITS.astype(np.float32) / np.float32(1000)
-    np.testing.assert_array_equal(depth_m_of(message, units_per_m=1000.0, where="m"), expected)
-    kept = depth_file_of(message)
-    assert kept is None or kept == encoded(UNITS, ".png")
-
-
-def test_a_tiff_of_32_bits_is_depth_in_metres():
-    depth = np.linspace(0.5, 4.0, 48 * 64, dtype=np.float32).reshape(48, 64)
-    message = file(encoded(depth, ".tiff"), "tiff")
-    assert is_depth(message)
-    assert has_float_depth(message)
-    np.testing.assert_array_equal(depth_m_of(message, units_per_m=1000.0, where="m"), depth)
 
 
 def test_rows_that_follow_each_other_are_read_whatever_step_says():
