@@ -14,8 +14,10 @@ from mapper.sources.base import Log
 _MAX_RATE_HZ = 1000.0
 _MAX_INTERVAL_S = 15.0
 """Milliseconds taken for seconds are more, up to 66 frames a second."""
-_STATIC = frozenset({"e57"})
-"""Formats of scanners on a tripod, which scan for minutes."""
+_UNEVEN = 0.1
+"""Median deviation of intervals in their median: less by a sensor's clock, more as a person moves a tripod."""
+_DATED_NS, _LONGEST_S = 10**9 * NS_PER_S, 3600.0
+"""Stamps since 2001 are seconds, in which scans come one by one; a device's count of µs has longer ones."""
 _PLACES, _ALL_PLACES = 6, 100
 """Places of half a log at which two consecutive images are compared; more where these are unlike."""
 _LEAST_FRAMES = 4 * _PLACES
@@ -33,13 +35,16 @@ def time_warnings(log: Log) -> list[str]:
 
 
 def _rate_warnings(log: Log) -> list[str]:
-    usual_s = float(np.median(np.diff(log.stamps_ns))) / NS_PER_S if len(log) > 1 else 1.0
+    apart_s = np.diff(log.stamps_ns) / NS_PER_S if len(log) > 1 else np.ones(1)
+    usual_s = float(np.median(apart_s))
     if usual_s * _MAX_RATE_HZ < 1.0:
         return [
             f"stamps: frames come every {usual_s:.2g} s, which no camera or LiDAR does; are they of another "
             "unit, or those of the file system?"
         ]
-    if usual_s > _MAX_INTERVAL_S and log.kind not in _STATIC:
+    is_even = float(np.median(np.abs(apart_s - usual_s))) < _UNEVEN * usual_s
+    is_dated = log.stamps_ns[0] > _DATED_NS and usual_s < _LONGEST_S
+    if usual_s > _MAX_INTERVAL_S and is_even and not is_dated:
         return [
             f"stamps: frames come every {usual_s:.3g} s, in which a moving sensor sees nothing again; are "
             "they milliseconds, microseconds or nanoseconds? want seconds"

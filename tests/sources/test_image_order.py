@@ -1,10 +1,13 @@
 """Stamps of other images: told by how alike consecutive images are."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
 
 from mapper.core.frames import PinholeCamera, RgbdFrame
+from mapper.core.timebase import NS_PER_S
 from mapper.sources.image_order import time_warnings
 from tests.support.logs import MemoryEntry, log_in_memory
 
@@ -49,6 +52,19 @@ def test_frames_that_come_every_few_microseconds_are_told():
     assert len(time_warnings(passing(np.arange(60), period_ns=28_000))) == 1
 
 
-@pytest.mark.parametrize(("period_s", "told"), [(67, 1), (10, 0)])
-def test_frames_that_come_every_minute_are_told(period_s, told):
-    assert len(time_warnings(passing(np.arange(60), period_ns=period_s * 10**9))) == told
+@pytest.mark.parametrize(("period_s", "first_s", "told"), [(67, 0, 1), (10, 0, 0), (60, 1_700_000_000, 0)])
+def test_a_clock_of_long_intervals_is_told_unless_it_has_a_date(period_s, first_s, told):
+    log = passing(np.arange(60), period_ns=period_s * NS_PER_S)
+    later = replace(log, stamps_ns=log.stamps_ns + first_s * NS_PER_S)
+    assert len(time_warnings(later)) == told
+
+
+@pytest.mark.parametrize(("unit", "told"), [(1, 0), (1000, 1)])
+def test_scans_one_by_one_are_told_from_milliseconds_by_uneven_intervals(unit, told):
+    """A person takes 45 to 90 s from scan to scan; a camera's clock shakes by 5 %, and loses frames."""
+    random = np.random.default_rng(7)
+    by_hand_s, by_clock_s = random.uniform(45.0, 90.0, 59), random.normal(0.1, 0.005, 59)
+    by_clock_s[::5] *= 2.0
+    apart_s = unit * (by_hand_s if unit == 1 else by_clock_s)
+    stamps_ns = np.concatenate([[0], np.rint(apart_s.cumsum() * NS_PER_S)]).astype(np.int64)
+    assert len(time_warnings(replace(passing(np.arange(60)), stamps_ns=stamps_ns))) == told
