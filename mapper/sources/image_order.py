@@ -15,7 +15,7 @@ _MAX_RATE_HZ = 1000.0
 _MAX_INTERVAL_S = 15.0
 """Milliseconds taken for seconds are more, up to 66 frames a second."""
 _UNEVEN = 0.1
-"""Median deviation of intervals in their median: less by a sensor's clock, more as a person moves a tripod."""
+"""Median deviation of intervals in their median: less by a sensor's clock, more where one moves a tripod."""
 _DATED_NS, _LONGEST_S = 10**9 * NS_PER_S, 3600.0
 """Stamps since 2001 are seconds, in which scans come one by one; a device's count of µs has longer ones."""
 _PLACES, _ALL_PLACES = 6, 100
