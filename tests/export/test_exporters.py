@@ -12,29 +12,18 @@ import pytest
 from plyfile import PlyData
 from pypcd4 import PointCloud
 
-from mapper.config.loading import load_config
 from mapper.core.errors import ConfigError, DependencyError, MapSizeError, RunError, WriteError
 from mapper.export.exporters import EXPORTERS, export
 from mapper.graph.g2o import read_g2o
 from mapper.octree.grid import OCCUPIED, UNKNOWN, read_grid
 from mapper.octree.map import read_octree
-from mapper.pipeline.build import build
 from mapper.run.file_checks import check_run
 from mapper.run.folder import moved_log, open_run
-from mapper.sources import open_source
 from mapper.sources.trajectory_files import read_kitti, read_tum
-from tests.support.files import files_of
+from tests.support.files import digest_of, files_of
 
 KINDS = [kind for kind, exporter in EXPORTERS.items() if exporter.file_name]
-COARSE_MESH = ["mesh.voxel_m=0.04", "mesh.frame_stride=2", "mesh.min_observations=1"]
-
-
-@pytest.fixture(scope="module")
-def run(desk_log, tmp_path_factory):
-    out = tmp_path_factory.mktemp("export") / "run"
-    settings = ["source.last_frame=12", "octree.resolution_m=0.1", *COARSE_MESH]
-    config = load_config(None, settings)
-    return build(open_source(desk_log, config.source), config, out)
+FOLDERS = [kind for kind in EXPORTERS if kind not in KINDS]
 
 
 @pytest.fixture(params=KINDS)
@@ -84,16 +73,37 @@ def check_ply(run, path):
     assert 0.0 < seen_s[-1] <= length_s
 
 
+def check_attributes(run, hits, times_s):
+    at = run.octree.attributes.at(run.cloud.points.astype(np.float64))
+    np.testing.assert_array_equal(hits, at.hits)
+    assert hits.min() >= 1
+    stamps_ns = run.trajectory.stamps_ns
+    np.testing.assert_allclose(times_s, (at.last_seen_ns - stamps_ns[0]) / 1e9)
+    assert 0.0 <= times_s.min() < times_s.max() <= (stamps_ns[-1] - stamps_ns[0]) / 1e9
+
+
 def check_las(run, path):
     cloud = laspy.read(path)
+    assert (cloud.header.version.major, cloud.header.version.minor, cloud.point_format.id) == (1, 2, 2)
+    assert cloud.header.generating_software == "mapper"
+    assert path.read_bytes()[90:94] == bytes(4)  # no date: the same run, the same bytes
+    assert cloud.header.are_points_compressed == (path.suffix == ".laz")
     np.testing.assert_allclose(cloud.xyz, run.cloud.points, atol=0.51e-4)
-    assert list(cloud.point_format.extra_dimension_names) == ["time_s"]
+    colors = np.column_stack([cloud.red, cloud.green, cloud.blue])
+    np.testing.assert_array_equal(colors // 256, run.cloud.colors)
+    assert colors.max() > 255
+    assert list(cloud.point_format.extra_dimension_names) == ["time_s", "last_seen_s", "hits"]
+    check_attributes(run, np.array(cloud.hits), np.array(cloud.last_seen_s))
 
 
 def check_pcd(run, path):
     cloud = PointCloud.from_path(path)
-    assert cloud.fields == ("x", "y", "z", "rgb", "time_s")
+    assert cloud.fields == ("x", "y", "z", "rgb", "time_s", "last_seen_s", "hits")
     np.testing.assert_array_equal(cloud.numpy(("x", "y", "z")), run.cloud.points)
+    packed = np.ascontiguousarray(cloud.pc_data["rgb"]).view(np.uint32)
+    channels = [packed >> 16, packed >> 8 & 255, packed & 255]
+    np.testing.assert_array_equal(np.column_stack(channels), run.cloud.colors)
+    check_attributes(run, cloud.pc_data["hits"], cloud.pc_data["last_seen_s"])
 
 
 def check_e57(run, path):
@@ -190,28 +200,23 @@ CHECKS = {
 
 
 def out_of(folder, kind):
-    return folder / f"taken{EXPORTERS[kind].endings[0]}"
+    return (folder / "taken").with_suffix("".join(EXPORTERS[kind].endings[:1]))
 
 
 @pytest.mark.parametrize("ending", [".bt", ".ot"])
-def test_an_octree_of_wider_voxels_is_one_that_octomap_reads(untouched, tmp_path, ending):
-    settings = {"octomap.level": 2}
+@pytest.mark.parametrize("level", [0, 2])
+def test_an_octree_of_wider_voxels_is_one_that_octomap_reads(untouched, tmp_path, ending, level):
+    settings = {"octomap.level": level}
     path = export(untouched, "octomap", tmp_path / f"coarse{ending}", settings=settings)
     tree = pyoctomap.OcTree(1.0)
     if ending == ".bt":
         assert tree.readBinary(str(path))
     else:
         tree = tree.read(str(path))
-    assert tree.getResolution() == pytest.approx(0.4)
-    mean = read_octree(untouched.path / "map.octree").leaves(depth=14, parent="mean")
+    assert tree.getResolution() == pytest.approx(0.1 * 2**level)
+    mean = read_octree(untouched.path / "map.octree").leaves(depth=16 - level, parent="mean")
     for centre, log_odds in zip(mean.centres_world, mean.log_odds, strict=True):
         assert tree.isNodeOccupied(tree.search(centre)) == (log_odds >= 0.0)
-
-
-def test_an_octree_of_wider_voxels_does_not_replace_the_run_s_own(untouched):
-    settings = {"octomap.level": 2}
-    with pytest.raises(RunError, match="name another file"):
-        export(untouched, "octomap", settings=settings)
 
 
 def test_what_is_written_is_read_by_others(untouched, kind, tmp_path):
@@ -223,12 +228,31 @@ def test_what_is_written_is_read_by_others(untouched, kind, tmp_path):
     assert set(out.parent.iterdir()) == {out, *beside}
 
 
+def test_las_may_be_uncompressed(untouched, tmp_path):
+    check_las(untouched, export(untouched, "las", tmp_path / "cloud.las"))
+
+
+@pytest.mark.parametrize(
+    "kind", sorted(EXPORTERS.keys() - {"e57"})
+)  # whose files have a GUID, as its standard wants
 def test_the_same_run_gives_the_same_bytes(untouched, kind, tmp_path):
-    if kind == "e57":
-        pytest.skip("each E57 file has a GUID of its own, as its standard wants")
     for folder in ("one", "two"):
+        (tmp_path / folder).mkdir()
         export(untouched, kind, out_of(tmp_path / folder, kind))
-    assert files_of(tmp_path / "one") == files_of(tmp_path / "two")
+    assert digest_of(tmp_path / "one") == digest_of(tmp_path / "two")
+
+
+@pytest.mark.parametrize("kind", FOLDERS)
+def test_a_folder_is_named_and_only_an_earlier_one_is_replaced(untouched, kind, tmp_path):
+    with pytest.raises(ConfigError, match="name it with --out"):
+        export(untouched, kind)
+    out = export(untouched, kind, tmp_path / "results")
+    with pytest.raises(RunError, match="exists already"):
+        export(untouched, kind, out)
+    assert export(untouched, kind, out, overwrite=True) == out
+    (out / "notes.txt").touch()
+    with pytest.raises(RunError, match=r"notes\.txt"):
+        export(untouched, kind, out, overwrite=True)
 
 
 def test_without_a_name_it_stays_in_the_run(run, kind, tmp_path):
@@ -287,14 +311,6 @@ def test_an_unknown_kind_names_the_known():
         export(None, "costmaps")
 
 
-def test_every_ending_of_octomap_is_its_own_format(untouched, tmp_path):
-    export(untouched, "octomap", tmp_path / "taken.ot")
-    tree = pyoctomap.OcTree(1.0).read(str(tmp_path / "taken.ot"))
-    centre = occupied_centres(untouched)[0]
-    octree = read_octree(untouched.path / "map.ot", untouched.config.octree)
-    assert tree.search(centre).getLogOdds() == pytest.approx(octree.log_odds_at(centre[None])[0])
-
-
 @pytest.mark.parametrize("name", ["cloud.ply", "map.bt", "map.octree", "slice.yaml", "trajectory.tum"])
 def test_a_run_with_a_hole_says_which_file(run, tmp_path, name):
     kind = {"cloud.ply": "ply", "map.bt": "octomap", "map.octree": "voxels", "slice.yaml": "grid"}.get(
@@ -308,12 +324,12 @@ def test_a_run_with_a_hole_says_which_file(run, tmp_path, name):
 
 
 def test_settings_that_a_kind_does_not_read_are_refused(untouched):
-    turned = {"mesh.voxel_m": 0.1}
     with pytest.raises(ConfigError, match="mesh: export --as ply has no settings"):
-        export(untouched, "ply", settings=turned)
-    turned = {"octree.resolution_m": 0.2}
+        export(untouched, "ply", settings={"mesh.voxel_m": 0.1})
     with pytest.raises(ConfigError, match="octree: export --as mesh reads mesh settings only"):
-        export(untouched, "mesh", settings=turned)
+        export(untouched, "mesh", settings={"octree.resolution_m": 0.2})
+    with pytest.raises(RunError, match="name another file"):  # than the run's own
+        export(untouched, "octomap", settings={"octomap.level": 2})
 
 
 class Missing:

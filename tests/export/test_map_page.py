@@ -15,12 +15,12 @@ from mapper.export.report.data import chapter_of
 from mapper.export.report.map_data import map_of
 from mapper.export.report.map_page import write_map_page
 from mapper.export.report.packing import pack_layers, pack_points
-from mapper.loops.closure import LoopClosure
 from mapper.octree.keys import codes_of
 from mapper.octree.map import read_octree
 from mapper.octree.scan_updates import open_scan_updates
 from tests.support.chromium import AXE, CHROMIUM, MISSING, NO_AXE
 from tests.support.command_line import invoke
+from tests.support.loop_closures import loop
 from tests.support.map_page import MapPage, change, lit
 
 needs_browser = pytest.mark.skipif(CHROMIUM is None, reason=MISSING)
@@ -215,13 +215,10 @@ def test_nothing_bars_a_person_from_the_page(page, width_px):
 @needs_browser
 def test_two_runs_lie_over_each_other_or_side_by_side_and_loops_tell_their_reason(desk_run, tmp_path):
     chapter = chapter_of(desk_run, "a", [])
-    graph = chapter.results.graph
-    first, *_, last = graph.T_world_node
-    loop = LoopClosure(
-        first, last, graph.stamps_ns[first], graph.stamps_ns[last], "bow", "rejected", reason="isvd: too few"
-    )
+    first, *_, last = chapter.results.graph.T_world_node
+    refused = loop(first, last, verdict="rejected", reason="isvd: too few")
     path = tmp_path / "two.html"
-    results = replace(chapter.results, loops=[loop])
+    results = replace(chapter.results, loops=[refused])
     write_map_page(path, [replace(chapter, results=results), replace(chapter, name="b", results=results)])
     with MapPage(path, height_px=800) as browser:
         over = browser.picture()

@@ -7,9 +7,9 @@ import pytest
 from mapper.config.loading import read_config
 from mapper.export.report.data import chapter_of
 from mapper.export.report.map_page import write_map_page
-from mapper.loops.closure import LoopClosure
 from mapper.run.edits_file import EditsFile
 from tests.support.chromium import AXE, CHROMIUM, MISSING, NO_AXE
+from tests.support.loop_closures import loop
 from tests.support.map_page import EditedPage
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason=MISSING)
@@ -24,16 +24,8 @@ def nodes(desk_run):
 def page(desk_run, nodes, tmp_path_factory):
     """The desk's page with a loop that holds, between the first and the last node, and one that does not."""
     chapter = chapter_of(desk_run, "desk", [])
-    graph = chapter.results.graph
     first, second, *_, last = nodes
-
-    def loop(i, j, verdict, reason=""):
-        measured = {"T_i_j": graph.T_world_node[i], "information": graph.factors[0].information}
-        return LoopClosure(
-            i, j, graph.stamps_ns[i], graph.stamps_ns[j], "places", verdict, reason, **measured
-        )
-
-    loops = [loop(first, last, "accepted"), loop(second, last, "rejected", "gate: too far")]
+    loops = [loop(first, last), loop(second, last, verdict="rejected", reason="gate: too far")]
     path = tmp_path_factory.mktemp("edited") / "desk.html"
     write_map_page(path, [replace(chapter, results=replace(chapter.results, loops=loops))])
     return path

@@ -78,24 +78,6 @@ def test_the_order_of_vertices_and_triangles_does_not_matter():
     assert len(np.unique(np.hstack([ours.points_world, ours.colors]), axis=0)) == len(ours.points_world)
 
 
-def test_sorting_moves_no_triangle_and_mirrors_none():
-    rng = np.random.default_rng(1)
-    points = rng.normal(size=(20, 3)).astype(np.float32)
-    triangles = rng.permuted(np.tile(np.arange(20, dtype=np.int32), (30, 1)), axis=1)[:, :3]
-
-    sorted_surface = in_order(points, np.zeros((20, 3), np.uint8), triangles)
-
-    def corner_sets(points, triangles):
-        a, b, c = np.moveaxis(points[triangles], 1, 0)
-        return np.sort(np.hstack([a + b + c, np.cross(b - a, c - a)]).round(4), axis=0)
-
-    np.testing.assert_allclose(
-        corner_sets(sorted_surface.points_world, sorted_surface.triangles),
-        corner_sets(points, triangles),
-        atol=2e-4,
-    )
-
-
 def test_the_pose_of_the_camera_on_the_body_counts():
     T_body_camera = POSES[2]
     frame = frame_of_a_plane(np.eye(4), distortion=FR1)

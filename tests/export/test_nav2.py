@@ -3,7 +3,7 @@ import json
 import numpy as np
 import pytest
 
-from mapper.core.errors import ConfigError, DataError, RunError
+from mapper.core.errors import DataError
 from mapper.export.exporters import export
 from mapper.export.nav2 import (
     FREE_SPACE,
@@ -73,18 +73,6 @@ def test_the_folder_holds_what_nav2_loads(desk_run, tmp_path):
         assert read_grid(out / f"{stem}.yaml").cells.shape == own.cells.shape
     assert "mode: raw" in (out / "speed_mask.yaml").read_text()
     assert json.loads((out / "manifest.json").read_text())["run"] == str(desk_run.path.resolve())
-
-
-def test_a_folder_is_named_and_spared_unless_told(desk_run, tmp_path):
-    with pytest.raises(ConfigError, match="name it with --out"):
-        export(desk_run, "nav2")
-    export(desk_run, "nav2", tmp_path / "nav2")
-    with pytest.raises(RunError, match="exists already"):
-        export(desk_run, "nav2", tmp_path / "nav2")
-    export(desk_run, "nav2", tmp_path / "nav2", overwrite=True)
-    (tmp_path / "nav2" / "notes.txt").write_text("mine")
-    with pytest.raises(RunError, match=r"notes\.txt"):
-        export(desk_run, "nav2", tmp_path / "nav2", overwrite=True)
 
 
 def cells_of(cells):

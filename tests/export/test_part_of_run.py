@@ -5,24 +5,14 @@ import pytest
 from plyfile import PlyData
 from pypcd4 import PointCloud
 
-from mapper.config.loading import load_config
 from mapper.core.errors import ConfigError, MapperError
 from mapper.core.geometry import apply, inverse
 from mapper.export.exporters import EXPORTERS, export
 from mapper.graph.g2o import read_g2o
 from mapper.octree.grid import read_grid
 from mapper.octree.map import read_octree
-from mapper.pipeline.build import build
-from mapper.sources import open_source
 from mapper.sources.trajectory_files import read_tum
 from tests.support.files import files_of
-
-
-@pytest.fixture(scope="module")
-def run(desk_log, tmp_path_factory):
-    settings = ["source.last_frame=12", "octree.resolution_m=0.1", "octree.attributes=true"]
-    config = load_config(None, [*settings, "mesh.voxel_m=0.04", "mesh.min_observations=1"])
-    return build(open_source(desk_log, config.source), config, tmp_path_factory.mktemp("part") / "run")
 
 
 @pytest.fixture(scope="module")

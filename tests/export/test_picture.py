@@ -35,20 +35,20 @@ def pixels_like(picture, rgb):
     return int((np.abs(picture.astype(int) - rgb[::-1]).max(axis=2) <= 12).sum())
 
 
-def test_summary_shows_estimate_and_truth(tmp_path):
-    path = tmp_path / "summary.png"
-    drawing = {
-        "grid": room(),
-        "trajectory": loop(),
-        "loops_world": NO_LOOPS,
-        "title": "a room",
-        "lines": ["200 frames"],
-    }
-    write_summary(path, truth=loop(radius_m=1.4), **drawing)
-    both = cv2.imread(str(path))
-    write_summary(path, truth=None, **drawing)
-    alone = cv2.imread(str(path))
+@pytest.fixture
+def summary(tmp_path):
+    """Write a summary, by default of a path without a truth or loops in a room, and read the picture."""
 
+    def written(name="summary.png", **drawing):
+        usual = {"grid": room(), "trajectory": loop(), "truth": None, "loops_world": NO_LOOPS}
+        write_summary(tmp_path / name, title="a room", **usual | drawing)
+        return cv2.imread(str(tmp_path / name))
+
+    return written
+
+
+def test_summary_shows_estimate_and_truth(summary):
+    both, alone = summary(truth=loop(radius_m=1.4), lines=["200 frames"]), summary()
     assert min(both.shape[:2]) > 500
     assert pixels_like(both, ESTIMATE) > 500
     assert pixels_like(alone, ESTIMATE) > 500
@@ -57,40 +57,26 @@ def test_summary_shows_estimate_and_truth(tmp_path):
     assert pixels_like(alone, with_alpha) == 0
 
 
-def test_summary_shows_what_loops_tie(tmp_path):
+def test_summary_shows_what_loops_tie(summary):
     ends = np.array([[[-0.8, 0.0, 1.2], [0.8, 0.1, 1.2]], [[0.0, -0.8, 1.2], [0.1, 0.8, 1.2]]])
-    drawing = {"grid": room(), "trajectory": loop(), "truth": None, "title": "a room"}
-    path = tmp_path / "summary.png"
-    write_summary(path, loops_world=NO_LOOPS, **drawing)
-    without = pixels_like(cv2.imread(str(path)), FACTORS["loop"])
-    write_summary(path, loops_world=ends, **drawing)
-    assert pixels_like(cv2.imread(str(path)), FACTORS["loop"]) > without + 100
+    without, tied = (pixels_like(each, FACTORS["loop"]) for each in (summary(), summary(loops_world=ends)))
+    assert tied > without + 100
 
 
 @pytest.mark.parametrize("shape", [(10, 400), (400, 10), (1, 1)])
-def test_summary_fits_maps_of_any_shape(tmp_path, shape):
+def test_summary_fits_maps_of_any_shape(summary, shape):
     grid = OccupancyGrid(np.zeros(shape, np.int8), np.array([0.0, 0.0]), 0.05)
-    write_summary(
-        tmp_path / "s.png", grid=grid, trajectory=loop(), truth=None, loops_world=NO_LOOPS, title="odd"
-    )
-    height, width = cv2.imread(str(tmp_path / "s.png")).shape[:2]
+    height, width = summary(grid=grid).shape[:2]
     assert width == 1040
     assert 400 < height < 1500
 
 
-def test_pictures_are_the_same_bytes_again_and_leave_no_pyplot(tmp_path):
+def test_pictures_are_the_same_bytes_again_and_leave_no_pyplot(summary, tmp_path):
     loaded_before = set(sys.modules)
     cloud = np.random.default_rng(0).normal(size=(2000, 3)).astype(np.float32)
     colors = height_colors(cloud[:, 2])
     for name in ("a.png", "b.png"):
-        write_summary(
-            tmp_path / name,
-            grid=room(),
-            trajectory=loop(),
-            truth=loop(),
-            loops_world=NO_LOOPS,
-            title="a room",
-        )
+        summary(name, truth=loop())
         write_cloud_views(tmp_path / f"views_{name}", cloud, colors, loop())
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
     assert (tmp_path / "views_a.png").read_bytes() == (tmp_path / "views_b.png").read_bytes()
@@ -177,23 +163,15 @@ def uncertain(trajectory, sigmas_m, doubtful=()):
     return UncertainPoses(trajectory, is_doubtful, covariances)
 
 
-def test_summary_shows_what_is_uncertain_and_what_is_doubtful(tmp_path):
-    drawing = {
-        "grid": room(),
-        "trajectory": loop(),
-        "truth": None,
-        "loops_world": NO_LOOPS,
-        "title": "a room",
-    }
-    pictures = []
-    for name, poses in {
-        "plain": None,
-        "certain": uncertain(loop(), np.full(200, 1e-4)),
-        "uncertain": uncertain(loop(), np.linspace(0.0, 0.1, 200), doubtful=range(50, 80)),
-    }.items():
-        write_summary(tmp_path / f"{name}.png", poses=poses, **drawing)
-        pictures.append(cv2.imread(str(tmp_path / f"{name}.png")))
-    plain, certain, doubted = pictures
+def test_summary_shows_what_is_uncertain_and_what_is_doubtful(summary):
+    plain, certain, doubted = (
+        summary(poses=poses)
+        for poses in (
+            None,
+            uncertain(loop(), np.full(200, 1e-4)),
+            uncertain(loop(), np.linspace(0.0, 0.1, 200), doubtful=range(50, 80)),
+        )
+    )
     band = tuple(round(60 / 255 * c + 195 / 255 * 255) for c in ESTIMATE)
     assert pixels_like(doubted, band) > 5 * max(pixels_like(certain, band), 100)
     assert pixels_like(doubted, DOUBTFUL) > 500

@@ -6,12 +6,10 @@ import pytest
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import QosDurability
 
-from mapper.core.errors import ConfigError, RunError
 from mapper.core.rotations import quaternion_from_rotation
 from mapper.export.exporters import export
 from mapper.export.run_maps import snapshots_of
 from mapper.octree.map import read_octree
-from tests.support.files import files_of
 
 TYPES = {
     "/tf": "tf2_msgs/msg/TFMessage",
@@ -181,19 +179,3 @@ def test_images_are_those_of_the_run_with_their_camera(desk_run, bag):
         np.testing.assert_array_equal(info.k.reshape(3, 3), ours.camera.matrix)
     (tf,) = only(bag["/tf_static"]).transforms
     assert (tf.header.frame_id, tf.child_frame_id) == ("body", "camera")
-
-
-def test_the_same_run_gives_the_same_bytes(desk_run, folder, tmp_path):
-    assert files_of(export(desk_run, "rosbag2", tmp_path / "other")) == files_of(folder)
-
-
-def test_only_an_earlier_bag_is_replaced(desk_run, tmp_path):
-    with pytest.raises(ConfigError, match="name it with --out"):
-        export(desk_run, "rosbag2")
-    out = export(desk_run, "rosbag2", tmp_path / "bag")
-    with pytest.raises(RunError, match="exists already"):
-        export(desk_run, "rosbag2", out)
-    assert export(desk_run, "rosbag2", out, overwrite=True) == out
-    (out / "notes.txt").touch()
-    with pytest.raises(RunError, match=r"notes\.txt"):
-        export(desk_run, "rosbag2", out, overwrite=True)

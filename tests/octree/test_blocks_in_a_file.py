@@ -13,7 +13,6 @@ from mapper.core.errors import WriteError
 from mapper.octree.config import OctreeConfig
 from mapper.octree.map import OctreeMap
 from mapper.octree.octomap_file import write_ot
-from mapper.octree.sparse_grid import FileArray
 from tests.support.paths import ROOT
 
 FILL = """
@@ -83,16 +82,6 @@ def test_a_map_that_comes_to_the_limit_keeps_what_it_has(tmp_path):
         write_ot(tmp_path / name, octree)
     assert in_file.memory_bytes > 1e6
     assert (tmp_path / "file.ot").read_bytes() == (tmp_path / "memory.ot").read_bytes()
-
-
-def test_arrays_that_have_grown_share_their_rows(tmp_path):
-    array = FileArray(tmp_path, 4, np.float32)
-    first = array.grown(2)
-    second = array.grown(5000)
-    first[1] = 7.0
-    second[0] = 3.0
-    np.testing.assert_array_equal(second[:3], [[3.0] * 4, [7.0] * 4, [0.0] * 4])
-    np.testing.assert_array_equal(first, second[:2])
 
 
 def test_a_full_disk_is_named(tmp_path, monkeypatch):

@@ -81,13 +81,22 @@ def street():
     ]
 
 
-def test_people_leave_and_ground_walls_and_poles_stay(street):
+@pytest.fixture(scope="module")
+def removed(street):
+    """The street's map and what was removed from it."""
     octree, updates = fused(street)
+    return octree, remove_moving_objects(octree, lambda: updates)
 
-    objects = remove_moving_objects(octree, lambda: updates)
 
-    points = np.concatenate([points for points, _, _ in street]).astype(np.float64)
-    owner = np.concatenate([owner for _, owner, _ in street])
+def gathered(scans):
+    """Return the points of all scans and what each of them lies on."""
+    points, owner, _ = zip(*scans, strict=True)
+    return np.concatenate(points), np.concatenate(owner)
+
+
+def test_people_leave_and_ground_walls_and_poles_stay(street, removed):
+    octree, objects = removed
+    points, owner = gathered(street)
     moving, kept = objects.contain(points), octree.are_occupied(points)
     body = (owner == 2) & (points[:, 2] > 0.2)
     assert moving[body].mean() > 0.98
@@ -99,13 +108,9 @@ def test_people_leave_and_ground_walls_and_poles_stay(street):
     assert kept[owner == 0].mean() > 0.98
 
 
-def test_feet_are_told_from_the_ground_of_the_same_voxel_scan_by_scan(street):
-    octree, updates = fused(street)
-
-    objects = remove_moving_objects(octree, lambda: updates)
-
-    owner = np.concatenate([owner for _, owner, _ in street])
-    points = np.concatenate([points for points, _, _ in street])
+def test_feet_are_told_from_the_ground_of_the_same_voxel_scan_by_scan(street, removed):
+    _, objects = removed
+    points, owner = gathered(street)
     moving = np.concatenate([objects.returns_of(points) for points, _, _ in street])
     feet = (owner == 2) & (points[:, 2] < 0.2)
     assert objects.contain(points)[feet].mean() < 0.2
@@ -130,8 +135,7 @@ def test_rings_that_lie_more_than_a_voxel_apart_are_of_one_person():
 
     objects = remove_moving_objects(octree, lambda: updates)
 
-    points = np.concatenate([points for points, _, _ in scans]).astype(np.float64)
-    owner = np.concatenate([owner for _, owner, _ in scans])
+    points, owner = gathered(scans)
     moving = objects.contain(points)
     assert moving[(owner == 2) & (points[:, 2] > 0.2)].mean() > 0.98
     assert not moving[owner == 1].any()
@@ -170,8 +174,7 @@ def test_what_is_beside_a_voxel_that_was_seen_through_leaves_with_it():
 
     objects = remove_moving_objects(octree, lambda: updates)
 
-    points = np.concatenate([points for points, _, _ in scans])
-    owner = np.concatenate([owner for _, owner, _ in scans])
+    points, owner = gathered(scans)
     moving, above = objects.contain(points), points[:, 2] > 0.3
     assert moving[(owner == 1) & above].mean() > 0.95
     assert moving[owner == 0].mean() < 0.001
@@ -181,7 +184,7 @@ def test_ground_that_octomap_erases_at_a_slant_is_kept():
     sparse = rays(ring_step_rad=0.03)
     scans = [scan_of([], x_m=-0.61 * i, directions=sparse, reach_m=25.0) for i in range(12)]
     octree, updates = fused(scans)
-    points = np.concatenate([points for points, _, _ in scans]).astype(np.float64)
+    points, _ = gathered(scans)
     ground = points[points[:, 2] < 0.1]
     lost = 1.0 - octree.are_occupied(ground).mean()
 
@@ -203,10 +206,8 @@ def test_a_scene_without_motion_loses_nothing_and_time_may_run_backwards(street)
     np.testing.assert_array_equal(one.leaves().log_odds, other.leaves().log_odds)
 
 
-def test_points_without_a_voxel_are_in_no_moving_thing(street):
-    octree, updates = fused(street)
-    objects = remove_moving_objects(octree, lambda: updates)
-
+def test_points_without_a_voxel_are_in_no_moving_thing(removed):
+    _, objects = removed
     far = np.array([[1e9, 0.0, 0.0], [np.nan, 0.0, 0.0], [500.0, 500.0, 500.0]])
     assert not objects.contain(far).any()
 
@@ -251,13 +252,12 @@ def test_a_wall_whose_depth_errs_from_view_to_view_does_not_move():
     x, y = np.meshgrid(np.arange(-0.4, 0.4, 0.008), np.arange(-0.4, 0.4, 0.008))
     directions = np.stack([x, y, np.ones_like(x)], -1).reshape(-1, 3)
     is_person = (np.abs(directions[:, 0]) < 0.1) & (directions[:, 1] > -0.2)
-    scans, owners = [], []
+    scans = []
     for i in range(12):
         depth_m = np.full(len(directions), 3.83 if i < 4 else 4.13)
-        owners.append(is_person & (i < 4))
-        depth_m[owners[-1]] = 2.03
-        scans.append(((directions * depth_m[:, None]).astype(np.float32), owners[-1], np.zeros(3)))
-    points, owner = np.concatenate([points for points, _, _ in scans]), np.concatenate(owners)
+        depth_m[is_person & (i < 4)] = 2.03
+        scans.append(((directions * depth_m[:, None]).astype(np.float32), is_person & (i < 4), np.zeros(3)))
+    points, owner = gathered(scans)
 
     octree, updates = fused(scans, config)
     as_lidar = remove_moving_objects(octree, lambda: updates).contain(points)

@@ -11,9 +11,9 @@ from mapper.octree.keys import KEY_BITS
 from mapper.octree.map import OctreeMap, read_octree
 from mapper.octree.octomap_file import TreeLeaves, write_bt, write_ot
 from mapper.octree.sparse_grid import log_odds
-from tests.support.octomap_oracle import fr1_xyz_scans, fuse
+from tests.support.octomap_oracle import fuse
 from tests.support.octree_maps import octree_of
-from tests.support.paths import DATA, FR1_XYZ
+from tests.support.paths import DATA
 
 BOTH_KINDS = pytest.mark.parametrize("write", [write_bt, write_ot], ids=["bt", "ot"])
 FREE, OCCUPIED = log_odds(0.1192), log_odds(0.971)
@@ -79,19 +79,6 @@ def test_nodes_pruned_above_blocks_are_written_some_blocks_at_a_time(
 
     assert (tmp_path / "map.ot").read_bytes() == (tmp_path / "at once.ot").read_bytes()
     assert_equal_leaves(read_octree(tmp_path / "map.ot"), octree)
-
-
-@pytest.mark.skipif(not FR1_XYZ.exists(), reason="needs ../shared/data/tum_fr1_xyz")
-def test_files_of_real_frames_equal_the_cpp_library_s(tmp_path):
-    scans = fr1_xyz_scans(8)
-    octree = octree_of(scans)
-    tree = fuse(scans, resolution_m=0.05, max_range_m=4.0, discretize=True)
-
-    write_ot(tmp_path / "map.ot", octree)
-    write_bt(tmp_path / "map.bt", octree)
-
-    assert (tmp_path / "map.ot").read_bytes() == tree.write()
-    assert (tmp_path / "map.bt").read_bytes() == tree.writeBinary()
 
 
 def test_bt_keeps_free_occupied_and_unknown(octree, tmp_path):

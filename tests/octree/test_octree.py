@@ -11,7 +11,7 @@ from mapper.octree import ray_casting_kernels as kernels
 from mapper.octree import sparse_grid
 from mapper.octree.config import OctreeConfig
 from mapper.octree.map import OctreeMap
-from mapper.octree.octomap_file import write_ot
+from mapper.octree.octomap_file import write_bt, write_ot
 from tests.support.octomap_oracle import fr1_xyz_scans, fuse, kitti_scans, voxels
 from tests.support.octree_maps import as_dict, octree_of
 from tests.support.paths import FR1_XYZ, KITTI
@@ -93,9 +93,11 @@ def test_equals_octomap_on_real_frames(scans_of, resolution_m, max_range_m, disc
     settings = {"resolution_m": resolution_m, "max_range_m": max_range_m, "discretize": discretize}
     scans = scans_of(3)
 
-    write_ot(tmp_path / "map.ot", octree_of(scans, **settings))
-
-    assert (tmp_path / "map.ot").read_bytes() == fuse(scans, **settings).write()
+    octree, tree = octree_of(scans, **settings), fuse(scans, **settings)
+    write_ot(tmp_path / "map.ot", octree)
+    write_bt(tmp_path / "map.bt", octree)
+    assert (tmp_path / "map.ot").read_bytes() == tree.write()
+    assert (tmp_path / "map.bt").read_bytes() == tree.writeBinary()
 
 
 @BOTH_MODES
