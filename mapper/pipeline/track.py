@@ -28,7 +28,7 @@ from mapper.run.observers import NULL_OBSERVER, Observer, Step
 from mapper.runtime.ordered_map import ordered_map
 from mapper.runtime.progress import Progress
 from mapper.sources.base import FrameRef, Log, Skipped
-from mapper.sources.depth_scale import depth_warnings, why_no_depth
+from mapper.sources.depth_scale import depth_warnings, read_spread, why_no_depth
 from mapper.sources.depth_shift import shift_warnings
 from mapper.sources.image_order import time_warnings
 from mapper.sources.reading_checks import ReadingChecks
@@ -312,12 +312,15 @@ def noted_log_warnings(source: Log, progress: Progress) -> list[RunWarning]:
     Raises:
         DataError: Its depth is none that a camera measures.
     """
-    if (why := why_no_depth(source)) is not None:
+    frames = read_spread(source)
+    if (why := why_no_depth(source, frames)) is not None:
         raise DataError(f"{source.path}: {why}")
     warnings = [
         *(RunWarning(kind="stamps", sentence=text, weight="doubt") for text in time_warnings(source)),
-        *(RunWarning(kind="depth", sentence=text, weight="doubt") for text in depth_warnings(source)),
-        *(RunWarning(kind="depth", sentence=text, weight="doubt") for text in shift_warnings(source)),
+        *(
+            RunWarning(kind="depth", sentence=text, weight="doubt")
+            for text in [*depth_warnings(source, frames), *shift_warnings(frames.values())]
+        ),
         *(RunWarning(kind="frame", sentence=text, weight="doubt") for text in scan_frame_warnings(source)),
     ]
     for warning in warnings:

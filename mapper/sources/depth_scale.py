@@ -15,7 +15,7 @@ from mapper.sensing.wheel_kinematics import pose_at
 from mapper.sources.base import Log, read_depth
 from mapper.sources.image_files.reading import TUM_UNITS_PER_M
 
-LOOKED_AT = 8
+_LOOKED_AT = 8
 """Frames, spread over the log, whose depth is looked at, and from which pairs begin."""
 
 _MIN_MEASURED_SHARE = 0.05
@@ -58,12 +58,17 @@ class _Features:
     descriptors: cv2.typing.MatLike
 
 
-def why_no_depth(log: Log) -> str | None:
-    """Return why an RGB-D log's depth is none that a camera measures, by a few frames; None if it may be."""
+def read_spread(log: Log) -> dict[int, RgbdFrame]:
+    """Return a few frames of an RGB-D log by index, for the checks of depth; none of other logs."""
     if log.sensor != "rgbd":
-        return None
-    frames = [frame for entry in log.spread_entries(LOOKED_AT) if (frame := read_depth(entry)) is not None]
-    medians_m = [_median_m(frame) for frame in frames if frame.depth_m.any()]
+        return {}
+    spread = np.unique(np.linspace(0, len(log) - 1, _LOOKED_AT).astype(int)).tolist()
+    return {index: frame for index in spread if (frame := read_depth(log.entry_at(index))) is not None}
+
+
+def why_no_depth(log: Log, frames: Mapping[int, RgbdFrame]) -> str | None:
+    """Return why a log's depth is none that a camera measures, by :func:`read_spread`; None if it may be."""
+    medians_m = [_median_m(frame) for frame in frames.values() if frame.depth_m.any()]
     if frames and not medians_m:
         return f"no depth in any of {len(frames)} frames looked at: all of it is 0, or the limit of 16 bits"
     least_m, most_m = _POSSIBLE_M
@@ -77,17 +82,13 @@ def why_no_depth(log: Log) -> str | None:
     )
 
 
-def depth_warnings(log: Log) -> list[str]:
-    """Return what is implausible about an RGB-D log's depth, a sentence each; a few frames are read.
+def depth_warnings(log: Log, frames: Mapping[int, RgbdFrame]) -> list[str]:
+    """Return what is implausible about a log's depth, a sentence each; ``frames`` are of :func:`read_spread`.
 
     Scale: features that are matched between two frames move by the known motion, of truth or else of wheels,
     at one scale of depth only. Range: without such a motion there is no scale to compare with, but cameras
     deliver depth of some ranges only.
     """
-    if log.sensor != "rgbd":
-        return []
-    spread = np.unique(np.linspace(0, len(log) - 1, LOOKED_AT).astype(int)).tolist()
-    frames = {index: frame for index in spread if (frame := read_depth(log.entry_at(index))) is not None}
     if not frames:
         return []
     measured = float(np.median([(frame.depth_m > 0.0).mean() for frame in frames.values()]))

@@ -1,12 +1,12 @@
 """Plausibility of depth as registered to the images: whether edges of depth lie on edges of brightness."""
 
+from collections.abc import Iterable
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.frames import RgbdFrame
-from mapper.sources.base import Log, read_depth
-from mapper.sources.depth_scale import LOOKED_AT
 
 _WIDTH_PX, _MOST_PX = 320, 48
 """Width to which images are reduced, and the largest shift that is tried there."""
@@ -19,25 +19,22 @@ _LEAST_SCORE, _TIMES_BETTER = 0.4, 1.4
 but 0.05 where nothing has contrast. Moved by 12 px, that score is 1.4 to 5 times the best within 4 px."""
 
 
-def shift_warnings(log: Log) -> list[str]:
-    """Return that depth does not lie on the image that it belongs to, in a sentence; a few frames are read.
+def shift_warnings(frames: Iterable[RgbdFrame]) -> list[str]:
+    """Return that depth does not lie on the images that it belongs to, in a sentence.
 
     Outlines of what stands before something else are edges of brightness too. The gradient of brightness at
     the edges of depth is averaged over frames for every shift of the images; it is largest at the true one.
     """
-    if log.sensor != "rgbd":
+    found = [(score, frame.camera.width_px) for frame in frames if (score := _scores(frame)) is not None]
+    if len(found) < _FEWEST_FRAMES:
         return []
-    frames = [frame for entry in log.spread_entries(LOOKED_AT) if (frame := read_depth(entry)) is not None]
-    scores = [score for frame in frames if (score := _scores(frame)) is not None]
-    if len(scores) < _FEWEST_FRAMES:
-        return []
-    score = np.mean(scores, axis=0)
+    score = np.mean([scores for scores, _ in found], axis=0)
     around = slice(_MOST_PX - _NEAR_PX, _MOST_PX + _NEAR_PX + 1)
     limit = max(_LEAST_SCORE, _TIMES_BETTER * float(score[around, around].max()))
     if score.max() < limit:
         return []
     row, column = np.unravel_index(score.argmax(), score.shape)
-    scale = frames[0].camera.width_px / _WIDTH_PX
+    scale = found[0][1] / _WIDTH_PX
     x_px, y_px = (scale * (int(k) - _MOST_PX) for k in (column, row))
     return [
         f"depth: its edges lie on those of the images if it is moved by {x_px:.0f}, {y_px:.0f} px (columns, "

@@ -14,7 +14,7 @@ from mapper.runtime.ordered_map import ordered_map
 from mapper.sources import RECORDING, format_of, open_source
 from mapper.sources.base import Log
 from mapper.sources.config import SourceConfig
-from mapper.sources.depth_scale import depth_warnings, why_no_depth
+from mapper.sources.depth_scale import depth_warnings, read_spread, why_no_depth
 from mapper.sources.depth_shift import shift_warnings
 from mapper.sources.image_order import time_warnings
 from mapper.sources.reading_checks import ReadingChecks
@@ -176,6 +176,7 @@ def _inspected(
     checks = ReadingChecks(source)
     damage = list(_damage(checks))  # loads grey images, before the first is loaded in colour
     first, problem = _first_frame(checks.log)
+    frames = read_spread(source)
     log = LogFacts(
         name=source.name,
         kind=source.kind,
@@ -197,13 +198,13 @@ def _inspected(
         notes=[*source.sentences, *damage, *checks.notes()],
         warnings=[
             *time_warnings(source),
-            *depth_warnings(source),
-            *shift_warnings(source),
+            *depth_warnings(source, frames),
+            *shift_warnings(frames.values()),
             *scan_frame_warnings(source),
         ],
         vehicle=vehicle_box(source),
     )
-    why = problem or why_no_depth(source) or _unwritable(source) or check(source)
+    why = problem or why_no_depth(source, frames) or _unwritable(source) or check(source)
     return Inspection(path, topics, log, why)
 
 

@@ -13,18 +13,24 @@ from mapper.core.errors import DataError
 from mapper.core.frames import PinholeCamera, RgbdFrame
 from mapper.core.timebase import NS_PER_S
 from mapper.pipeline.build import build
+from mapper.pipeline.track import noted_log_warnings
 from mapper.run.folder import open_run
+from mapper.runtime.progress import SILENT
 from mapper.simulation import CameraSimulator
 from mapper.simulation.config import SynthConfig, SynthWheelsConfig
 from mapper.sources import open_source
 from mapper.sources.base import Log
 from mapper.sources.config import CameraConfig, SourceConfig
-from mapper.sources.depth_scale import depth_warnings
+from mapper.sources.depth_scale import depth_warnings, read_spread
 from tests.support.command_line import mapper
 from tests.support.logs import MemoryEntry, log_in_memory
 from tests.support.tum_logs import copy_numbered
 
 CAMERA = PinholeCamera(40, 30, 30.0, 30.0, 19.5, 14.5)
+
+
+def warnings_of(log):
+    return depth_warnings(log, read_spread(log))
 
 
 def desk(log, factor):
@@ -33,7 +39,7 @@ def desk(log, factor):
 
 @pytest.mark.parametrize("factor", [4300, 5000, 5700])
 def test_depth_that_fits_the_truth_is_silent(desk_log, factor):
-    assert depth_warnings(desk(desk_log, factor)) == []
+    assert warnings_of(desk(desk_log, factor)) == []
 
 
 @pytest.mark.parametrize(
@@ -46,7 +52,7 @@ def test_depth_that_fits_the_truth_is_silent(desk_log, factor):
     ],
 )
 def test_a_wrong_factor_is_found_by_the_truth_and_the_right_one_is_named(desk_log, factor, wrong):
-    assert depth_warnings(desk(desk_log, factor)) == [
+    assert warnings_of(desk(desk_log, factor)) == [
         f"depth: {wrong} for the true motion of the camera; "
         f"source.camera.depth_factor=5000 fits, not {factor}"
     ]
@@ -81,8 +87,8 @@ def test_wheels_are_enough():
         posters_per_room=3, furniture_per_room=4, wheels=SynthWheelsConfig(),
     )  # fmt: skip
     log = CameraSimulator(config).log()
-    assert depth_warnings(in_other_units(log, 1.0)) == []
-    (warning,) = depth_warnings(in_other_units(log, 0.2))
+    assert warnings_of(in_other_units(log, 1.0)) == []
+    (warning,) = warnings_of(in_other_units(log, 0.2))
     too_small = "depth: 5 times too small for the wheels' motion of the camera"
     assert warning == f"{too_small}; source.camera.depth_factor is wrong"
 
@@ -109,7 +115,7 @@ def plain(depths_m, *, image=None):
     ],
 )
 def test_depth_without_any_motion_is_held_against_what_cameras_deliver(depths_m, warning):
-    found = depth_warnings(plain(depths_m))
+    found = warnings_of(plain(depths_m))
     assert len(found) == (warning is not None)
     assert warning is None or found[0].startswith(warning)
 
@@ -118,7 +124,7 @@ def test_depth_without_any_motion_is_held_against_what_cameras_deliver(depths_m,
 def test_a_change_of_units_in_the_middle_is_found(after, is_change):
     depths_m = [1.5 + 0.01 * i for i in range(40)]
     depths_m[23:] = [depth_m * after for depth_m in depths_m[23:]]
-    found = depth_warnings(plain(depths_m))
+    found = warnings_of(plain(depths_m))
     assert len(found) == is_change
     assert not is_change or "from frame 23 on" in found[0]
 
@@ -126,11 +132,11 @@ def test_a_change_of_units_in_the_middle_is_found(after, is_change):
 def test_a_change_of_units_in_the_last_quarter_of_varied_depth_is_found():
     depths_m = np.linspace(1.9, 3.8, 40)
     depths_m[30:] *= 0.2
-    assert "from frame 30 on" in depth_warnings(plain(depths_m))[0]
+    assert "from frame 30 on" in warnings_of(plain(depths_m))[0]
 
 
 def test_a_walk_from_near_to_far_is_no_change_of_units():
-    assert depth_warnings(plain(np.linspace(0.6, 5.0, 60))) == []
+    assert warnings_of(plain(np.linspace(0.6, 5.0, 60))) == []
 
 
 @pytest.mark.parametrize(
@@ -139,7 +145,7 @@ def test_a_walk_from_near_to_far_is_no_change_of_units():
 def test_units_that_fit_are_named(desk_log, factor, fitting):
     for is_assumed in (True, False):
         log = replace(desk(desk_log, factor), truth=None, are_units_assumed=is_assumed)
-        assert depth_warnings(log)[0].endswith(fitting)
+        assert warnings_of(log)[0].endswith(fitting)
 
 
 def test_motion_that_no_scale_fits_says_nothing_of_depth(desk_log):
@@ -152,11 +158,11 @@ def test_motion_that_no_scale_fits_says_nothing_of_depth(desk_log):
         path=source.path, name="shuffled", kind="tum", sensor="rgbd", stamps_ns=source.stamps_ns,
         entry_at=source.entry_at, truth=type(truth)(truth.stamps_ns, T_world_body),
     )  # fmt: skip
-    assert depth_warnings(shuffled) == []
+    assert warnings_of(shuffled) == []
 
 
 def test_frames_that_cannot_be_read_and_scans_are_left_alone():
-    assert depth_warnings(log_in_memory([MemoryEntry(0, OSError())], sensor="lidar")) == []
+    assert warnings_of(log_in_memory([MemoryEntry(0, OSError())], sensor="lidar")) == []
 
 
 def test_black_images_show_no_scale(desk_log):
@@ -170,7 +176,7 @@ def test_black_images_show_no_scale(desk_log):
         black = replace(frame, image=np.zeros_like(frame.image), depth_m=np.zeros_like(frame.depth_m))
         return MemoryEntry(int(source.stamps_ns[index]), black)
 
-    assert depth_warnings(replace(source, entry_at=covered)) == []
+    assert warnings_of(replace(source, entry_at=covered)) == []
 
 
 def millimetres_for_redwood(desk_log, folder):
@@ -216,3 +222,14 @@ def test_a_camera_above_every_ceiling_is_noted(desk_log, tmp_path):
         run = build(log, config, tmp_path / f"{factor}")
         high = [note for note in run.manifest.input.notes if "m above the floor; is source.camera" in note]
         assert bool(high) == is_high
+
+
+def test_all_checks_of_depth_read_the_same_eight_frames_once(desk_log):
+    source, loaded = open_source(desk_log)[:20], []
+
+    def entry_at(index):
+        loaded.append(index)
+        return source.entry_at(index)
+
+    assert noted_log_warnings(replace(source, entry_at=entry_at, truth=None), SILENT) == []
+    assert loaded == [0, *loaded[1:7], 19]

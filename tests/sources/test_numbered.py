@@ -8,7 +8,7 @@ from mapper.core.errors import FrameError, SourceError
 from mapper.core.geometry import exp
 from mapper.sources import open_source
 from mapper.sources.config import SourceConfig
-from mapper.sources.depth_scale import why_no_depth
+from mapper.sources.depth_scale import read_spread, why_no_depth
 from tests.support.tum_logs import CALIBRATION, write_picture
 
 POSES = [exp(np.array([0.1 * i, -0.2, 0.3 * i]), np.array([i, 2.0, -0.5 * i])) for i in range(4)]
@@ -241,7 +241,8 @@ def test_depth_of_no_camera_names_the_units_that_were_assumed(tmp_path, ending, 
             str(path.with_suffix(ending)), depth
         )
         path.unlink()
-    assert f"depth_factor={assumed} right" in why_no_depth(open_source(folder))
+    log = open_source(folder)
+    assert f"depth_factor={assumed} right" in why_no_depth(log, read_spread(log))
 
 
 def test_folders_whose_numbers_do_not_meet_are_named(tmp_path):

@@ -19,7 +19,7 @@ from mapper.graph.optimize import optimize
 from mapper.pipeline.build import build
 from mapper.sources import open_source
 from mapper.sources.config import CameraConfig, SourceConfig
-from mapper.sources.depth_scale import depth_warnings
+from mapper.sources.depth_scale import depth_warnings, read_spread
 from mapper.sources.inspection import inspect_log
 from tests.support.paths import CONFIGS, SHARED
 
@@ -48,9 +48,10 @@ def test_each_camera_has_the_calibration_of_its_own_stream(name):
 
 def test_depth_in_millimetres_that_is_read_as_tum_s_units_is_doubted():
     log = open_source(case("02_own_dataset_with_associations_in_mm/log"), SourceConfig())
-    assert len(depth_warnings(log)) == 1
+    assert len(depth_warnings(log, read_spread(log))) == 1
     right = SourceConfig(camera=CameraConfig(depth_factor=1000.0))
-    assert depth_warnings(open_source(log.path, right)) == []
+    right_log = open_source(log.path, right)
+    assert depth_warnings(right_log, read_spread(right_log)) == []
 
 
 @pytest.mark.parametrize("name", ["ros2", "foxglove.mcap"])

@@ -6,7 +6,7 @@ import pytest
 from mapper.core.errors import SourceError
 from mapper.sources import open_source
 from mapper.sources.config import CameraConfig, SourceConfig
-from mapper.sources.depth_scale import depth_warnings
+from mapper.sources.depth_scale import depth_warnings, read_spread
 from mapper.sources.image_folders.tum import METRES_NOTE, MILLIMETRES_NOTE, UNITS_NOTE
 from tests.support.tum_logs import CALIBRATION, FIRST_NS, PERIOD_NS, write_picture
 
@@ -106,7 +106,7 @@ def test_millimetres_taken_for_tums_units_are_told_without_a_truth(tiny_tum_log,
     log = open_source(folder)
     assert (UNITS_NOTE in log.notes) == is_assumed
     why = "a twentieth of it is within 0.22 m, but cameras measure 0.3 to 8 m; is source.camera"
-    assert [why in warning for warning in depth_warnings(log)] == [True]
+    assert [why in warning for warning in depth_warnings(log, read_spread(log))] == [True]
 
 
 def write_near(folder):
