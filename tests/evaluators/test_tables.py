@@ -8,16 +8,16 @@ COLUMNS = (
     Column("n", "n"),
 )
 RECORDS = [
-    {"name": "one, the first", "error_m": 0.1 + 0.2, "n": 7},
+    {"name": "one, | first", "error_m": 0.1 + 0.2, "n": 7},
     {"name": "two", "error_m": None, "n": 12},
 ]
 
 
 def test_text_is_aligned_and_says_what_is_not_known():
     assert text_table(COLUMNS, RECORDS).splitlines() == [
-        "name            error cm   n",
-        "one, the first      30.0   7",
-        "two                    –  12",
+        "name          error cm   n",
+        "one, | first      30.0   7",
+        "two                  –  12",
     ]
 
 
@@ -25,7 +25,7 @@ def test_markdown_has_a_rule_below_its_titles():
     assert markdown_table(COLUMNS, RECORDS).splitlines() == [
         "| name | error cm | n |",
         "| --- | ---: | ---: |",
-        "| one, the first | 30.0 | 7 |",
+        r"| one, \| first | 30.0 | 7 |",
         "| two | – | 12 |",
     ]
 
@@ -33,6 +33,6 @@ def test_markdown_has_a_rule_below_its_titles():
 def test_csv_keeps_every_digit_and_leaves_the_unknown_empty():
     assert csv_text(RECORDS).splitlines() == [
         "name,error_m,n",
-        '"one, the first",0.30000000000000004,7',
+        '"one, | first",0.30000000000000004,7',
         "two,,12",
     ]

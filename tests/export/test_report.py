@@ -8,7 +8,7 @@ import pytest
 
 from mapper.config.build import BuildConfig
 from mapper.core.doubts import Doubt
-from mapper.core.errors import ConfigError
+from mapper.core.errors import ConfigError, DataError
 from mapper.evaluators.metrics.agreement import CommonViews
 from mapper.evaluators.metrics.evaluate import evaluate
 from mapper.evaluators.pictures.run_report import report
@@ -176,6 +176,17 @@ def test_a_run_without_truth_loops_and_views_has_a_page(desk_log, tmp_path):
     assert "no picture" in page_of([chapter_of(run, "bare", [])])
 
 
+@pytest.fixture
+def unmeasured(monkeypatch):
+    """Spare reports the agreement of views, nearly all of their time."""
+
+    def refuse(_log):
+        raise DataError("no views")
+
+    monkeypatch.setattr("mapper.evaluators.pictures.run_report.CommonViews", refuse)
+
+
+@pytest.mark.usefixtures("unmeasured")
 def test_runs_of_one_name_are_told_apart(runs, tmp_path):
     with pytest.raises(ConfigError, match="each of its own name"):
         write_report(tmp_path / "report.html", [chapter_of(runs[0], "desk", [])] * 2)
@@ -189,6 +200,7 @@ def test_runs_of_one_name_are_told_apart(runs, tmp_path):
     assert names == [str(runs[0].path), str(twin)]
 
 
+@pytest.mark.usefixtures("unmeasured")
 def test_pages_without_a_name_are_numbered(runs, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert [invoke("report", run.path).stdout for run in runs] == ["report.html\n", "report-2.html\n"]

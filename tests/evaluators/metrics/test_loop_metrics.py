@@ -30,7 +30,7 @@ def truth() -> Trajectory:
     return Trajectory(stamps_ns, np.array([at(value) for value in x]))
 
 
-def closure(i: int, j: int, x: float, *, verdict: str = "accepted") -> LoopClosure:
+def closure(i: int, j: int, x: float, verdict: str = "accepted") -> LoopClosure:
     return LoopClosure(
         i=i,
         j=j,
@@ -51,39 +51,29 @@ def values(metrics) -> dict[str, float]:
 def test_revisits_are_near_alike_and_long_ago(truth):
     revisit = revisits_of(truth.stamps_ns, truth)
     assert revisit.nonzero()[0].tolist() == list(range(12, 21))  # at 12 s as at 7 s, half a metre away
-
-
-def test_looking_the_other_way_is_no_revisit(truth):
     T = truth.T_world_body.copy()
-    T[11:, :3, :3] = at(0.0, yaw=np.pi)[:3, :3]
+    T[11:, :3, :3] = at(0.0, yaw=np.pi)[:3, :3]  # looking the other way
     assert not revisits_of(truth.stamps_ns, Trajectory(truth.stamps_ns, T)).any()
+    assert not revisits_of(truth.stamps_ns + 1000 * NS_PER_S, truth).any()  # the truth does not cover it
 
 
-def test_a_loop_off_the_truth_is_wrong(truth):
-    told = values(loop_metrics([closure(2, 18, 0.05), closure(3, 17, 0.5)], truth.stamps_ns, truth))
-    assert told["loops"] == 2
-    assert told["loops wrongly accepted"] == 1
-
-
-def test_rejected_candidates_count_neither_way(truth):
-    told = values(loop_metrics([closure(3, 17, 0.5, verdict="rejected")], truth.stamps_ns, truth))
-    assert told.pop("true revisits") == 9
-    assert set(told.values()) == {0}
-
-
-def test_a_revisit_with_two_loops_counts_once(truth):
-    told = values(loop_metrics([closure(2, 18, 0.0), closure(1, 18, 0.5)], truth.stamps_ns, truth))
-    assert (told["true revisits with a loop"], told["true revisits"]) == (1, 9)
+@pytest.mark.parametrize(
+    ("loops", "wrong", "found", "count"),
+    [
+        ([(2, 18, 0.05), (3, 17, 0.5)], 1, 2, 2),
+        ([(2, 18, 0.0), (1, 18, 0.5)], 0, 1, 2),  # of one revisit
+        ([(3, 17, 0.5, "rejected")], 0, 0, 0),
+    ],
+)
+def test_accepted_loops_are_right_or_wrong_by_the_truth(truth, loops, wrong, found, count):
+    told = values(loop_metrics([closure(*loop) for loop in loops], truth.stamps_ns, truth))
+    assert told["loops"] == count
+    assert told["loops wrongly accepted"] == wrong
+    assert (told["true revisits with a loop"], told["true revisits"]) == (found, 9)
 
 
 def test_without_revisits_there_are_none(truth):
-    told = values(loop_metrics([], truth.stamps_ns[:10], truth))
-    assert set(told.values()) == {0}
-
-
-def test_what_the_truth_does_not_cover_is_not_judged(truth):
-    late = truth.stamps_ns + 1000 * NS_PER_S
-    assert not revisits_of(late, truth).any()
+    assert set(values(loop_metrics([], truth.stamps_ns[:10], truth)).values()) == {0}
 
 
 def test_where_looks_are_rare_a_loop_counts_for_the_keyframes_around(truth):

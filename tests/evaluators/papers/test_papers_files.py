@@ -16,7 +16,7 @@ from mapper.evaluators.papers.model import (
     compared,
     everything,
 )
-from mapper.evaluators.study.table import Column, latex_table, latex_text, markdown_table, shown_cells
+from mapper.evaluators.study.table import Column, latex_table, latex_text, shown_cells
 from mapper.sources.trajectory_files import write_tum
 
 
@@ -170,10 +170,6 @@ def test_latex_text_escapes_what_latex_reads():
     table = latex_table([Column("a", "a")], [{"a": "[3]"}, {"a": "*x"}])
     assert "\n[" not in table  # after a line's end it would be its option
     assert "\n*" not in table
-
-
-def test_markdown_keeps_bars_inside_their_cells():
-    assert markdown_table([Column("a", "a")], [{"a": "x|y"}]).splitlines()[-1] == r"| x\|y |"
 
 
 def test_the_page_holds_tables_and_plots_and_loads_nothing(written):

@@ -6,14 +6,13 @@ import numpy as np
 import pytest
 
 from mapper.config.loading import load_config
-from mapper.core.errors import ConfigError, DataError
+from mapper.core.errors import ConfigError
 from mapper.core.geometry import exp
 from mapper.core.trajectory import trajectory_from
 from mapper.evaluators.papers.model import PaperCell
 from mapper.evaluators.papers.paper import CONFIGS, Cut, cells_of, job_for
 from mapper.evaluators.papers.thesis import PAPER, ThesisJob, follow, table_of
 from mapper.evaluators.papers.thesis_tables import tables
-from mapper.evaluators.study.engine import seeded
 from mapper.odometry.config import IsvdOdometryConfig
 from mapper.pipeline.solve import solve
 from mapper.pipeline.track import track_log
@@ -82,14 +81,6 @@ def test_tables_compare_what_they_say():
 
 def settings(table):
     return tables()[table].settings.items()
-
-
-def test_a_seed_reaches_every_draw():
-    config = seeded(load_config(CONFIGS / "thesis/ISVD+LC.toml"), 7)
-
-    assert config.odometry.match.seed == config.odometry.fallback.seed == 7
-    assert config.loops.verification.match.seed == 7
-    assert seeded(config, 0) == load_config(CONFIGS / "thesis/ISVD+LC.toml")
 
 
 def test_settings_followed_together_are_as_each_alone(desk_log):
@@ -171,14 +162,6 @@ def test_another_log_seed_or_part_is_another_cell_and_another_place_is_not(job, 
 
     assert len({job_for(each).key for each in [job, *others]}) == 6
     assert job_for(moved).key == job_for(job).key
-
-
-def test_a_log_without_truth_has_no_error(tiny_tum_log, tmp_path):
-    log = tiny_tum_log()
-    (log / "groundtruth.txt").unlink()
-
-    with pytest.raises(DataError, match="no ground truth"):
-        ThesisJob("fr1/xyz", log, 0, Cut(), ("5.2",), tmp_path)()
 
 
 def test_tables_of_the_same_frames_are_measured_together(job):
