@@ -206,12 +206,6 @@ def test_ros_messages_are_what_a_ros_library_reads(run):
         assert {name: getattr(got, name) for name in record_of(i)} == record_of(i)
 
 
-def test_the_same_run_gives_the_same_bytes(run, tmp_path):
-    path, *_ = run
-    write_run(tmp_path / "again.mcap")
-    assert (tmp_path / "again.mcap").read_bytes() == path.read_bytes()
-
-
 def test_a_broken_off_run_leaves_no_file(tmp_path):
     def break_off():
         with McapLog(tmp_path / "run.mcap") as log:

@@ -10,7 +10,6 @@ from mapper.cli.summary import summary_text
 from mapper.config.loading import overridden
 from mapper.core.errors import ConfigError, RunError
 from mapper.evaluators.metrics.trajectory_errors import align, associate, ate, ate_rmse_m
-from mapper.loops.config import NoLoopsConfig
 from mapper.octree.map import read_octree
 from mapper.pipeline.append import append
 from mapper.pipeline.fuse import fuse
@@ -181,18 +180,13 @@ def test_another_place_is_refused_and_the_run_is_untouched(first, elsewhere, tmp
         ("level.frames=3", "level: fixed by"),
         ("graph.solve=proportional", "graph.solve=proportional: cannot join"),
         ("loops.propose=nearby", "recognised by visual words alone"),
+        ("loops.kind=none", "loops.kind=none: cannot connect two sessions; want places"),
     ],
 )
 def test_settings_that_cannot_join_are_refused(first, desk_log, tmp_path, override, message):
     config = overridden(first.config, [override, "source.first_frame=16", "source.last_frame=30"])
     with pytest.raises(ConfigError, match=message):
         append(open_source(desk_log, config.source), first, config, tmp_path / "out")
-
-
-def test_a_run_without_loops_takes_no_session(first, desk_log, tmp_path):
-    config = first.config.model_copy(update={"loops": NoLoopsConfig()})
-    with pytest.raises(ConfigError, match=r"loops\.kind=none: cannot connect two sessions; want places"):
-        append(open_source(desk_log), first, config, tmp_path / "out")
 
 
 def test_a_configuration_file_and_a_run_to_append_to_exclude_each_other(first, desk_log, tmp_path):

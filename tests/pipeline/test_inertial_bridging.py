@@ -239,11 +239,15 @@ def test_accelerations_that_contradict_the_path_are_not_used_and_named(fault):
     assert [warning.kind for warning in found.warnings] == ["imu"]
 
 
-def test_accelerations_in_g_are_the_same():
+@pytest.mark.parametrize(("factor", "notes"), [(1.0 / 9.80665, 0), (-1.0, 1)], ids=["in g", "reversed"])
+def test_accelerations_in_g_and_of_the_opposite_sign_bridge_as_well(factor, notes):
     log_, tracking, truth = made(6, lost=range(70, 90))
-    in_g = replace(log_.accelerations, acceleration_mps2=log_.accelerations.acceleration_mps2 / 9.80665)
-    found = bridge(replace(log_, accelerations=in_g), tracking, progress=SILENT)
+    felt = log_.accelerations
+    given = replace(log_, accelerations=replace(felt, acceleration_mps2=factor * felt.acceleration_mps2))
+    found = bridge(given, tracking, progress=SILENT)
+    assert len(components(found.graph)) == 1
     assert np.linalg.norm(relative(found, truth, 69, 95)[3:]) < 0.04
+    assert sum("opposite sign" in warning.sentence for warning in found.warnings) == notes
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -255,16 +259,6 @@ def test_accelerations_of_either_sign_point_up_at_rest(seed, sign):
     checked, warnings, _ = check_accelerations(given, tracking)
     assert np.array_equal(checked.accelerations.acceleration_mps2, felt.acceleration_mps2)
     assert [(warning.kind, warning.weight) for warning in warnings] == [("imu", "note")] * (sign < 0.0)
-
-
-def test_a_later_session_bridges_by_reversed_accelerations_as_the_first_does():
-    log_, tracking, truth = made(5, lost=range(70, 90))
-    felt = log_.accelerations
-    given = replace(log_, accelerations=replace(felt, acceleration_mps2=-felt.acceleration_mps2))
-    found = bridge(given, tracking, progress=SILENT)
-    assert len(components(found.graph)) == 1
-    assert np.linalg.norm(relative(found, truth, 69, 95)[3:]) < 0.06
-    assert sum("opposite sign" in warning.sentence for warning in found.warnings) == 1
 
 
 @pytest.mark.parametrize("is_exact", [True, False])

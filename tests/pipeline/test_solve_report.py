@@ -6,8 +6,8 @@ import pytest
 from mapper.core.geometry import exp, inverse, transform
 from mapper.graph.config import GraphConfig
 from mapper.graph.model import BetweenFactor, PoseGraph, PoseSigmas
-from mapper.loops.closure import LoopClosure
 from mapper.pipeline.solve import solve
+from tests.support.loop_closures import loop
 
 STEP = PoseSigmas(rotation_rad=0.002, translation_m=0.005)
 NODES = 40
@@ -41,14 +41,10 @@ def two_laps(jump: np.ndarray, *, loops: int = 12, false: int = 0):
         graph.add_node(step.j, step.j, T)
     aside = transform(np.eye(3), [5.0, 0.0, 0.0])
     closures = [
-        LoopClosure(
-            i=k,
-            j=k + 20,
-            stamp_i_ns=k,
-            stamp_j_ns=k + 20,
-            proposed_by="places",
-            verdict="accepted",
-            T_i_j=measured(k, k + 20, np.eye(4) if k >= 2 + false else aside),
+        loop(
+            k,
+            k + 20,
+            measured(k, k + 20, np.eye(4) if k >= 2 + false else aside),
             information=STEP.information,
         )
         for k in range(2, 2 + loops)
@@ -75,7 +71,7 @@ def test_one_wrong_step_of_the_odometry_shows_in_every_loop():
 
 def test_the_share_of_rejected_loops_is_told():
     solved = solve(*two_laps(np.eye(4), false=3), GraphConfig())
-    assert sum(loop.verdict == "rejected" for loop in solved.loops) == 3
+    assert sum(each.verdict == "rejected" for each in solved.loops) == 3
     assert solved.report.loops_rejected == pytest.approx(3 / 12)
     assert solved.report.loop_residual_m < 0.1  # of those that hold
 

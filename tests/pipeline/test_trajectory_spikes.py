@@ -63,9 +63,6 @@ def test_what_a_sensor_can_be_carried_along_is_none(step_ns, are_spikes):
     assert doubted(aside) == doubted(turned) == (frames if are_spikes else [])
 
 
-def test_a_step_that_stays_is_none():
-    assert doubted(walk(dict.fromkeys(range(50, 120), 0.25).items())) == []
-
-
-def test_what_the_log_does_all_the_time_is_none():
-    assert doubted(walk(dict.fromkeys(range(0, 120, 2), 0.15).items())) == []
+@pytest.mark.parametrize(("frames", "off_m"), [(range(50, 120), 0.25), (range(0, 120, 2), 0.15)])
+def test_a_step_that_stays_and_what_the_log_does_all_the_time_are_none(frames, off_m):
+    assert doubted(walk(dict.fromkeys(frames, off_m).items())) == []

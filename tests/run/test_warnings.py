@@ -1,5 +1,6 @@
 """Every warning about a run: found where there is reason, silent where there is none."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +10,7 @@ from mapper.core.doubts import Doubt
 from mapper.core.geometry import exp, inverse
 from mapper.core.trajectory import Trajectory
 from mapper.graph.model import BetweenFactor, PoseSigmas
-from mapper.loops.closure import Discrepancy, LoopClosure
+from mapper.loops.closure import Discrepancy
 from mapper.run.frame_outcomes import DISCONNECTED
 from mapper.run.manifest import Levelling, RunWarning, SkippedFrame
 from mapper.run.manifest_logs import AppendedLog
@@ -17,6 +18,7 @@ from mapper.run.pose_covariances import uncertain_poses
 from mapper.run.results import aligned_truth
 from mapper.run.verdict import find_warnings, merge_warnings
 from mapper.sources.config import SourceConfig
+from tests.support.loop_closures import loop
 from tests.support.run_results import MANIFEST, STEP_NS, doubted, lost, results_of
 
 INFORMATION = PoseSigmas(0.01, 0.02).information
@@ -31,17 +33,21 @@ def only(results, manifest=MANIFEST):
     return warning
 
 
+def numbers_in(sentence):
+    return [float(number) for number in re.findall(r"\d+(?:\.\d+)?", sentence)]
+
+
 def with_loops(results, misses_m, *, reason="", miss_rad=0.0):
     """Loops over 100 frames, 5 m of path, that far from the odometry."""
+    verdict = {"verdict": "rejected", "reason": reason, "weight": 0.0} if reason else {"weight": 1.0}
     loops = [
-        LoopClosure(
-            i, i + 20, i * 5 * STEP_NS, (i + 20) * 5 * STEP_NS, "places",
-            "rejected" if reason else "accepted", reason,
-            T_i_j=np.eye(4), information=INFORMATION,
-            before=Discrepancy(miss_m, miss_rad), after=Discrepancy(0.0, 0.0), weight=0.0 if reason else 1.0,
+        replace(
+            loop(i, i + 20, before=Discrepancy(miss_m, miss_rad), after=Discrepancy(0.0, 0.0), **verdict),
+            stamp_i_ns=i * 5 * STEP_NS,
+            stamp_j_ns=(i + 20) * 5 * STEP_NS,
         )
         for i, miss_m in enumerate(misses_m)
-    ]  # fmt: skip
+    ]
     return replace(results, loops=[*results.loops, *loops])
 
 
@@ -52,20 +58,30 @@ def test_a_good_run_has_none():
     ]
 
 
+REPEATED = doubted(Doubt("repeated image", "same image as 1 frames before"))
+UNSEEN = doubted(unobservable="translation along x")
+
+
 @pytest.mark.parametrize(
-    ("indices", "weight"),
+    ("frame", "indices", "count", "kind", "weight", "numbers"),
     [
-        ([50], "note"),
-        ([50, 51, 52, 90, 91, 92], "note"),
-        (range(50, 61), "doubt"),
-        (range(50, 75), "break"),
-        (range(20, 180, 3), "break"),
+        (lost(), [50], 200, "lost", "note", [1, 200]),
+        (lost(), [50, 51, 52, 90, 91, 92], 200, "lost", "note", [6, 200]),
+        (lost(), range(50, 61), 200, "lost", "doubt", [11, 200]),
+        (lost(), range(50, 75), 200, "lost", "break", [25, 200]),
+        (lost(), range(20, 180, 3), 200, "lost", "break", [54, 200]),
+        (lost(DISCONNECTED), range(150, 200), 200, "left out", "break", [50, 200]),
+        (doubted(), [12, 51, 99], 200, "doubtful", "note", [3, 200, 1.5]),
+        (doubted(), range(100, 118), 2000, "doubtful", "note", [18, 2000, 0.9, 1.9]),
+        (doubted(), range(100, 125), 2000, "doubtful", "doubt", [25, 2000, 1.2, 2.6]),  # too long to fill
+        (REPEATED, range(10, 200, 10), 200, "doubtful", "note", [19, 200]),
+        (REPEATED, range(100, 125), 200, "doubtful", "doubt", [25, 200]),
     ],
 )
-def test_lost_frames(indices, weight):
-    warning = only(results_of(changed={k: lost() for k in indices}))
-    assert (warning.kind, warning.weight) == ("lost", weight)
-    assert warning.sentence.startswith(f"{len(indices)} of 200 frames were lost")
+def test_frames_that_were_not_tracked(frame, indices, count, kind, weight, numbers):
+    warning = only(results_of(count, changed=dict.fromkeys(indices, frame)))
+    assert (warning.kind, warning.weight) == (kind, weight)
+    assert numbers_in(warning.sentence)[: len(numbers)] == numbers
 
 
 def test_where_frames_were_lost():
@@ -77,47 +93,32 @@ def test_where_frames_were_lost():
 def test_frames_that_are_left_out_do_not_count_as_lost_too():
     changed = {k: lost() for k in (140, 141)} | {k: lost(DISCONNECTED) for k in range(142, 200)}
     left_out, few = found(results_of(changed=changed))
-    assert (left_out.kind, few.kind) == ("left out", "lost")
-    assert few.weight == "note"
-    assert few.where == "13.9 … 14.2 s"
-
-
-def test_a_part_that_is_left_out_breaks_a_run():
-    changed = {k: lost(DISCONNECTED) for k in range(150, 200)}
-    warning = only(results_of(changed=changed))
-    assert (warning.kind, warning.weight) == ("left out", "break")
-    assert "50 of 200 frames" in warning.sentence
+    assert (left_out.kind, few.kind, few.weight, few.where) == ("left out", "lost", "note", "13.9 … 14.2 s")
 
 
 def test_doubtful_frames_and_their_main_reasons():
     jumps = {k: doubted(Doubt("jump", f"jump of 0.{k} m where 0.09 m was predicted")) for k in range(11, 19)}
     some = {k: doubted(Doubt("disagreement", "12 inliers on one side of the image")) for k in range(51, 54)}
     warning = only(results_of(changed=jumps | some))
-    assert (warning.kind, warning.weight) == ("doubtful", "doubt")
-    assert "11 of 200 placed frames are doubtful, 5.5%, for 0.9 s at the longest" in warning.sentence
-    assert "jump of 0.11 m where 0.09 m was predicted (8); 12 inliers on one side of the image (3)" in (
-        warning.sentence
-    )
-    assert warning.where == "1.0 … 1.9 s"
-    assert only(results_of(changed={12: doubted(), 51: doubted(), 99: doubted()})).weight == "note"
+    assert (warning.kind, warning.weight, warning.where) == ("doubtful", "doubt", "1.0 … 1.9 s")
+    numbers = numbers_in(warning.sentence)
+    assert (numbers[:4], numbers[-5:]) == ([11, 200, 5.5, 0.9], [0.11, 0.09, 8, 12, 3])
 
 
 def test_motions_that_nothing_shows_have_another_remedy_than_settings():
-    unseen = doubted(unobservable="translation along x")
-    warning = only(results_of(changed=dict.fromkeys(range(11, 23), unseen)))
+    warning = only(results_of(changed=dict.fromkeys(range(11, 23), UNSEEN)))
     assert "wheel odometry" in warning.suggestion
 
-    results = results_of(changed=dict.fromkeys(range(11, 23), unseen), sigmas=PoseSigmas(0.04, 0.05))
+    results = results_of(changed=dict.fromkeys(range(11, 23), UNSEEN), sigmas=PoseSigmas(0.04, 0.05))
     (uncertain,) = found(results, kind="uncertainty")
     assert uncertain.suggestion == warning.suggestion  # not to come back, for loops
 
-    few = dict.fromkeys(range(11, 14), unseen) | {k: doubted() for k in range(20, 30)}
+    few = dict.fromkeys(range(11, 14), UNSEEN) | {k: doubted() for k in range(20, 30)}
     assert not only(results_of(changed=few)).suggestion
 
 
 def test_wheels_that_are_in_the_graph_are_not_asked_for():
-    unseen = doubted(unobservable="translation along x")
-    results = results_of(changed=dict.fromkeys(range(11, 23), unseen))
+    results = results_of(changed=dict.fromkeys(range(11, 23), UNSEEN))
     T = results.graph.T_world_node
     results.graph.add_factors(
         BetweenFactor(k - 1, k, inverse(T[k - 1]) @ T[k], INFORMATION, "wheel") for k in range(1, 40)
@@ -130,17 +131,6 @@ def test_loops_are_not_asked_for_where_a_path_has_none():
     assert "loops" not in warning.suggestion
 
 
-def test_single_repeated_images_do_not_count_but_a_long_repetition_does():
-    repeated = doubted(Doubt("repeated image", "same image as 1 frames before"))
-    assert only(results_of(changed=dict.fromkeys(range(10, 200, 10), repeated))).weight == "note"
-    assert only(results_of(changed=dict.fromkeys(range(100, 125), repeated))).weight == "doubt"
-
-
-def test_doubtful_frames_for_longer_than_neighbours_hold_a_path():
-    assert only(results_of(2000, changed=dict.fromkeys(range(100, 118), doubted()))).weight == "note"
-    assert only(results_of(2000, changed=dict.fromkeys(range(100, 125), doubted()))).weight == "doubt"
-
-
 def test_skipped_frames():
     manifest = MANIFEST.model_copy(
         update={"skipped": tuple(SkippedFrame(stamp_ns=k, reason="7.png: truncated") for k in range(3))}
@@ -148,8 +138,7 @@ def test_skipped_frames():
     assert only(results_of(), manifest).weight == "note"
     many = manifest.model_copy(update={"skipped": manifest.skipped * 10})
     warning = only(results_of(), many)
-    assert warning.weight == "doubt"
-    assert warning.sentence == "30 of 200 frames could not be read; the first: 7.png: truncated"
+    assert (warning.weight, numbers_in(warning.sentence)) == ("doubt", [30, 200, 7])
 
 
 def late(first, by_ns, count=200):
@@ -159,7 +148,7 @@ def late(first, by_ns, count=200):
 def test_a_missing_stretch_of_the_log_is_a_gap():
     warning = only(results_of(stamps_ns=late(80, 2_000_000_000)))
     assert (warning.kind, warning.where) == ("gap", "7.9 … 10.0 s")
-    assert warning.sentence == "the log has 1 gap, 2.1 s in all, the longest 2.1 s; frames come every 0.1 s"
+    assert numbers_in(warning.sentence) == [1, 2.1, 2.1, 0.1]
     assert found(results_of(stamps_ns=late(80, 300_000_000))) == []
 
 
@@ -177,9 +166,7 @@ def test_loops_far_from_the_odometry():
     assert found(with_loops(results_of(), [0.2] * 5), kind="loops") == []
     warning = found(with_loops(results_of(), [2.5, 2.4, 2.6]), kind="loops")[0]
     assert warning.weight == "doubt"
-    assert "2.50 m and 0.0° from the odometry, over 5.0 m of path (at most 0.30 m and 10° are usual)" in (
-        warning.sentence
-    )
+    assert numbers_in(warning.sentence)[-5:] == [2.5, 0.0, 5.0, 0.3, 10.0]
     assert found(with_loops(results_of(), [0.0], miss_rad=0.3), kind="loops")[0].weight == "doubt"
 
 

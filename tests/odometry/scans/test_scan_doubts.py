@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mapper.core.frames import Scan
-from mapper.core.geometry import angle_between, apply, exp, inverse, log
+from mapper.core.geometry import angle_between, exp, inverse, log
 from mapper.odometry.motion_prior import MotionPrior
 from mapper.odometry.scans.config import GicpOdometryConfig
 from mapper.odometry.scans.gicp_matcher import GicpMatcher
@@ -14,7 +14,6 @@ from mapper.odometry.scans.motion_model import MotionModel, Spread
 from mapper.odometry.scans.odometry import ScanOdometry
 from mapper.odometry.scans.pose_assessment import FitStatistics
 from mapper.odometry.scans.pose_candidate import Shares, fuse_with_prediction, jump_between
-from mapper.odometry.scans.pose_search import Answers
 from mapper.odometry.scans.scan_fit import ScanKeyframe, contradiction, described, fit_of
 from mapper.odometry.scans.scan_matcher import DeskewedScan
 from mapper.odometry.scans.scan_noise import ScanNoise, surface_covariance
@@ -140,18 +139,6 @@ def test_a_search_ends_when_several_guesses_lead_to_one_pose(monkeypatch):
 
     assert 3 <= matcher.count <= 10  # of 8 guesses, each to the map and to two scans
     assert np.linalg.norm(track.T_world_body[:3, 3]) < 0.02
-
-
-def test_answers_count_the_guesses_that_led_to_them():
-    answers = Answers(0.2, [np.eye(4)])
-    close, far = (exp(np.zeros(3), np.array([x_m, 0.0, 0.0])) for x_m in (0.02, 0.2))
-    turned = exp(np.array([0.0, 0.0, 0.05]), np.zeros(3))
-
-    assert not answers.add(close, 1)
-    assert answers.add(far, 1)
-    assert answers.add(turned, 2)
-    assert not answers.add(close, 1)
-    assert [answers.guesses_of(pose) for pose in (np.eye(4), far, turned)] == [2, 1, 1]
 
 
 def test_scans_that_fit_are_not_doubted_and_all_have_a_covariance():
@@ -350,9 +337,3 @@ def test_a_motion_that_two_scans_leave_open_is_no_doubt():
     doubts = [noise.of(fit, open_m, OFF, 0.1, np.zeros((6, 6))).doubts for _ in range(4)]
 
     assert [bool(doubt) for doubt in doubts] == [False, False, True, True]
-
-
-def test_points_are_where_the_truth_puts_them():
-    here, there = room_scan(0, seed=1, noise_m=0.0), room_scan(1, OFF, seed=2, noise_m=0.0)
-    _, distances_m = keyframe(here).deskewed.prepared.nearest(apply(OFF, there.points_body))
-    assert np.median(distances_m) < 0.1
