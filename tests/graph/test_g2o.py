@@ -127,13 +127,6 @@ def test_indefinite_information_is_what_gtsam_makes_of_it(tmp_path):
     assert optimize(graph, GraphConfig(solve="none")).error_before == pytest.approx(factors.error(values))
 
 
-def test_positive_information_is_kept_to_the_bit(tmp_path):
-    graph = random_graph(6, seed=2)
-    write_g2o(tmp_path / "graph.g2o", graph)
-    for ours, theirs in zip(graph.factors, read_g2o(tmp_path / "graph.g2o").factors, strict=True):
-        assert (theirs.information == 0.5 * (ours.information + ours.information.T)).all()
-
-
 def test_loops_of_a_foreign_file_are_guessed_by_their_ids(tmp_path):
     vertices = "".join(f"VERTEX_SE2 {k} {k} 0 0\n" for k in range(4))
     edges = "".join(f"EDGE_SE2 {i} {j} 1 0 0 1 0 0 1 0 1\n" for i, j in ((0, 1), (2, 1), (0, 2), (3, 0)))

@@ -49,17 +49,7 @@ def test_growing_arrives_where_the_batch_solve_does():
     assert gap_m(solver.poses(), batch) < 0.01
     assert gap_m(solver.poses(), dict(enumerate(truth))) < 0.25
     assert list(solver.poses()) == list(graph.T_world_node)
-
-
-def test_one_pose_is_that_of_all_poses():
-    solver, _, _ = grown(40)
-    alone = solver.pose_of(33)
-    np.testing.assert_allclose(alone, solver.poses()[33], atol=1e-12)
-
-
-def test_the_same_log_gives_the_same_bits():
-    first, second = grown(50)[0].poses(), grown(50)[0].poses()
-    assert all((first[node] == second[node]).all() for node in first)
+    np.testing.assert_allclose(solver.pose_of(33), solver.poses()[33], atol=1e-12)
 
 
 def test_what_waits_is_where_it_was_put():

@@ -124,14 +124,6 @@ def test_further_fixed_nodes_of_a_component_are_noted():
     assert notes == ["of 2 connected nodes that are fixed only node 7 keeps its pose"]
 
 
-def test_one_node_without_factors_is_its_own_solution():
-    graph = PoseGraph()
-    graph.add_node(7, 0, transform(np.eye(3), [1.0, 2.0, 3.0]))
-    solution = optimize(graph, GraphConfig())
-    np.testing.assert_array_equal(solution.T_world_node[7], graph.T_world_node[7])
-    assert (solution.error_after, solution.iterations, solution.factor_errors) == (0.0, 0, ())
-
-
 def test_the_graph_is_left_as_it_was_and_the_answer_repeats_to_the_bit():
     graph, _ = loop(30, rng=np.random.default_rng(4))
     before = {node: T.copy() for node, T in graph.T_world_node.items()}

@@ -94,21 +94,6 @@ def test_loops_are_spread_in_the_order_in_which_they_closed():
         np.testing.assert_array_equal(together[node], apart[node])
 
 
-def test_drift_that_grows_with_the_way_is_taken_back_wholly():
-    """Odometry that rises 3 % of its way, on a walk of uneven steps around a square."""
-    rng = np.random.default_rng(4)
-    T_world_node, drifted, way_m = {0: np.eye(4)}, {0: np.eye(4)}, 0.0
-    for k in range(1, 41):
-        turn = rotation_exp(np.array([0.0, 0.0, np.pi / 2 if k % 10 == 0 else 0.0]))
-        step_m = rng.uniform(0.1, 0.4)
-        way_m += step_m
-        T_world_node[k] = T_world_node[k - 1] @ transform(turn, [step_m, 0.0, 0.0])
-        drifted[k] = transform(np.eye(3), [0.0, 0.0, 0.03 * way_m]) @ T_world_node[k]
-    corrected = spread(drifted, loop(0, 40, T_world_node[40]))
-    for node, T in T_world_node.items():
-        np.testing.assert_allclose(corrected[node], T, atol=1e-12)
-
-
 def test_the_proportional_solve_believes_every_loop_and_says_how_well_it_fits():
     closing = loop(0, 4, transform(np.eye(3), [3.6, 0.0, 0.0]))
     graph = graph_of(walk([1.0] * 4), closing)
