@@ -20,7 +20,7 @@ from mapper.line_laser.calibration import (
 )
 from mapper.line_laser.config import THESIS, LineLaserCalibration, LineLaserConfig, VehicleConfig
 from mapper.line_laser.files import find_images, read_shots
-from mapper.line_laser.ranging import LineScan, line_scan, local_grid, scan_image
+from mapper.line_laser.ranging import line_scan, local_grid, scan_image
 from mapper.line_laser.survey import drive, map_scans, scan_images, sensor_poses
 from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN
 from tests.support.grids import state_at
@@ -226,6 +226,9 @@ def test_the_local_grid_has_the_vehicle_at_the_middle_of_row_zero():
     )
     assert D.shape == (190, 240)
     assert np.argwhere(D).tolist() == [[50, 120 + 10], [100, 120 - 100]]
+    smaller = CONFIG.map.model_copy(update={"width_cells": 40, "depth_cells": 120})
+    scan = scan_at((0.505, -0.105), (1.005, 0.995), (1.505, 0.0))
+    assert np.argwhere(local_grid(scan, smaller)).tolist() == [[50, 20 + 10]]
 
 
 WALL = [(1.01, y) for y in np.linspace(0.4, -0.4, 81)]
@@ -390,13 +393,6 @@ def test_each_threshold_of_the_stripe_belongs_to_one_method(method, setting, val
     assert np.count_nonzero(after[method]) < np.count_nonzero(before[method])
     others = {"hue", "intensity", "weight", "edges"} - {method}
     assert all(np.array_equal(after[other], before[other]) for other in others)
-
-
-def test_the_local_grid_ends_where_its_settings_say():
-    points = np.array([[0.505, -0.105], [1.005, 0.995], [1.505, 0.0]])
-    scan = LineScan(0, np.arange(3), np.zeros(3), points, np.zeros(3, np.bool_))
-    smaller = CONFIG.map.model_copy(update={"width_cells": 40, "depth_cells": 120})
-    assert np.argwhere(local_grid(scan, smaller)).tolist() == [[50, 20 + 10]]
 
 
 def test_the_floor_begins_a_margin_before_the_reach():

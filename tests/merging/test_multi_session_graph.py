@@ -6,9 +6,9 @@ import pytest
 from mapper.core.geometry import exp, inverse
 from mapper.graph.config import GraphConfig
 from mapper.graph.model import BetweenFactor, PoseGraph, PoseSigmas
-from mapper.loops.closure import LoopClosure
 from mapper.loops.inter_session_loops import shared_place
 from mapper.merging.multi_session_graph import solve_jointly
+from tests.support.loop_closures import loop
 
 CONFIG = GraphConfig()
 NODES = 21
@@ -43,17 +43,8 @@ def seen_again(graphs, first, second, nodes, *, T_off=None):
     places = []
     for k in nodes:
         i, j = (list(graphs[number].T_world_node)[k] for number in (first, second))
-        loop = LoopClosure(
-            i=i,
-            j=j,
-            stamp_i_ns=0,
-            stamp_j_ns=0,
-            proposed_by="scans",
-            verdict="accepted",
-            T_i_j=np.eye(4) if T_off is None else T_off,
-            information=SURE,
-        )
-        places.append(shared_place(first, second, loop, *(graphs[n].T_world_node for n in (first, second))))
+        seen = loop(i, j, T_off, information=SURE)
+        places.append(shared_place(first, second, seen, *(graphs[n].T_world_node for n in (first, second))))
     return places
 
 
@@ -99,8 +90,8 @@ def test_false_loops_are_rejected_and_say_why(graphs):
     )
     other = seen_again(graphs, 0, 1, [19], T_off=T_off)
     joint = solve_jointly(*poses(graphs, 0, 1), [*true, *false], other, CONFIG)
-    assert [loop.verdict for loop in joint.loops] == ["accepted"] * 11 + ["rejected"] * 4
-    assert all(loop.reason.startswith("solver: ") for loop in joint.loops[11:14])
+    assert [each.verdict for each in joint.loops] == ["accepted"] * 11 + ["rejected"] * 4
+    assert all(each.reason.startswith("solver: ") for each in joint.loops[11:14])
     assert joint.loops[14].reason.startswith("consensus: ")
     assert miss_m(joint, 1).max() < 0.03
     assert sum(factor.origin == "loop" for factor in joint.graph.factors) == 11

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from mapper.core.geometry import exp, inverse, length_and_angle
-from mapper.loops.closure import LoopClosure
 from mapper.loops.config import GateConfig
 from mapper.loops.inter_session_loops import SharedPlace
 from mapper.merging.multi_session_graph import solve_worlds
+from tests.support.loop_closures import loop
 
 GATE = GateConfig()
 WORLDS = [
@@ -24,17 +24,8 @@ def on_path(along_m):
 
 def measured(first, second, T_first_place, T_first_body, T_second_body):
     """Return a place that two runs share, its keyframe measured at a pose in the first run's world."""
-    loop = LoopClosure(
-        i=0,
-        j=0,
-        stamp_i_ns=0,
-        stamp_j_ns=0,
-        proposed_by="places",
-        verdict="accepted",
-        T_i_j=inverse(T_first_place) @ T_first_body,
-        information=np.eye(6),
-    )
-    return SharedPlace(first, second, T_first_place, T_first_body, T_second_body, loop)
+    seen = loop(0, 0, inverse(T_first_place) @ T_first_body, information=np.eye(6))
+    return SharedPlace(first, second, T_first_place, T_first_body, T_second_body, seen)
 
 
 def shared(first, second, along_m, *, rng, noise_m=0.01, T_off=None):

@@ -8,16 +8,14 @@ from mapper.core.geometry import adjoint, exp, inverse
 from mapper.graph.components import align_components
 from mapper.graph.config import GraphConfig
 from mapper.graph.model import BetweenFactor, PoseGraph, PoseSigmas
-from mapper.loops.closure import LoopClosure
 from mapper.odometry.base import Diagnostics, FrameResult
 from mapper.pipeline.disconnected_components import DISCONNECTED, largest_component, without_doubtful_ends
 from mapper.pipeline.solve import solve
 from mapper.pipeline.tracking_result import TrackingResult
 from mapper.runtime.progress import SILENT
 from tests.support.feature_room import track
+from tests.support.loop_closures import SURE, loop
 from tests.support.planar import at
-
-SURE = PoseSigmas(rotation_rad=0.01, translation_m=0.01).information
 
 
 class Listener:
@@ -43,10 +41,9 @@ def two_parts(*, tied: bool) -> TrackingResult:
         tracks.append(track(node, 10 * node, T))
         graph.add_node(node, 10 * node, T)
     graph.add_factors(BetweenFactor(k, k + 1, at(1.0), SURE) for k in (0, 1, 3, 4, 5, 6))
-    inner = LoopClosure(0, 2, 0, 20, "places", "accepted", T_i_j=at(2.0), information=SURE)
-    outer = LoopClosure(1, 5, 10, 50, "places", "accepted", T_i_j=at(4.0), information=SURE)
+    inner, outer = loop(0, 2, at(2.0)), loop(1, 5, at(4.0))
     loops = (inner, outer) if tied else (inner,)
-    graph.add_factors(loop.factor for loop in loops)
+    graph.add_factors(each.factor for each in loops)
     return TrackingResult(tuple(tracks), (), graph, loops, {})
 
 
@@ -56,7 +53,7 @@ def test_only_the_largest_part_is_kept_and_it_is_said():
     assert sorted(kept.graph.T_world_node) == [3, 4, 5, 6, 7]
     assert [t.node for t in kept.tracks] == [None, None, None, 3, 4, 5, 6, 7]
     assert kept.tracks[0].diagnostics.method == DISCONNECTED
-    assert [(loop.verdict, loop.reason.split(":")[0]) for loop in kept.loops] == [
+    assert [(each.verdict, each.reason.split(":")[0]) for each in kept.loops] == [
         ("rejected", "disconnected")
     ]
     assert {(f.i, f.j) for f in kept.graph.factors} == {(3, 4), (4, 5), (5, 6), (6, 7)}
@@ -90,7 +87,7 @@ def test_a_part_without_a_tie_stays():
 def test_the_solver_finds_the_line(robust):
     tracking = two_parts(tied=True)
     solved = solve(tracking.graph, tracking.loops, GraphConfig(robust=robust))
-    assert [loop.verdict for loop in solved.loops] == ["accepted", "accepted"]
+    assert [each.verdict for each in solved.loops] == ["accepted", "accepted"]
     assert solved.report.components == 1
     for node, T in solved.graph.T_world_node.items():
         np.testing.assert_allclose(T, at(float(node)), atol=1e-6)

@@ -1,5 +1,6 @@
 """Precision and recall of loop closures against the truth."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -19,6 +20,7 @@ from mapper.graph.model import BetweenFactor, PoseGraph, PoseSigmas
 from mapper.graph.optimize import optimize
 from mapper.loops.closure import LoopClosure
 from mapper.loops.config import PlaceLoopsConfig, ScanLoopsConfig
+from tests.support.loop_closures import loop
 from tests.support.planar import at
 
 
@@ -31,17 +33,9 @@ def truth() -> Trajectory:
 
 
 def closure(i: int, j: int, x: float, verdict: str = "accepted") -> LoopClosure:
-    return LoopClosure(
-        i=i,
-        j=j,
-        stamp_i_ns=i * NS_PER_S,
-        stamp_j_ns=j * NS_PER_S,
-        proposed_by="places",
-        verdict=verdict,
-        reason="" if verdict == "accepted" else "isvd: no",
-        T_i_j=at(x),
-        information=np.eye(6),
-    )
+    reason = "" if verdict == "accepted" else "isvd: no"
+    found = loop(i, j, at(x), verdict=verdict, reason=reason, information=np.eye(6))
+    return replace(found, stamp_i_ns=i * NS_PER_S, stamp_j_ns=j * NS_PER_S)
 
 
 def values(metrics) -> dict[str, float]:
@@ -66,7 +60,7 @@ def test_revisits_are_near_alike_and_long_ago(truth):
     ],
 )
 def test_accepted_loops_are_right_or_wrong_by_the_truth(truth, loops, wrong, found, count):
-    told = values(loop_metrics([closure(*loop) for loop in loops], truth.stamps_ns, truth))
+    told = values(loop_metrics([closure(*each) for each in loops], truth.stamps_ns, truth))
     assert told["loops"] == count
     assert told["loops wrongly accepted"] == wrong
     assert (told["true revisits with a loop"], told["true revisits"]) == (found, 9)
@@ -115,10 +109,10 @@ def solved(graph):
 def test_a_loop_is_as_far_from_the_others_as_a_solve_without_it_says():
     graph = ring()
     distances_m = []
-    for loop in graph.loops:
-        without = solved(graph.with_factors(factor for factor in graph.factors if factor is not loop))
-        T_i_j = inverse(without.T_world_node[loop.i]) @ without.T_world_node[loop.j]
-        distances_m.append(np.linalg.norm(log(inverse(T_i_j) @ loop.T_i_j)[1]))
+    for left_out in graph.loops:
+        without = solved(graph.with_factors(factor for factor in graph.factors if factor is not left_out))
+        T_i_j = inverse(without.T_world_node[left_out.i]) @ without.T_world_node[left_out.j]
+        distances_m.append(np.linalg.norm(log(inverse(T_i_j) @ left_out.T_i_j)[1]))
     told = values(agreement_of_loops(graph))
     assert told["loops compared with all others"] == 10
     assert told["loops off the others, median"] == pytest.approx(np.median(distances_m), rel=0.03)
