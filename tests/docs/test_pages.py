@@ -20,8 +20,12 @@ SCANS = "kitti_00"
 TEXTS = {page_name(path): path.read_text(encoding="utf-8") for path in PAGES}
 RUN_PAGES = [name for name, text in TEXTS.items() if list(blocks_of(text))]
 
-QUICKER = {"compare": ["--last", "6", "--pairs", "1"], "synth": ["--seconds", "4"]}
-"""What is added to a command that takes minutes; its rows are the same."""
+QUICKER = {
+    "compare": ["--last", "6", "--pairs", "1"],
+    "sweep": ["--processes", "1"],
+    "synth": ["--seconds", "4"],
+}
+"""What is added to a command that takes minutes, or would import all in other processes; its rows are the same."""
 
 
 @pytest.fixture(scope="module")

@@ -52,19 +52,17 @@ def test_the_published_camera_depth_and_rate_are_taken(tmp_path):
     assert source.notes == ["fy < 0: the camera's y axis points up; y of camera and truth is mirrored"]
 
 
-def test_the_truth_is_of_frame_numbers_and_mirrored(tmp_path):
+@pytest.mark.parametrize("is_listed", [True, False])
+@pytest.mark.parametrize("camera", [{}, {"fx_px": 60, "fy_px": 61, "cx_px": 31.5, "cy_px": 23.5}])
+def test_the_truth_is_of_frame_numbers_and_mirrored_whoever_states_the_camera(tmp_path, camera, is_listed):
     folder = icl_nuim(tmp_path)
-    (folder / "calibration.toml").write_text(Y_UP)
-    source = open_source(folder, SourceConfig(rate_hz=10.0))
+    if not camera:
+        (folder / "calibration.toml").write_text(Y_UP)
+    if not is_listed:
+        (folder / "associations.txt").unlink()
+    source = open_source(folder, SourceConfig(rate_hz=10.0, camera=CameraConfig(**camera)))
+    assert (source.kind, len(source), source[0].camera.fy_px) == ("icl-nuim", 4, 61.0)
     assert source.truth.stamps_ns.tolist() == [100_000_000, 200_000_000, 300_000_000]
-    np.testing.assert_allclose(source.truth.T_world_body, POSES[1:], atol=1e-12)
-    assert source[0].camera.fy_px == 61.0
-
-
-def test_configured_numbers_keep_the_convention_of_the_log(tmp_path):
-    camera = CameraConfig(fx_px=60, fy_px=61, cx_px=31.5, cy_px=23.5)
-    source = open_source(icl_nuim(tmp_path), SourceConfig(camera=camera))
-    assert source[0].camera.fy_px == 61.0
     np.testing.assert_allclose(source.truth.T_world_body, POSES[1:], atol=1e-12)
 
 
@@ -87,14 +85,6 @@ def test_images_on_a_mirrored_axis_show_the_same_points(tmp_path):
     point_world = T_world_body @ [*scan.points_body[index], 1.0]
 
     np.testing.assert_allclose(point_world, MIRROR_Y @ published_world, atol=1e-5)
-
-
-def test_images_without_a_list_are_paired_by_their_numbers(tmp_path):
-    folder = icl_nuim(tmp_path)
-    (folder / "associations.txt").unlink()
-    (folder / "calibration.toml").write_text(Y_UP)
-    source = open_source(folder)
-    assert (source.kind, len(source)) == ("icl-nuim", 4)
 
 
 def test_a_list_of_numbers_alone_is_enough_but_the_camera_is_noted(tmp_path):

@@ -29,11 +29,6 @@ def test_a_pixel_is_read_where_the_lens_projects_its_ray(lens):
     map_columns, map_rows = lens.maps(CAMERA)
     found = np.column_stack([map_columns[rows, columns], map_rows[rows, columns]])
     np.testing.assert_allclose(found, projected(lens, columns.astype(float), rows.astype(float)), atol=0.01)
-
-
-@pytest.mark.parametrize("lens", [Lens("rational_polynomial", AZURE), Lens("equidistant", FISHEYE)])
-def test_a_pixel_s_ray_is_projected_to_the_pixel(lens):
-    columns, rows = np.array([0, 12, 80, 159]), np.array([0, 100, 60, 119])
     rays = lens.rays(CAMERA)
     assert rays.shape == (120, 160, 2)
     ideal = rays[rows, columns] * (131.0, 130.0) + (79.5, 59.5)

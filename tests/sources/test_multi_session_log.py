@@ -32,6 +32,8 @@ def test_a_later_log_keeps_its_clock(tiny_tum_log):
     assert stamps_of(source) == stamps_of(source), "repeatable"
     assert len(source) == 6
     assert [session.shift_ns for session in source.sessions] == [0, 0]
+    # The first truth goes on past its log, and yields to the next.
+    np.testing.assert_array_equal(source.truth.stamps_ns, open_source(log).truth.stamps_ns)
 
 
 def test_a_log_that_is_not_later_begins_a_second_after_the_first(two):
@@ -39,9 +41,9 @@ def test_a_log_that_is_not_later_begins_a_second_after_the_first(two):
     end_ns = FIRST_NS + 3 * PERIOD_NS
     assert stamps_of(source)[4:] == [end_ns + NS_PER_S + i * PERIOD_NS for i in range(3)]
     assert f"two: stamps raised by {source.sessions[1].shift_ns / 1e9:.3f} s" in "; ".join(source.notes)
-
-
-def test_a_remembered_shift_is_used_as_it_is(two):
+    last = source.sessions[-1].log
+    assert (stamps_of(last), len(last), last.name) == (stamps_of(source)[4:], 3, "two")
+    np.testing.assert_array_equal(last.truth.stamps_ns, source.truth.stamps_ns[4:])
     assert chained(*two, shift_ns=5 * NS_PER_S).sessions[1].shift_ns == 5 * NS_PER_S
 
 
@@ -78,12 +80,6 @@ def test_truths_are_joined_and_it_is_said(two):
     assert "the ground truths of one and two are taken to be in one world" in source.notes
 
 
-def test_a_truth_that_goes_on_past_its_log_yields_to_the_next(tiny_tum_log):
-    log = tiny_tum_log(6)
-    first, second = (open_source(log, SourceConfig(first_frame=a, last_frame=b)) for a, b in ((0, 3), (4, 5)))
-    np.testing.assert_array_equal(chained(first, second).truth.stamps_ns, open_source(log).truth.stamps_ns)
-
-
 def test_the_truth_of_one_log_alone_is_kept_and_it_is_said(tiny_tum_log):
     log = tiny_tum_log(3, folder="two")
     (log / "groundtruth.txt").unlink()
@@ -100,14 +96,6 @@ def test_without_truth_there_is_none(tiny_tum_log):
     source = chained(*map(open_source, logs))
     assert source.truth is None
     assert not any("truth" in note for note in source.notes)
-
-
-def test_the_last_session_is_on_the_common_clock(two):
-    source = chained(*two)
-    last = source.sessions[-1].log
-    assert stamps_of(last) == stamps_of(source)[4:]
-    assert (len(last), last.name) == (3, "two")
-    np.testing.assert_array_equal(last.truth.stamps_ns, source.truth.stamps_ns[4:])
 
 
 def test_a_single_log_is_one_session(two):

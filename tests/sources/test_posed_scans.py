@@ -16,7 +16,6 @@ from mapper.sources import open_source
 from mapper.sources.config import SourceConfig
 from mapper.sources.inspection import inspect_log
 from mapper.sources.writers import write_log
-from tests.support.desk import write_desk_log
 from tests.support.posed_scans import WRITERS, Shots, shots_of, write_record3d
 
 DEVICE = {"stray-scanner", "record3d", "polycam", "nerfstudio"}
@@ -26,25 +25,17 @@ LOSSLESS = {"nerfstudio", "redwood", "openloris"}
 
 
 @pytest.fixture(scope="module")
-def shots(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("desk") / "log"
-    write_desk_log(folder)
-    log = open_source(folder, SourceConfig(stride=2))
+def shots(desk_log):
+    log = open_source(desk_log, SourceConfig(stride=2))
     frames = list(log)
     at = np.searchsorted(log.truth.stamps_ns, [frame.stamp_ns for frame in frames])
     return shots_of(frames, log.truth.T_world_body[at])
 
 
-@pytest.fixture(scope="module", params=sorted(WRITERS))
-def written(request, shots, tmp_path_factory):
-    write, name = WRITERS[request.param]
-    folder = tmp_path_factory.mktemp("scan")
-    return request.param, write(folder / name, shots)
-
-
-def test_every_layout_is_read_as_it_was_taken(written, shots):
-    kind, path = written
-    log = open_source(path)
+@pytest.mark.parametrize("kind", sorted(WRITERS))
+def test_every_layout_is_read_as_it_was_taken(shots, tmp_path, kind):
+    write, name = WRITERS[kind]
+    log = open_source(write(tmp_path / name, shots))
     assert (log.kind, log.sensor, len(log)) == (kind.removesuffix("-sens"), "rgbd", len(shots.frames))
     np.testing.assert_allclose(
         np.diff(log.stamps_ns) / 1e9, 1.0 / (30.0 if kind in UNTIMED else 15.0), atol=1e-3
@@ -61,9 +52,10 @@ def test_every_layout_is_read_as_it_was_taken(written, shots):
     np.testing.assert_allclose(poses.T_world_body, [shot.T_world_camera for shot in shots.frames], atol=1e-5)
 
 
-def test_every_layout_is_mapped(written, shots, tmp_path):
-    kind, path = written
-    log = open_source(path)
+@pytest.mark.parametrize("kind", ["stray-scanner", "record3d", "polycam", "scannet-sens", "replica"])
+def test_layouts_of_every_way_of_reading_are_mapped(shots, tmp_path, kind):
+    write, name = WRITERS[kind]
+    log = open_source(write(tmp_path / name, shots))
     run = build(log, load_config(None), tmp_path / "run")
     assert run.manifest.counts.tracked == len(shots.frames)
     assert evaluate(run.trajectory, log.device_poses if kind in DEVICE else log.truth).ate_m < 0.02

@@ -44,12 +44,20 @@ def frozen(n, first, count):
     return [first if first <= i < first + count else i for i in range(n)]
 
 
-def test_a_frozen_camera_is_noted_with_its_frames_and_times():
-    log = log_of(frozen(40, 7, FROZEN_IMAGES + 2), range(100, 140))
-    noted = ["frames 7 … 13, 0.7 … 1.3 s after the first, show the same image; was the camera frozen?"]
-    assert notes_on(log) == noted
-    assert notes_on(log, np.random.default_rng(0).permutation(40).tolist()) == noted
-    assert notes_on(log_of(frozen(40, 7, FROZEN_IMAGES - 1), range(100, 140))) == []
+@pytest.mark.parametrize(
+    ("is_depth", "what"),
+    [(False, "same image; was the camera frozen?"), (True, "same depth image; was the depth camera frozen?")],
+)
+def test_a_frozen_camera_is_noted_with_its_frames_and_times(is_depth, what):
+    def log(count):
+        seeds = frozen(40, 7, count), range(100, 140)
+        return log_of(*(reversed(seeds) if is_depth else seeds))
+
+    verb = "have" if is_depth else "show"
+    noted = [f"frames 7 … 13, 0.7 … 1.3 s after the first, {verb} the {what}"]
+    assert notes_on(log(FROZEN_IMAGES + 2)) == noted
+    assert notes_on(log(FROZEN_IMAGES + 2), np.random.default_rng(0).permutation(40).tolist()) == noted
+    assert notes_on(log(FROZEN_IMAGES - 1)) == []
 
 
 def test_frames_that_repeat_earlier_ones_are_doubted():
@@ -91,14 +99,6 @@ def test_a_second_of_the_same_image_is_long_whatever_the_frame_rate():
     slow = replace(log, stamps_ns=log.stamps_ns * 6)
     assert notes_on(log) == []
     assert len(notes_on(slow)) == 1
-
-
-def test_depth_that_repeats_is_noted():
-    noted = notes_on(log_of(range(20), frozen(20, 12, FROZEN_IMAGES)))
-    assert noted == [
-        "frames 12 … 16, 1.2 … 1.6 s after the first, have the same depth image; was the depth camera frozen?"
-    ]
-    assert notes_on(log_of(range(20), frozen(20, 12, FROZEN_IMAGES - 1))) == []
 
 
 def test_a_damaged_frame_among_the_same_ones_hides_nothing():

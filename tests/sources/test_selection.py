@@ -54,12 +54,3 @@ def test_cannot_require_truth_of_a_log_without(tiny_tum_log):
     (log / "groundtruth.txt").unlink()
     with pytest.raises(SourceError, match=r"ground truth is required .*the log has none"):
         open_source(log, SourceConfig(require_truth=True))
-
-
-def test_what_is_no_log_says_what_was_looked_for(tmp_path):
-    with pytest.raises(SourceError, match=r"nowhere: no such file or folder"):
-        open_source(tmp_path / "nowhere")
-    (tmp_path / "notes.txt").write_text("hello")
-    for path in (tmp_path, tmp_path / "notes.txt"):
-        with pytest.raises(SourceError, match=r"known format .*TUM.*7-Scenes.*mbag"):
-            open_source(path)

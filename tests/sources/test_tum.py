@@ -36,37 +36,29 @@ def test_reads_every_frame_with_exact_stamps_pixels_and_truth(tiny_tum_log):
     assert (frame.camera.fx_px, frame.camera.cy_px, frame.camera.width_px) == (60.0, 23.5, 64)
     np.testing.assert_allclose(source.truth.positions_world[:, 0], [0, 0.01, 0.02, 0.03])
     assert source.accelerations is None
-
-
-def test_reads_the_same_twice(tiny_tum_log):
-    source = open_source(tiny_tum_log(3))
     assert stamps_of(source) == stamps_of(source)
-    once, again = (next(iter(source.entries())).load() for _ in range(2))
-    np.testing.assert_array_equal(once.depth_m, again.depth_m)
+    np.testing.assert_array_equal(source[1].depth_m, source[1].depth_m)
 
 
-def test_colour_without_near_depth_is_left_out_and_counted(tiny_tum_log):
+@pytest.mark.parametrize(
+    ("lost", "end"), [(2, "left out"), (3, "more than half of the log is left out (source.max_pair_gap_s)")]
+)
+def test_colour_without_near_depth_is_left_out_and_counted(tiny_tum_log, lost, end):
     log = tiny_tum_log(5)
-    edit(log / "depth.txt", lambda text: "\n".join(text.splitlines()[:-2]))
+    edit(log / "depth.txt", lambda text: "\n".join(text.splitlines()[:-lost]))
     source = open_source(log)
-    assert len(source) == 3
-    assert source.notes == ["2 of 5 colour images have no depth image within 20 ms; left out"]
+    assert len(source) == 5 - lost
+    assert source.notes == [f"{lost} of 5 colour images have no depth image within 20 ms; {end}"]
 
 
-def test_more_than_half_left_out_is_noted_with_the_setting(tiny_tum_log):
-    log = tiny_tum_log(5)
-    edit(log / "depth.txt", lambda text: "\n".join(text.splitlines()[:-3]))
-    assert open_source(log).notes == [
-        "3 of 5 colour images have no depth image within 20 ms; "
-        "more than half of the log is left out (source.max_pair_gap_s)"
-    ]
-
-
-def test_the_pair_gap_is_inclusive_to_the_nanosecond(tiny_tum_log):
+def test_the_pair_gap_is_inclusive_to_the_nanosecond_and_says_how_far_the_closest_is(tiny_tum_log):
     log = tiny_tum_log(3)
     assert len(open_source(log, SourceConfig(max_pair_gap_s=0.009999))) == 3
     with pytest.raises(SourceError, match=r"within 9\.998 ms; the closest pair is 0\.009999 s apart"):
         open_source(log, SourceConfig(max_pair_gap_s=0.009998))
+    edit(log / "depth.txt", lambda text: text.replace("\n13050311", "\n13050411"))
+    with pytest.raises(SourceError, match=r"within 20 ms; the closest pair is 9999\.92 s apart"):
+        open_source(log)
 
 
 def test_listed_files_that_do_not_exist_are_dropped_and_counted(tiny_tum_log):
@@ -91,6 +83,7 @@ def test_lists_out_of_order_are_sorted_and_repeats_dropped(tiny_tum_log):
     ("name", "text", "message"),
     [
         ("rgb.txt", "", r"rgb\.txt: empty list"),
+        ("depth.txt", None, r"depth\.txt: cannot be read: No such file"),
         ("depth.txt", "# only a comment\n", r"depth\.txt: empty list"),
         ("rgb.txt", "1.0 rgb/a.png extra\n", r"rgb\.txt:1: 3 columns, want 2"),
         ("rgb.txt", "# x\nsoon rgb/a.png\n", r"rgb\.txt:2: stamp 'soon' is not a decimal number"),
@@ -105,48 +98,32 @@ def test_lists_out_of_order_are_sorted_and_repeats_dropped(tiny_tum_log):
 )
 def test_malformed_files_are_named_with_their_line(tiny_tum_log, name, text, message):
     log = tiny_tum_log(2)
-    (log / name).write_bytes(text if isinstance(text, bytes) else text.encode())
+    (log / name).unlink(missing_ok=True)
+    if text is not None:
+        (log / name).write_bytes(text if isinstance(text, bytes) else text.encode())
     with pytest.raises(SourceError, match=message) as caught:
         open_source(log)
     assert "\n" not in str(caught.value)
 
 
-def test_a_missing_depth_list_is_named(tiny_tum_log):
+BAD = "1305031102.5 nan nan nan nan nan nan nan\n1305031102.6 0 0 0 0 0 0 0\nnan 0 0 0 0 0 0 1\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "stamps_ns", "noted"),
+    [
+        (None, [], []),
+        ("# header\n", [], ["no usable pose"]),
+        (BAD, [], ["3 of 3 poses are not finite rigid motions; dropped", "no usable pose"]),
+        (f"{BAD}1.0 0 0 0 0 0 0 1\n", [10**9], ["3 of 4 poses are not finite rigid motions; dropped"]),
+    ],
+)
+def test_truth_is_of_the_usable_poses(tiny_tum_log, text, stamps_ns, noted):
     log = tiny_tum_log(2)
-    (log / "depth.txt").unlink()
-    with pytest.raises(SourceError, match=r"depth\.txt: cannot be read: No such file"):
-        open_source(log)
-
-
-def test_depth_far_in_time_says_how_far(tiny_tum_log):
-    log = tiny_tum_log(2)
-    edit(log / "depth.txt", lambda text: text.replace("\n13050311", "\n13050411"))
-    with pytest.raises(SourceError, match=r"within 20 ms; the closest pair is 9999\.96 s apart"):
-        open_source(log)
-
-
-def test_unusable_truth_lines_are_dropped_and_noted(tiny_tum_log):
-    log = tiny_tum_log(4)
-    bad = "1305031102.5 nan nan nan nan nan nan nan\n1305031102.6 0 0 0 0 0 0 0\nnan 0 0 0 0 0 0 1\n"
-    edit(log / "groundtruth.txt", lambda text: text + bad)
+    (log / "groundtruth.txt").unlink() if text is None else (log / "groundtruth.txt").write_text(text)
     source = open_source(log)
-    assert len(source.truth) == 4
-    assert source.notes == ["groundtruth.txt: 3 of 7 poses are not finite rigid motions; dropped"]
-
-
-@pytest.mark.parametrize("text", ["", "# header\n", "1.0 nan 0 0 0 0 0 1\n"])
-def test_truth_without_a_single_pose_is_no_truth(tiny_tum_log, text):
-    log = tiny_tum_log(2)
-    (log / "groundtruth.txt").write_text(text)
-    source = open_source(log)
-    assert source.truth is None
-    assert source.notes[-1] == "groundtruth.txt: no usable pose"
-
-
-def test_no_truth_file_is_no_truth(tiny_tum_log):
-    log = tiny_tum_log(2)
-    (log / "groundtruth.txt").unlink()
-    assert open_source(log).truth is None
+    assert ([] if source.truth is None else source.truth.stamps_ns.tolist()) == stamps_ns
+    assert source.notes == [f"groundtruth.txt: {note}" for note in noted]
 
 
 def test_accelerations_are_read_in_time_order(tiny_tum_log):
@@ -188,32 +165,28 @@ def test_the_camera_is_as_large_as_the_first_readable_image(tiny_tum_log):
         open_source(log)
 
 
-def test_intrinsics_unknown_says_the_remedy(tiny_tum_log):
-    log = tiny_tum_log(2)
+@pytest.mark.parametrize(
+    ("folder", "why"),
+    [
+        ("log", r"calibration\.toml .*--set source\.camera\.fx_px="),
+        ("rgbd_dataset_freiburg2_desk", r"camera of TUM freiburg2: holds for 640×480 px, but .* 64×48"),
+    ],
+)
+def test_without_a_calibration_the_camera_is_known_by_the_folder_s_name_or_asked_for(
+    tiny_tum_log, folder, why
+):
+    log = tiny_tum_log(2, folder=folder)
     (log / "calibration.toml").unlink()
-    with pytest.raises(SourceError, match=r"calibration\.toml .*--set source\.camera\.fx_px="):
+    with pytest.raises(SourceError, match=why):
         open_source(log)
 
 
-def test_the_users_depth_factor_leaves_the_camera_alone(tiny_tum_log):
+def test_the_users_camera_wins_over_the_file_and_a_depth_factor_leaves_it_alone(tiny_tum_log):
     log = tiny_tum_log(2)
-    camera = open_source(log)[0].camera
-    source = open_source(log, SourceConfig(camera=CameraConfig(depth_factor=1000)))
-    assert (source[0].camera, source.entry_at(0).files.depth_units_per_m) == (camera, 1000)
-
-
-def test_the_users_camera_wins_over_the_file(tiny_tum_log):
-    camera = CameraConfig(fx_px=50, fy_px=51, cx_px=32, cy_px=24, depth_factor=1000)
-    source = open_source(tiny_tum_log(2), SourceConfig(camera=camera))
-    assert source[0].camera.fx_px == 50
-    assert source.entry_at(0).files.depth_units_per_m == 1000
-
-
-def test_a_known_camera_of_another_size_is_refused(tiny_tum_log):
-    log = tiny_tum_log(2, folder="rgbd_dataset_freiburg2_desk")
-    (log / "calibration.toml").unlink()
-    with pytest.raises(SourceError, match=r"camera of TUM freiburg2: holds for 640×480 px, but .* 64×48"):
-        open_source(log)
+    numbers = {"fx_px": 50, "fy_px": 51, "cx_px": 32, "cy_px": 24}
+    for camera, fx_px in (({}, 60), (numbers, 50)):
+        source = open_source(log, SourceConfig(camera=CameraConfig(**camera, depth_factor=1000)))
+        assert (source[0].camera.fx_px, source.entry_at(0).files.depth_units_per_m) == (fx_px, 1000)
 
 
 @pytest.mark.skipif(not FR1_XYZ.is_dir(), reason=f"{FR1_XYZ} is missing")

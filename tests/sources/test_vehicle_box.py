@@ -51,44 +51,29 @@ def test_the_box_holds_vehicle_and_driver_and_little_else():
     assert total - kept == pytest.approx(len(own), rel=0.03)
 
 
-def test_a_street_alone_has_no_vehicle():
-    assert vehicle_box(street_log(vehicle=False)[0]) is None
+@pytest.mark.parametrize(
+    ("vehicle", "parked", "frames"), [(False, False, FRAMES), (True, True, FRAMES), (True, False, 5)]
+)
+def test_a_street_alone_a_sensor_that_stands_and_few_frames_show_no_vehicle(vehicle, parked, frames):
+    log, _ = street_log(vehicle=vehicle, parked=parked)
+    assert vehicle_box(log.subset(np.arange(frames))) is None
 
 
-def test_while_the_sensor_stands_nothing_can_be_told():
-    assert vehicle_box(street_log(vehicle=True, parked=True)[0]) is None
-
-
-def test_few_frames_tell_nothing():
-    log, _ = street_log(vehicle=True)
-    assert vehicle_box(log.subset(np.arange(5))) is None
-
-
-@pytest.mark.parametrize(("columns", "is_vehicle"), [(20, True), (60, False)])
-def test_what_takes_up_most_of_the_view_is_scanned_and_no_vehicle(columns, is_vehicle):
+def box_before_a_camera(pixels):
+    """Return the box proposed where some pixels show 0.4 m while a wall goes away."""
     entries = []
     for k in range(FRAMES):
         depth_m = np.full((60, 80), 1.3 + 0.12 * k, np.float32)
-        depth_m[:, 40 - columns // 2 : 40 + columns // 2] = 0.6
-        frame = RgbdFrame(k, np.zeros((60, 80), np.uint8), depth_m, CAMERA)
-        entries.append(MemoryEntry(k, frame))
-    assert (vehicle_box(log_in_memory(entries)) is not None) == is_vehicle
+        depth_m[pixels] = 0.4
+        entries.append(MemoryEntry(k, RgbdFrame(k, np.zeros((60, 80), np.uint8), depth_m, CAMERA)))
+    return vehicle_box(log_in_memory(entries))
 
 
-@pytest.mark.parametrize("bumper", [True, False])
-def test_a_bumper_below_a_camera_is_found(bumper):
-    entries = []
-    for k in range(FRAMES):
-        depth_m = np.full((60, 80), 1.3 + 0.12 * k, np.float32)
-        if bumper:
-            depth_m[48:, 20:60] = 0.4
-        frame = RgbdFrame(k, np.zeros((60, 80), np.uint8), depth_m, CAMERA)
-        entries.append(MemoryEntry(k, frame))
-    box = vehicle_box(log_in_memory(entries))
-    if not bumper:
-        assert box is None
-        return
-    lower, upper = np.array(box).reshape(2, 3)
+def test_a_bumper_below_a_camera_is_found_and_what_takes_up_most_of_the_view_is_scanned():
+    lower, upper = np.array(box_before_a_camera(np.s_[48:, 20:60])).reshape(2, 3)
     assert (lower <= (-0.11, 0.11, 0.4)).all()
     assert (upper >= (0.11, 0.16, 0.4)).all()
     assert (upper - lower < 0.5).all()
+    assert box_before_a_camera(np.s_[:, 30:50]) is not None
+    for no_vehicle in (np.s_[:, 10:70], np.s_[:0]):
+        assert box_before_a_camera(no_vehicle) is None

@@ -22,6 +22,7 @@ from tests.support.recordings import CAMERA, COLOR, DEPTH, camera_info, image, s
 from tests.support.tum_logs import FIRST_NS, PERIOD_NS, picture
 
 RVL = "16UC1; compressedDepth rvl"
+INFO = "/cam/color/camera_info"
 T_BASE_LIDAR = exp(np.array([0.0, 0.0, 1.5]), np.array([0.2, 0.0, 1.1]))
 
 
@@ -163,21 +164,45 @@ def test_a_choice_that_cannot_be_is_refused(tmp_path, topics, why):
         opened(tmp_path / "a.mcap", shots(2), topics=TopicsConfig(**topics))
 
 
+NO_DEPTH = "nothing to map: colour images /cam/color/image_raw, but neither depth images"
+
+
+def only(topic):
+    return [message for message in shots(3) if message.topic == topic]
+
+
 @pytest.mark.parametrize(
-    ("kept", "why"),
+    ("messages", "why"),
     [
-        (COLOR, "nothing to map: colour images /cam/color/image_raw, but neither depth images"),
-        (DEPTH, "nothing to map: depth images /cam/aligned_depth/image_raw, but neither colour images"),
+        (only(COLOR), NO_DEPTH),
+        (only(DEPTH), "nothing to map: depth images /cam/aligned_depth/image_raw, but neither colour images"),
+        (only(INFO), r"neither images with depth nor several point clouds, only /cam/color/c"),
+        ([], "no message of it can be read"),
         (
-            "/cam/color/camera_info",
-            r"neither images with depth nor several point clouds, only /cam/color/c",
+            [message for message in shots(2) if message.topic != INFO],
+            r"no camera info for /cam/color/image_raw; .*source.camera.fx_px",
         ),
-        ("", "no message of it can be read"),
+        (
+            [
+                *only(COLOR),
+                *(
+                    compressed_image_message(
+                        t, f"{DEPTH}/compressedDepth", bytes(40), format_=RVL, frame="optical"
+                    )
+                    for t in stamps(3)
+                ),
+            ],
+            r"neither depth .*/cam/aligned_depth/image_raw/compressedDepth: .* RVL is not",
+        ),
+        (
+            [m._replace(cdr=m.cdr[:40]) if m.topic == COLOR else m for m in shots(3)],
+            "first messages can be read: /cam/color/image_raw: a damaged m",
+        ),
     ],
 )
-def test_what_is_missing_is_named(tmp_path, kept, why):
+def test_what_is_missing_is_named(tmp_path, messages, why):
     with pytest.raises(SourceError, match=why):
-        opened(tmp_path / "a.mcap", [message for message in shots(3) if message.topic == kept])
+        opened(tmp_path / "a.mcap", messages)
 
 
 def test_depth_that_is_not_registered_is_refused(tmp_path):
@@ -242,26 +267,17 @@ def test_depth_of_one_camera_is_not_paired_with_colour_of_another(tmp_path):
     assert source.choices[0].startswith("colour /b/color/image_raw, depth /b/depth/image_raw;")
 
 
-def test_a_camera_that_nothing_tells_is_an_error_with_a_remedy(tmp_path):
-    messages = [message for message in shots(2) if "info" not in message.topic]
-    with pytest.raises(SourceError, match=r"no camera info for /cam/color/image_raw; .*source.camera.fx_px"):
-        opened(tmp_path / "a.mcap", messages)
-
-
-def test_depth_units_can_be_set(tmp_path):
-    camera = CameraConfig(fx_px=60, fy_px=60, cx_px=32, cy_px=24, depth_factor=5000)
-    frame = next(opened(tmp_path / "a.mcap", shots(1), camera=camera).entries()).load()
-    np.testing.assert_array_equal(frame.depth_m, picture(0)[1].astype(np.float32) / np.float32(5000))
-
-
 @pytest.mark.parametrize("factor", [None, 1.0, 1000.0])
-def test_units_of_depth_of_32_bits_can_be_set(tmp_path, factor):
+def test_units_of_depth_can_be_set(tmp_path, factor):
+    camera = {"fx_px": 60, "fy_px": 60, "cx_px": 32, "cy_px": 24}
+    of_16_bits = opened(tmp_path / "b.mcap", shots(1), camera=CameraConfig(**camera, depth_factor=5000))
+    np.testing.assert_array_equal(of_16_bits[0].depth_m, picture(0)[1].astype(np.float32) / np.float32(5000))
+
     depth_m = np.linspace(0.5, 4.0, 48 * 64, dtype=np.float32).reshape(48, 64)
     stored = depth_m * np.float32(factor or 1.0)
     messages = [image(FIRST_NS, DEPTH, stored, "32FC1") if m.topic == DEPTH else m for m in shots(1)]
-    camera = CameraConfig(fx_px=60, fy_px=60, cx_px=32, cy_px=24, depth_factor=factor)
-    entry = next(opened(tmp_path / "a.mcap", messages, camera=camera).entries())
-
+    log = opened(tmp_path / "a.mcap", messages, camera=CameraConfig(**camera, depth_factor=factor))
+    entry = next(log.entries())
     np.testing.assert_allclose(entry.load().depth_m, depth_m, rtol=1e-6)
     assert entry.files.recorded_units_per_m == (factor or 1.0)
     written_m = decode_depth_units(entry.files.depth.read_bytes(), "png") / entry.files.depth_units_per_m
@@ -368,22 +384,6 @@ def test_points_of_a_camera_are_told_to_look_forward(tmp_path):
     assert notes[-1].startswith("points are in depth_optical, whose z looks forward")
 
 
-def test_depth_in_a_coding_that_is_not_read_is_named_with_the_reason(tmp_path):
-    colour = [message for message in shots(3) if message.topic != DEPTH]
-    depth = [
-        compressed_image_message(t, "/cam/depth/compressedDepth", bytes(40), format_=RVL, frame="optical")
-        for t in stamps(3)
-    ]
-    with pytest.raises(SourceError, match=r"neither depth .*/cam/depth/compressedDepth: .* RVL is not"):
-        opened(tmp_path / "a.mcap", [*colour, *depth])
-
-
-def test_a_topic_whose_images_are_all_damaged_is_named(tmp_path):
-    messages = [m._replace(cdr=m.cdr[:40]) if m.topic == COLOR else m for m in shots(3)]
-    with pytest.raises(SourceError, match="first messages can be read: /cam/color/image_raw: a damaged m"):
-        opened(tmp_path / "a.mcap", messages)
-
-
 def test_a_damaged_first_image_file_does_not_hide_the_log(tiny_tum_log, tmp_path):
     source = open_source(tiny_tum_log(4, ending=".jpg"))
     file = next(source.entries()).files.colour
@@ -395,18 +395,12 @@ def test_a_damaged_first_image_file_does_not_hide_the_log(tiny_tum_log, tmp_path
     assert again[1].load().image.shape == (48, 64, 3)
 
 
-@pytest.mark.parametrize("name", ["log.mcap", "log.bag"])
-def test_another_body_is_refused_where_the_camera_is_the_body(tmp_path, name):
-    log = write(tmp_path / name, shots(3))
-    with pytest.raises(SourceError, match=r"body_frame=base_link: .* is the camera"):
-        open_source(log, SourceConfig(body_frame="base_link"))
-
-
-def test_another_body_is_refused_where_there_is_no_tf(tiny_tum_log, tmp_path):
-    scans = tmp_path / "scans"
-    scans.mkdir()
+def test_another_body_is_refused_where_the_camera_is_the_body_or_there_is_no_tf(tiny_tum_log, tmp_path):
+    logs = [write(tmp_path / name, shots(3)) for name in ("log.mcap", "log.bag")]
     for i in range(2):
-        np.save(scans / f"{i}.npy", np.random.default_rng(i).normal(0.0, 9.0, (20, 3)))
-    for log in (tiny_tum_log(2), scans):
-        with pytest.raises(SourceError, match=r"body_frame=base_link: only a recording's tf"):
+        (tmp_path / "scans").mkdir(exist_ok=True)
+        np.save(tmp_path / f"scans/{i}.npy", np.random.default_rng(i).normal(0.0, 9.0, (20, 3)))
+    why = r"body_frame=base_link: (.* is the camera|only a recording's tf)"
+    for log in (*logs, tiny_tum_log(2), tmp_path / "scans"):
+        with pytest.raises(SourceError, match=why):
             open_source(log, SourceConfig(body_frame="base_link"))
