@@ -142,7 +142,10 @@ def _draw_view(axes: "Axes", view: _View, colors: NDArray[np.uint8]) -> None:
     cloud, path, low, high = view.cloud, view.path, view.low, view.high
     pixel_m = float((high - low).max()) / IMAGE_PX
     image = splat(cloud, colors, low=low, pixel_m=pixel_m, shape=np.ceil((high - low)[::-1] / pixel_m))
-    axes.imshow(image, origin="lower", interpolation="antialiased", extent=(low[0], high[0], low[1], high[1]))
+    box = axes.get_window_extent()
+    scale = min(1.0, box.width / image.shape[1], box.height / image.shape[0])
+    image = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)  # matplotlib's is slow
+    axes.imshow(image, origin="lower", interpolation="nearest", extent=(low[0], high[0], low[1], high[1]))
     axes.plot(*path[:, :2].T, color="white", linewidth=2.4, alpha=0.75)
     axes.plot(*path[:, :2].T, color=hex_of(ESTIMATE), linewidth=1.3, label="path")
     mark_ends(axes, path)

@@ -10,8 +10,9 @@ from mapper.core.frames import Scan
 from mapper.core.geometry import Array
 from mapper.sources.base import FrameRef, Log
 
-_LOOKED_AT, _LOOKED_AT_AT_FIRST = 6, 3
-"""Scans, spread over the log; where the middle of what the first of them show stays, no others are read."""
+_LOOKED_AT_AT_FIRST, _LOOKED_AT = 3, 6
+"""Scans, spread over the log; six are read where three show that the middle of what is seen moves, and points
+behind others."""
 _DIRECTION_RAD = np.radians(1.0)
 _BEHIND_RATIO, _BEHIND_M = 1.3, 0.3
 """A point is behind another in its direction if it is farther by this ratio; neighbours on a wall are not."""
@@ -35,14 +36,14 @@ def scan_frame_warnings(log: Log) -> list[str]:
     """
     if log.sensor != "lidar":
         return []
-    for most in (_LOOKED_AT_AT_FIRST, _LOOKED_AT):
+    for most, share_of in ((_LOOKED_AT_AT_FIRST, max), (_LOOKED_AT, np.median)):
         scans = list(_readable(log.spread_entries(most)))
         ways_m = [float(np.linalg.norm(_middle_way(one, other))) for one, other in pairwise(scans)]
         if not any(way_m > _MOVED_M for way_m in ways_m):
             return []
-    behind = [_share_behind(scan, scan.origin_body) for scan in scans]
-    if np.median(behind) <= _MOST_BEHIND and not _is_seen_from_the_middle(scans, behind):
-        return []
+        behind = [_share_behind(scan, scan.origin_body) for scan in scans]
+        if share_of(behind) <= _MOST_BEHIND and not _is_seen_from_the_middle(scans, behind):
+            return []
     moved = [k for k, way_m in enumerate(ways_m) if way_m > _MOVED_M]
     stayed = [k for k in moved if _surfaces_way_m(scans[k], scans[k + 1]) < _STAYED_SHARE * ways_m[k]]
     if len(stayed) < 2 or 2 * len(stayed) < len(moved):
