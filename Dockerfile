@@ -5,7 +5,7 @@
 FROM python:3.12-slim-bookworm AS wheel
 WORKDIR /source
 COPY . .
-RUN python -m pip wheel --no-cache-dir --no-deps --wheel-dir /wheel .
+RUN MAPPER_KERNELS=0 python -m pip wheel --no-cache-dir --no-deps --wheel-dir /wheel .
 
 FROM python:3.12-slim-bookworm
 ARG EXTRAS=""

@@ -154,7 +154,7 @@ if [ "$(cat "$stamp" 2>/dev/null)" != "$want" ]; then
   fi
   rm -f "$venv/.libraries" # tells scripts/test.sh that all are there, while the kernels are compiled
   say "installing the project"
-  install --editable .
+  MAPPER_KERNELS=0 install --editable . # compiled below, beside the sources
   compile_kernels &
   say "installing its extras [$extra]"
   install "octree-mapper[$extra]"

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mapper.core.frames import Points32, Scan
 from mapper.core.geometry import Array, Transform, exp, inverse, log, rotation_log
-from mapper.core.linear import rotation_of
+from mapper.core.linear import rodrigues, rotation_of
 from mapper.core.timebase import NS_PER_S
 from mapper.core.trajectory import Trajectory
 
@@ -159,12 +159,23 @@ def _rotation_at(times_s, R, rates_radps, time_s):  # type: ignore[no-untyped-de
 
 @njit(cache=True, nogil=True)
 def _moved_by_samples(points, point_times_s, times_s, R, rates_radps, translation_mps):  # type: ignore[no-untyped-def]
-    """Return R(τ)·p + τ·v of every point."""
+    """Return R(τ)·p + τ·v of every point, R(τ) = R[k] · exp((τ − t_k)·ω_k) from the sample k before τ on."""
     moved = np.empty_like(points)
+    k, last = 0, len(rates_radps) - 1
     for index in range(len(points)):
         t = float(point_times_s[index])
-        R_t = _rotation_at(times_s, R, rates_radps, t)
+        while k < last and times_s[k + 1] <= t:  # points lie in the order of time, or in that of rings
+            k += 1
+        while k > 0 and times_s[k] > t:
+            k -= 1
+        since_s = t - times_s[k]
+        wx, wy, wz = since_s * rates_radps[k, 0], since_s * rates_radps[k, 1], since_s * rates_radps[k, 2]
+        a, b = rodrigues(wx * wx + wy * wy + wz * wz)
         x, y, z = points[index]
-        for a in range(3):
-            moved[index, a] = R_t[a, 0] * x + R_t[a, 1] * y + R_t[a, 2] * z + t * translation_mps[a]
+        px, py, pz = wy * z - wz * y, wz * x - wx * z, wx * y - wy * x
+        x += a * px + b * (wy * pz - wz * py)
+        y += a * py + b * (wz * px - wx * pz)
+        z += a * pz + b * (wx * py - wy * px)
+        for i in range(3):
+            moved[index, i] = R[k, i, 0] * x + R[k, i, 1] * y + R[k, i, 2] * z + t * translation_mps[i]
     return moved

@@ -101,15 +101,19 @@ def twist_exp(delta, T):
 
 
 @njit(cache=True, nogil=True)
+def rodrigues(squared):
+    """Return the factors sin(θ) / θ and (1 − cos(θ)) / θ² of Rodrigues' formula for θ²."""
+    if squared < 1e-16:
+        return 1.0, 0.5
+    angle = np.sqrt(squared)
+    return np.sin(angle) / angle, (1.0 - np.cos(angle)) / squared
+
+
+@njit(cache=True, nogil=True)
 def rotation_of(vector):
     """Return the (3, 3) rotation of a (3,) rotation vector (Rodrigues' formula), for compiled code."""
     x, y, z = vector
-    squared = x * x + y * y + z * z
-    if squared < 1e-16:
-        a, b = 1.0, 0.5
-    else:
-        angle = np.sqrt(squared)
-        a, b = np.sin(angle) / angle, (1.0 - np.cos(angle)) / squared
+    a, b = rodrigues(x * x + y * y + z * z)
     R = np.empty((3, 3))
     R[0, 0], R[0, 1], R[0, 2] = 1.0 - b * (y * y + z * z), b * x * y - a * z, b * x * z + a * y
     R[1, 0], R[1, 1], R[1, 2] = b * x * y + a * z, 1.0 - b * (x * x + z * z), b * y * z - a * x
