@@ -13,6 +13,7 @@ from mapper.navigation.reachable_floor import driven_ground, reachable_floor
 from mapper.navigation.traversable_grid import traversable
 from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN
 from tests.support.floor_scenes import two_storeys
+from tests.support.grids import state_at
 from tests.support.octree_maps import as_dict, mapped
 
 PATH = np.array([[-0.4, 0.1, 0.0], [0.0, 0.2, 0.1], [0.5, 0.9, 0.3]])
@@ -121,23 +122,18 @@ def edited(house, **regions):
     return found.storeys, done
 
 
-def code_at(storey, x_m, y_m):
-    column, row = np.floor((np.array([x_m, y_m]) - storey.grid.origin_world_m) / storey.grid.resolution_m)
-    return storey.grid.cells[int(row), int(column)]
-
-
 def test_a_keepout_is_blocked_on_the_storeys_whose_room_it_reaches(house):
     square = ((2.0, 4.0), (4.0, 4.0), (4.0, 6.0), (2.0, 6.0))
     before = house[2].storeys
-    assert [code_at(storey, 3.0, 5.0) for storey in before] == [FREE, FREE]
+    assert [state_at(storey.grid, 3.0, 5.0) for storey in before] == [FREE, FREE]
 
     (hall, upper), (done,) = edited(house, keepout=(Region(polygon_m=square, height_m=(0.0, 1.0)),))
-    assert [code_at(storey, 3.0, 5.0) for storey in (hall, upper)] == [OCCUPIED, FREE]
-    assert code_at(hall, 1.95, 5.0) == FREE
+    assert [state_at(storey.grid, 3.0, 5.0) for storey in (hall, upper)] == [OCCUPIED, FREE]
+    assert state_at(hall.grid, 1.95, 5.0) == FREE
     assert done.count == np.count_nonzero(hall.grid.cells != before[0].grid.cells) == 400
 
     both, _ = edited(house, keepout=(Region(polygon_m=square),))
-    assert [code_at(storey, 3.0, 5.0) for storey in both] == [OCCUPIED, OCCUPIED]
+    assert [state_at(storey.grid, 3.0, 5.0) for storey in both] == [OCCUPIED, OCCUPIED]
 
 
 def test_a_crop_leaves_the_floor_whose_room_it_reaches(house):

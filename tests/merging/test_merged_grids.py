@@ -22,6 +22,7 @@ from mapper.octree.occupied_columns import occupied_columns
 from mapper.octree.slice import cut_slice
 from tests.support.command_line import mapper
 from tests.support.floor_scenes import two_storeys
+from tests.support.grids import state_at
 from tests.support.merged_runs import BAND, ROBOT, make_run, merged_map_of
 from tests.support.octree_maps import COLORED, CONFIG, as_dict, mapped, total
 
@@ -162,8 +163,7 @@ def test_keepout_regions_of_a_run_that_is_turned_hold_on_their_storeys(tmp_path)
     def cells(folder, stem, x, y):
         grid = read_grid(folder.path / f"{stem}.yaml")
         (point,) = apply(T_map_world, np.array([[x, y, 0.0]]))
-        column, row = np.floor((point[:2] - grid.origin_world_m) / grid.resolution_m).astype(int)
-        return grid.cells[row, column]
+        return state_at(grid, *point[:2])
 
     assert cells(found, "traversable_0", 5.0, 5.0) == cells(found, "traversable_1", 5.0, 3.0) == OCCUPIED
     assert cells(found, "traversable_0", 5.0, 3.0) == cells(found, "traversable_1", 7.0, 5.0) == FREE

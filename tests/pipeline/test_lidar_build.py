@@ -17,6 +17,7 @@ from mapper.run.folder import open_run
 from mapper.simulation.config import STREET, LidarSensorConfig
 from mapper.simulation.lidar import write_lidar_log
 from mapper.sources import open_source
+from tests.support.grids import state_at
 from tests.support.paths import DATA
 
 REPEATABLE = ("mcap.frame_times=false",)
@@ -59,9 +60,8 @@ def test_the_floor_is_under_the_vehicle(run):
 
 def test_the_street_is_free_where_the_vehicle_drove(run):
     grid = read_grid(run.path / "slice.yaml")
-    for position in run.trajectory.positions_world[5:-1]:
-        column, row = np.floor((position[:2] - grid.origin_world_m) / grid.resolution_m).astype(int)
-        assert grid.cells[row, column] == FREE
+    for x_m, y_m, _ in run.trajectory.positions_world[5:-1]:
+        assert state_at(grid, x_m, y_m) == FREE
 
 
 def test_the_log_shows_scans_in_the_body_frame(run):
