@@ -25,7 +25,7 @@ QUICKER = {
     "sweep": ["--processes", "1"],
     "synth": ["--seconds", "4"],
 }
-"""What is added to a command that takes minutes, or would import all in other processes; its rows are the same."""
+"""What is added to a command that takes minutes, or imports all in other processes; its rows are the same."""
 
 
 @pytest.fixture(scope="module")

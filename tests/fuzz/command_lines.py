@@ -14,9 +14,8 @@ import typer
 from hypothesis import strategies as st
 
 from mapper.cli.main import app
-from tests.fuzz.corpus import Corpus
 from tests.fuzz.damage import KINDS, damage
-from tests.fuzz.runner import SECOND_LIMIT_S, Child, Reading
+from tests.fuzz.runner import SECOND_LIMIT_S, Reading, Runner
 
 LINE = "line"
 """Word of ``tests.fuzz.child`` before the folder that a command line is run in, and before the line."""
@@ -176,11 +175,10 @@ def _kind_of(parameter: Any) -> Any:
 class Sandbox:
     """Folder in which command lines are run: ``work`` with what they may name, and ``outside`` beside it."""
 
-    def __init__(self, scratch: Path, child: Child) -> None:
-        self._folder, self._model, self._child = scratch / "box", scratch / "model", child
-        corpus = Corpus(scratch / "corpus")
+    def __init__(self, scratch: Path, runner: Runner) -> None:
+        self._folder, self._model, self._child = scratch / "box", scratch / "model", runner
         work = self._model / "work"
-        corpus.copy("run", work)  # with the log that it is built of
+        runner.corpus.copy("run", work)  # with the log that it is built of
         (work / "notes.txt").write_text("nothing of ours\n")
         (work / "empty").mkdir()
         rng = np.random.default_rng(0)

@@ -3,7 +3,6 @@
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from mapper.core.frames import PinholeCamera
@@ -12,7 +11,7 @@ from mapper.sources.calibration_file import calibration_text
 from tests.support.azure_kinect import Capture, write_azure_kinect
 from tests.support.hololens import write_hololens
 from tests.support.recordings import CAMERA
-from tests.support.tum_logs import FIRST_NS, picture
+from tests.support.tum_logs import FIRST_NS, picture, write_picture
 
 FRAMES = 4
 CALIBRATION_YAML = """%YAML:1.0
@@ -41,10 +40,7 @@ def _numbered(colour: str, depth: str) -> Callable[[Path], Path]:
         log = folder / "log"
         poses = []
         for i in range(FRAMES):
-            rgb, units = picture(i)
-            for kind, ending, pixels in (("rgb", colour, rgb[:, :, ::-1]), ("depth", depth, units)):
-                (log / kind).mkdir(parents=True, exist_ok=True)
-                assert cv2.imwrite(str(log / kind / f"{i:06}{ending}"), pixels)
+            write_picture(log / f"rgb/{i:06}{colour}", log / f"depth/{i:06}{depth}", i)
             matrix = "\n".join(" ".join(f"{value:.6f}" for value in row) for row in pose(i))
             poses.append(f"{i} {i} {i + 1}\n{matrix}\n")
         (log / "trajectory.log").write_text("".join(poses))
@@ -56,11 +52,8 @@ def _numbered(colour: str, depth: str) -> Callable[[Path], Path]:
 
 def _seven_scenes(folder: Path) -> Path:
     log = folder / "log"
-    log.mkdir()
     for i in range(FRAMES):
-        rgb, units = picture(i)
-        assert cv2.imwrite(str(log / f"frame-{i:06}.color.png"), rgb)
-        assert cv2.imwrite(str(log / f"frame-{i:06}.depth.png"), units)
+        write_picture(log / f"frame-{i:06}.color.png", log / f"frame-{i:06}.depth.png", i)
         np.savetxt(log / f"frame-{i:06}.pose.txt", pose(i), fmt="%.7e", delimiter="\t")
     (log / "calibration.toml").write_text(calibration_text(CAMERA, depth_units_per_m=1000.0))
     return log
