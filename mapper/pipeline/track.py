@@ -28,8 +28,8 @@ from mapper.run.observers import NULL_OBSERVER, Observer, Step
 from mapper.runtime.ordered_map import ordered_map
 from mapper.runtime.progress import Progress
 from mapper.sources.base import FrameRef, Log, Skipped
+from mapper.sources.depth_outlines import outline_warnings
 from mapper.sources.depth_scale import depth_warnings, read_spread, why_no_depth
-from mapper.sources.depth_shift import shift_warnings
 from mapper.sources.image_order import time_warnings
 from mapper.sources.reading_checks import ReadingChecks
 from mapper.sources.scan_frame import scan_frame_warnings
@@ -319,7 +319,7 @@ def noted_log_warnings(source: Log, progress: Progress) -> list[RunWarning]:
         *(RunWarning(kind="stamps", sentence=text, weight="doubt") for text in time_warnings(source)),
         *(
             RunWarning(kind="depth", sentence=text, weight="doubt")
-            for text in [*depth_warnings(source, frames), *shift_warnings(frames.values())]
+            for text in [*depth_warnings(source, frames), *outline_warnings(frames.values())]
         ),
         *(RunWarning(kind="frame", sentence=text, weight="doubt") for text in scan_frame_warnings(source)),
     ]

@@ -14,8 +14,8 @@ from mapper.runtime.ordered_map import ordered_map
 from mapper.sources import RECORDING, format_of, open_source
 from mapper.sources.base import Log
 from mapper.sources.config import SourceConfig
+from mapper.sources.depth_outlines import outline_warnings
 from mapper.sources.depth_scale import depth_warnings, read_spread, why_no_depth
-from mapper.sources.depth_shift import shift_warnings
 from mapper.sources.image_order import time_warnings
 from mapper.sources.reading_checks import ReadingChecks
 from mapper.sources.ros import files as recordings
@@ -199,7 +199,7 @@ def _inspected(
         warnings=[
             *time_warnings(source),
             *depth_warnings(source, frames),
-            *shift_warnings(frames.values()),
+            *outline_warnings(frames.values()),
             *scan_frame_warnings(source),
         ],
         vehicle=vehicle_box(source),
