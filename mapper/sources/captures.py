@@ -19,6 +19,8 @@ _VLANS = (0x8100, 0x88A8)
 _UDP, _FRAGMENT = 17, 44
 _TRIED = 2000
 """Captured packets by which it is told whose they are: as many as come in a third of a second."""
+_MOST_BYTES = 1 << 18
+"""Most of a packet that tcpdump and Wireshark capture."""
 _MOST_PARTIAL = 64
 """Datagrams that are put together at a time: of older ones a fragment was lost."""
 
@@ -75,7 +77,7 @@ def captured(path: Path, offset: int | None = None) -> Iterator[tuple[int, Datag
                     received_s, data = next(packets)
                 except Exception:  # it ends, is cut off, or damaged from here on
                     return
-                if not data:  # zeros: a file system's hole may have terabytes of them
+                if not 0 < len(data) <= _MOST_BYTES:  # damaged; a file system's hole may have terabytes of 0
                     return
                 number += 1
                 fragment = _fragment(data, link)

@@ -1,6 +1,7 @@
 """Captures of a Velodyne's packets become scans, a turn each."""
 
 import os
+import struct
 import sys
 
 import numpy as np
@@ -44,6 +45,11 @@ def test_turns_that_are_cut_and_a_damaged_end_are_left_out(tmp_path, simulator):
     path.write_bytes(data)
     os.truncate(path, 1 << 40)  # a hole behind it
     assert len(open_source(path)) == 3
+    (size,) = struct.unpack_from("<I", data, 24 + 8)
+    at = 24 + round(2.5 * TURN) * (16 + size)
+    path.write_bytes(data[: at + 8] + struct.pack("<I", 1 << 19) + data[at + 12 :])
+    os.truncate(path, 1 << 40)  # in which a packet begins that none captures
+    assert len(open_source(path)) == 2
 
 
 @pytest.mark.parametrize("data", [b"", b"x" * 100, bytes(24)])
