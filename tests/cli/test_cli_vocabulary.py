@@ -62,11 +62,8 @@ def test_a_mistake_is_one_line_and_leaves_no_file(desk_log, tmp_path, extra, mes
     assert message in result.stderr
     assert result.stderr.count("\n") == 1
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_missing_log_is_said_before_any_work(desk_log, tmp_path):
-    result = mapper("vocabulary", "train", desk_log, tmp_path / "none", "--out", tmp_path / "v", status=1)
-    assert result.stderr == f"mapper: {tmp_path / 'none'}: no such file or folder\n"
+    refused = mapper("vocabulary", "train", desk_log, tmp_path / "none", "--out", tmp_path / "v", status=1)
+    assert refused.stderr == f"mapper: {tmp_path / 'none'}: no such file or folder\n"  # before any work
 
 
 def test_frames_that_cannot_be_read_are_noted_and_left_out(tiny_tum_log, tmp_path):

@@ -67,12 +67,9 @@ def test_the_last_word_is_completed(words, values):
         assert "build" in completed(*words)
 
 
-def test_settings_are_those_of_the_models_each_with_its_meaning():
+def test_settings_have_their_meaning_and_folders_that_cannot_be_read_complete_nothing(tmp_path):
     found = dict(candidates(COMMAND, ["build", "log", "--set", "octree."]))
     assert found["octree.resolution_m="].startswith("Edge of a voxel")
-
-
-def test_folders_that_cannot_be_read_complete_nothing(tmp_path):
     assert run_folders("gone/") == []
     assert run_folders(f"{tmp_path}/runs/x") == [(f"{tmp_path}/runs/xyz", "")]
 
@@ -116,21 +113,17 @@ def test_bash_gets_only_what_it_replaces():
 
 
 @pytest.mark.parametrize("shell", SCRIPTS)
-def test_a_shell_is_made_to_read_its_script_once(home, shell):
+def test_a_shell_is_made_to_read_its_script_once_and_what_it_started_with_stays(home, shell):
+    start, before = home / f".{shell}rc", "alias ll='ls -l'"
+    if shell != "fish":
+        start.write_text(before)
     for _ in range(2):
         path = mapper("--install-completion", "--shell", shell).stdout.partition(":")[0]
     assert mapper("--show-completion", "--shell", shell).stdout == SCRIPTS[shell]
     assert Path(path).read_text() == SCRIPTS[shell]
-    start = home / f".{shell}rc"
     assert start.exists() is (shell != "fish")
     if start.exists():
-        assert start.read_text() == f"source {path}\n"
-
-
-def test_what_a_shell_started_with_stays(home):
-    (home / ".bashrc").write_text("alias ll='ls -l'")
-    mapper("--install-completion", "--shell", "bash")
-    assert (home / ".bashrc").read_text().splitlines()[0] == "alias ll='ls -l'"
+        assert start.read_text().split("\n")[:2] == [before, f"source {path}"]
 
 
 def test_an_unknown_shell_is_told(monkeypatch):

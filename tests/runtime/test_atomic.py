@@ -32,37 +32,27 @@ def test_a_file_appears_whole_with_its_folders(tmp_path):
     assert [p.name for p in path.parent.iterdir()] == ["c.txt"]
 
 
-def test_a_failure_leaves_the_old_file_and_nothing_else(tmp_path):
-    path = tmp_path / "map.bt"
-    path.write_text("old")
-
+def test_the_old_file_stays_until_the_new_one_is_whole(tmp_path):
     def write_half(part):
         part.write_text("ha")
         raise KeyboardInterrupt
 
-    with pytest.raises(KeyboardInterrupt), atomic_file(path) as part:
-        write_half(part)
-    assert path.read_text() == "old"
-    assert list(tmp_path.iterdir()) == [path]
-
-
-def test_the_old_file_stays_readable_until_the_new_one_is_whole(tmp_path):
-    path = tmp_path / "map.png"
+    path, names = tmp_path / "map.png", set()
     path.write_text("old")
-    with atomic_file(path) as part:
-        assert part.suffix == ".png", "writers choose the format by the ending"
-        part.write_text("new")
-        assert path.read_text() == "old"
-    assert path.read_text() == "new"
-
-
-def test_temporary_names_differ_and_are_made_anew(tmp_path):
-    names = set()
-    for _ in range(3):
-        with atomic_file(tmp_path / "map.bt") as part:
-            assert part.stat().st_size == 0
+    for new in ("a", "b"):
+        old = path.read_text()
+        with pytest.raises(KeyboardInterrupt), atomic_file(path) as part:
+            write_half(part)
+        assert list(tmp_path.iterdir()) == [path]
+        with atomic_file(path) as part:
             names.add(part.name)
-    assert len(names) == 3
+            assert (part.suffix, part.stat().st_size) == (".png", 0), (
+                "writers choose the format by the ending"
+            )
+            part.write_text(new)
+            assert path.read_text() == old
+        assert path.read_text() == new
+    assert len(names) == 2
 
 
 def test_a_full_disk_is_told_with_the_final_name(tmp_path):

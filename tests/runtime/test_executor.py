@@ -45,22 +45,17 @@ def test_what_raises_is_tried_again_and_the_others_go_on(anywhere, diary):
 
 
 def test_what_ends_its_worker_is_the_only_one_lost(diary):
-    jobs = [Work(diary, "1", "exit"), Work(diary, "2", "kill"), *(Work(diary, str(n)) for n in (3, 4, 5))]
+    jobs = [Work(diary, "1", "exit"), Work(diary, "2", "kill"), Work(diary, "flaky", "exit_once")]
+    jobs += [Work(diary, str(n)) for n in (4, 5)]
     outcomes = outcomes_of(jobs, Workers(2))
     assert outcomes == {
         0: Failure("its worker ended with exit status 3", 2),
         1: Failure("its worker was killed by SIGKILL", 2),
-        2: 9,
+        2: 7,
         3: 16,
         4: 25,
     }
-    assert told(diary) == {"1": 2, "2": 2, "3": 1, "4": 1, "5": 1}
-
-
-def test_what_ended_its_worker_once_gets_another(diary):
-    jobs = [Work(diary, "flaky", "exit_once"), Work(diary, "2")]
-    assert outcomes_of(jobs, Workers(2)) == {0: 7, 1: 4}
-    assert told(diary) == {"flaky": 2, "2": 1}
+    assert told(diary) == {"1": 2, "2": 2, "flaky": 2, "4": 1, "5": 1}
 
 
 def test_what_ends_a_cluster_s_worker_is_the_only_one_lost(diary, dask_scheduler):

@@ -33,14 +33,11 @@ def test_no_extra_is_needed_twice():
         assert not core & {line.partition(">")[0] for line in lines}, name
 
 
-def test_a_library_that_is_there_is_loaded():
+def test_a_library_that_is_there_is_loaded_and_other_errors_of_an_import_stay():
+    require("json", "viewer", "a test")
     with extra("viewer", "a test"):
         import json
     assert json.loads("1") == 1
-    require("json", "viewer", "a test")
-
-
-def test_other_errors_of_an_import_stay():
     with pytest.raises(ImportError, match="libGL"), extra("viewer", "a test"):
         raise ImportError("libGL.so.1: cannot open shared object file")
 

@@ -56,21 +56,17 @@ def test_a_torn_tail_is_cut_off(tmp_path):
 
 
 @pytest.mark.parametrize("place", [0, 9, 24, 30])
-def test_a_flipped_byte_is_found(tmp_path, place):
+def test_a_flipped_byte_and_a_file_shorter_than_its_state_tells_are_found(tmp_path, place):
     journal, _ = written(tmp_path / "journal", b"first", b"second")
+    with pytest.raises(DataError, match="damaged"):
+        list(journal.records(journal.end + 30))
+    with pytest.raises(DataError, match="cannot be read: No such file"):
+        list(Journal(tmp_path / "none").records(5))
     data = bytearray(journal.path.read_bytes())
     data[place] ^= 1
     journal.path.write_bytes(data)
     with pytest.raises(DataError, match="journal: damaged at byte"):
         list(journal.records(journal.end))
-
-
-def test_a_journal_that_is_shorter_than_its_state_tells_is_damaged(tmp_path):
-    journal, _ = written(tmp_path / "journal", b"first")
-    with pytest.raises(DataError, match="damaged"):
-        list(journal.records(journal.end + 30))
-    with pytest.raises(DataError, match="cannot be read: No such file"):
-        list(Journal(tmp_path / "none").records(5))
 
 
 def save(data):

@@ -130,28 +130,20 @@ def test_several_sequences_are_named(tmp_path):
         open_source(tmp_path)
 
 
-def test_more_poses_than_scans_pair_by_the_scans_numbers(tmp_path):
-    folder = scans(tmp_path, numbers=[1, 3])
+def test_more_or_fewer_poses_than_scans_pair_by_the_scans_numbers_and_another_truth_can_be_named(tmp_path):
+    folder = scans(tmp_path / "more", numbers=[1, 3])
     poses(folder / "poses.txt")
+    poses(folder / "gps/poses.txt", T_WORLD_LIDAR[::-1])
     source = open_source(folder)
     np.testing.assert_allclose(source.truth.T_world_body, T_WORLD_LIDAR[[1, 3]], atol=1e-12)
     assert source.truth.stamps_ns.tolist() == stamps_of(source) == [100_000_000, 300_000_000]
-
-
-def test_fewer_poses_than_scans_are_the_truth_of_the_first(tmp_path):
-    folder = scans(tmp_path)
+    other = open_source(folder, SourceConfig(truth_file="gps/poses.txt")).truth
+    np.testing.assert_allclose(other.T_world_body, T_WORLD_LIDAR[::-1][[1, 3]], atol=1e-12)
+    folder = scans(tmp_path / "fewer")
     poses(folder / "poses.txt", T_WORLD_LIDAR[:3])
     source = open_source(folder)
     assert source.truth.stamps_ns.tolist() == stamps_of(source)[:3]
     assert "poses.txt: 3 poses for 3 of 5 scans" in source.notes
-
-
-def test_another_truth_can_be_named(tmp_path):
-    folder = scans(tmp_path)
-    poses(folder / "poses.txt")
-    poses(folder / "gps/poses.txt", T_WORLD_LIDAR[::-1])
-    truth = open_source(folder, SourceConfig(truth_file="gps/poses.txt")).truth
-    np.testing.assert_allclose(truth.T_world_body, T_WORLD_LIDAR[::-1], atol=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -123,25 +123,20 @@ def test_of_several_folders_the_shortest_name_is_read_and_the_others_are_named(t
     assert "rgb/ is read, not rgb_mask/" in source.notes
 
 
-def test_a_log_of_less_than_half_of_its_images_is_noted(tmp_path):
-    folder = redwood(tmp_path, ["1", "2", "3", "4", "5"])
+@pytest.mark.parametrize(("colour", "images", "pairs"), [("rgb", 5, 2), ("color_raw", 9, 1)])
+def test_a_log_of_less_than_half_of_its_images_is_noted(tmp_path, colour, images, pairs):
+    """Its own pairs, or one that lies beside the folders."""
+    folder = redwood(tmp_path, [f"{i}" for i in range(images)], colour=colour)
     assert not any("less than half" in note for note in open_source(folder).notes)
-    for number in (3, 4, 5):
-        (folder / f"depth/{number}.png").rename(folder / f"depth/at_{number}.25.png")
-    notes = open_source(folder).notes
-    assert "3 depth images have no partner of the same number; left out" in notes
-    want = "only 2 pairs are read of 5 images, less than half; names of colour and depth must have the same"
-    assert any(note.startswith(want) for note in notes)
-
-
-def test_pairs_beside_a_folder_of_more_images_are_noted(tmp_path):
-    folder = redwood(tmp_path, [f"{i}" for i in range(9)], colour="color_raw")
-    for path in (folder / "depth").iterdir():
-        path.rename(path.with_name(f"{path.stem}.5.png"))
-    write_picture(folder / "color_0.png", folder / "depth_0.png", 0)
+    lost = sorted((folder / "depth").iterdir())[0 if colour == "color_raw" else pairs :]
+    for path in lost:
+        path.rename(path.with_name(f"at_{path.stem}.25.png"))
+    if colour == "color_raw":
+        write_picture(folder / "color_0.png", folder / "depth_0.png", 0)
     source = open_source(folder)
-    assert len(source) == 1
-    assert any(note.startswith("only 1 pairs are read of 9 images, less than half") for note in source.notes)
+    want = f"only {pairs} pairs are read of {images} images, less than half; names of colour and depth must"
+    assert len(source) == pairs
+    assert any(note.startswith(want) for note in source.notes)
 
 
 def test_redwood_trajectory_counts_images_from_zero(tmp_path):
@@ -213,36 +208,35 @@ def test_a_tum_folder_that_lost_a_list_is_not_taken_for_numbered_images(tiny_tum
     assert source.entry_at(0).files.depth_units_per_m == 5000.0
 
 
-@pytest.mark.parametrize(("unit_m", "kind"), [(1.0, np.float32), (0.001, np.uint16)])
-def test_depth_in_tiffs_is_metres_in_floats_and_else_millimetres(tmp_path, unit_m, kind):
-    folder = redwood(tmp_path, ["000000", "000001"])
+def with_depth(folder, ending, depth):
+    """Return a log whose depth images are of one array."""
+    folder = redwood(folder, ["000000", "000001"])
+    for path in (folder / "depth").iterdir():
+        path.unlink()
+        other = path.with_suffix(ending)
+        np.save(other, depth) if ending == ".npy" else cv2.imwrite(str(other), depth)
+    return open_source(folder)
+
+
+@pytest.mark.parametrize(
+    ("ending", "kind", "unit_m", "wrong", "assumed"),
+    [
+        (".tiff", np.float32, 1.0, 400, 1),
+        (".npy", np.float32, 1.0, 400, 1),
+        (".tiff", np.uint16, 0.001, 2, 1000),
+    ],
+)
+def test_depth_is_metres_in_floats_and_else_millimetres_and_doubted_where_it_is_no_camera_s(
+    tmp_path, ending, kind, unit_m, wrong, assumed
+):
     expected_m = np.full((48, 64), 1.5)
-    for path in (folder / "depth").iterdir():
-        cv2.imwrite(str(path.with_suffix(".tiff")), (expected_m / unit_m).astype(kind))
-        path.unlink()
-    np.testing.assert_array_equal(open_source(folder)[0].depth_m, expected_m)
-
-
-def test_depth_of_floats_that_is_no_metres_is_refused_with_the_setting(tmp_path):
-    folder = redwood(tmp_path, ["000000", "000001"])
-    for path in (folder / "depth").iterdir():
-        np.save(path.with_suffix(".npy"), np.full((48, 64), 1e5, np.float32))
-        path.unlink()
-    with pytest.raises(FrameError, match="depth_factor=1000"):
-        open_source(folder)[0]
-
-
-@pytest.mark.parametrize(("ending", "kind", "assumed"), [(".npy", np.float32, 1), (".tiff", np.uint16, 1000)])
-def test_depth_of_no_camera_names_the_units_that_were_assumed(tmp_path, ending, kind, assumed):
-    folder = redwood(tmp_path, ["000000", "000001"])
-    for path in (folder / "depth").iterdir():
-        depth = np.full((48, 64), 400 if kind is np.float32 else 2, kind)
-        np.save(path.with_suffix(ending), depth) if ending == ".npy" else cv2.imwrite(
-            str(path.with_suffix(ending)), depth
-        )
-        path.unlink()
-    log = open_source(folder)
+    log = with_depth(tmp_path / "a", ending, (expected_m / unit_m).astype(kind))
+    np.testing.assert_array_equal(log[0].depth_m, expected_m)
+    log = with_depth(tmp_path / "b", ending, np.full((48, 64), wrong, kind))
     assert f"depth_factor={assumed} right" in why_no_depth(log, read_spread(log))
+    if kind is np.float32:
+        with pytest.raises(FrameError, match="depth_factor=1000"):
+            with_depth(tmp_path / "c", ending, np.full((48, 64), 1e5, kind))[0]
 
 
 def test_folders_whose_numbers_do_not_meet_are_named(tmp_path):
