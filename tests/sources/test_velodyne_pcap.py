@@ -13,6 +13,7 @@ from mapper.core.trajectory import Trajectory
 from mapper.evaluators.metrics.evaluate import evaluate
 from mapper.pipeline.build import build
 from mapper.sources import open_source
+from mapper.sources.captures import captured
 from tests.support.driver_recordings import FIRST_NS, TURN, street, write_datagrams, write_pcap
 
 
@@ -45,11 +46,16 @@ def test_turns_that_are_cut_and_a_damaged_end_are_left_out(tmp_path, simulator):
     path.write_bytes(data)
     os.truncate(path, 1 << 40)  # a hole behind it
     assert len(open_source(path)) == 3
-    (size,) = struct.unpack_from("<I", data, 24 + 8)
-    at = 24 + round(2.5 * TURN) * (16 + size)
-    path.write_bytes(data[: at + 8] + struct.pack("<I", 1 << 19) + data[at + 12 :])
-    os.truncate(path, 1 << 40)  # in which a packet begins that none captures
-    assert len(open_source(path)) == 2
+
+
+def test_a_packet_of_a_size_that_none_captures_ends_the_capture(tmp_path):
+    path = write_datagrams(tmp_path / "a.pcap", [bytes(100)] * 5, port=7502)
+    places = [place for place, _ in captured(path)]
+    data = bytearray(path.read_bytes())
+    struct.pack_into("<I", data, places[3] + 8, 1 << 19)
+    path.write_bytes(data)
+    os.truncate(path, 1 << 40)
+    assert [place for place, _ in captured(path)] == places[:3]
 
 
 @pytest.mark.parametrize("data", [b"", b"x" * 100, bytes(24)])
