@@ -19,6 +19,7 @@ from mapper.loops.factory import build_loop_detector, build_verifier
 from mapper.loops.verification_log import VerificationLog
 from mapper.odometry.base import FrameResult, GyroscopeUser, Odometry, SensorCheck
 from mapper.odometry.factory import build_odometry, odometry_for
+from mapper.odometry.gyroscope_calibration import with_body_rates
 from mapper.pipeline.disconnected_components import without_doubtful_ends
 from mapper.pipeline.tracking_checkpoints import FrameCheckpoint, TrackingCheckpoints
 from mapper.pipeline.tracking_result import BY_POSES, TrackingResult
@@ -282,7 +283,9 @@ def _in_hindsight(
     """Return the frames' results with all factors, and with what later frames and the readings add."""
     if tracks:
         tracks = [*tracks[:-1], replace(tracks[-1], factors=(*tracks[-1].factors, *odometry.finish()))]
-    tracks, doubts = with_doubtful_spikes(tracks), checks.doubts()
+    calibration = odometry.gyroscope_calibration() if isinstance(odometry, GyroscopeUser) else None
+    gyroscope = None if calibration is None else with_body_rates(checks.log, calibration).gyroscope
+    tracks, doubts = with_doubtful_spikes(tracks, gyroscope), checks.doubts()
     return [
         replace(track, doubts=track.doubts or tuple(doubts.get(track.stamp_ns, ())))
         if track.node is not None

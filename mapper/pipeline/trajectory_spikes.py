@@ -2,14 +2,15 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 
 from mapper.core.doubts import Doubt
-from mapper.core.geometry import Array, log, transform
+from mapper.core.geometry import Array, rotation_log
+from mapper.core.timebase import NS_PER_S
 from mapper.odometry.base import FrameResult
+from mapper.sensing.gyroscope import Gyroscope
 
 _MOST_FRAMES = 5
 _RATIO = 8.0
@@ -34,27 +35,36 @@ class _Spike(NamedTuple):
     text: str
 
 
-def with_doubtful_spikes(tracks: Sequence[FrameResult]) -> list[FrameResult]:
+def with_doubtful_spikes(
+    tracks: Sequence[FrameResult], gyroscope: Gyroscope | None = None
+) -> list[FrameResult]:
     """Return results of which those are doubtful that step off the path and back by far more than is usual.
 
     While a log is tracked, a jump that all features support is believed. In both directions of time it is
-    measured against the motion around it: no sensor is carried aside and back between a few frames. Such a
-    frame's covariance grows by the square of the step, so that its neighbours place it.
+    measured against the motion around it: no sensor is carried aside and back between a few frames. Turns are
+    measured against the gyroscope. Such a frame's covariance grows by the square of the step, so that its
+    neighbours place it.
 
     Args:
         tracks: Results of a log's frames, in time order.
+        gyroscope: Angular velocities of the body; None if they are not known.
     """
     placed = [k for k, track in enumerate(tracks) if track.node is not None]
-    times_s = 1e-9 * np.array([tracks[k].stamp_ns - tracks[0].stamp_ns for k in placed])
-    T_world_body = [tracks[k].T_world_body for k in placed]
-    positions = np.array([T[:3, 3] for T in T_world_body]).reshape(-1, 3)
-    turns = [
-        np.zeros(3),
-        *(log(transform(b[:3, :3] @ a[:3, :3].T, np.zeros(3)))[0] for a, b in pairwise(T_world_body)),
-    ]
+    if not placed:
+        return list(tracks)
+    stamps_ns = np.array([tracks[k].stamp_ns for k in placed])
+    times_s = (stamps_ns - tracks[0].stamp_ns) / NS_PER_S
+    T_world_body = np.array([tracks[k].T_world_body for k in placed])
+    R_expected = T_world_body[:-1, :3, :3]
+    if gyroscope is not None:
+        turned, known = gyroscope.rotations(stamps_ns[:-1], stamps_ns[1:], np.zeros(3), 1.0)
+        R_expected = np.where(known[:, None, None], R_expected @ turned, R_expected)
+    turns = [rotation_log(b @ a.T) for a, b in zip(R_expected, T_world_body[1:, :3, :3], strict=True)]
     found = [
-        *_spikes(positions, times_s, _LEAST_M, _CARRIED_MPS2, is_turn=False),
-        *_spikes(np.cumsum(turns, axis=0), times_s, _LEAST_RAD, _CARRIED_RADPS2, is_turn=True),
+        *_spikes(T_world_body[:, :3, 3], times_s, _LEAST_M, _CARRIED_MPS2, is_turn=False),
+        *_spikes(
+            np.cumsum([np.zeros(3), *turns], axis=0), times_s, _LEAST_RAD, _CARRIED_RADPS2, is_turn=True
+        ),
     ]
     changed, taken = list(tracks), np.zeros(len(placed), np.bool_)
     for spike in sorted(found, reverse=True):

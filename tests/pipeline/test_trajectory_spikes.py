@@ -1,11 +1,15 @@
 """Spikes of a path: found in both directions of time, and nothing else that moves fast."""
 
+from dataclasses import replace
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
-from mapper.core.geometry import exp
+from mapper.core.geometry import exp, rotation_log, transform
 from mapper.odometry.base import Diagnostics, FrameResult
 from mapper.pipeline.trajectory_spikes import with_doubtful_spikes
+from mapper.sensing.gyroscope import Gyroscope
 
 HOW = Diagnostics(100, 50, 40, 0.5, "px", "map")
 STEP_NS = 66_666_667
@@ -29,8 +33,8 @@ def walk(offs_m=(), offs_rad=(), *, count=120, seed=0, step_ns=STEP_NS):
     return tracks
 
 
-def doubted(tracks):
-    return [k for k, track in enumerate(with_doubtful_spikes(tracks)) if track.doubts]
+def doubted(tracks, gyroscope=None):
+    return [k for k, track in enumerate(with_doubtful_spikes(tracks, gyroscope)) if track.doubts]
 
 
 def test_a_walk_has_none():
@@ -51,6 +55,27 @@ def test_a_step_aside_and_back_is_a_spike_keyframes_included(frames):
 
 def test_one_turned_frame_is_a_spike():
     assert doubted(walk(offs_rad={33: np.radians(9.6)}.items())) == [33]
+
+
+def test_turns_are_measured_against_the_gyroscope():
+    """What it measured is the sensor's own motion; what it did not is none."""
+    still = walk()
+    jerked = [
+        replace(a, T_world_body=transform(b.T_world_body[:3, :3], a.T_world_body[:3, 3]))
+        for a, b in zip(still, walk(offs_rad={33: np.radians(9.6)}.items()), strict=True)
+    ]
+
+    assert doubted(jerked, gyroscope_of(jerked)) == doubted(still, gyroscope_of(still)) == []
+    assert doubted(jerked, gyroscope_of(still)) == doubted(still, gyroscope_of(jerked)) == [33]
+    assert doubted(jerked) == [33]
+
+
+def gyroscope_of(tracks):
+    """The constant angular velocities that turn each frame into the next, read six times between them."""
+    R = [track.T_world_body[:3, :3] for track in tracks]
+    stamps_ns = np.arange(6 * (len(R) - 1)) * (STEP_NS // 6) + STEP_NS // 12
+    rates = [6e9 / STEP_NS * rotation_log(a.T @ b) / 6 for a, b in pairwise(R)]
+    return Gyroscope("imu", stamps_ns, np.repeat(rates, 6, axis=0), is_of_body=True)
 
 
 @pytest.mark.parametrize(("step_ns", "are_spikes"), [(STEP_NS, True), (500_000_000, False)])
