@@ -34,7 +34,7 @@ from tests.support.driver_recordings import write_livox
 from tests.support.logs import MemoryEntry, log_in_memory
 from tests.support.octree_maps import COLORED, mapped
 from tests.support.posed_scans import WRITERS, shots_of
-from tests.support.recordings import CAMERA, add_messages, shots, write, write_folder
+from tests.support.recordings import CAMERA, add_messages, shots, write, write_folder, write_foxglove
 from tests.support.tum_logs import FIRST_NS, picture
 
 FRAMES = 4
@@ -143,20 +143,10 @@ def _foxglove_messages(i: int) -> list[tuple[str, object]]:
 
 
 def _foxglove(folder: Path) -> Path:
-    path = folder / "log.mcap"
-    with path.open("wb") as file:
-        writer = McapWriter(file)
-        writer.start()
-        channels: dict[str, int] = {}
-        for i in range(FRAMES):
-            for topic, message in _foxglove_messages(i):
-                schema = message.get_schema()
-                if topic not in channels:
-                    number = writer.register_schema(schema.name, schema.encoding, schema.data)
-                    channels[topic] = writer.register_channel(topic, "protobuf", number)
-                writer.add_message(channels[topic], int(STAMPS_NS[i]), message.encode(), int(STAMPS_NS[i]))
-        writer.finish()
-    return path
+    messages = [
+        (topic, int(STAMPS_NS[i]), one) for i in range(FRAMES) for topic, one in _foxglove_messages(i)
+    ]
+    return write_foxglove(folder / "log.mcap", messages)
 
 
 def _foxglove_json(folder: Path) -> Path:

@@ -109,51 +109,27 @@ def test_a_receivers_topic_goes_before_a_filters_and_another_can_be_chosen(tmp_p
     assert chosen.gnss.name == "/a/filtered"
 
 
-GPS_STATUS = """std_msgs/Header header
-uint16 satellites_used
-int32[] satellite_used_prn
-uint16 satellites_visible
-int32[] satellite_visible_prn
-int32[] satellite_visible_z
-int32[] satellite_visible_azimuth
-int32[] satellite_visible_snr
-int16 STATUS_DGPS_FIX=18
-int16 status
-uint16 motion_source
-uint16 orientation_source
-uint16 position_source
-"""
-GPS_FIX = """std_msgs/Header header
-GPSStatus status
-float64 latitude
-float64 longitude
-float64 altitude
-float64 track
-float64 speed
-float64 climb
-float64 pitch
-float64 roll
-float64 dip
-float64 time
-float64 gdop
-float64 pdop
-float64 hdop
-float64 vdop
-float64 tdop
-float64 err
-float64 err_horz
-float64 err_vert
-float64 err_track
-float64 err_speed
-float64 err_climb
-float64 err_time
-float64 err_pitch
-float64 err_roll
-float64 err_dip
-float64[9] position_covariance
-uint8 COVARIANCE_TYPE_KNOWN=3
-uint8 position_covariance_type
-"""
+GPS_STATUS = "std_msgs/Header header\n" + "\n".join(
+    [
+        "uint16 satellites_used\nint32[] satellite_used_prn\nuint16 satellites_visible",
+        *(f"int32[] satellite_visible_{name}" for name in ("prn", "z", "azimuth", "snr")),
+        "int16 STATUS_DGPS_FIX=18\nint16 status",
+        *(f"uint16 {name}_source" for name in ("motion", "orientation", "position")),
+    ]
+)
+NUMBERS = (
+    *("latitude", "longitude", "altitude", "track", "speed", "climb", "pitch", "roll", "dip", "time"),
+    *("gdop", "pdop", "hdop", "vdop", "tdop", "err", "err_horz", "err_vert", "err_track", "err_speed"),
+    *("err_climb", "err_time", "err_pitch", "err_roll", "err_dip"),
+)
+GPS_FIX = "std_msgs/Header header\nGPSStatus status\n" + "\n".join(
+    [
+        *(f"float64 {name}" for name in NUMBERS),
+        "float64[9] position_covariance\nuint8 COVARIANCE_TYPE_KNOWN=3\nuint8 position_covariance_type",
+    ]
+)
+
+
 """As gps_umd defines them."""
 
 
@@ -185,8 +161,7 @@ def test_gps_fixes_are_fixes_with_their_own_numbers_of_status(tmp_path):
             satellites_used=7, satellites_visible=9, status=18,
             motion_source=0, orientation_source=0, position_source=1,
         )  # fmt: skip
-        others = [line.split()[1] for line in GPS_FIX.splitlines() if line.startswith("float64 ")]
-        place = dict.fromkeys(others, 0.0) | {"latitude": 47.0, "longitude": 19.0, "altitude": 100.0 + k}
+        place = dict.fromkeys(NUMBERS, 0.0) | {"latitude": 47.0, "longitude": 19.0, "altitude": 100.0 + k}
         covariance = {"position_covariance": np.eye(3).ravel() * 0.25, "position_covariance_type": 3}
         stamp_ns = shot.stamp_ns
         messages.append(

@@ -87,11 +87,8 @@ def test_a_raw_drive_has_the_positions_of_its_navigation_system(drive):
     assert log.gnss.sigmas_m == pytest.approx(0.19921351667516)
     assert set(log.gnss.status.tolist()) == {2}
     np.testing.assert_array_equal(log.gnss.antenna_body, [-0.81, 0.32, -0.8])
+    (drive.parent / "calib_imu_to_velo.txt").unlink()
+    assert open_source(drive).gnss.antenna_body is None
     (drive / "oxts/data/0000000002.txt").write_text("1 2 3")
     with pytest.raises(SourceError, match=r"0000000002\.txt: 3 numbers"):
         open_source(drive)
-
-
-def test_without_a_mounting_the_antenna_is_unknown(drive):
-    (drive.parent / "calib_imu_to_velo.txt").unlink()
-    assert open_source(drive).gnss.antenna_body is None

@@ -44,10 +44,15 @@ def test_a_recording_tells_its_topics_and_its_frames(tmp_path, name):
     assert found.problem is None
 
 
-def test_a_folder_tells_its_frames_and_truth(tiny_tum_log):
-    found = inspect_log(tiny_tum_log(5), SourceConfig())
+def test_a_folder_tells_its_frames_truth_both_sizes_and_what_is_resized(tiny_tum_log):
+    log = tiny_tum_log(5)
+    for path in (log / "depth").iterdir():
+        path.write_bytes(encode_depth(np.full((24, 32), 1.0, np.float32), 5000.0))
+    found = inspect_log(log, SourceConfig())
     assert (found.log.kind, found.log.frames.count, list(found.topics)) == ("tum", 5, [])
     assert found.log.truth == "5 poses over 0.0 m, within 20 ms of 5 of 5 frames"
+    assert found.log.content.startswith("colour and depth of 64×48 px")
+    assert any("colour of 64×48 and depth of 32×24 px" in note for note in found.log.notes)
 
 
 def test_a_run_of_our_own_is_recognised(tmp_path):
@@ -136,12 +141,3 @@ def test_stamps_that_no_run_can_have_are_said_before_anything_is_tracked(tiny_tu
     assert result.exit_code == 1
     assert reason in result.stderr
     assert not list(tmp_path.glob("run*"))
-
-
-def test_both_sizes_and_what_is_resized_are_said(tiny_tum_log):
-    log = tiny_tum_log(2)
-    for path in (log / "depth").iterdir():
-        path.write_bytes(encode_depth(np.full((24, 32), 1.0, np.float32), 5000.0))
-    facts = inspect_log(log, SourceConfig()).log
-    assert facts.content.startswith("colour and depth of 64×48 px")
-    assert any("colour of 64×48 and depth of 32×24 px" in note for note in facts.notes)

@@ -80,20 +80,18 @@ def test_a_signalling_nan_costs_its_point_alone():
     assert np.flatnonzero(np.isnan(found)).tolist() == [10]
 
 
-def test_a_32_bit_counter_that_begins_anew_is_counted_on():
-    ns = (np.arange(1000) * 100_000 + (2**32 - 30_000_000)) % 2**32
-    found = relative_times_s(ns.astype(np.uint32), stamp_ns=0)
-    assert not np.isnan(found).any()
-    np.testing.assert_allclose(np.diff(found), 1e-4, atol=1e-6)
-
-
 @pytest.mark.parametrize(
-    ("period_s", "unit"), [(1, 1e9), (3600, 1e6), (3600, 1.0), (86_400, 1.0), (604_800, 1e3)]
+    ("period_s", "unit", "kind"),
+    [
+        *((1, 1e9, "f8"), (3600, 1e6, "f8"), (3600, 1.0, "f8"), (86_400, 1.0, "f8"), (604_800, 1e3, "f8")),
+        (2**32 * 1e-9, 1e9, "u4"),
+    ],
 )
-def test_a_clock_that_begins_anew_is_counted_on(period_s, unit):
+def test_a_clock_or_a_32_bit_counter_that_begins_anew_is_counted_on(period_s, unit, kind):
     values = (period_s - 0.03 + np.arange(1000) * 1e-4) % period_s * unit
-    found = relative_times_s(values, stamp_ns=STAMP_NS)
-    np.testing.assert_allclose(np.diff(found), 1e-4, atol=1e-6)
+    for stamp_ns in (0, STAMP_NS):
+        found = relative_times_s(values.astype(kind), stamp_ns=stamp_ns)
+        np.testing.assert_allclose(np.diff(found), 1e-4, atol=1e-6)
 
 
 def test_a_sweep_of_a_second_with_a_blind_sector_is_as_it_was():

@@ -28,11 +28,19 @@ def test_selects_like_a_slice(tiny_tum_log, first, last, stride):
     assert indices_of(source, open_source(log)) == want, "repeatable"
 
 
-def test_says_the_range_that_left_nothing(tiny_tum_log):
-    with pytest.raises(SourceError, match=r"range 9 … end; the log has 3 frames"):
-        open_source(tiny_tum_log(3), SourceConfig(first_frame=9))
-    with pytest.raises(SourceError, match=r"range 2 … 1; the log has 3 frames"):
-        open_source(tiny_tum_log(3, folder="again"), SourceConfig(first_frame=2, last_frame=1))
+@pytest.mark.parametrize(
+    ("settings", "why"),
+    [
+        ({"first_frame": 9}, r"range 9 … end; the log has 3 frames"),
+        ({"first_frame": 2, "last_frame": 1}, r"range 2 … 1; the log has 3 frames"),
+        ({"require_truth": True}, r"ground truth is required .*the log has none"),
+    ],
+)
+def test_a_choice_that_leaves_nothing_is_refused(tiny_tum_log, settings, why):
+    log = tiny_tum_log(3)
+    (log / "groundtruth.txt").unlink()
+    with pytest.raises(SourceError, match=why):
+        open_source(log, SourceConfig(**settings))
 
 
 def test_drops_frames_without_truth_and_counts_them(tiny_tum_log):
@@ -47,10 +55,3 @@ def test_drops_frames_without_truth_and_counts_them(tiny_tum_log):
         open_source(log, SourceConfig(first_frame=5, require_truth=True))
     lenient = SourceConfig(first_frame=1, require_truth=True, max_truth_gap_s=60.0)
     assert indices_of(open_source(log, lenient), open_source(log)) == [1, 2, 3, 4, 5]
-
-
-def test_cannot_require_truth_of_a_log_without(tiny_tum_log):
-    log = tiny_tum_log(2)
-    (log / "groundtruth.txt").unlink()
-    with pytest.raises(SourceError, match=r"ground truth is required .*the log has none"):
-        open_source(log, SourceConfig(require_truth=True))

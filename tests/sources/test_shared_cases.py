@@ -126,13 +126,6 @@ def test_the_bags_of_a_split_recording_are_joined():
     np.testing.assert_array_equal(log.stamps_ns, np.concatenate([part.stamps_ns for part in parts]))
 
 
-def test_bags_of_other_names_are_no_parts_of_one(tmp_path):
-    for path, name in zip(case("09_folder_of_split_bags/log").glob("*.bag"), ("one", "other"), strict=True):
-        (tmp_path / f"{name}.bag").write_bytes(path.read_bytes())
-    with pytest.raises(SourceError, match="open one of"):
-        open_source(tmp_path, SourceConfig())
-
-
 @pytest.mark.parametrize(
     ("name", "points", "named"),
     [

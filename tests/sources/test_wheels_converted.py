@@ -8,7 +8,7 @@ import pytest
 from mapper.simulation import CameraSimulator, write_tum_log
 from mapper.simulation.lidar import LidarSimulator
 from mapper.sources import open_source
-from mapper.sources.config import SourceConfig, TopicsConfig, WheelsConfig
+from mapper.sources.config import SourceConfig, WheelsConfig
 from mapper.sources.writers import left_out, write_log
 from tests.support.command_line import invoke
 from tests.support.wheeled_worlds import EXACT, FLAT, STREET_ON_WHEELS
@@ -58,14 +58,6 @@ def test_what_a_format_has_no_place_for_is_told(flat, tmp_path):
     assert told.exit_code == 0
     assert "mbag has no place for wheel odometry; left out" in told.stderr
     assert open_source(tmp_path / "mbag").wheels is None
-
-
-def test_another_topic_of_odometry_is_told_but_not_used(flat, tmp_path):
-    flat_as_truth = SourceConfig(topics=TopicsConfig(truth="/wheel_odometry", wheels="/ground_truth"))
-    write_log(flat, tmp_path / "log.mcap", kind="mcap")
-    swapped = open_source(tmp_path / "log.mcap", flat_as_truth)
-    np.testing.assert_allclose(swapped.truth.T_world_body, flat.wheels.T_world_body, atol=1e-8)
-    assert len(swapped.wheels) == len(flat.truth)
 
 
 def test_inspection_tells_rate_span_and_gaps(tmp_path):

@@ -3,6 +3,7 @@
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from mcap.writer import Writer as McapWriter
@@ -74,6 +75,22 @@ def changed(message: SerializedMessage, **fields: object) -> SerializedMessage:
     store = typestore("cdr")
     made = replace(store.deserialize_cdr(message.cdr, message.type), **fields)
     return message._replace(cdr=serialize(made))
+
+
+def write_foxglove(path: Path, messages: Iterable[tuple[str, int, Any]]) -> Path:
+    """Write (topic, time in nanoseconds, message) of Foxglove's own library as protobuf in an MCAP file."""
+    channels: dict[str, int] = {}
+    with path.open("wb") as file:
+        writer = McapWriter(file)
+        writer.start()
+        for topic, log_ns, message in messages:
+            if topic not in channels:
+                schema = message.get_schema()
+                number = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[topic] = writer.register_channel(topic, "protobuf", number)
+            writer.add_message(channels[topic], log_ns, message.encode(), log_ns)
+        writer.finish()
+    return path
 
 
 def add_messages(writer: McapWriter, messages: Iterable[SerializedMessage]) -> None:

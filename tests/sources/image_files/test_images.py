@@ -192,14 +192,6 @@ def test_depth_is_metres_and_neither_zero_nor_saturation_is_a_measurement(tmp_pa
     np.testing.assert_array_equal(depth_m, want)
 
 
-def test_other_one_channel_16_bit_formats_are_depth_too(tmp_path):
-    _, units = picture(1)
-    for ending in (".tiff", ".pgm"):
-        path = tmp_path / f"d{ending}"
-        assert cv2.imwrite(str(path), units)
-        np.testing.assert_array_equal(read_depth_m(path, 1000.0), units.astype(np.float32) / np.float32(1000))
-
-
 def test_a_colour_image_is_no_depth_and_a_depth_image_no_colour(tmp_path):
     rgb, units = picture(0)
     (tmp_path / "c.png").write_bytes(encoded(rgb))

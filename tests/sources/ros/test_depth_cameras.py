@@ -11,7 +11,7 @@ from mapper.core.frames import PinholeCamera
 from mapper.core.geometry import apply, exp, inverse
 from mapper.core.rotations import row_of_pose
 from mapper.sources import open_source
-from mapper.sources.config import CameraConfig, SourceConfig, TopicsConfig
+from mapper.sources.config import CameraConfig, SourceConfig
 from mapper.sources.inspection import inspect_log
 from mapper.sources.ros.decode import decode
 from mapper.sources.ros.encode_ros import SerializedMessage
@@ -189,14 +189,6 @@ def test_colour_of_a_wide_image_is_reduced_and_depth_is_as_large(tmp_path):
     assert frame.camera == color.resized(640, 360)
     assert (frame.depth_m > 0.0).mean() > 0.95
     np.testing.assert_allclose(frame.depth_m[frame.depth_m > 0.0], 2.0, atol=0.05)
-
-
-def test_depth_called_registered_of_the_same_lens_is_taken_so(tmp_path):
-    messages = unregistered(CAMERA, topic="/cam/depth_registered/image")
-    assert not any("as it is read" in note for note in opened(tmp_path / "a.mcap", messages).notes)
-    chosen = TopicsConfig(depth=DEPTH)
-    log = opened(tmp_path / "b.mcap", unregistered(CAMERA), topics=chosen)
-    assert any("as it is read" in note for note in log.notes)
 
 
 def stream_pose(topic, T):

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from foxglove import messages
 from foxglove.messages import PackedElementFieldNumericType as NumericType
-from mcap.writer import Writer
 
 from mapper.core.errors import DataError
 from mapper.core.timebase import NS_PER_S
@@ -15,6 +14,7 @@ from mapper.sources import open_source
 from mapper.sources.ros.decode import decode
 from mapper.sources.ros.decode_foxglove import decode_foxglove, stamp_of
 from mapper.sources.ros.recording import Topic
+from tests.support.recordings import write_foxglove
 from tests.support.tum_logs import FIRST_NS, picture
 
 STAMP = messages.Timestamp(sec=FIRST_NS // NS_PER_S, nsec=FIRST_NS % NS_PER_S)
@@ -206,20 +206,9 @@ def test_what_is_not_read_is_named():
 
 
 def test_a_foxglove_recording_is_a_log(tmp_path):
-    with (tmp_path / "log.mcap").open("wb") as file:
-        writer = Writer(file)
-        writer.start()
-        for topic, message in (
-            ("/depth", raw_image(UNITS, "16UC1")),
-            ("/color", raw_image(RGB, "rgb8")),
-            ("/calibration", calibration()),
-        ):
-            schema = message.get_schema()
-            number = writer.register_schema(schema.name, schema.encoding, schema.data)
-            channel = writer.register_channel(topic, "protobuf", number)
-            writer.add_message(channel, 7, message.encode(), 7)
-        writer.finish()
-    (entry,) = open_source(tmp_path / "log.mcap").entries()
+    messages = {"/depth": raw_image(UNITS, "16UC1"), "/color": raw_image(RGB, "rgb8"), "/info": calibration()}
+    recorded = [(topic, 7, message) for topic, message in messages.items()]
+    (entry,) = open_source(write_foxglove(tmp_path / "log.mcap", recorded)).entries()
     frame = entry.load()
     assert frame.stamp_ns == FIRST_NS
     assert (frame.camera.fx_px, frame.camera.distortion) == (60.0, tuple(D))

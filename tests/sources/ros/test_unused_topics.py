@@ -35,30 +35,6 @@ def write_mcap(path, messages):
     return path
 
 
-def opened(path, messages):
-    return open_source(write(path, messages))
-
-
-def test_the_depth_camera_s_own_calibration_is_not_colour_s(tmp_path):
-    raw = "/cam/depth/image_raw"
-    messages = [one._replace(topic=raw) if one.topic == DEPTH else one for one in shots(2)]
-    of_depth = [
-        one._replace(topic="/cam/depth/camera_info") if "info" in one.topic else one for one in messages
-    ]
-    with pytest.raises(SourceError, match=r"no camera info for .*/cam/depth/camera_info"):
-        opened(tmp_path / "a.mcap", of_depth)
-    assert len(opened(tmp_path / "b.mcap", messages)) == 2
-
-
-def test_topics_that_cannot_be_read_are_named_where_nothing_can_be_mapped(tmp_path):
-    type_ = "sensor_msgs/msg/JointState"
-    packets = [
-        one._replace(topic=f"{COLOR}/h264", type=type_) if one.topic == COLOR else one for one in shots(2)
-    ]
-    with pytest.raises(SourceError, match=f"{COLOR}/h264 .{type_}"):
-        opened(tmp_path / "a.mcap", packets)
-
-
 @pytest.mark.parametrize(
     "type_",
     [
@@ -77,22 +53,54 @@ def test_packets_that_are_not_decoded_are_named_with_the_remedy(tmp_path, type_)
     assert sum(type_ in note and "driver" in note for note in log.notes) == 1
 
 
-def test_depth_of_8_bits_is_named_where_nothing_can_be_mapped(tmp_path):
-    shallow = [
-        image(one.stamp_ns, DEPTH, np.zeros((48, 64), np.uint8), "mono8") if one.topic == DEPTH else one
-        for one in shots(2)
+def opened(path, messages):
+    return open_source(write(path, messages))
+
+
+def test_the_depth_camera_s_own_calibration_is_not_colour_s(tmp_path):
+    raw = "/cam/depth/image_raw"
+    messages = [one._replace(topic=raw) if one.topic == DEPTH else one for one in shots(2)]
+    of_depth = [
+        one._replace(topic="/cam/depth/camera_info") if "info" in one.topic else one for one in messages
     ]
-    with pytest.raises(SourceError, match=f"{DEPTH} is 'mono8', not depth"):
-        opened(tmp_path / "a.mcap", shallow)
+    with pytest.raises(SourceError, match=r"no camera info for .*/cam/depth/camera_info"):
+        opened(tmp_path / "a.mcap", of_depth)
+    assert len(opened(tmp_path / "b.mcap", messages)) == 2
 
 
-def test_accelerations_that_are_not_used_beside_their_gyroscope_are_named(tmp_path):
-    for name, length, named in (("a", 100.0, 1), ("b", 0.0, 0), ("c", 9.8, 0)):
-        readings = [imu(t, length) for t in STAMPS_NS]
-        log = opened(tmp_path / f"{name}.mcap", [*readings, *(cloud(t) for t in STAMPS_NS)])
-        assert log.gyroscope is not None
-        assert sum("/imu (100)" in note for note in log.notes) == named
-        assert (log.accelerations is not None) == (length == 9.8)
+JOINTS, SHALLOW = "sensor_msgs/msg/JointState", np.zeros((48, 64), np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("topic", "changed", "why"),
+    [
+        (COLOR, lambda one: one._replace(topic=f"{COLOR}/h264", type=JOINTS), f"{COLOR}/h264 .{JOINTS}"),
+        (DEPTH, lambda one: image(one.stamp_ns, DEPTH, SHALLOW, "mono8"), f"{DEPTH} is 'mono8', not depth"),
+    ],
+)
+def test_topics_that_cannot_be_read_are_named_where_nothing_can_be_mapped(tmp_path, topic, changed, why):
+    messages = [changed(one) if one.topic == topic else one for one in shots(2)]
+    with pytest.raises(SourceError, match=why):
+        opened(tmp_path / "a.mcap", messages)
+
+
+@pytest.mark.parametrize(
+    ("length", "rate", "is_used", "is_noted"),
+    [
+        (100.0, 0.1, (False, True), "/imu (100)"),
+        (0.0, 0.1, (False, True), ""),
+        (9.8, 0.1, (True, True), ""),
+        (9.8, 0.0, (True, False), "angular velocities"),
+    ],
+)
+def test_readings_that_are_not_used_beside_the_others_of_their_unit_are_named(
+    tmp_path, length, rate, is_used, is_noted
+):
+    messages = [one for t in STAMPS_NS for one in (imu(t, length, rate=rate), cloud(t))]
+    log = opened(tmp_path / "a.mcap", messages)
+    assert (log.accelerations is not None, log.gyroscope is not None) == is_used
+    for words in ("/imu (100)", "angular velocities"):
+        assert sum(words in note for note in log.notes) == (words == is_noted)
 
 
 @pytest.mark.parametrize(("unit", "tolerance"), [(1.0, 1e-4), (1000.0, 1e-4), (980.665, 0.02)])
@@ -101,14 +109,6 @@ def test_accelerations_in_g_mg_or_cm_become_metres(tmp_path, unit, tolerance):
     lengths = np.linalg.norm(log.accelerations.acceleration_mps2, axis=1)
     np.testing.assert_allclose(lengths, 9.80665, rtol=tolerance)
     assert sum("accelerations" in note for note in log.notes) == 1
-
-
-@pytest.mark.parametrize(("rate", "noted"), [(0.1, 0), (0.0, 1)])
-def test_a_gyroscope_that_measures_nothing_is_noted(tmp_path, rate, noted):
-    messages = [one for t in STAMPS_NS for one in (imu(t, 9.8, rate=rate), cloud(t))]
-    log = opened(tmp_path / "a.mcap", messages)
-    assert (log.gyroscope is None) == bool(noted)
-    assert sum("angular velocities" in note for note in log.notes) == noted
 
 
 def test_readings_that_are_no_numbers_are_left_out_and_counted(tmp_path):
