@@ -24,8 +24,12 @@ def toml(tmp_path):
     return write
 
 
-def test_no_file_and_no_override_are_the_defaults():
-    assert load_config() == BuildConfig()
+def test_the_defaults_are_those_of_the_sensor():
+    assert load_config() == load_config(sensor="rgbd") == BuildConfig()
+    config = load_config(sensor="lidar")
+    assert (config.odometry.kind, config.loops.kind, config.slice.above) == ("gicp", "scans", "ground")
+    assert config.octree.resolution_m == 0.2
+    assert load_config(CONFIGS / "lidar_outdoor.toml", sensor="lidar") == config  # which spells them out
 
 
 def test_an_override_wins_over_the_file_and_leaves_the_rest(toml):
@@ -80,18 +84,17 @@ def test_a_mistake_is_named_in_one_line(override, message):
     assert "\n" not in str(caught.value)
 
 
-def test_a_mistake_in_a_file_names_the_file(toml):
-    path = toml("[slice]\nmax_height = 2\n")
-
-    with pytest.raises(ConfigError, match=r"lab\.toml: slice\.max_height: unknown; did you mean max_h"):
-        load_config(path, ["workers=1"])
-
-
-def test_files_that_cannot_be_parsed_or_read(toml, tmp_path):
+def test_a_mistake_in_a_file_names_the_file(toml, tmp_path):
+    (tmp_path / "config.json").write_text('{"octree": {"resolution": 0.1}}')
+    for path, why in (
+        (toml("[slice]\nmax_height = 2\n"), r"lab\.toml: slice\.max_height: unknown; did you mean max_h"),
+        (tmp_path / "config.json", r"octree\.resolution"),  # of a user, not of a run
+        (tmp_path / "none.toml", "No such file"),
+    ):
+        with pytest.raises(ConfigError, match=why):
+            load_config(path, ["workers=1"])
     with pytest.raises(ConfigError, match="not valid TOML"):
         load_config(toml("[slice\n"))
-    with pytest.raises(ConfigError, match="No such file"):
-        load_config(tmp_path / "none.toml")
 
 
 def test_a_run_s_own_json_gives_the_same_configuration(tmp_path):
@@ -141,18 +144,13 @@ def test_a_run_of_an_older_version_loses_the_settings_that_are_no_more(tmp_path)
     assert loaded == again == BuildConfig(octree=OctreeConfig(resolution_m=0.1))
 
 
-def test_a_file_of_a_user_keeps_no_unknown_setting(tmp_path):
-    path = tmp_path / "config.json"
-    path.write_text('{"octree": {"resolution": 0.1}}')
-    with pytest.raises(ConfigError, match=r"octree\.resolution"):
-        load_config(path)
-
-
-def test_any_configuration_can_be_overridden():
+def test_any_configuration_can_be_overridden_and_a_part_that_was_missing_be_set():
     config = overridden(SynthConfig(), ["sensor.axial_noise_ratio=0", "seed=5"])
-
-    assert config.sensor.axial_noise_ratio == 0.0
-    assert config.seed == 5
+    assert (config.sensor.axial_noise_ratio, config.seed) == (0.0, 5)
+    assert (
+        overridden(BuildConfig(), ["octree.depth_noise.constant_m=0.01"]).octree.depth_noise.constant_m
+        == 0.01
+    )
 
 
 CAMERA = [f"source.camera.{name}=1" for name in ("fx_px", "fy_px", "cx_px", "cy_px")]
@@ -234,12 +232,6 @@ def test_turning_one_knob_leaves_the_others_of_its_part():
     assert (fallback.fallback.filter, fallback.fallback.max_ratio) == ("none", 0.95)
 
 
-def test_a_part_that_was_missing_can_be_set():
-    config = overridden(BuildConfig(), ["octree.depth_noise.constant_m=0.01"])
-    assert config.octree.depth_noise is not None
-    assert config.octree.depth_noise.constant_m == 0.01
-
-
 def test_settings_are_values_by_name_dotted_or_nested(tmp_path):
     file = tmp_path / "lab.toml"
     file.write_text("octree.resolution_m = 0.2\noctree.hit_probability = 0.8\n")
@@ -272,55 +264,20 @@ def test_settings_that_are_not_by_name(load, settings):
         load(settings=settings)
 
 
-def test_an_rgbd_log_has_the_plain_defaults():
-    assert load_config(sensor="rgbd") == load_config()
+def test_one_knob_turned_leaves_the_sensors_others_and_another_kind_takes_its_own(toml):
+    path = toml("[octree]\nresolution_m = 0.1\n")
+    config = load_config(
+        path, ["slice.max_height_m=3.0", "odometry.kind=kiss-icp", "loops.kind=none"], sensor="lidar"
+    )
+    assert (config.octree.resolution_m, config.octree.max_range_m) == (0.1, 80.0)
+    assert (config.slice.max_height_m, config.slice.min_height_m) == (3.0, 0.3)
+    assert (config.odometry.kind, config.odometry.map_voxel_m, config.loops.kind) == ("kiss-icp", 1.0, "none")
 
 
-def test_a_lidar_log_is_placed_by_gicp_in_a_coarser_map():
-    config = load_config(sensor="lidar")
-
-    assert config.odometry.kind == "gicp"
-    assert config.loops.kind == "scans"
-    assert config.octree.resolution_m == 0.2
-    assert config.slice.above == "ground"
-
-
-def test_one_knob_turned_leaves_the_sensors_others(tmp_path):
-    path = tmp_path / "street.toml"
-    path.write_text("[octree]\nresolution_m = 0.1\n")
-
-    config = load_config(path, ["slice.max_height_m=3.0"], sensor="lidar")
-
-    assert config.octree.resolution_m == 0.1
-    assert config.octree.max_range_m == 80.0
-    assert config.slice.max_height_m == 3.0
-    assert config.slice.min_height_m == 0.3
-
-
-def test_another_kind_takes_its_own_defaults():
-    config = load_config(None, ["odometry.kind=kiss-icp", "loops.kind=none"], sensor="lidar")
-
-    assert config.odometry.kind == "kiss-icp"
-    assert config.odometry.map_voxel_m == 1.0
-    assert config.loops.kind == "none"
-
-
-def test_the_source_is_known_before_the_sensor(tmp_path):
-    path = tmp_path / "street.toml"
-    path.write_text("[source]\nstride = 2\n[odometry]\ncell_m = 0.4\n")  # a knob that no RGB-D odometry has
-
+def test_the_source_is_known_before_the_sensor(toml):
+    path = toml("[source]\nstride = 2\n[odometry]\ncell_m = 0.4\n")  # a knob that no RGB-D odometry has
     source = load_source_config(path, ["source.first_frame=3", "odometry.voxel_m=0.3"])
-
     assert (source.stride, source.first_frame) == (2, 3)
     assert load_config(path, sensor="lidar").odometry.cell_m == 0.4
-
-
-def test_a_wrong_knob_of_the_source_is_named():
     with pytest.raises(ConfigError, match=r"source\.strid"):
         load_source_config(None, ["source.strid=2"])
-
-
-def test_the_outdoor_file_spells_the_defaults_out():
-    path = CONFIGS / "lidar_outdoor.toml"
-
-    assert load_config(path, sensor="lidar") == load_config(sensor="lidar")

@@ -117,15 +117,11 @@ def test_kinds_say_what_they_are_and_which_settings_they_have():
     assert named("odometry.keyframe_ratio").needs == (("odometry.kind", ("local-map", "pnp")),)
 
 
-def test_a_setting_that_a_class_overrides_keeps_the_meaning_of_the_class_above():
+def test_a_sensor_has_its_own_defaults_with_the_meaning_of_the_class_above():
+    of = {one.key: one.default for one in described("lidar")}
+    assert (of["octree.resolution_m"], of["odometry.kind"]) == (0.2, "gicp")
     (scans,) = [one for one in described("lidar") if one.key == "loops.min_gap_m" and one.default == 20.0]
     assert scans.doc == "Places nearer than this along the path are left to the odometry."
-
-
-def test_a_sensor_has_its_own_defaults():
-    of = {one.key: one.default for one in described("lidar")}
-    assert of["octree.resolution_m"] == 0.2
-    assert of["odometry.kind"] == "gicp"
 
 
 def test_any_model_is_described():

@@ -94,31 +94,22 @@ def test_a_build_needs_nothing_of_linux(tmp_path):
     assert (tmp_path / "log_run/map.octree").stat().st_size > 1000
 
 
-def test_zeros_without_advice_on_huge_pages(monkeypatch):
+def test_memory_and_processors_are_counted_without_what_linux_has(monkeypatch):
+    def no_handle(_name):
+        raise TypeError("LoadLibrary() argument 1 must be str, not None")
+
     monkeypatch.delattr(mmap, "MADV_NOHUGEPAGE")
     zeros = sparse_zeros(5000)
     zeros[7] = 1
     assert (zeros.sum(), zeros.dtype, zeros.shape) == (1, np.uint8, (5000,))
-
-
-def test_processors_are_counted_without_affinity(monkeypatch):
     monkeypatch.delattr(os, "sched_getaffinity")
     assert processors() == os.cpu_count()
-
-
-def test_memory_is_unknown_where_nothing_tells(monkeypatch):
+    monkeypatch.setattr("mapper.runtime.progress.ctypes.CDLL", no_handle)
+    forget_peak_memory()
     monkeypatch.setattr("mapper.runtime.progress.Path.exists", lambda _path: False)
     assert peak_memory_mb() > 1.0
     monkeypatch.setitem(sys.modules, "resource", None)
     assert peak_memory_mb() == 0.0
-
-
-def test_peak_memory_begins_anew_only_where_it_can(monkeypatch):
-    def no_handle(_name):
-        raise TypeError("LoadLibrary() argument 1 must be str, not None")
-
-    monkeypatch.setattr("mapper.runtime.progress.ctypes.CDLL", no_handle)
-    forget_peak_memory()
 
 
 def test_folders_are_replaced_without_locks(monkeypatch, tmp_path):
