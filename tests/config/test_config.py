@@ -1,5 +1,4 @@
 import json
-import re
 
 import pytest
 
@@ -74,13 +73,28 @@ def test_one_knob_keeps_the_kind_of_the_file_and_its_default_detector(toml):
         ("workers=many", "want a whole number, not many"),
         ("workers", "setting 'workers': want name=value, such as"),
         ("workers.x.y=1", "workers: want a whole number"),
+        # What would fail late:
+        ("octree.resolution_m=inf", "octree.resolution_m: want a finite number"),
+        ("slice.min_height_m=nan", "slice.min_height_m: want a finite number"),
+        ("source.camera.fx_px=500", "source.camera: … want fx_px, fy_px, cx_px and cy_px, all four"),
+        ("source.camera.depth_in_color=0,0,0,0,0,0,0", "source.camera: … quaternion is zero"),
+        ("source.camera.depth_distortion=0.1,0,0,0,0", "source.camera: … without depth_intrinsics_px"),
+        ("slice.min_height_m=1.2", "slice: … max_height_m 1.2 must be above min_height_m 1.2"),
+        ("octree.resolution_m=4", "octree.resolution_m is 4 m, … want at most 2.4"),
+        ("cloud.voxel_m=20", "cloud.voxel_m is 20 m, where 0.02 m is usual; it is in metres"),
+        ("slice.max_height_m=1200", "slice.max_height_m is 1200 m, where 1.2 m is usual"),
+        ("odometry.keyframe_distance_m=300", "keyframe_distance_m"),
+        # Lists:
+        ("source.camera.distortion=0.1,0.2", "source.camera.distortion: 2 values are too few"),
+        ("source.camera.distortion=0,0,0,0,0,0", "source.camera.distortion: want at most 5 values"),
+        ("source.camera.distortion=0,a,0,0,0", "source.camera.distortion.1: want a number"),
+        ("source.camera.distortion=[0,0,0,0,0", "source.camera.distortion: want a list, as in 1,2,3"),
     ],
 )
 def test_a_mistake_is_named_in_one_line(override, message):
     with pytest.raises(ConfigError) as caught:
         load_config(overrides=[override])
-
-    assert message in str(caught.value)
+    assert all(part in str(caught.value) for part in message.split(" … "))
     assert "\n" not in str(caught.value)
 
 
@@ -103,26 +117,6 @@ def test_a_run_s_own_json_gives_the_same_configuration(tmp_path):
     path.write_text(config.model_dump_json(indent=2))
 
     assert load_config(path) == config
-
-
-@pytest.mark.parametrize(
-    ("override", "message"),
-    [
-        ("octree.resolution_m=inf", "octree.resolution_m: want a finite number"),
-        ("slice.min_height_m=nan", "slice.min_height_m: want a finite number"),
-        ("source.camera.fx_px=500", "source.camera: .*want fx_px, fy_px, cx_px and cy_px, all four"),
-        ("source.camera.depth_in_color=0,0,0,0,0,0,0", "source.camera: .*quaternion is zero"),
-        ("source.camera.depth_distortion=0.1,0,0,0,0", "source.camera: .*without depth_intrinsics_px"),
-        ("slice.min_height_m=1.2", "slice: .*max_height_m 1.2 must be above min_height_m 1.2"),
-        ("octree.resolution_m=4", "octree.resolution_m is 4 m, .* want at most 2.4"),
-        ("cloud.voxel_m=20", "cloud.voxel_m is 20 m, where 0.02 m is usual; it is in metres"),
-        ("slice.max_height_m=1200", "slice.max_height_m is 1200 m, where 1.2 m is usual"),
-        ("odometry.keyframe_distance_m=300", "keyframe_distance_m"),
-    ],
-)
-def test_values_that_would_fail_late_are_refused_early(override, message):
-    with pytest.raises(ConfigError, match=message):
-        load_config(None, [override])
 
 
 def test_a_run_of_an_older_version_loses_the_settings_that_are_no_more(tmp_path):
@@ -191,20 +185,6 @@ class Lists(Config):
 )
 def test_lists_of_text_lists_and_parts_are_understood(override, want):
     assert overridden(Lists(), [override]) == want
-
-
-@pytest.mark.parametrize(
-    ("text", "why"),
-    [
-        ("0.1,0.2", "source.camera.distortion: 2 values are too few"),
-        ("0,0,0,0,0,0", "source.camera.distortion: want at most 5 values"),
-        ("0,a,0,0,0", "source.camera.distortion.1: want a number"),
-        ("[0,0,0,0,0", "source.camera.distortion: want a list, as in 1,2,3"),
-    ],
-)
-def test_a_list_that_is_none_is_refused_with_the_reason(text, why):
-    with pytest.raises(ConfigError, match=re.escape(why)):
-        load_config(overrides=[*CAMERA, f"source.camera.distortion={text}"])
 
 
 @pytest.mark.parametrize("path", sorted(CONFIGS.rglob("*.toml")), ids=lambda p: p.stem)

@@ -66,11 +66,16 @@ def test_missing_system_libraries_have_a_package_or_a_way_to_find_it():
     assert doctor.apt_line(["libGL.so.1", "libEGL.so.1"]) == "sudo apt-get install libgl1 libegl1"
 
 
-def test_a_cache_that_cannot_be_written_fails(monkeypatch, tmp_path):
+def test_what_is_scarce_is_a_warning_and_a_cache_that_cannot_be_written_fails(monkeypatch, tmp_path):
+    monkeypatch.setattr(doctor, "_LEAST_GB", 1e9)
+    monkeypatch.setenv("OMP_NUM_THREADS", "8")
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
-    assert doctor.check_kernels().verdict == "warning"
+    checks = (doctor.check_room, doctor.check_machine, doctor.check_kernels)
+    assert [check().verdict for check in checks] == ["warning"] * 3
     monkeypatch.setattr(doctor.os, "access", lambda _path, _mode: False)
     assert doctor.check_kernels().verdict == "failed"
+    with pytest.raises(DataError, match="verdict 'failed' with remedy ''"):
+        Finding("x", "failed", "broken")
 
 
 def test_kernels_are_counted_once_however_often_they_were_compiled(monkeypatch, tmp_path):
@@ -80,18 +85,6 @@ def test_kernels_are_counted_once_however_often_they_were_compiled(monkeypatch, 
         (folder / name).touch()
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
     assert doctor.compiled_kernels() == {folder / "kernels._add"}
-
-
-def test_what_is_scarce_is_a_warning(monkeypatch):
-    monkeypatch.setattr(doctor, "_LEAST_GB", 1e9)
-    assert doctor.check_room().verdict == "warning"
-    monkeypatch.setenv("OMP_NUM_THREADS", "8")
-    assert doctor.check_machine().verdict == "warning"
-
-
-def test_a_finding_that_is_not_well_says_what_to_do():
-    with pytest.raises(DataError, match="verdict 'failed' with remedy ''"):
-        Finding("x", "failed", "broken")
 
 
 def test_the_verb_fails_when_a_library_does(monkeypatch):

@@ -65,22 +65,16 @@ def test_a_user_s_place_of_the_depth_camera_goes_before_the_file_s(tmp_path):
     assert depth_m[60:120, 100:220] == pytest.approx(np.full((60, 120), 2.25), abs=1e-3)
 
 
-def test_samples_of_the_imu_are_read_with_their_own_times(tmp_path):
+def test_samples_of_the_imu_are_read_with_their_own_times_but_for_those_that_are_not_finite(tmp_path):
     log = open_source(recording(tmp_path, samples=samples()))
     at_ns = DATE_S * 10**9 + np.array([1000 * one[0] for one in samples()])
-    assert log.gyroscope is not None
-    assert log.accelerations is not None
     assert np.array_equal(log.gyroscope.stamps_ns, at_ns + 2000)
     assert np.array_equal(log.accelerations.stamps_ns, at_ns)
     assert log.gyroscope.rates_radps == pytest.approx(np.array([one[2] for one in samples()]), abs=1e-6)
     assert log.accelerations.acceleration_mps2[0] == pytest.approx([0.0, 0.0, 9.8], abs=1e-5)
-
-
-def test_readings_that_are_not_finite_are_left_out(tmp_path):
     damaged = [(at, (np.nan, 0.0, 9.8), radps) for at, _, radps in samples()]
-    log = open_source(recording(tmp_path, samples=[*samples(3), *damaged[3:]]))
-    assert log.accelerations is not None
-    assert len(log.accelerations.stamps_ns) == 3
+    part = open_source(recording(tmp_path, samples=[*samples(3), *damaged[3:]]))
+    assert len(part.accelerations.stamps_ns) == 3
     assert open_source(recording(tmp_path, samples=damaged)).accelerations is None
 
 

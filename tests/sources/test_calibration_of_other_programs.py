@@ -154,10 +154,18 @@ def test_eight_coefficients_are_a_rational_lens(tmp_path):
     assert (calibration.lens, calibration.depth.calibration.lens.coefficients) == (None, azure)
 
 
-@pytest.mark.parametrize("text", [b"recorded on a Tuesday\n", b"am Dienstag, den 3. M\xe4rz\n"])
-def test_notes_on_something_else_are_no_calibration(tmp_path, text):
-    (tmp_path / "info.txt").write_bytes(text)
-    assert calibration_files(tmp_path) == ([], False)
+def test_notes_on_something_else_are_no_calibration_and_intrinsics_that_are_not_read_are_named(
+    tiny_tum_log, tmp_path
+):
+    for text in (b"recorded on a Tuesday\n", b"am Dienstag, den 3. M\xe4rz\n"):
+        (tmp_path / "info.txt").write_bytes(text)
+        assert calibration_files(tmp_path) == ([], False)
+    folder = tiny_tum_log()
+    assert not any("camera_info.yaml" in note for note in open_source(folder).notes)
+    (folder / "camera_info.yaml").write_text("camera_matrix:\n  data: [90, 0, 31.5, 0, 90, 23.5, 0, 0, 1]\n")
+    log = open_source(folder)
+    assert sum("camera_info.yaml" in note for note in log.notes) == 1
+    assert next(iter(log)).camera.fx_px == 60.0
 
 
 @pytest.mark.parametrize(
@@ -197,15 +205,6 @@ def test_a_file_of_another_name_is_read_if_it_alone_has_intrinsics(tiny_tum_log)
     (folder / "TUM2.yaml").write_text("Camera.fx: 61.0\n")
     with pytest.raises(SourceError, match="intrinsics unknown"):
         open_source(folder)
-
-
-def test_intrinsics_that_are_not_read_are_named(tiny_tum_log):
-    folder = tiny_tum_log()
-    assert not any("camera_info.yaml" in note for note in open_source(folder).notes)
-    (folder / "camera_info.yaml").write_text("camera_matrix:\n  data: [90, 0, 31.5, 0, 90, 23.5, 0, 0, 1]\n")
-    log = open_source(folder)
-    assert sum("camera_info.yaml" in note for note in log.notes) == 1
-    assert next(iter(log)).camera.fx_px == 60.0
 
 
 @pytest.mark.parametrize("scale", [0.0002, 5000])

@@ -59,15 +59,8 @@ def test_resized_images_show_every_direction_at_its_pixel(colour_px, depth_px, f
     nearest = 1.0 / (of_depth.fx_px, of_depth.fy_px)[axis]
     assert np.abs(depth_m - wanted).max() < 0.51 * nearest
     assert abs((depth_m - wanted).mean()) < 0.08 * nearest  # where a pixel is as near to two, one is taken
-
-
-@pytest.mark.parametrize(("colour_px", "depth_px", "frame_px"), SIZES)
-def test_a_depth_image_gets_no_depth_that_it_does_not_have(colour_px, depth_px, frame_px):
-    width_px, height_px = depth_px
-    depth_m = np.random.default_rng(0).uniform(0.5, 5.0, (height_px, width_px)).astype(np.float32)
-    resized = recorded(colour_px, depth_px).depth_m(depth_m, "depth")
-    assert resized.shape == frame_px[::-1]
-    assert np.isin(resized, depth_m).all()
+    measured_m = np.random.default_rng(0).uniform(0.5, 5.0, depth_px[::-1]).astype(np.float32)
+    assert np.isin(sizes.depth_m(measured_m, "depth"), measured_m).all()
 
 
 def test_a_calibration_holds_for_colour_or_for_the_size_that_it_states():
@@ -100,20 +93,21 @@ def test_another_aspect_ratio_is_another_view(depth_px):
         recorded((640, 480), depth_px)
 
 
-def test_what_is_resized_is_noted():
-    (note,) = recorded((1920, 1440), (256, 192)).notes()
-    assert note == (
-        "colour of 1920×1440 and depth of 256×192 px are taken to show the same view; "
-        "colour and depth are resized to 768×576"
-    )
-    assert recorded((1296, 968), (640, 480)).notes()[0].endswith("; colour is resized to 640×480")
-    assert recorded((640, 480), (320, 240)).notes()[0].endswith("; depth is resized to 640×480")
-
-
-def test_an_image_unlike_the_first_is_refused():
-    sizes = recorded((640, 480), (320, 240))
-    with pytest.raises(FrameError, match="depth 7: 640×480 px, but the log has 320×240"):
-        sizes.depth_m(np.zeros((480, 640), np.float32), "depth 7")
+@pytest.mark.parametrize(
+    ("sizes_px", "resized"),
+    [
+        (((1920, 1440), (256, 192)), "colour and depth are resized to 768×576"),
+        (((1296, 968), (640, 480)), "colour is resized to 640×480"),
+        (((640, 480), (320, 240)), "depth is resized to 640×480"),
+    ],
+)
+def test_what_is_resized_is_noted_and_an_image_unlike_the_first_refused(sizes_px, resized):
+    sizes = recorded(*sizes_px)
+    of_colour, of_depth = (f"{width}×{height}" for width, height in sizes_px)
+    both = f"colour of {of_colour} and depth of {of_depth} px are taken to show the same view"
+    assert sizes.notes() == [f"{both}; {resized}"]
+    with pytest.raises(FrameError, match=f"depth 7: 64×48 px, but the log has {of_depth}"):
+        sizes.depth_m(np.zeros((48, 64), np.float32), "depth 7")
 
 
 def test_depth_of_a_lens_keeps_its_values_and_colour_is_interpolated():
