@@ -3,10 +3,7 @@
 import numpy as np
 import pytest
 
-from mapper.core.geometry import transform
-from mapper.core.trajectory import Trajectory
 from mapper.evaluators.metrics.coverage import frame_coverage, time_coverage
-from mapper.evaluators.metrics.evaluate import assess
 
 MS = 1_000_000
 FRAMES_NS = 7_000_000_000 + np.arange(100, dtype=np.int64) * 33 * MS
@@ -41,20 +38,6 @@ def test_without_frames_the_truth_s_time_counts_up_to_pauses():
     assert values["gaps"] == 2
     assert values["longest gap"] == pytest.approx(31 * 0.033)
     assert values["coverage, share of the truth's time"] == pytest.approx(100.0 * (99 - 20 - 31) / 99)
-
-
-def test_a_late_truth_and_a_missing_pose_are_no_gaps():
-    poses_ns = np.delete(FRAMES_NS, [30, 60])
-    values = values_of(time_coverage(poses_ns, begin_ns=int(FRAMES_NS[2]) + 1, end_ns=int(FRAMES_NS[90])))
-    assert values["coverage, share of the truth's time"] == 100.0
-    assert values["gaps"] == 0
-
-
-def test_poses_without_times_have_no_coverage():
-    poses = np.array([transform(np.eye(3), [0.1 * k, 0.0, 0.0]) for k in range(100)])
-    numbered, timed = Trajectory(np.arange(100), poses), Trajectory(FRAMES_NS, poses)
-    assert "longest gap" not in values_of(assess(numbered, numbered).metrics)
-    assert values_of(assess(timed, timed).metrics)["coverage, share of the truth's time"] == 100.0
 
 
 def test_a_pause_of_the_log_is_a_gap_too():

@@ -91,14 +91,6 @@ def test_a_map_too_coarse_to_be_cut_up_is_refused(tmp_path, monkeypatch):
         read_reference(tmp_path / "coarse.bt", voxel_m=EDGE_M)
 
 
-def test_free_space_that_another_map_fills_counts_against_both():
-    octree, reference = mapped(wall(2.02)), mapped(wall(1.02), wall(2.02, along=ROW[ROW > 0.5]))
-    occupied = reference.leaves().centres_world[reference.leaves().log_odds > 0.0]
-    values = scores(octree, occupied, log_odds_at=reference.log_odds_at)
-    assert values["free precision"] < 0.99  # it is free where the other has its nearer wall
-    assert values[RECALL] < 0.5
-
-
 def test_a_reference_is_laid_where_it_is_said_to_lie(tmp_path):
     T_map_reference = exp(np.array([0.0, 0.0, 0.4]), np.array([0.5, -0.2, 0.1]))
     points = wall(2.02) @ inverse(T_map_reference)[:3, :3].T + inverse(T_map_reference)[:3, 3]

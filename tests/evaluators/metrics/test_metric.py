@@ -55,12 +55,6 @@ def test_a_program_reads_back_every_digit_and_radians():
     assert read == [(metric.name, metric.value, metric.unit) for metric in METRICS]
 
 
-def test_a_name_has_the_condition():
-    metric = Metric("ATE RMSE", 0.01, "m", "SE(3)-aligned")
-    assert metric.name == "ATE RMSE, SE(3)-aligned"
-    assert records_of([metric]) == [{"name": metric.name, "value": 0.01, "unit": "m"}]
-
-
 def test_limits_are_compared_in_the_units_that_people_see():
     records = records_of(METRICS)
     assert exceeded(records, {"ATE": 0.02, "matched": 786.0, "turn": 28.7}) == []

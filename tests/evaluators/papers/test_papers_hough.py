@@ -11,7 +11,6 @@ from mapper.evaluators.papers.hough_pairs import (
     FEW_RINGS,
     fewer_rings,
     find_pairs,
-    merged,
 )
 from mapper.runtime.resumable_jobs import JobResult
 from mapper.sources.trajectory_files import read_kitti, write_kitti
@@ -98,16 +97,6 @@ def test_every_fourth_of_64_rings_is_kept():
     rings = np.unique(np.degrees(np.arcsin(kept[:, 2] / 20.0)).round(2))
     assert 15 <= len(rings) <= 17
     assert len(kept) == pytest.approx(1600, rel=0.07)
-
-
-def test_maps_hold_one_point_per_voxel():
-    points = np.random.default_rng(0).uniform(0.0, 1.0, (2000, 3)).astype(np.float32)
-    shifted = transform(np.eye(3), np.array([10.0, 0.0, 0.0]))
-
-    dense = merged([Scan(0, points), Scan(0, points)], [np.eye(4), shifted], voxel_m=0.5)
-
-    assert len(dense.points_body) == 16
-    assert set(np.floor(dense.points_body[:, 0])) == {0.0, 10.0}
 
 
 def write_pairs(folder, text):
@@ -221,15 +210,6 @@ def test_the_summary_counts_over_pairs_and_spreads_over_seeds(tmp_path):
     assert doubted.ours == (50.0,)
     assert doubted.failures == ("seed 0: not trusted: doubtful",)
     assert reproduction.seeds == 2
-
-
-def test_only_pictures_of_these_pairs_are_shown(tmp_path):
-    (tmp_path / "a_all_rings_hough-gicp.png").touch()
-    (tmp_path / "b_all_rings_hough-gicp.png").touch()  # of another session
-
-    reproduction = hough_reproduction(results_of(trial(), trial(seed=1)), pictures=tmp_path)
-
-    assert reproduction.pictures == (tmp_path / "a_all_rings_hough-gicp.png",)
 
 
 def test_fewer_rings_stand_beside_the_vlp_and_other_sensors_beside_nothing(tmp_path):
