@@ -58,14 +58,14 @@ def bytes_of(folder):
 
 
 def test_a_map_with_a_run_added_is_that_of_all_runs(runs, tmp_path, worked):
-    whole = merged_map_of(as_built(runs), tmp_path / "whole", tile_m=1.6).map
-    known = merged_map_of(as_built(runs[:2]), tmp_path / "map", tile_m=1.6).map
+    whole = merged_map_of(as_built(runs), tmp_path / "whole", tile_m=2.4).map
+    known = merged_map_of(as_built(runs[:2]), tmp_path / "map", tile_m=2.4).map
     of_new = {tile.name for tile in whole.manifest.tiles if 2 in tile.runs}
     assert 0 < len(of_new) < len(whole.manifest.tiles) / 2
     for calls in worked.values():
         calls.clear()
 
-    found = merged_map_of(as_built(runs), known.path, tile_m=1.6, known=known, overwrite=True).map
+    found = merged_map_of(as_built(runs), known.path, tile_m=2.4, known=known, overwrite=True).map
 
     assert bytes_of(found.path) == bytes_of(whole.path)
     assert len(worked["join"]) == len(of_new)  # the other tiles are taken over
@@ -74,14 +74,14 @@ def test_a_map_with_a_run_added_is_that_of_all_runs(runs, tmp_path, worked):
 
 
 def test_a_run_that_has_moved_is_merged_again_and_one_that_has_not_stays(runs, tmp_path, worked):
-    known = merged_map_of(as_built(runs[:2]), tmp_path / "map", tile_m=1.6).map
+    known = merged_map_of(as_built(runs[:2]), tmp_path / "map", tile_m=2.4).map
     resolution_m = known.manifest.octree.resolution_m
     near, far = (exp(np.zeros(3), np.array([by * resolution_m, 0.0, 0.0])) for by in (0.3, 3.0))
     first, second, third = as_built(runs)
     worked["join"].clear()
 
     kept = merged_map_of(
-        [first, replace(second, T_map_world=near), third], tmp_path / "kept", tile_m=1.6, known=known
+        [first, replace(second, T_map_world=near), third], tmp_path / "kept", tile_m=2.4, known=known
     ).map
     assert np.array_equal(kept.manifest.runs[1].T_map_world, np.eye(4))
     some = len(worked["join"])
@@ -89,15 +89,15 @@ def test_a_run_that_has_moved_is_merged_again_and_one_that_has_not_stays(runs, t
     worked["join"].clear()
 
     moved = [first, replace(second, T_map_world=far), third]
-    again = merged_map_of(moved, tmp_path / "again", tile_m=1.6, known=known).map
+    again = merged_map_of(moved, tmp_path / "again", tile_m=2.4, known=known).map
     assert len(worked["join"]) > some
-    whole = merged_map_of(moved, tmp_path / "whole", tile_m=1.6).map
+    whole = merged_map_of(moved, tmp_path / "whole", tile_m=2.4).map
     assert bytes_of(again.path) == bytes_of(whole.path)
 
 
 def test_a_map_of_other_runs_or_tiles_is_made_anew(runs, tmp_path):
-    known = merged_map_of(as_built(runs[:2]), tmp_path / "map", tile_m=1.6).map
-    for number, (placed, tile_m) in enumerate([(as_built(runs[1:]), 1.6), (as_built(runs), 3.2)]):
+    known = merged_map_of(as_built(runs[:2]), tmp_path / "map", tile_m=2.4).map
+    for number, (placed, tile_m) in enumerate([(as_built(runs[1:]), 2.4), (as_built(runs), 3.2)]):
         found = merged_map_of(placed, tmp_path / f"found{number}", tile_m=tile_m, known=known).map
         whole = merged_map_of(placed, tmp_path / f"whole{number}", tile_m=tile_m).map
         assert bytes_of(found.path) == bytes_of(whole.path)

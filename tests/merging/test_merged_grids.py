@@ -66,7 +66,7 @@ def test_the_floor_is_that_of_the_whole_below_all_paths(maps, tmp_path):
     octree, _ = total(maps[:3], config=COLORED)
     expected = traversable(floor_of_whole(octree, runs), ROBOT)
 
-    found = merged_map_of(as_built(runs), tmp_path / "map", tile_m=1.6).map
+    found = merged_map_of(as_built(runs), tmp_path / "map", tile_m=2.4).map
 
     home = expected.home
     assert (home.grid.cells == FREE).any()
