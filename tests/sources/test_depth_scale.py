@@ -224,6 +224,20 @@ def test_a_camera_above_every_ceiling_is_noted(desk_log, tmp_path):
         assert bool(high) == is_high
 
 
+@pytest.mark.parametrize("far_m", [1.2, 4.0, 10.0])
+def test_pixels_filled_with_the_farthest_depth_are_told(desk_log, far_m):
+    log = open_source(desk_log)
+    frames = read_spread(log)
+    cut = {k: replace(one, depth_m=np.minimum(one.depth_m, np.float32(far_m))) for k, one in frames.items()}
+    filled = {k: replace(one, depth_m=one.depth_m.copy()) for k, one in cut.items()}
+    for one in filled.values():
+        one.depth_m[:24] = far_m
+    (warning,) = depth_warnings(log, filled)
+    assert f"max_range_m={0.999 * far_m:.4g} " in warning
+    assert len(depth_warnings(log, cut)) == (far_m < max(one.depth_m.max() for one in frames.values()))
+    assert depth_warnings(log, dict.fromkeys(frames, frames[0])) == []
+
+
 def test_all_checks_of_depth_read_the_same_eight_frames_once(desk_log):
     source, loaded = open_source(desk_log)[:20], []
 
