@@ -50,9 +50,7 @@ def positions_and_faces(path):
 
 
 def occupied_centres(run):
-    octree = read_octree(run.path / "map.ot", run.config.octree)
-    leaves = octree.leaves()
-    return leaves.centres_world[leaves.log_odds >= octree.occupied_log_odds]
+    return read_octree(run.path / "map.ot", run.config.octree).occupied()
 
 
 def check_octomap(run, path):

@@ -88,8 +88,7 @@ def shown(desk_run):
 def test_voxels_are_the_octree_s_with_their_hits(desk_run, shown):
     centres, (first, octaves) = unpacked(shown["voxels"], (2, 1))
     octree = read_octree(desk_run.path / "map.octree")
-    leaves = octree.leaves()
-    expected = leaves.centres_world[leaves.log_odds >= octree.occupied_log_odds]
+    expected = octree.occupied()
     order = np.lexsort(np.rint(centres.T / 1e-3))
     expected = expected[np.lexsort(np.rint(expected.T / 1e-3))]
     np.testing.assert_allclose(centres[order], expected, atol=1e-6)

@@ -88,9 +88,7 @@ def test_every_loop_is_a_line_by_verdict_and_a_line_of_text(run, told):
 
 
 def test_the_voxels_are_the_occupied_ones(run, told):
-    octree = maps_of(run).octree
-    leaves = octree.leaves()
-    occupied = leaves.centres_world[leaves.log_odds >= octree.occupied_log_odds]
+    occupied = maps_of(run).octree.occupied()
     indices = told.one("/world/map/voxels", "VoxelGridMap:voxel_indices")
     edge_m = told.one("/world/map/voxels", "VoxelGridMap:voxel_size")[0]
     np.testing.assert_allclose((indices + 0.5) * edge_m, occupied, atol=1e-5)

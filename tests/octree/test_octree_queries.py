@@ -34,11 +34,6 @@ def points(octree):
     return rng.uniform(centres.min(axis=0) - 1.0, centres.max(axis=0) + 1.0, (500, 3))
 
 
-def obstacles(octree):
-    leaves = octree.leaves()
-    return leaves.centres_world[leaves.log_odds >= octree.occupied_log_odds]
-
-
 @ALL_DEPTHS
 def test_coarse_queries_equal_octomap_s(octree, points, depth):
     tree = fuse(scans(0), resolution_m=0.05, max_range_m=4.0, discretize=True)
@@ -94,7 +89,7 @@ def test_nearest_obstacles_equal_brute_force(seed, max_range_m):
     octree = OctreeMap(OctreeConfig())
     for scan_points, origin in scans(seed, spread_m=0.4 + seed, count=2):
         octree.insert_points(scan_points, origin)
-    centres = obstacles(octree)
+    centres = octree.occupied()
     rng = np.random.default_rng(seed)
     points = np.concatenate(
         [

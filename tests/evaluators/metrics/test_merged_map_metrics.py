@@ -56,9 +56,8 @@ def test_a_run_whose_folder_is_gone_has_no_truth(runs, tmp_path):
 
 def test_the_map_is_held_against_a_reference_in_its_own_world(runs, tmp_path):
     merged = merged_map_of(as_built(runs), tmp_path / "map").map
-    leaves = merged.octree.leaves()
-    centres = leaves.centres_world[leaves.log_odds >= merged.octree.occupied_log_odds]
-    (_, precision, *_) = merged_map_quality(merged, Reference("cloud", points=centres), voxels=0)
+    reference = Reference("cloud", points=merged.octree.occupied())
+    (_, precision, *_) = merged_map_quality(merged, reference, voxels=0)
     assert precision.quantity == "occupied precision"
     assert precision.value == 1.0
     with pytest.raises(DataError, match="no truth of its own"):

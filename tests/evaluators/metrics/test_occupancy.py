@@ -36,9 +36,7 @@ def values_of(octree, signed_distance_m, **options):
 
 def ghosts(octree, signed_distance_m):
     """How many voxels are occupied further than a voxel and a half from every solid."""
-    leaves = octree.leaves()
-    occupied = leaves.centres_world[leaves.log_odds >= octree.occupied_log_odds]
-    return int((signed_distance_m(occupied) > 1.5 * leaves.resolution_m).sum())
+    return int((signed_distance_m(octree.occupied()) > 1.5 * octree.resolution_m).sum())
 
 
 def wall_seen(at_x_m):
