@@ -50,18 +50,13 @@ def test_the_numbers_are_kept(measured):
     assert record["levels"][0]["typical"]["raw"]["std_m"] == float(rows[0]["std_m"])
 
 
-def test_a_build_reads_the_noise(measured):
+def test_a_build_reads_the_noise_and_the_pictures_can_be_read(measured):
     out, _ = measured
     record = json.loads((out / "manifest.json").read_text(encoding="utf-8"))
     config = load_config(out / "sensor.toml")
     assert config.odometry.depth_noise.model_dump() == record["noise"]
-    plain = load_config()
-    assert config.odometry.model_copy(update={"depth_noise": None}) == plain.odometry
+    assert config.odometry.model_copy(update={"depth_noise": None}) == load_config().odometry
     assert record["noise"]["quadratic_per_m"] == pytest.approx(0.0022, rel=0.25)
-
-
-def test_the_pictures_can_be_read(measured):
-    out, _ = measured
     assert read_grey(out / "accuracy.png").shape[1] > 1000
     assert read_grey(out / "residuals.png").shape[0] > 300
 
@@ -102,15 +97,3 @@ def test_what_cannot_be_measured_is_said_in_one_line(walls, arguments, message):
     result = mapper("sensor", "depth", walls[0], *given, "--quiet", status=1)
     assert message in result.stderr
     assert len(result.stderr.strip().splitlines()) == 1
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["--path", "desk"], "--path desk: has no meaning with --plane-at"),
-        (["--sensor", "lidar"], "--plane-at 1.0: has no meaning with --sensor lidar"),
-    ],
-)
-def test_a_wall_is_for_a_camera_that_stands_still(tmp_path, arguments, message):
-    result = mapper("synth", tmp_path / "log", "--plane-at", "1", *arguments, status=1)
-    assert message in result.stderr

@@ -83,6 +83,8 @@ def test_an_uncalibrated_sensor_has_every_error_but_those_set_by_hand(config_of)
         (("--sensor", "lidar", "--uncalibrated"), "--uncalibrated: has no meaning with --sensor lidar"),
         (("--scene", "hall", "--rooms", "6"), "--rooms 6: has no meaning with --scene hall"),
         (("--plane-at", "2", "--scene", "hall"), "--scene hall: has no meaning with --plane-at"),
+        (("--plane-at", "1", "--path", "desk"), "--path desk: has no meaning with --plane-at"),
+        (("--plane-at", "1", "--sensor", "lidar"), "--plane-at 1.0: has no meaning with --sensor lidar"),
         (("--sensor", "lidar", "--scene", "staircase", "--wheels"), "do not climb a staircase"),
         (("--scene", "tunnel"), "want one of flat, corridor, hall, white-room, twin-rooms"),
     ],

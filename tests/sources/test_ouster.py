@@ -14,6 +14,7 @@ from mapper.pipeline.build import build
 from mapper.sources import open_source
 from mapper.sources.inspection import inspect_log
 from mapper.sources.ouster_packets import OusterSensor
+from mapper.sources.ros.encode_ros import cloud_message
 from tests.support.driver_recordings import DriverRecording, street
 from tests.support.ouster_packets import (
     FIRST_NS,
@@ -234,36 +235,29 @@ def test_packets_without_fitting_metadata_are_refused_in_a_line(tmp_path, metada
     assert "\n" not in str(refused.value)
 
 
-def test_inspect_says_that_metadata_are_missing(tmp_path):
+def test_inspect_says_that_metadata_are_missing_and_osf_is_refused_with_the_command(tmp_path):
     path = write_recording(tmp_path / "a.bag", recorded(SENSOR, [drawn(SENSOR, 0)] * 2))
     with pytest.raises(SourceError, match="record its metadata topic too"):
         inspect_log(path, config=load_config(None).source)
+    (tmp_path / "a.osf").write_bytes(bytes(100))
+    with pytest.raises(SourceError, match=r"ouster-cli source .*\.osf save .*\.pcap"):
+        open_source(tmp_path / "a.osf")
 
 
 @pytest.mark.parametrize("has_metadata", [True, False])
 def test_clouds_are_taken_before_packets_which_are_named(tmp_path, has_metadata):
-    scans = [drawn(SENSOR, seed) for seed in range(3)]
     points = np.random.default_rng(0).uniform(-9.0, 9.0, (50, 3)).astype(np.float32)
-    with DriverRecording(tmp_path / "a.bag", "ouster_ros") as recording:
+    with DriverRecording(tmp_path / "a", "ouster_ros") as recording:
         if has_metadata:
             text = recording.make("std_msgs/msg/String", data=SENSOR.metadata())
             recording.write(FIRST_NS, "/ouster/metadata", text)
-        for received_ns, packet in recorded(SENSOR, scans):
+        for received_ns, packet in recorded(SENSOR, [drawn(SENSOR, seed) for seed in range(3)]):
             message = recording.make("PacketMsg", buf=np.frombuffer(packet, np.uint8))
             recording.write(received_ns, "/ouster/lidar_packets", message)
         for turn in range(3):
-            fields = [
-                recording.make("sensor_msgs/msg/PointField", name=name, offset=4 * i, datatype=7, count=1)
-                for i, name in enumerate("xyz")
-            ]
-            cloud = recording.make(
-                "sensor_msgs/msg/PointCloud2",
-                header=recording.header(FIRST_NS + turn * SCAN_NS, "os_lidar"),
-                height=1, width=50, fields=fields, is_bigendian=False, point_step=12, row_step=600,
-                data=points.view(np.uint8).reshape(-1), is_dense=True,
-            )  # fmt: skip
-            recording.write(FIRST_NS + turn * SCAN_NS, "/ouster/points", cloud)
-    log = open_source(tmp_path / "a.bag")
+            scan = Scan(FIRST_NS + turn * SCAN_NS, points)
+            recording.add(cloud_message("/ouster/points", scan, frame="os_lidar"))
+    log = open_source(tmp_path / "a")
     assert log.body_frame == "os_lidar"
     np.testing.assert_array_equal(log[0].points_body, points)
     assert any("/ouster/lidar_packets" in note for note in log.notes)
@@ -316,12 +310,6 @@ def test_a_lost_fragment_costs_its_packet(tmp_path):
     log = open_source(path)
     assert len(log) == 3
     assert any("1 of 48 packets are missing" in note for note in log.notes)
-
-
-def test_osf_is_refused_with_the_command_that_converts_it(tmp_path):
-    (tmp_path / "a.osf").write_bytes(bytes(100))
-    with pytest.raises(SourceError, match=r"ouster-cli source .*\.osf save .*\.pcap"):
-        open_source(tmp_path / "a.osf")
 
 
 @pytest.mark.parametrize("size", [0, 10, 43, 44, 3000, 3328])

@@ -96,16 +96,12 @@ def test_euroc_readings_come_with_their_mounting(tmp_path):
     assert log.accelerations.are_axes_stated
 
 
-def test_kitti_folder_shows_the_wall_from_the_true_poses(tmp_path):
-    log = open_source(write_kitti(tmp_path / "00"))
-    assert log.kind == "kitti-stereo"
-    assert log.stamps_ns.tolist() == [0, 100_000_000]
-    assert_shows_wall(log)
-    np.testing.assert_array_equal(log[0].gray, cv2.imread(str(tmp_path / "00/image_0/000000.png"), 0))
-
-
-def test_kitti_s_folder_of_sequences_shows_the_wall_from_the_poses_beside(tmp_path):
+def test_kitti_sequence_shows_the_wall_from_its_poses_or_from_those_beside_its_data_set(tmp_path):
     sequence = write_kitti(tmp_path / "dataset/sequences/03")
+    log = open_source(sequence)
+    assert (log.kind, log.stamps_ns.tolist()) == ("kitti-stereo", [0, 100_000_000])
+    assert_shows_wall(log)
+    np.testing.assert_array_equal(log[0].gray, cv2.imread(str(sequence / "image_0/000000.png"), 0))
     (tmp_path / "dataset/poses").mkdir()
     (sequence / "poses.txt").rename(tmp_path / "dataset/poses/03.txt")
     log = open_source(tmp_path / "dataset")

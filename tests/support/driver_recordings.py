@@ -20,6 +20,7 @@ from mapper.core.trajectory import Trajectory
 from mapper.simulation.config import STREET, LidarSensorConfig
 from mapper.simulation.lidar.cast import cast
 from mapper.simulation.lidar.source import LidarSimulator
+from mapper.sources.ros.encode_ros import SerializedMessage
 
 FIRST_NS = 1_700_000_000_000_000_000
 _DEFINITIONS = {
@@ -75,6 +76,10 @@ class DriverRecording:
     def header(self, stamp_ns: int, frame: str) -> Any:
         fields = {"seq": 0} if self._is_ros1 else {}
         return self.make("std_msgs/msg/Header", **fields, stamp=self.stamp(stamp_ns), frame_id=frame)
+
+    def add(self, message: SerializedMessage) -> None:
+        """Write a standard message."""
+        self.write(message.stamp_ns, message.topic, self._store.deserialize_cdr(message.cdr, message.type))
 
     def write(self, stamp_ns: int, topic: str, message: Any) -> None:
         if topic not in self._connections:

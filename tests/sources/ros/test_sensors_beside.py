@@ -82,12 +82,6 @@ def test_packets_of_a_driver_whose_clouds_are_used_are_not_fused_again(tmp_path)
     assert [one.log.name for one in log.beside] == ["/lidar/points", "/rear/packets"]
 
 
-def test_the_user_leaves_them_out(tmp_path):
-    log = opened(tmp_path / "a.mcap", [MOUNTED, *shots(), *clouds()], others="unused")
-    assert log.beside == []
-    assert any("not used" in sentence and "/lidar/points" in sentence for sentence in log.sentences)
-
-
 @pytest.fixture(scope="module")
 def mixed(desk_log, tmp_path_factory):
     """Return the desk's recording with a LiDAR that sees a wall 7 m behind the camera, and the wall."""
