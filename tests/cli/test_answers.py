@@ -141,26 +141,19 @@ def test_a_log_file_keeps_what_is_printed_with_times(desk_run, tmp_path):
         assert desk_run.file(name).read_bytes() == before
 
 
-def test_progress_is_in_the_log_file(desk_log, tmp_path):
-    log = tmp_path / "mapper.log"
-    mapper("build", desk_log, "--last", 11, "--out", tmp_path / "run", "--quiet", "--log-file", log)
-    text = log.read_text()
-    for row in ("track: 12/12 in", "fuse: 12/12 in", "frames ", "verdict "):
-        assert f" {row}" in text
-
-
-def test_verbose_prints_every_row_and_quiet_none(desk_run):
-    shown = mapper("loops", desk_run.path, "--accepted").stdout
-    assert mapper("loops", desk_run.path, "--accepted", "--quiet").output == ""
-    assert shown
-    both = mapper("loops", desk_run.path, "--quiet", "--verbose", status=1)
-    assert both.stderr == "mapper: --verbose and --quiet: choose one\n"
-
-
-def test_a_build_tells_the_rest_with_verbose(desk_log, tmp_path):
-    rest = mapper("build", desk_log, "--last", 11, "--out", tmp_path / "run", "--verbose").stdout
+def test_verbose_prints_every_row_and_quiet_none_and_progress_is_in_the_log_file(
+    desk_log, desk_run, tmp_path
+):
+    log, build = tmp_path / "mapper.log", ("build", desk_log, "--last", 11, "--out", tmp_path / "run")
+    rest = mapper(*build, "--verbose", "--log-file", log).stdout
     for row in ("keyframes", "levelled by", "seconds", "peak memory", "trajectory.tum"):
         assert row in rest
+    for row in ("track: 12/12 in", "fuse: 12/12 in", "frames ", "verdict "):
+        assert f" {row}" in log.read_text()
+    assert mapper("loops", desk_run.path, "--accepted").stdout
+    assert mapper("loops", desk_run.path, "--accepted", "--quiet").output == ""
+    both = mapper("loops", desk_run.path, "--quiet", "--verbose", status=1)
+    assert both.stderr == "mapper: --verbose and --quiet: choose one\n"
 
 
 def test_values_become_json_without_losing_or_inventing_any():

@@ -150,15 +150,11 @@ def test_a_mistake_is_one_line_and_changes_nothing(options, message, run_folder)
     assert files_of(run_folder) == before
 
 
-def test_a_mistake_in_the_file_ends_a_fuse_before_it_begins(run_folder):
+def test_a_mistake_in_the_file_ends_a_fuse_before_it_begins_and_no_build_replaces_edits(run_folder, desk_log):
     (run_folder / "edits.toml").write_text("[[erase]]\nheight = [0, 1]\n")
     result = mapper("fuse", run_folder, status=1)
     assert "edits.toml: erase.0.height: unknown; did you mean height_m?" in result.stderr
     assert not run_folder.with_name("desk.partial").exists()
     assert open_run(run_folder).manifest.status == "complete"
-
-
-def test_a_build_replaces_no_run_with_edits(run_folder, desk_log):
-    (run_folder / "edits.toml").write_text("[[keep]]\npath_radius_m = 3\n")
     result = mapper("build", desk_log, "--out", run_folder, "--overwrite", status=1)
     assert "holds files that are not of a run folder: edits.toml" in result.stderr

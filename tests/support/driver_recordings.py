@@ -162,29 +162,53 @@ def write_vlp16(path: Path, simulator: LidarSimulator, *, scans: int) -> tuple[P
 
 def write_pcap(path: Path, simulator: LidarSimulator, *, packets: int) -> Path:
     """Write what a VLP-16 sends in a street, and its position packets, as tcpdump captures them."""
-    with path.open("wb") as file:
-        writer = (dpkt.pcapng.Writer if path.suffix == ".pcapng" else dpkt.pcap.Writer)(file)
+
+    def sent() -> Iterator[tuple[int, int, bytes]]:
         for number, (stamp_ns, data) in enumerate(vlp16_packets(simulator, range(packets))):
             if number % 50 == 0:
-                writer.writepkt(_ethernet(bytes(512), port=8308), ts=stamp_ns / 1e9)
-            writer.writepkt(_ethernet(data.tobytes(), port=2368), ts=stamp_ns / 1e9)
-    return path
+                yield stamp_ns, 8308, bytes(512)
+            yield stamp_ns, 2368, data.tobytes()
+
+    return write_captured(path, sent())
 
 
 def write_datagrams(path: Path, payloads: Iterable[bytes], *, port: int) -> Path:
     """Write a capture of datagrams to a port, a millisecond apart."""
+    return write_captured(path, ((FIRST_NS + 10**6 * k, port, one) for k, one in enumerate(payloads)))
+
+
+def write_captured(path: Path, datagrams: Iterable[tuple[int, int, bytes]]) -> Path:
+    """Write datagrams as tcpdump captures them, in fragments of an Ethernet.
+
+    Args:
+        path: File to write, ``.pcapng`` or else pcap.
+        datagrams: When each was received, nanoseconds; the port that it was sent to; its content.
+    """
     with path.open("wb") as file:
-        writer = dpkt.pcap.Writer(file)
-        for number, payload in enumerate(payloads):
-            writer.writepkt(_ethernet(payload, port=port), ts=FIRST_NS / 1e9 + 1e-3 * number)
+        writer = (dpkt.pcapng.Writer if path.suffix == ".pcapng" else dpkt.pcap.Writer)(file)
+        for number, (received_ns, port, payload) in enumerate(datagrams):
+            for frame in _frames(payload, port=port, number=number % (1 << 16)):
+                writer.writepkt(frame, ts=received_ns / 1e9)
     return path
 
 
-def _ethernet(payload: bytes, *, port: int) -> bytes:
-    udp = dpkt.udp.UDP(sport=443, dport=port, ulen=8 + len(payload), data=payload)
-    ip = dpkt.ip.IP(src=bytes([192, 168, 1, 201]), dst=bytes([255] * 4), p=dpkt.ip.IP_PROTO_UDP, data=udp)
-    ip.len = len(ip)
-    return bytes(dpkt.ethernet.Ethernet(src=bytes(6), dst=bytes([255] * 6), data=ip))
+def _frames(payload: bytes, *, port: int, number: int, most: int = 1480) -> list[bytes]:
+    """Return the Ethernet frames of a datagram."""
+    whole = bytes(dpkt.udp.UDP(sport=7502, dport=port, ulen=8 + len(payload), data=payload))
+    frames = []
+    for start in range(0, len(whole), most):
+        more = 0x2000 if start + most < len(whole) else 0
+        ip = dpkt.ip.IP(
+            src=bytes([192, 168, 1, 201]),
+            dst=bytes([192, 168, 1, 10]),
+            p=dpkt.ip.IP_PROTO_UDP,
+            id=number,
+            data=whole[start : start + most],
+        )
+        ip._flags_offset = more | start // 8
+        ip.len = len(ip)
+        frames.append(bytes(dpkt.ethernet.Ethernet(src=bytes(6), dst=bytes(6), data=ip)))
+    return frames
 
 
 def vlp16_packets(simulator: LidarSimulator, numbers: Iterable[int]) -> Iterator[tuple[int, np.ndarray]]:

@@ -8,12 +8,11 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import dpkt
 import numpy as np
 
 from mapper.core.geometry import rotation_exp, transform
 from mapper.sources.base import Log
-from tests.support.driver_recordings import DriverRecording
+from tests.support.driver_recordings import DriverRecording, write_captured
 
 FIRST_NS = 1_700_000_000_000_000_000
 COLUMNS_PER_PACKET = 16
@@ -210,35 +209,11 @@ def write_recording(
 def write_capture(
     path: Path, lidar: Iterable[Stamped], imu: Iterable[Stamped] = (), *, metadata: str | None = None
 ) -> Path:
-    """Write packets as tcpdump captures them, in fragments of an Ethernet, and the metadata beside them."""
-    streams = [(7502, one) for one in lidar] + [(7503, one) for one in imu]
-    with path.open("wb") as file:
-        writer = (dpkt.pcapng.Writer if path.suffix == ".pcapng" else dpkt.pcap.Writer)(file)
-        for number, (port, (received_ns, packet)) in enumerate(sorted(streams, key=lambda one: one[1][0])):
-            for frame in _frames(packet, port=port, number=number % (1 << 16)):
-                writer.writepkt(frame, ts=received_ns / 1e9)
+    """Write packets as tcpdump captures them, and the metadata beside them."""
+    streams = [(ns, 7502, packet) for ns, packet in lidar] + [(ns, 7503, packet) for ns, packet in imu]
     if metadata is not None:
         path.with_suffix(".json").write_text(metadata)
-    return path
-
-
-def _frames(payload: bytes, *, port: int, number: int, most: int = 1480) -> list[bytes]:
-    """Return the Ethernet frames of a datagram."""
-    whole = bytes(dpkt.udp.UDP(sport=7502, dport=port, ulen=8 + len(payload), data=payload))
-    frames = []
-    for start in range(0, len(whole), most):
-        more = 0x2000 if start + most < len(whole) else 0
-        ip = dpkt.ip.IP(
-            src=bytes([192, 168, 1, 201]),
-            dst=bytes([192, 168, 1, 10]),
-            p=dpkt.ip.IP_PROTO_UDP,
-            id=number,
-            data=whole[start : start + most],
-        )
-        ip._flags_offset = more | start // 8
-        ip.len = len(ip)
-        frames.append(bytes(dpkt.ethernet.Ethernet(src=bytes(6), dst=bytes(6), data=ip)))
-    return frames
+    return write_captured(path, sorted(streams, key=lambda one: one[0]))
 
 
 def simulated(
