@@ -324,14 +324,13 @@ def test_scans_of_any_bytes_are_decoded_or_refused(size, fill):
         assert len(sensor.scan([packet], FIRST_NS).points_body) == 0
 
 
-@pytest.mark.parametrize("name", ["bag", "pcap"])
-def test_packets_are_mapped_as_the_scans_that_they_are_made_of(tmp_path, name):
+def test_packets_are_mapped_as_the_scans_that_they_are_made_of(tmp_path):
     simulator = street(azimuth_steps=256)
     log = simulator.log()
     rings_deg = np.linspace(-15.0, 15.0, 16).tolist()
     sensor, lidar, imu = simulated(log, rings_deg=rings_deg, columns=256)
     config = load_config(None, sensor="lidar")
-    read = open_source(writers()[name](tmp_path, lidar, imu, metadata=sensor.metadata()))
+    read = open_source(write_recording(tmp_path / "a.bag", lidar, imu, metadata=sensor.metadata()))
     ate_m = [
         evaluate(build(one, config, tmp_path / f"run{i}").trajectory, simulator.truth).ate_m
         for i, one in enumerate((log, read))

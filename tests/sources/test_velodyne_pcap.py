@@ -22,10 +22,14 @@ def simulator():
     return street()
 
 
-@pytest.mark.parametrize("name", ["a.pcap", "b.pcapng"])
-def test_a_capture_is_mapped_a_turn_at_a_time(tmp_path, simulator, name):
-    log = open_source(write_pcap(tmp_path / name, simulator, packets=round(9.7 * TURN)))
-    assert (log.kind, log.sensor) == ("velodyne-pcap", "lidar")
+def test_a_capture_is_mapped_a_turn_at_a_time(tmp_path, simulator):
+    log, of_pcapng = (
+        open_source(write_pcap(tmp_path / name, simulator, packets=round(9.7 * TURN)))
+        for name in ("a.pcap", "b.pcapng")
+    )
+    assert (log.kind, log.sensor) == (of_pcapng.kind, of_pcapng.sensor) == ("velodyne-pcap", "lidar")
+    np.testing.assert_allclose(of_pcapng.stamps_ns, log.stamps_ns, atol=1000)  # microseconds are stored
+    np.testing.assert_array_equal(of_pcapng[3].points_body, log[3].points_body)
     np.testing.assert_allclose(np.diff(log.stamps_ns[:-1]) / 1e9, 0.1, atol=0.0014)  # the last turn is cut
     scan = log[3]
     np.testing.assert_allclose([scan.times_s.min(), scan.times_s.max()], [-0.0995, 0.0013], atol=0.0014)
