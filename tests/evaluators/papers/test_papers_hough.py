@@ -212,6 +212,15 @@ def test_the_summary_counts_over_pairs_and_spreads_over_seeds(tmp_path):
     assert reproduction.seeds == 2
 
 
+def test_only_pictures_of_these_pairs_are_shown(tmp_path):
+    (tmp_path / "a_all_rings_hough-gicp.png").touch()
+    (tmp_path / "b_all_rings_hough-gicp.png").touch()  # of another session
+
+    reproduction = hough_reproduction(results_of(trial(), trial(seed=1)), pictures=tmp_path)
+
+    assert reproduction.pictures == (tmp_path / "a_all_rings_hough-gicp.png",)
+
+
 def test_fewer_rings_stand_beside_the_vlp_and_other_sensors_beside_nothing(tmp_path):
     reproduction = hough_reproduction(
         results_of(trial(sensor=FEW_RINGS), trial(sensor="os1")), pictures=tmp_path
