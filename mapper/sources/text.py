@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.errors import DataError, SourceError
-from mapper.core.geometry import Array, Transform, is_rigid, nearest_rotation, transform
+from mapper.core.geometry import FARTHEST_M, Array, Transform, is_rigid, nearest_rotation, transform
 from mapper.core.rotations import pose_of_row
 from mapper.core.timebase import Stamps, ns_from_date_text, ns_from_seconds_text
 from mapper.core.trajectory import Trajectory
@@ -126,9 +126,8 @@ def pose_from_numbers(numbers: Array) -> Transform | None:
 
 def poses_from_numbers(numbers: Array) -> list[Transform | None]:
     """Return the same of each row of (N, 7) numbers."""
-    with np.errstate(over="ignore"):
-        lengths = np.sqrt(np.square(numbers[:, 3:]).sum(axis=1))
-    usable = np.isfinite(numbers).all(axis=1) & (lengths >= 1e-9) & np.isfinite(lengths)
+    sizes = np.abs(numbers)
+    usable = (sizes < FARTHEST_M).all(axis=1) & (sizes[:, 3:].max(axis=1) >= 1e-9)
     kept = numbers[usable]
     poses = iter(pose_of_row(kept))
     return [next(poses) if is_usable else None for is_usable in usable]
@@ -137,12 +136,12 @@ def poses_from_numbers(numbers: Array) -> list[Transform | None]:
 def pose_from_matrix(matrix: Sequence[Sequence[float]] | Array) -> Transform | None:
     """Return the pose of three or four rows of four numbers, its rotation made exact; None of no pose.
 
-    Files say that a camera was lost by numbers that are not finite, or by zeros.
+    Files say that a camera was lost by numbers that are not finite, or by zeros; damaged ones are far off.
     """
     if len({len(row) for row in matrix}) != 1:
         return None
     T = np.asarray(matrix, np.float64)
-    if T.ndim != 2 or T.shape[0] not in (3, 4) or T.shape[1] != 4 or not np.isfinite(T).all():
+    if T.ndim != 2 or T.shape[0] not in (3, 4) or T.shape[1] != 4 or not (np.abs(T) < FARTHEST_M).all():
         return None
     R = nearest_rotation(T[:3, :3])
     return transform(R, T[:3, 3]) if np.abs(R - T[:3, :3]).max() < ROUNDING else None

@@ -1,5 +1,7 @@
 """Stereo pairs: rectified and matched as they are read, of data sets' folders and of recordings."""
 
+import re
+
 import cv2
 import numpy as np
 import pytest
@@ -180,6 +182,16 @@ def test_what_is_missing_or_swapped_is_named(tmp_path):
     folder = write_euroc(tmp_path / "c", BARREL)
     (folder / "mav0/cam1/sensor.yaml").unlink()
     with pytest.raises(SourceError, match="camchain"):
+        open_source(folder)
+    folder = write_euroc(tmp_path / "far", BARREL)
+    file = folder / "mav0/cam1/sensor.yaml"
+    numbers = re.search(r"data: *\[[^]]*\]", file.read_text())[0].split(",")
+    file.write_text(
+        re.sub(
+            r"data: *\[[^]]*\]", ",".join([*numbers[:3], " 1e200", *numbers[4:]]), file.read_text(), count=1
+        )
+    )
+    with pytest.raises(SourceError, match="no rigid motion"):
         open_source(folder)
     folder = write_euroc(tmp_path / "d", BARREL[::-1])
     with pytest.raises(SourceError, match="right"):

@@ -5,6 +5,7 @@ import struct
 import numpy as np
 import pytest
 
+from mapper.core.errors import FrameError
 from mapper.core.frames import Scan
 from mapper.core.timebase import NS_PER_S
 from mapper.sources import open_source
@@ -66,3 +67,13 @@ def test_clouds_of_a_frame_that_tf_does_not_connect_are_named_and_left_out(tmp_p
     log = open_source(write(tmp_path / f"a{ending}", [tf, *clouds]))
     assert log.stamps_ns.tolist() == [ns for k, ns in enumerate(RECORDED_NS) if k % 3 < 2]
     assert sum("right" in note and "left," not in note for note in log.notes) == 1
+
+
+def test_clouds_of_another_frame_after_the_others_are_frames_that_cannot_be_read(tmp_path):
+    """A driver that was started again with another name of its frame: the rest of the path is missing."""
+    clouds = [cloud(ns, ns, frame="old" if k < 15 else "new") for k, ns in enumerate(RECORDED_NS)]
+    log = open_source(write(tmp_path / "a.mcap", clouds))
+    assert log.stamps_ns.tolist() == RECORDED_NS
+    assert len(log[14].points_body)
+    with pytest.raises(FrameError, match="new"):
+        log[15]
