@@ -106,6 +106,9 @@ def depth_warnings(log: Log, frames: Mapping[int, RgbdFrame]) -> list[str]:
         return []
     wrong = f"{1.0 / scale:.2g} times too large" if scale < 1.0 else f"{scale:.2g} times too small"
     whose = "wheels' motion" if log.truth is None else "true motion"
+    median_m = np.median([_median_m(frame) for frame in frames.values() if frame.depth_m.any()])
+    if _NEAR_M < median_m < _FAR_M and not _NEAR_M < scale * median_m < _FAR_M:
+        return [f"depth: the {whose} of the camera is {scale:.3g} times that by depth; is it in metres?"]
     units_per_m = _units_per_m(log)
     fitting = "" if units_per_m is None else f"={_rounded(units_per_m / scale):g} fits, not {units_per_m:g}"
     return [

@@ -58,6 +58,16 @@ def test_a_wrong_factor_is_found_by_the_truth_and_the_right_one_is_named(desk_lo
     ]
 
 
+@pytest.mark.parametrize("units_per_m", [100.0, 1000.0])
+def test_motion_in_other_units_is_named_where_depth_is_that_of_cameras(desk_log, units_per_m):
+    log = open_source(desk_log)
+    T = log.truth.T_world_body.copy()
+    T[:, :3, 3] *= units_per_m
+    (warning,) = warnings_of(replace(log, truth=replace(log.truth, T_world_body=T)))
+    assert "depth_factor" not in warning
+    assert float(re.search(r"([\d.e+-]+) times", warning)[1]) == pytest.approx(units_per_m, rel=0.1)
+
+
 @pytest.mark.parametrize("factor", [1, 20, 400_000, 5_000_000])
 def test_depth_that_no_camera_measures_is_refused_before_tracking(desk_log, tmp_path, factor):
     config = load_config({"source.camera.depth_factor": factor})
