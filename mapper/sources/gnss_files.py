@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from mapper.core.errors import SourceError
-from mapper.core.geometry import Array, Transform, is_rigid, transform
+from mapper.core.geometry import FARTHEST_M, Array, Transform, is_rigid, transform
 from mapper.core.timebase import seconds_text_from_ns
 from mapper.runtime.atomic import write_text
 from mapper.sensing.gnss import NO_FIX, GnssFixes
@@ -109,7 +109,10 @@ def _read_oxts(folder: Path) -> tuple[GnssFixes | None, list[str]]:
     by_number = [(int(file.stem), file) for file in files if file.stem.isdecimal()]
     paired = [(stamps_ns[number], file) for number, file in by_number if number < len(stamps_ns)]
     readings = np.array(list(_oxts_rows(file for _, file in paired))).reshape(-1, _OXTS_COLUMNS)
-    accuracy_m, modes = readings[:, _ACCURACY], readings[:, _POSITION_MODE].astype(int)
+    accuracy_m, modes = (
+        np.minimum(readings[:, _ACCURACY], FARTHEST_M),
+        readings[:, _POSITION_MODE].astype(int),
+    )
     variances = np.square(accuracy_m[:, None] * [1.0, 1.0, _VERTICAL_RATIO])
     T_lidar_imu = _mounting(folder.parent)
     status = [NO_FIX if mode < _LEAST_MODE else _AUGMENTED_MODES.get(mode, 0) for mode in modes.tolist()]

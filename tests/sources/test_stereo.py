@@ -198,6 +198,11 @@ def test_what_is_missing_or_swapped_is_named(tmp_path):
         open_source(folder)
     with pytest.raises(SourceError, match=r"source\.camera"):
         open_source(folder, SourceConfig(camera=CameraConfig(depth_factor=1000.0)))
+    folder = write_kitti(tmp_path / "flat")
+    file = folder / "calib.txt"
+    file.write_text(re.sub(r"(?m)^P0: *\S+", "P0: 0", file.read_text()))
+    with pytest.raises(SourceError, match="focal length"):
+        open_source(folder)
     folder = write_kitti(tmp_path / "e")
     (folder / "image_1/000001.png").unlink()
     with pytest.raises(SourceError, match="image_1"):

@@ -173,6 +173,8 @@ def _raw_camera(pairs: _Pairs, size_px: Size) -> tuple[StereoCamera, Transform]:
 
 def _rectified(pairs: _Pairs, P_left: Array, P_right: Array, size_px: Size) -> StereoCamera:
     fx, fy, cx, cy = (P_left[k] for k in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    if not fx > 0.0:
+        raise SourceError(f"{pairs.calibration}: focal length {fx:g} px, want > 0")
     calibration = Calibration(f"{pairs.calibration}", fx, fy, cx, cy, size_px=size_px)
     return rectified_pair(calibration, (P_left[0, 3] - P_right[0, 3]) / fx, size_px)
 
