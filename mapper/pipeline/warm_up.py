@@ -15,6 +15,7 @@ from mapper.features.hamming import match_mutual_bits, pack
 from mapper.pipeline.build import build
 from mapper.registration.config import IsvdConfig
 from mapper.registration.isvd import Isvd
+from mapper.registration.reprojection import variance_factor
 from mapper.runtime.doctor import processors
 from mapper.runtime.progress import SILENT, Progress
 from mapper.simulation import write_tum_log
@@ -44,10 +45,11 @@ def compile_kernels(*, progress: Progress = SILENT) -> None:
 
 
 def _build_rgbd(folder: Path) -> None:
-    bits = pack(np.zeros((2, 32), np.uint8))  # matching and ISVD of loop closures, which a second has none of
+    bits = pack(np.zeros((2, 32), np.uint8))  # what loop closures need, which a second has none of
     match_mutual_bits(bits, bits, 50, 0.8)
     points = np.random.default_rng(0).normal(size=(100, 3))
     Isvd(IsvdConfig()).fit(points, points)
+    variance_factor(np.eye(4), points + np.array([0.0, 0.0, 9.0]), points, np.ones((100, 3)), np.ones(5))
     write_tum_log(folder, _CAMERA)
     _build(folder, "run")
 

@@ -50,7 +50,7 @@ _ORDER: tuple[Weight, ...] = ("break", "doubt", "note")
 _LEAST_GAP_S = 0.5
 _MAX_SHARE, _BROKEN_SHARE, _FEW_FRAMES = 0.05, 0.25, 2
 """Frames that may be without a sure pose: those around them hold the path where they are single ones. Good
-logs have up to 5 %; paths that were wrong had 13 % and more."""
+logs have up to 5 %; paths that were wrong had 8 % and more."""
 _LONG_FRAMES = 3
 _MIN_COUNTED_DEPTH = 0.5
 _LEAST_AGREEMENT, _LEAST_SHARED_VOXELS = 0.15, 1000
