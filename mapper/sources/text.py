@@ -140,7 +140,8 @@ def pose_from_matrix(matrix: Sequence[Sequence[float]] | Array) -> Transform | N
     """
     if len({len(row) for row in matrix}) != 1:
         return None
-    T = np.asarray(matrix, np.float64)
+    with np.errstate(invalid="ignore"):  # damaged numbers may be signalling NaN
+        T = np.asarray(matrix, np.float64)
     if T.ndim != 2 or T.shape[0] not in (3, 4) or T.shape[1] != 4 or not (np.abs(T) < FARTHEST_M).all():
         return None
     R = nearest_rotation(T[:3, :3])

@@ -61,6 +61,21 @@ def test_layouts_of_every_way_of_reading_are_mapped(shots, tmp_path, kind):
     assert evaluate(run.trajectory, log.device_poses if kind in DEVICE else log.truth).ate_m < 0.02
 
 
+def test_damaged_poses_and_stamps_of_a_sens_file(shots, tmp_path):
+    path = WRITERS["scannet-sens"][0](tmp_path / "scene.sens", shots)
+    data = bytearray(path.read_bytes())
+    second, third = (data.index(shot.T_world_camera.astype("<f4").tobytes()) for shot in shots.frames[1:3])
+    data[second : second + 4] = b"\x01\x00\x80\x7f"  # a signalling NaN
+    path.write_bytes(data)
+    log = open_source(path)
+    assert len(log) == len(shots.frames)
+    assert len(log.truth) == len(log) - 1
+
+    data[third + 64 : third + 72] = b"\xff" * 8
+    path.write_bytes(data)
+    assert len(open_source(path)) == 2
+
+
 @pytest.mark.parametrize("kind", ["polycam", "record3d"])
 def test_device_poses_can_replace_the_odometry(shots, tmp_path, kind):
     write, name = WRITERS[kind]

@@ -13,6 +13,7 @@ import numpy as np
 
 from mapper.core.errors import FrameError, SourceError
 from mapper.core.frames import DepthImage
+from mapper.core.timebase import LATEST_NS
 from mapper.core.units import MM_PER_M
 from mapper.runtime.regular_files import MOST_BYTES
 from mapper.sources.calibration import Calibration
@@ -97,6 +98,7 @@ def _read(file: BinaryIO, path: Path, config: SourceConfig) -> PosedFrames:
             or colour_bytes == 0  # zeros: a file system's hole may have terabytes of them
             or start + colour_bytes + depth_bytes > size
             or max(colour_bytes, depth_bytes) > MOST_BYTES
+            or record["stamps_us"][0] > LATEST_NS // 1000  # damaged
         ):
             notes.append(f"{path.name}: cut off after {len(frames)} of {count} frames")
             break
@@ -108,7 +110,7 @@ def _read(file: BinaryIO, path: Path, config: SourceConfig) -> PosedFrames:
                 stamps_us[-1] * 1000,
                 FilePart(path, start, colour_bytes, suffix),
                 DecodedDepth(part, decode, units_per_m),
-                pose_from_matrix(record["pose"].astype(np.float64)),
+                pose_from_matrix(record["pose"]),
             )
         )
         file.seek(start + colour_bytes + depth_bytes)
