@@ -23,7 +23,13 @@ class BuildWithKernels(build_py):
     def run(self) -> None:
         """Copy and compile; what cannot be compiled here is compiled by the first build of a log."""
         super().run()
-        if not WITH_KERNELS or self.editable_mode:
+        if self.editable_mode:
+            return
+        # setuptools leaves build/lib to the next build: numba notices that a kernel's own module has changed
+        # since, but not one whose kernels it calls.
+        for file in Path(self.build_lib).rglob("*.nb[ic]"):
+            file.unlink()
+        if not WITH_KERNELS:
             return
         environment = dict(os.environ)
         environment.pop("NUMBA_CACHE_DIR", None)

@@ -28,6 +28,7 @@ from mapper.run.manifest import RunWarning
 from mapper.run.observers import NULL_OBSERVER, Observer, Step
 from mapper.runtime.ordered_map import ordered_map
 from mapper.runtime.progress import Progress
+from mapper.sensing.gyroscope import Gyroscope
 from mapper.sources.base import FrameRef, Log, Skipped
 from mapper.sources.depth_outlines import outline_warnings
 from mapper.sources.depth_scale import depth_warnings, read_spread, why_no_depth
@@ -218,7 +219,9 @@ class _FirstPass:
         progress: Progress,
     ) -> TrackingResult:
         """Return the result of all frames; nothing is added afterwards."""
-        tracks = _in_hindsight(self.tracks, odometry, checks)
+        calibration = odometry.gyroscope_calibration() if isinstance(odometry, GyroscopeUser) else None
+        gyroscope = None if calibration is None else with_body_rates(checks.log, calibration).gyroscope
+        tracks = _in_hindsight(self.tracks, odometry, checks, gyroscope)
         before = self._start.graph
         graph = PoseGraph(
             dict(before.T_world_node), dict(before.stamps_ns), list(before.factors), fixes=before.fixes
@@ -243,7 +246,7 @@ class _FirstPass:
             self.frame_ms,
             warnings,
             detector.places(),
-            odometry.gyroscope_calibration() if isinstance(odometry, GyroscopeUser) else None,
+            calibration,
         )
 
     def _new_wheel_factors(self, graph: PoseGraph) -> list[BetweenFactor]:
@@ -278,13 +281,17 @@ class _FirstPass:
 
 
 def _in_hindsight(
-    tracks: Sequence[FrameResult], odometry: Odometry[Any], checks: ReadingChecks
+    tracks: Sequence[FrameResult],
+    odometry: Odometry[Any],
+    checks: ReadingChecks,
+    gyroscope: Gyroscope | None,
 ) -> list[FrameResult]:
-    """Return the frames' results with all factors, and with what later frames and the readings add."""
+    """Return the frames' results with all factors, and with what later frames and the readings add.
+
+    ``gyroscope`` gives the angular velocities of the body, if they are known.
+    """
     if tracks:
         tracks = [*tracks[:-1], replace(tracks[-1], factors=(*tracks[-1].factors, *odometry.finish()))]
-    calibration = odometry.gyroscope_calibration() if isinstance(odometry, GyroscopeUser) else None
-    gyroscope = None if calibration is None else with_body_rates(checks.log, calibration).gyroscope
     tracks, doubts = with_doubtful_spikes(tracks, gyroscope), checks.doubts()
     return [
         replace(track, doubts=track.doubts or tuple(doubts.get(track.stamp_ns, ())))

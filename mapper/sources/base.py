@@ -292,10 +292,15 @@ class Log:
         """Return the entry of the frame with a stamp; there is one."""
         return self.entry_at(int(np.searchsorted(self.stamps_ns, stamp_ns)))
 
+    def spread_indices(self, most: int) -> list[int]:
+        """Return the indices of at most ``most`` frames, evenly spread over the log."""
+        spread = np.linspace(0, len(self) - 1, min(most, len(self))).round().astype(int)
+        indices: list[int] = np.unique(spread).tolist()
+        return indices
+
     def spread_entries(self, most: int) -> Iterator[FrameRef]:
         """Yield the entries of at most ``most`` frames, evenly spread over the log."""
-        indices = np.unique(np.linspace(0, len(self) - 1, min(most, len(self))).round().astype(int))
-        return map(self.entry_at, indices.tolist())
+        return map(self.entry_at, self.spread_indices(most))
 
     def subset(self, indices: NDArray[np.intp]) -> "Log":
         """Return the log with only the frames of some increasing indices; all else stays as it is."""

@@ -57,9 +57,11 @@ def outline_warnings(frames: Iterable[RgbdFrame]) -> list[str]:
             "(columns, rows): is it registered to colour, and of the same time? export registered depth, or "
             "give the depth camera: source.camera.depth_intrinsics_px and depth_in_color"
         ]
+    if near >= _SOUND:
+        return []
     crossed = [(gradient, edges) for (gradient, _), (_, edges) in permutations(pairs, 2)]
     own, others = (np.mean([_scores(*both, _NEAR_PX).max() for both in some]) for some in (pairs, crossed))
-    if near < _SOUND and own < min(_LEAST_SCORE, _TIMES_OTHERS * others):
+    if own < min(_LEAST_SCORE, _TIMES_OTHERS * others):
         return [
             "depth: its edges lie on those of the images no better than other frames' depth; is it "
             "of the same time (source.depth_offset_s), and of the same camera?"

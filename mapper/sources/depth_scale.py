@@ -66,8 +66,8 @@ def read_spread(log: Log) -> dict[int, RgbdFrame]:
     """Return a few frames of an RGB-D log by index, for the checks of depth; none of other logs."""
     if log.sensor != "rgbd":
         return {}
-    spread = np.unique(np.linspace(0, len(log) - 1, _LOOKED_AT).astype(int)).tolist()
-    return {index: frame for index in spread if (frame := read_depth(log.entry_at(index))) is not None}
+    read = ((index, read_depth(log.entry_at(index))) for index in log.spread_indices(_LOOKED_AT))
+    return {index: frame for index, frame in read if frame is not None}
 
 
 def why_no_depth(log: Log, frames: Mapping[int, RgbdFrame]) -> str | None:

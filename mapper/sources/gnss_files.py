@@ -109,10 +109,8 @@ def _read_oxts(folder: Path) -> tuple[GnssFixes | None, list[str]]:
     by_number = [(int(file.stem), file) for file in files if file.stem.isdecimal()]
     paired = [(stamps_ns[number], file) for number, file in by_number if number < len(stamps_ns)]
     readings = np.array(list(_oxts_rows(file for _, file in paired))).reshape(-1, _OXTS_COLUMNS)
-    accuracy_m, modes = (
-        np.minimum(readings[:, _ACCURACY], FARTHEST_M),
-        readings[:, _POSITION_MODE].astype(int),
-    )
+    accuracy_m = np.minimum(readings[:, _ACCURACY], FARTHEST_M)
+    modes = readings[:, _POSITION_MODE].astype(int)
     variances = np.square(accuracy_m[:, None] * [1.0, 1.0, _VERTICAL_RATIO])
     T_lidar_imu = _mounting(folder.parent)
     status = [NO_FIX if mode < _LEAST_MODE else _AUGMENTED_MODES.get(mode, 0) for mode in modes.tolist()]

@@ -180,10 +180,9 @@ def lidar_frames(reader: RecordingReader, clouds: Series, config: SourceConfig) 
             f"{clouds.topic.name}: {left_out.sum()} of {len(clouds)} clouds are in frames that tf does not "
             f"connect to {body}; left out: {names}; record /tf_static too"
         )
-        stamps_ns, kept = clouds.stamps_ns[i], ~left_out[i]
-        first_ns, last_ns = stamps_ns[kept][[0, -1]]
+        kept, seen = ~left_out[i], np.logical_or.accumulate
         # Before and after the others a part of the path is missing, so there they count as skipped.
-        i = i[kept | (stamps_ns < first_ns) | (stamps_ns > last_ns)]
+        i = i[kept | ~seen(kept) | ~seen(kept[::-1])[::-1]]
     tree = reader.tree_of(body, frame)
     return RecordedFrames("lidar-2d" if is_planar else "lidar", body, clouds.stamps_ns[i], entry_at, notes)
 
