@@ -125,3 +125,4 @@ def test_real_streets(name, limit_m, tmp_path):
 
     assert run.manifest.counts.lost == 0
     assert error_m(run) < limit_m
+    assert run.manifest.solve.planes is None  # of 20 nodes or fewer
