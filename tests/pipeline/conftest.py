@@ -9,10 +9,11 @@ from mapper.config.loading import load_config
 from mapper.pipeline.build import build
 from mapper.run.folder import Run
 from mapper.runtime.atomic import partial_of
+from mapper.simulation import write_tum_log
 from mapper.simulation.config import STREET, LidarSensorConfig
 from mapper.simulation.lidar import write_lidar_log
 from mapper.sources import open_source
-from tests.support.desk import MANY_KEYFRAMES, write_log_of_another_flat
+from tests.support.desk import DESK, MANY_KEYFRAMES, write_log_of_another_flat
 from tests.support.stopped_builds import StopAt, start, stopped
 
 
@@ -31,11 +32,25 @@ def elsewhere(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return log
 
 
+@pytest.fixture(scope="session")
+def short_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A log of sixteen frames before a desk, for what is built again and again."""
+    log = tmp_path_factory.mktemp("logs") / "short"
+    write_tum_log(log, DESK.model_copy(update={"duration_s": 1.0}))
+    return log
+
+
+@pytest.fixture(scope="session")
+def short_run(short_log: Path, tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """The run built of it."""
+    return start(short_log, tmp_path_factory.mktemp("runs") / "short", checkpoint_s=None)
+
+
 @pytest.fixture(scope="module")
-def half(desk_log: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A build of the desk log that was stopped at frame 20; tests work on copies."""
+def half(short_log: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A build of the short log that was stopped at frame 11; tests work on copies."""
     out = tmp_path_factory.mktemp("half") / "run"
-    stopped(desk_log, out, observer=StopAt(20))
+    stopped(short_log, out, observer=StopAt(11))
     return out
 
 

@@ -30,17 +30,17 @@ def damage(path, how):
 
 
 @pytest.mark.parametrize("how", ["torn", "flipped"])
-def test_a_damaged_checkpoint_leaves_the_one_before_it(desk_log, desk_run, unfinished, how):
+def test_a_damaged_checkpoint_leaves_the_one_before_it(short_log, short_run, unfinished, how):
     folder, progress = partial_of(unfinished) / CHECKPOINTS, Stage()
     damage(newest(folder), how)
-    run = start(desk_log, unfinished, progress=progress)
+    run = start(short_log, unfinished, progress=progress)
     assert "the newest checkpoint is damaged or torn; the one before it is used" in progress.notes
     assert resumed(run)
-    assert_same(run, desk_run)
+    assert_same(run, short_run)
 
 
 @pytest.mark.parametrize("what", ["both checkpoints", "journal"])
-def test_damaged_checkpoints_begin_anew_with_a_word(desk_log, desk_run, unfinished, what):
+def test_damaged_checkpoints_begin_anew_with_a_word(short_log, short_run, unfinished, what):
     folder, progress = partial_of(unfinished) / CHECKPOINTS, Stage()
     if what == "journal":
         data = bytearray((folder / "tracking.journal").read_bytes())
@@ -49,41 +49,41 @@ def test_damaged_checkpoints_begin_anew_with_a_word(desk_log, desk_run, unfinish
     else:
         for path in folder.glob("odometry.*"):
             damage(path, "flipped")
-    run = start(desk_log, unfinished, progress=progress)
+    run = start(short_log, unfinished, progress=progress)
     assert "the checkpoints of an earlier process are damaged; tracking begins anew" in progress.notes
     assert resumed(run) == []
-    assert_same(run, desk_run)
+    assert_same(run, short_run)
 
 
-def test_a_torn_tail_of_the_journal_costs_nothing(desk_log, desk_run, unfinished):
+def test_a_torn_tail_of_the_journal_costs_nothing(short_log, short_run, unfinished):
     with (partial_of(unfinished) / CHECKPOINTS / "tracking.journal").open("ab") as file:
         file.write(b"\x20\0\0\0\0\0\0\0half of a record")
-    run = start(desk_log, unfinished)
+    run = start(short_log, unfinished)
     assert resumed(run)
-    assert_same(run, desk_run)
+    assert_same(run, short_run)
 
 
-def test_a_torn_file_of_updates_is_not_used(desk_log, desk_run, tmp_path):
+def test_a_torn_file_of_updates_is_not_used(short_log, short_run, tmp_path):
     out = tmp_path / "run"
-    stopped(desk_log, out, progress=Stage("fuse", 20))
+    stopped(short_log, out, progress=Stage("fuse", 11))
     damage(partial_of(out) / "scan_updates.bin", "flipped")
-    run = start(desk_log, out)
-    assert_same(run, desk_run)
+    run = start(short_log, out)
+    assert_same(run, short_run)
     assert [step for step, _ in resumed(run)] == ["fuse"]
 
 
 @pytest.fixture(scope="module")
-def half_fused(desk_log, tmp_path_factory):
-    """A build of the desk log that was stopped while its frames were fused; tests work on copies."""
+def half_fused(short_log, tmp_path_factory):
+    """A build of the short log that was stopped while its frames were fused; tests work on copies."""
     out = tmp_path_factory.mktemp("half_fused") / "run"
-    stopped(desk_log, out, progress=Stage("fuse", 20))
+    stopped(short_log, out, progress=Stage("fuse", 11))
     return out
 
 
 @pytest.mark.parametrize("stage", ["half", "half_fused"])
 @pytest.mark.parametrize("seed", range(3))
 def test_a_power_cut_that_spoils_any_file_costs_work_and_no_bytes(
-    request, desk_log, desk_run, tmp_path, stage, seed
+    request, short_log, short_run, tmp_path, stage, seed
 ):
     out, rng = tmp_path / "run", np.random.default_rng(seed)
     shutil.copytree(partial_of(request.getfixturevalue(stage)), partial_of(out))
@@ -99,11 +99,11 @@ def test_a_power_cut_that_spoils_any_file_costs_work_and_no_bytes(
         elif what == "flipped":
             data[place] ^= 1 << int(rng.integers(8))
         path.write_bytes(data)
-    assert_same(start(desk_log, out), desk_run)
+    assert_same(start(short_log, out), short_run)
 
 
 def test_what_lies_on_the_disk_alone_is_read_again_to_the_same_bytes(
-    desk_log, desk_run, street, street_run, tmp_path, monkeypatch
+    short_log, short_run, street, street_run, tmp_path, monkeypatch
 ):
     read = []
 
@@ -117,7 +117,7 @@ def test_what_lies_on_the_disk_alone_is_read_again_to_the_same_bytes(
 
     monkeypatch.setattr("mapper.pipeline.checkpoints.Archive", Forgetful)
     monkeypatch.setattr("mapper.odometry.keyframes.keyframe._READY", 1)
-    for log, wanted, frame in ((desk_log, desk_run, 20), (street, street_run, 12)):
+    for log, wanted, frame in ((short_log, short_run, 11), (street, street_run, 12)):
         read.clear()
         stopped(log, tmp_path / log.name, observer=StopAt(frame))
         assert_same(start(log, tmp_path / log.name), wanted)
@@ -125,8 +125,8 @@ def test_what_lies_on_the_disk_alone_is_read_again_to_the_same_bytes(
 
 
 @pytest.mark.parametrize("left", ["", "{", "[]", "[3]", '{"config": 3}', None])
-def test_checkpoints_without_a_sound_identity_are_not_used(desk_log, unfinished, left):
+def test_checkpoints_without_a_sound_identity_are_not_used(short_log, unfinished, left):
     path = partial_of(unfinished) / CHECKPOINTS / "identity.json"
     path.write_text(path.read_text().replace("0", "1", 1) if left is None else left)
     with pytest.raises(Stopped):
-        start(desk_log, unfinished, observer=StopAt(1))
+        start(short_log, unfinished, observer=StopAt(1))

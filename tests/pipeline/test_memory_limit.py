@@ -32,34 +32,34 @@ def assert_same_map(run, wanted):
         assert ours[name] == theirs[name], name
 
 
-@pytest.mark.parametrize("limit_mb", [0.001, 0.15, 0.18])
+@pytest.mark.parametrize("limit_mb", [0.001, 0.15, 0.17])
 def test_a_build_that_was_stopped_while_fusing_makes_the_same_map(
-    desk_log, desk_run, tmp_path, grown, limit_mb
+    short_log, short_run, tmp_path, grown, limit_mb
 ):
     limit = f"octree.max_memory_mb={limit_mb}"
-    stopped(desk_log, tmp_path / "run", limit, progress=Stage("fuse", 20))
-    run = start(desk_log, tmp_path / "run", limit)
+    stopped(short_log, tmp_path / "run", limit, progress=Stage("fuse", 14))
+    run = start(short_log, tmp_path / "run", limit)
 
     assert max(grown) * sparse_grid.BLOCK_BYTES > 1e6 * limit_mb
     assert [step for step, _ in resumed(run)] == ["fuse"]
-    assert_same_map(run, desk_run)
+    assert_same_map(run, short_run)
 
 
 @pytest.mark.parametrize("limits", [[], ["octree.max_memory_mb=0.1"]])
-def test_a_build_goes_on_with_another_limit(desk_log, desk_run, tmp_path, grown, limits):
-    stopped(desk_log, tmp_path / "run", *limits, progress=Stage("fuse", 20))
+def test_a_build_goes_on_with_another_limit(short_log, short_run, tmp_path, grown, limits):
+    stopped(short_log, tmp_path / "run", *limits, progress=Stage("fuse", 14))
     grown.clear()
 
-    run = start(desk_log, tmp_path / "run", "octree.max_memory_mb=0.15")
+    run = start(short_log, tmp_path / "run", "octree.max_memory_mb=0.15")
 
     assert grown
     assert resumed(run)
     assert run.config.octree.max_memory_mb == 0.15
-    assert_same_map(run, desk_run)
+    assert_same_map(run, short_run)
 
 
-def test_a_run_is_fused_again_within_a_limit(desk_log, desk_run, street, street_run, tmp_path, grown):
-    for log, wanted in ((desk_log, desk_run), (street, street_run)):
+def test_a_run_is_fused_again_within_a_limit(short_log, short_run, street, street_run, tmp_path, grown):
+    for log, wanted in ((short_log, short_run), (street, street_run)):
         grown.clear()
         run = start(log, tmp_path / log.name)
         octree = run.config.octree.model_copy(update={"max_memory_mb": 0.1})
@@ -68,6 +68,6 @@ def test_a_run_is_fused_again_within_a_limit(desk_log, desk_run, street, street_
         assert_same_map(open_run(run.path), wanted)
 
 
-def test_a_map_below_the_limit_is_in_memory(desk_log, tmp_path, grown):
-    start(desk_log, tmp_path / "run", "octree.max_memory_mb=1000")
+def test_a_map_below_the_limit_is_in_memory(short_log, tmp_path, grown):
+    start(short_log, tmp_path / "run", "octree.max_memory_mb=1000")
     assert not grown

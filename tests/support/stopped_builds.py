@@ -57,9 +57,8 @@ class Stage(Silent):
 
 
 def start(log, out, *overrides, checkpoint_s=0.0, **arguments):
-    source = open_source(log)
-    config = load_config(None, [REPEATABLE, *overrides], sensor=source.sensor)
-    return build(source, config, out, checkpoint_s=checkpoint_s, **arguments)
+    config = load_config(None, [REPEATABLE, *overrides], sensor=open_source(log).sensor)
+    return build(open_source(log, config.source), config, out, checkpoint_s=checkpoint_s, **arguments)
 
 
 def stopped(log, out, *overrides, **arguments):
