@@ -52,10 +52,10 @@ def rooms(request, tmp_path_factory):
     """Two rooms twice around, with wheels that slip by 5 %."""
     folder = tmp_path_factory.mktemp("flat")
     if "ROS" in request.param:
-        driven = drive(flat(), RPLIDAR, speed_mps=0.8)
+        driven = drive(flat(), RPLIDAR, speed_mps=1.2)
         path = write_ros(folder / "log", driven)
     else:
-        driven = drive(flat(), SICK, speed_mps=0.4)
+        driven = drive(flat(), SICK, speed_mps=0.7)
         path = write_carmen(folder / "log.log", driven)
     return driven, built(path, folder / "run")
 
@@ -112,7 +112,7 @@ def test_free_cells_of_the_layer_are_floor(rooms):
 
 
 def test_wheels_measure_the_length_of_a_bare_corridor(tmp_path):
-    driven = drive(corridor(20.0), RPLIDAR, speed_mps=1.0)
+    driven = drive(corridor(20.0), RPLIDAR, speed_mps=1.6)
 
     run = built(write_ros(tmp_path / "log.bag", driven), tmp_path / "run")
 
@@ -121,7 +121,7 @@ def test_wheels_measure_the_length_of_a_bare_corridor(tmp_path):
 
 
 def test_walls_alone_place_scans_without_wheels(tmp_path):
-    driven = drive(flat(), SICK, speed_mps=0.4)
+    driven = drive(flat(), SICK, speed_mps=0.7)
     path = write_carmen(tmp_path / "log.log", replace(driven, readings=np.zeros_like(driven.readings)))
 
     run = built(path, tmp_path / "run")
@@ -132,7 +132,7 @@ def test_walls_alone_place_scans_without_wheels(tmp_path):
 
 def test_another_drive_is_localised_in_the_map(rooms, tmp_path):
     driven, run = rooms
-    again = drive(flat(), driven.laser, speed_mps=0.6, seed=5)
+    again = drive(flat(), driven.laser, speed_mps=1.0, seed=5)
     known = load_known_map(run.path)
 
     localise(open_source(write_ros(tmp_path / "log", again)), known, known.config, tmp_path / "run")
