@@ -197,7 +197,7 @@ def millimetres_for_redwood(desk_log, folder):
     return folder
 
 
-def test_inspect_and_build_tell_and_the_setting_alone_mends_it(desk_log, tmp_path):
+def test_inspect_and_build_tell_and_the_setting_alone_mends_it(desk_log, desk_run, tmp_path):
     log = millimetres_for_redwood(desk_log, tmp_path / "log")
     text = mapper("inspect", log).stdout
     assert "source.camera.depth_factor=1000 right?" in " ".join(
@@ -206,32 +206,17 @@ def test_inspect_and_build_tell_and_the_setting_alone_mends_it(desk_log, tmp_pat
     facts = json.loads(mapper("inspect", log, "--json").stdout)
     assert len(facts["log"]["warnings"]) == 1
 
-    result = mapper(
-        "build",
-        log,
-        "--out",
-        tmp_path / "run",
-        "--set",
-        "odometry.max_depth_m=30",
-        "--set",
-        "slice.max_height_m=9",
-    )
+    coarse = ("--set", "octree.resolution_m=0.2", "--set", "odometry.max_depth_m=30")
+    out = tmp_path / "run"
+    result = mapper("build", log, "--out", out, "--last", 14, *coarse, "--set", "slice.max_height_m=9")
     assert "depth: a tenth of it is beyond" in result.stderr
-    notes = open_run(tmp_path / "run").manifest.input.notes
+    notes, known = (run.manifest.input.notes for run in (open_run(out), desk_run))
     assert any(note.startswith("depth: a tenth of it is beyond") for note in notes)
+    is_high = [any("m above the floor; is source.camera" in note for note in all_) for all_ in (notes, known)]
+    assert is_high == [True, False]
 
     mended = mapper("inspect", log, "--set", "source.camera.depth_factor=5000").stdout
     assert "warning" not in mended
-
-
-def test_a_camera_above_every_ceiling_is_noted(desk_log, tmp_path):
-    """Levelled, the camera of a log in the wrong units stands higher than any hand reaches."""
-    config = load_config(overrides=["odometry.max_depth_m=30", "slice.max_height_m=9"])
-    for factor, is_high in ((5000, False), (1000, True)):
-        log = desk(desk_log, factor)
-        run = build(log, config, tmp_path / f"{factor}")
-        high = [note for note in run.manifest.input.notes if "m above the floor; is source.camera" in note]
-        assert bool(high) == is_high
 
 
 @pytest.mark.parametrize("far_m", [1.2, 4.0, 10.0])

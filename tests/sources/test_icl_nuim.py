@@ -12,7 +12,8 @@ from mapper.core.rotations import quaternion_from_rotation
 from mapper.core.timebase import NS_PER_S
 from mapper.core.trajectory import Trajectory
 from mapper.evaluators.metrics.evaluate import evaluate
-from mapper.pipeline.build import build
+from mapper.pipeline.track import track_log
+from mapper.runtime.progress import SILENT
 from mapper.sources import open_source
 from mapper.sources.config import CameraConfig, SourceConfig
 from mapper.sources.trajectory_files import write_tum
@@ -139,7 +140,7 @@ def test_a_negative_fy_is_understood_in_any_format(tiny_tum_log):
     )
 
 
-def test_a_build_has_the_error_of_the_same_frames_in_a_tum_folder(desk_log, tmp_path):
+def test_tracking_has_the_error_of_the_same_frames_in_a_tum_folder(desk_log, tmp_path):
     """With a truth that is not mirrored the errors would not be equal: 9 mm are added to the ATE."""
     source = open_source(desk_log)
     icl, tum = tmp_path / "traj1_frei_png", tmp_path / "tum"
@@ -167,8 +168,8 @@ def test_a_build_has_the_error_of_the_same_frames_in_a_tum_folder(desk_log, tmp_
     metrics = {}
     for folder in (icl, tum):
         log = open_source(folder)
-        run = build(log, load_config(), tmp_path / f"run of {folder.name}")
-        metrics[log.kind] = {m.name: m.value for m in evaluate(run.trajectory, run.truth)}
+        found = track_log(log, load_config(None, ["loops.kind=none"]), progress=SILENT).trajectory()
+        metrics[log.kind] = {m.name: m.value for m in evaluate(found, log.truth)}
 
     assert metrics["icl-nuim"] == pytest.approx(metrics["tum"], rel=1e-6, abs=1e-9)
     assert metrics["icl-nuim"]["ATE RMSE, SE(3)-aligned"] < 0.02

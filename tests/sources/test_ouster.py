@@ -11,6 +11,8 @@ from mapper.core.errors import SourceError
 from mapper.core.frames import Scan
 from mapper.evaluators.metrics.evaluate import evaluate
 from mapper.pipeline.build import build
+from mapper.pipeline.track import track_log
+from mapper.runtime.progress import SILENT
 from mapper.sources import open_source
 from mapper.sources.inspection import inspect_log
 from mapper.sources.ouster_packets import OusterSensor
@@ -331,9 +333,10 @@ def test_packets_are_mapped_as_the_scans_that_they_are_made_of(tmp_path):
     sensor, lidar, imu = simulated(log, rings_deg=rings_deg, columns=256)
     config = load_config(None, sensor="lidar")
     read = open_source(write_recording(tmp_path / "a.bag", lidar, imu, metadata=sensor.metadata()))
-    ate_m = [
-        evaluate(build(one, config, tmp_path / f"run{i}").trajectory, simulator.truth).ate_m
-        for i, one in enumerate((log, read))
-    ]
+    scans, packets = (
+        track_log(log, config, progress=SILENT).trajectory(),
+        build(read, config, tmp_path / "run"),
+    )
+    expected_m, ate_m = (evaluate(one, simulator.truth).ate_m for one in (scans, packets.trajectory))
     assert len(read) == len(log)
-    np.testing.assert_allclose(ate_m[1], ate_m[0], atol=0.003)
+    np.testing.assert_allclose(ate_m, expected_m, atol=0.003)

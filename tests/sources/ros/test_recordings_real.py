@@ -22,21 +22,22 @@ def log_or_skip(name):
     return DATA / name
 
 
-@pytest.mark.parametrize("kind", ["mcap", "bag"])
-def test_fr1_xyz_gives_the_identical_trajectory(tmp_path, kind):
+def test_fr1_xyz_gives_the_identical_trajectory(tmp_path):
     config = load_config(None, ["loops.kind=none"])
-    source = open_source(log_or_skip("tum_fr1_xyz"), SourceConfig(last_frame=60))
-    assert write_log(source, tmp_path / f"xyz.{kind}", kind=kind) == []
-    again = open_source(tmp_path / f"xyz.{kind}", SourceConfig())
-    expected, found = (track_log(log, config, progress=SILENT).trajectory() for log in (source, again))
-    assert len(expected) == 61
-    np.testing.assert_array_equal(found.stamps_ns, expected.stamps_ns)
-    np.testing.assert_array_equal(found.T_world_body, expected.T_world_body)
+    source = open_source(log_or_skip("tum_fr1_xyz"), SourceConfig(last_frame=30))
+    expected = track_log(source, config, progress=SILENT).trajectory()
+    assert len(expected) == 31
+    for kind in ("mcap", "bag"):
+        assert write_log(source, tmp_path / f"xyz.{kind}", kind=kind) == []
+        again = open_source(tmp_path / f"xyz.{kind}", SourceConfig())
+        found = track_log(again, config, progress=SILENT).trajectory()
+        np.testing.assert_array_equal(found.stamps_ns, expected.stamps_ns)
+        np.testing.assert_array_equal(found.T_world_body, expected.T_world_body)
 
 
 @pytest.mark.slow
 def test_fr1_xyz_seen_by_a_depth_camera_beside_colour_s_gives_the_path_and_the_map(tmp_path):
-    registered = open_source(log_or_skip("tum_fr1_xyz"), SourceConfig(last_frame=60, stride=5))
+    registered = open_source(log_or_skip("tum_fr1_xyz"), SourceConfig(last_frame=60, stride=6))
     write_unregistered(tmp_path / "bag", registered)
     config = load_config()
     wanted, found = (
