@@ -180,7 +180,7 @@ def test_another_street_is_lost_and_then_begins_a_sub_map():
     config = GicpOdometryConfig(max_lost_scans=2, rescue=None)
     elsewhere = [
         Scan(scan.stamp_ns + 10_000_000_000, (scan.points_body * [1.0, -1.0, 1.0]).astype(np.float32))
-        for scan in scans(seed=5)[:6]
+        for scan in (street(5).entry_at(index).load() for index in range(6))
     ]
 
     tracks = tracked(config, [*scans()[:6], *elsewhere])
