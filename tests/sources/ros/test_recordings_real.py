@@ -1,12 +1,10 @@
-"""Real logs as recordings, where they are: the map of the folder, and the scans that kiss-icp reads."""
+"""Real logs as recordings, where they are: the path and the depth of the folder, and the scans that kiss-icp reads."""
 
 import numpy as np
 import pytest
 from kiss_icp.datasets.rosbag import RosbagDataset
 
 from mapper.config.loading import load_config
-from mapper.evaluators.metrics.trajectory_errors import align, associate, ate
-from mapper.pipeline.build import build
 from mapper.pipeline.track import track_log
 from mapper.runtime.progress import SILENT
 from mapper.sources import open_source
@@ -35,21 +33,14 @@ def test_fr1_xyz_gives_the_identical_trajectory(tmp_path):
         np.testing.assert_array_equal(found.T_world_body, expected.T_world_body)
 
 
-@pytest.mark.slow
-def test_fr1_xyz_seen_by_a_depth_camera_beside_colour_s_gives_the_path_and_the_map(tmp_path):
-    registered = open_source(log_or_skip("tum_fr1_xyz"), SourceConfig(last_frame=60, stride=6))
+def test_fr1_xyz_seen_by_a_depth_camera_beside_colour_s_has_the_same_depth(tmp_path):
+    registered = open_source(log_or_skip("tum_fr1_xyz"), SourceConfig(last_frame=60, stride=30))
     write_unregistered(tmp_path / "bag", registered)
-    config = load_config()
-    wanted, found = (
-        build(log, config, tmp_path / name)
-        for name, log in (("wanted", registered), ("found", open_source(tmp_path / "bag")))
-    )
-    pairs = [associate(run.trajectory, registered.truth) for run in (wanted, found)]
-    errors_m = [ate(align(one, "se3").moved(one)).rmse for one in pairs]
-    assert errors_m[1] < 1.15 * errors_m[0]
-    counts = [run.manifest.counts for run in (wanted, found)]
-    assert counts[1].tracked >= counts[0].tracked - 2
-    assert counts[1].occupied == pytest.approx(counts[0].occupied, rel=0.05)
+    for wanted, found in zip(registered, open_source(tmp_path / "bag"), strict=True):
+        measured = wanted.depth_m > 0.0
+        both = measured & (found.depth_m > 0.0)
+        assert both.sum() > 0.995 * measured.sum()
+        assert np.isclose(found.depth_m, wanted.depth_m, rtol=0.01)[both].mean() > 0.99
 
 
 @pytest.mark.parametrize("kind", ["mcap", "bag"])
