@@ -14,6 +14,7 @@ from mapper.runtime.progress import SILENT
 from mapper.simulation.config import LIDAR_SCENES
 from mapper.simulation.lidar import write_lidar_log
 from mapper.sources import open_source
+from mapper.sources.config import SourceConfig
 from tests.support.paths import DATA
 
 
@@ -48,7 +49,7 @@ def test_rooms_are_more_accurate_and_the_manifest_says_so(tmp_path, monkeypatch)
 def test_a_real_courtyard_is_not_less_accurate():
     if not (DATA / "courtyard_2hz").exists():
         pytest.skip("no courtyard_2hz")
-    log = open_source(DATA / "courtyard_2hz")
+    log = open_source(DATA / "courtyard_2hz", SourceConfig(last_frame=79))
     config = load_config(None, sensor="lidar")
     tracking = track_log(log, config, progress=SILENT)
     solved = replace(tracking, graph=solve(tracking.graph, tracking.loops, config.graph).graph)

@@ -121,7 +121,7 @@ def test_real_streets(name, limit_m, tmp_path):
     if not (DATA / name).is_dir():
         pytest.skip(f"{DATA / name} is not here")
 
-    run = built(DATA / name, tmp_path / "run")
+    run = built(DATA / name, tmp_path / "run", "octree.resolution_m=0.5")
 
     assert run.manifest.counts.lost == 0
     assert error_m(run) < limit_m

@@ -105,8 +105,8 @@ def test_both_sessions_keep_their_gyroscopes(tmp_path):
         yaw_swing_rad=1.5, imu=SynthImuConfig(),
         sensor=LidarSensorConfig(rings=16, lowest_ring_rad=-0.26, highest_ring_rad=0.26, azimuth_steps=450),
     )  # fmt: skip
-    for name in ("one", "two"):
-        write_lidar_log(tmp_path / name, hand)
+    write_lidar_log(tmp_path / "one", hand)
+    shutil.copytree(tmp_path / "one", tmp_path / "two")
     config = load_config(None, SETTINGS, sensor="lidar")
     one = build(open_source(tmp_path / "one", config.source), config, tmp_path / "run")
     both = appended(one, tmp_path / "two", tmp_path / "both")

@@ -1,4 +1,4 @@
-"""Real logs as recordings, where they are: the path and the depth of the folder, and the scans that kiss-icp reads."""
+"""Real logs as recordings, where they are: path and depth of the folder, and the scans of kiss-icp."""
 
 import numpy as np
 import pytest
