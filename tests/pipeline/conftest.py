@@ -64,10 +64,10 @@ def unfinished(half: Path, tmp_path: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def street(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A log of twenty scans in a street."""
+    """A log of thirteen scans in a street."""
     folder = tmp_path_factory.mktemp("logs") / "street"
     sensor = LidarSensorConfig(rings=24, azimuth_steps=360)
-    write_lidar_log(folder, STREET.model_copy(update={"duration_s": 2.0, "sensor": sensor}))
+    write_lidar_log(folder, STREET.model_copy(update={"duration_s": 1.2, "sensor": sensor}))
     return folder
 
 

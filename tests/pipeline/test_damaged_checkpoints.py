@@ -117,7 +117,7 @@ def test_what_lies_on_the_disk_alone_is_read_again_to_the_same_bytes(
 
     monkeypatch.setattr("mapper.pipeline.checkpoints.Archive", Forgetful)
     monkeypatch.setattr("mapper.odometry.keyframes.keyframe._READY", 1)
-    for log, wanted, frame in ((short_log, short_run, 11), (street, street_run, 12)):
+    for log, wanted, frame in ((short_log, short_run, 11), (street, street_run, 8)):
         read.clear()
         stopped(log, tmp_path / log.name, observer=StopAt(frame))
         assert_same(start(log, tmp_path / log.name), wanted)

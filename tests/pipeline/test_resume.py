@@ -57,8 +57,8 @@ def test_tracking_goes_on_at_the_frame_where_it_was_stopped(short_log, short_run
 def test_a_scan_odometry_of_a_compiled_library_goes_on_to_the_same_bytes(street, tmp_path):
     chosen = "odometry.kind=kiss-icp"
     wanted = start(street, tmp_path / "wanted", chosen, checkpoint_s=None)
-    stopped(street, tmp_path / "run", chosen, observer=StopAt(7))
-    stopped(street, tmp_path / "run", chosen, observer=StopAt(7))
+    stopped(street, tmp_path / "run", chosen, observer=StopAt(4))
+    stopped(street, tmp_path / "run", chosen, observer=StopAt(4))
     run = start(street, tmp_path / "run", chosen)
     assert_same(run, wanted)
     assert len(resumed(run)) == 2
@@ -82,7 +82,7 @@ def test_every_image_odometry_goes_on_to_the_same_bytes(short_log, tmp_path, set
 
 
 def test_fusing_goes_on_without_casting_again(short_log, short_run, street, street_run, tmp_path):
-    for log, wanted, frame in ((short_log, short_run, 6), (street, street_run, 15)):
+    for log, wanted, frame in ((short_log, short_run, 6), (street, street_run, 8)):
         out = tmp_path / log.name
         stopped(log, out, progress=Stage("fuse", frame))
         progress = Stage("fuse", frame + 4)
