@@ -202,7 +202,7 @@ class Score:
     path_unknown: float
 
 
-_SAMPLES = 4000
+_SAMPLES = 2000
 """Places that are looked at, about."""
 
 
@@ -211,14 +211,11 @@ def _agree(top, z, cell_m):
     return top == NOWHERE or abs(top * cell_m - z) <= 1.5 * cell_m + 0.1
 
 
-def score(world, octree, config):
+def score(world, truth, octree, config):
     """Return how right the traversable floor of a world's map is; unseen ground is not asked for."""
     floor = reachable_floor(octree, config, positions_world=world.positions())
     storeys = traversable(floor, config).storeys
     cell = octree.resolution_m
-    truth = world.reachable(
-        step_m=config.max_step_m, slope=np.tan(config.max_slope_rad), room_m=config.head_room_m
-    )
     right = total = found = asked = 0
     by_place = {}
     for storey in storeys:
