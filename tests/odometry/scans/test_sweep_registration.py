@@ -104,7 +104,7 @@ def tracked_turns(sweep_s, count=16, dt_s=0.5):
         at = [exp(np.array([0.0, 0.0, yaw_rad(k + d)]), np.zeros(3)) for d in (-0.05, 0.0, 0.05)]
         rate = (yaw_rad(k + 0.05) - yaw_rad(k - 0.05)) / (0.1 * dt_s)
         twist = Twist(np.array([0.0, 0.0, rate * sweep_s / SWEEP_S]), np.zeros(3))
-        scan = swept_room(at[1], twist, stamp_ns=round(k * dt_s * 1e9), seed=k)
+        scan = swept_room(at[1], twist, stamp_ns=round(k * dt_s * 1e9), seed=k, points=5000)
         scan = replace(scan, times_s=scan.times_s * np.float32(sweep_s / SWEEP_S))
         results.append(odometry.track(odometry.observe(scan)))
     return results
