@@ -6,11 +6,9 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from mapper.config.build import BuildConfig
-from mapper.config.loading import load_config
+from mapper.config.loading import load_config, overridden
 from mapper.core.geometry import angle_between, exp, inverse
 from mapper.core.trajectory import Trajectory
-from mapper.graph.config import WheelFactorsConfig
 from mapper.pipeline.disconnected_components import largest_component
 from mapper.pipeline.solve import solve
 from mapper.pipeline.track import track_log
@@ -52,13 +50,8 @@ def mapped(source, config):
 
 @pytest.mark.slow
 def test_wheels_connect_what_is_before_and_after_a_covered_lens(interrupted):
-    config: BuildConfig = load_config(None, ["loops.kind=none"])
-    alone = mapped(
-        interrupted,
-        config.model_copy(
-            update={"graph": config.graph.model_copy(update={"wheels": WheelFactorsConfig(use=False)})}
-        ),
-    )
+    config = load_config(None, ["loops.kind=none"])
+    alone = mapped(interrupted, overridden(config, ["graph.wheels.use=false"]))
     connected = mapped(interrupted, config)
     covered, begun_anew_after = 50, config.odometry.max_lost_frames
     assert len(alone) < 30
