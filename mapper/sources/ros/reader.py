@@ -35,12 +35,13 @@ from mapper.sources.ros.messages import (
     frame_of,
 )
 from mapper.sources.ros.recording import Recording
+from mapper.sources.ros.topic_ranks import shared_namespaces
 from mapper.sources.text import ROUNDING, time_order
 from mapper.sources.wheel_files import mounting
 
 _MAX_TRANSFORMS = 1_000
 _BASES = ("base_link", "base_footprint")
-"""Frames of a robot's base (REP 105, REP 120)."""
+"""Frames of a robot's base (REP 105, REP 120); with several robots each has a namespace before them."""
 SAME_CLOCK_NS = 60 * NS_PER_S
 """Messages are recorded within seconds of their stamps."""
 
@@ -205,8 +206,9 @@ class RecordingReader:
 
     def base_of(self, frame: str) -> str | None:
         """Return the frame of the robot that carries a frame; None where tf names none."""
-        bases = (base for base in _BASES if base in self.tree.frames)
-        return next((base for base in bases if self.tree.find(base, frame) is not None), None)
+        bases = (one for base in _BASES for one in self.tree.frames if one.rpartition("/")[2] == base)
+        tied = [base for base in bases if self.tree.find(base, frame) is not None]
+        return max(tied, key=lambda base: shared_namespaces(base, frame), default=None)
 
     def mounting(self, body: str) -> Transform | None:
         """Return T_base_body, the pose of the body on the robot; None where tf names none, or it moves."""

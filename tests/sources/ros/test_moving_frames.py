@@ -163,3 +163,12 @@ def test_a_body_that_stays_is_refused(tmp_path):
     messages = [*moving(drive, "map", "base_link"), *clouds(lambda _: np.eye(4), frame="base_link")]
     with pytest.raises(SourceError, match="want a frame of the robot: base_link"):
         opened(tmp_path / "a.mcap", messages, body_frame="map")
+
+
+def test_of_several_robots_the_base_in_the_sensor_s_namespace_carries_it(tmp_path):
+    bases = [("map", f"{robot}/base_link", np.eye(4)) for robot in "abc"]
+    mounted = transforms(*bases, ("b/base_link", "b/lidar", pan(FIRST_NS)))
+    scans = clouds(lambda t: inverse(pan(t)), frame="b/lidar")
+    log = opened(tmp_path / "a.mcap", [mounted, *scans])
+    assert log.base_frame == "b/base_link"
+    np.testing.assert_allclose(log.T_base_body, pan(FIRST_NS), atol=1e-9)
