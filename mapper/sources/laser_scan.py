@@ -24,11 +24,11 @@ def beam_points(
         ranges_m: (N,) in the order of the beams. What is not finite, or outside the limits, is no return.
         first_rad: Direction of the first beam, from x to y.
         step_rad: From each beam to the next.
-        limits_m: Least and largest range.
+        limits_m: Least and largest range; many drivers write the largest itself where nothing returns.
     """
     with np.errstate(invalid="ignore"):  # damaged numbers may be signalling NaN
         ranges_m = np.asarray(ranges_m, np.float64)
-        is_return = (ranges_m > 0.0) & (ranges_m >= limits_m[0]) & (ranges_m <= limits_m[1])
+        is_return = (ranges_m > 0.0) & (ranges_m >= limits_m[0]) & (ranges_m < limits_m[1])
     beams = np.flatnonzero(is_return & np.isfinite(ranges_m))
     directions = first_rad + step_rad * beams
     plane = ranges_m[beams, None] * np.column_stack([np.cos(directions), np.sin(directions)])

@@ -56,7 +56,7 @@ def test_tilted_laser_is_refused(tmp_path, driven):
 def test_ranges_outside_the_limits_are_no_returns(tmp_path, driven):
     ranges_m = driven.ranges_m.copy()
     ranges_m[:, :50], ranges_m[:, 50:100], ranges_m[:, 100:150] = 0.01, 40.0, np.nan
-    ranges_m[:, 150:200], ranges_m[:, 200:] = -np.inf, 2.0
+    ranges_m[:, 150:175], ranges_m[:, 175:200], ranges_m[:, 200:] = -np.inf, RPLIDAR.max_m, 2.0
 
     log = open_source(write_ros(tmp_path / "limits", replace(driven, ranges_m=ranges_m)))
 
