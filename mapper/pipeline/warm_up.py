@@ -7,7 +7,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from mapper.config.loading import load_config
+from mapper.config.loading import load_config, load_source_config
 from mapper.export.exporters import export
 from mapper.export.report.data import chapter_of
 from mapper.export.report.page import write_report
@@ -19,20 +19,30 @@ from mapper.registration.reprojection import variance_factor
 from mapper.runtime.doctor import processors
 from mapper.runtime.progress import SILENT, Progress
 from mapper.simulation import write_tum_log
-from mapper.simulation.config import LidarSynthConfig, SynthConfig
+from mapper.simulation.config import LidarSensorConfig, LidarSynthConfig, SynthConfig, SynthImuConfig
 from mapper.simulation.lidar import write_lidar_log
 from mapper.sources import open_source
 
-_CAMERA = SynthConfig(duration_s=1.0, width_px=320, height_px=240)
+_CAMERA = SynthConfig(duration_s=8.0, frame_rate_hz=1.5, width_px=320, height_px=240)
+"""Frames so far apart that depth images are aligned, and landmarks are searched in all of a keyframe."""
+_LIDAR = LidarSynthConfig(
+    scene="courtyard",
+    loop_m=30.0,
+    laps=1.5,
+    rate_hz=5.0,
+    imu=SynthImuConfig(),
+    sensor=LidarSensorConfig(rings=16),
+)
+"""A lap and a half, so that places are recognised and poses are adjusted to planes."""
 
 
 def compile_kernels(*, progress: Progress = SILENT) -> None:
     """Compile every kernel that builds of RGB-D and LiDAR logs, and reports of their runs, use by default.
 
-    A second of a synthetic log of each sensor is rendered and built, by two processes: the last job begins
-    when the scans, the sooner of the first two, are done. What is compiled already is kept.
+    A short synthetic log of each sensor is rendered and built, in a process of its own. What is compiled
+    already is kept.
     """
-    jobs = (_build_rgbd, _build_lidar, _build_rolling_shutter)
+    jobs = (_build_rgbd, _build_lidar)
     with (
         TemporaryDirectory(prefix="mapper-warm-") as scratch,
         progress.stage("compile") as report,
@@ -51,21 +61,23 @@ def _build_rgbd(folder: Path) -> None:
     Isvd(IsvdConfig()).fit(points, points)
     variance_factor(np.eye(4), points + np.array([0.0, 0.0, 9.0]), points, np.ones((100, 3)), np.ones(5))
     write_tum_log(folder, _CAMERA)
-    _build(folder, "run")
-
-
-def _build_rolling_shutter(folder: Path) -> None:
-    write_tum_log(folder, _CAMERA)
-    _build(folder, "run", "odometry.readout_s=0.03", "source.last_frame=9")  # found only in longer logs
+    fx_px, cx_px, cy_px = 262.0, 159.5, 119.5
+    _build(
+        folder,
+        "odometry.readout_s=0.03",  # found only in longer logs
+        f"source.camera.depth_intrinsics_px=[{fx_px},{fx_px},{cx_px},{cy_px}]",
+        "source.camera.depth_in_color=[0.01,0,0,0,0,0,1]",
+    )
 
 
 def _build_lidar(folder: Path) -> None:
-    write_lidar_log(folder, LidarSynthConfig(duration_s=1.0))
-    _build(folder, "run")
+    write_lidar_log(folder, _LIDAR)
+    _build(folder)
 
 
-def _build(log: Path, name: str, *overrides: str) -> None:
-    source, out = open_source(log), log.with_name(f"{log.name}_{name}")
+def _build(log: Path, *overrides: str) -> None:
+    source = open_source(log, load_source_config(None, overrides))
+    out = log.with_name(f"{log.name}_run")
     run = build(source, load_config(None, overrides, sensor=source.sensor), out)
     export(run, "octomap", out.with_suffix(".bt"))  # reads map.octree
     export(run, "nav2", out.with_name(f"{out.name}_nav2"))  # inflates the slice

@@ -1,19 +1,16 @@
 import re
 
-import pytest
-
 from mapper.pipeline import warm_up
-from mapper.simulation.config import SynthConfig
+from mapper.run.folder import open_run
 from tests.support.command_line import invoke
 
 
-@pytest.mark.parametrize("job", [warm_up._build_rgbd, warm_up._build_rolling_shutter])
-def test_a_log_of_images_is_built_and_exported(tmp_path, monkeypatch, job):
-    """Of fewer pixels than set-up has; the log of scans is built in test_platforms.py."""
-    small = SynthConfig(duration_s=0.5, width_px=160, height_px=120, texture_px_per_m=64)
-    monkeypatch.setattr(warm_up, "_CAMERA", small)
-    job(tmp_path / "log")
-    assert (tmp_path / "log_run" / "map.octree").exists()
+def test_depth_of_a_camera_of_its_own_takes_part_in_poses(tmp_path):
+    """The log of scans is built in test_platforms.py."""
+    warm_up._build_rgbd(tmp_path / "log")
+    run = open_run(tmp_path / "log_run")
+    assert any("depth" in record.diagnostics.method for record in run.records)
+    assert run.open_log()[0].is_depth_moved
 
 
 def test_the_verb_compiles_and_says_how_many_there_are(monkeypatch):

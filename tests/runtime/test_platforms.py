@@ -10,6 +10,7 @@ import pytest
 
 from mapper.octree.ray_casting import sparse_zeros
 from mapper.octree.sparse_grid import FileArray
+from mapper.run.folder import open_run
 from mapper.runtime import atomic
 from mapper.runtime.atomic import FolderKind, atomic_folder, flush_to_disk
 from mapper.runtime.doctor import processors
@@ -91,7 +92,11 @@ def test_every_module_can_be_imported():
 def test_a_build_needs_nothing_of_linux(tmp_path):
     ended = run(MAC + BUILD, str(tmp_path))
     assert ended.returncode == 0, ended.stderr
-    assert (tmp_path / "log_run/map.octree").stat().st_size > 1000
+    manifest = open_run(tmp_path / "log_run").manifest
+    assert manifest.counts.occupied > 1000
+    assert manifest.counts.loops > 0
+    assert manifest.solve.planes is not None
+    assert manifest.gyroscope is not None
 
 
 def test_memory_and_processors_are_counted_without_what_linux_has(monkeypatch):
