@@ -58,6 +58,11 @@ class Calibration:
     depth: "DepthCamera | None" = None
     unread: Sequence[str] = ()
 
+    @property
+    def needs_depth_pose(self) -> bool:
+        """Depth is of a camera of its own, whose pose nothing states."""
+        return self.depth is not None and self.depth.T_color_depth is None
+
     def notes(self) -> list[str]:
         """Return sentences on what is made of the images as they are read."""
         notes = [] if self.depth is None else [self.depth.note]
@@ -123,22 +128,23 @@ class DepthCamera:
 
     Attributes:
         calibration: Its intrinsics.
-        T_color_depth: (4, 4) its pose in the colour camera's frame.
+        T_color_depth: (4, 4) its pose in the colour camera's frame; None until it is estimated from the log.
         origin: Source of the pose, for messages.
         tangents: (H, W, 2) x/z and y/z of every pixel's ray where the log states these, and the intrinsics
             are about theirs.
     """
 
     calibration: Calibration
-    T_color_depth: Transform
+    T_color_depth: Transform | None
     origin: str
     tangents: NDArray[np.float32] | None = None
 
     @property
     def note(self) -> str:
         """Sentence on the pose."""
-        apart_mm = 1e3 * float(np.linalg.norm(self.T_color_depth[:3, 3]))
-        turned_deg = np.degrees(angle_between(np.eye(3), self.T_color_depth[:3, :3]))
+        T_color_depth = np.eye(4) if self.T_color_depth is None else self.T_color_depth
+        apart_mm = 1e3 * float(np.linalg.norm(T_color_depth[:3, 3]))
+        turned_deg = np.degrees(angle_between(np.eye(3), T_color_depth[:3, :3]))
         return (
             f"depth is registered to colour as it is read: its camera, of focal length "
             f"{self.calibration.fx_px:.1f} px, is {apart_mm:.1f} mm from colour's and turned by "

@@ -213,9 +213,10 @@ def _depth_camera(found: _Numbers, origin: str) -> DepthCamera | None:
     intrinsics, pose = found.get("depth_intrinsics", ()), found.get("depth_in_color", ())
     distortion, lens = _distortion(found.get("depth_distortion", ()), "")
     T_color_depth = pose_from_numbers(np.array(pose)) if len(pose) == 7 else None
-    if len(intrinsics) != 4 or T_color_depth is None:
+    if len(intrinsics) != 4 or (pose and T_color_depth is None):
         raise DataError(
-            "want depth_intrinsics_px = [fx, fy, cx, cy] and depth_in_color = [x, y, z, qx, qy, qz, qw]"
+            "want depth_intrinsics_px = [fx, fy, cx, cy] and, if known, depth_in_color = "
+            "[x, y, z, qx, qy, qz, qw]"
         )
     fx, fy, cx, cy = intrinsics
     calibration = Calibration(f"{origin}: depth", fx, fy, cx, cy, distortion=distortion, lens=lens)

@@ -12,14 +12,14 @@ from mapper.core.frames import RgbdFrame
 
 _WIDTH_PX, _MOST_PX, _NEAR_PX = 320, 48, 4
 """Width to which images are reduced, the largest shift that is tried there, and the largest that is none."""
-_STEP, _FAR_M = 1.08, 1e6
+OUTLINE_STEP, _FAR_M = 1.08, 1e6
 """Ratio of two neighbouring depths between which an outline lies; and what unknown depth is replaced by."""
 _FEWEST_PX, _MOST_SHARE, _FEWEST_FRAMES = 200, 0.05, 4
 """Pixels of outlines: fewer tell nothing, and of more the most are noise."""
 _LEAST_CONTRAST, _LEAST_GRADIENT = 4.0, 20.0
 """95th percentile of the gradient in its median, and in itself (a step of 5 grey levels): 2.1 and 12 of noise
 alone, and less where a JPEG smooths it; 4.8 and 45 and more of rooms with texture."""
-_LEAST_SCORE, _TIMES_BETTER, _SOUND = 0.4, 1.4, 0.7
+_LEAST_SCORE, _TIMES_BETTER, SOUND_SCORE = 0.4, 1.4, 0.7
 """Registered depth has its best score within 1 px of no shift, 0.6 standard deviations of brightness or more.
 Moved by 12 px, that score is 1.4 to 5 times the best within 4 px, and mirrored 3; registered 0.7."""
 _TIMES_OTHERS = 2.0
@@ -44,7 +44,7 @@ def outline_warnings(frames: Iterable[RgbdFrame]) -> list[str]:
     around = slice(_MOST_PX - _NEAR_PX, _MOST_PX + _NEAR_PX + 1)
     near = float(score[around, around].max())
     limit = max(_LEAST_SCORE, _TIMES_BETTER * near)
-    if near < _SOUND:
+    if near < SOUND_SCORE:
         for how, code in _FLIPS.items():
             flipped = [_scores(gradient, cv2.flip(edges, code), _NEAR_PX) for gradient, edges in pairs]
             if np.mean(flipped, axis=0).max() >= max(limit, score.max()):
@@ -57,7 +57,7 @@ def outline_warnings(frames: Iterable[RgbdFrame]) -> list[str]:
             "(columns, rows): is it registered to colour, and of the same time? export registered depth, or "
             "give the depth camera: source.camera.depth_intrinsics_px and depth_in_color"
         ]
-    if near >= _SOUND:
+    if near >= SOUND_SCORE:
         return []
     crossed = [(gradient, edges) for (gradient, _), (_, edges) in permutations(pairs, 2)]
     own, others = (np.mean([_scores(*both, _NEAR_PX).max() for both in some]) for some in (pairs, crossed))
@@ -81,7 +81,7 @@ def _outlines(frame: RgbdFrame) -> tuple[_Pixels, _Pixels] | None:
     depth_m = cv2.resize(frame.depth_m, size_px, interpolation=cv2.INTER_NEAREST)
     around = np.ones((3, 3), np.uint8)
     nearest_m = cv2.erode(np.where(depth_m > 0.0, depth_m, np.float32(_FAR_M)), around)
-    edges = ((depth_m > 0.0) & (cv2.dilate(depth_m, around) > _STEP * nearest_m)).astype(np.float32)
+    edges = ((depth_m > 0.0) & (cv2.dilate(depth_m, around) > OUTLINE_STEP * nearest_m)).astype(np.float32)
     grey = cv2.resize(frame.gray, size_px, interpolation=cv2.INTER_AREA).astype(np.float32)
     gradient = np.hypot(cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1))
     usual, most = np.percentile(gradient, (50.0, 95.0))

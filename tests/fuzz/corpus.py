@@ -237,7 +237,7 @@ def _run_without_digests(folder: Path) -> Path:
 
 def _depth_camera(folder: Path) -> Path:
     wide = PinholeCamera(106, 60, 53.0, 53.0, 52.4, 30.1)
-    write_unregistered(folder / "log", rgbd_log(), wide, is_in_tf=False)
+    write_unregistered(folder / "log", rgbd_log(), wide, stated_in="topic")
     return folder / "log"
 
 

@@ -194,8 +194,9 @@ def test_a_depth_camera_beside_colour_s_is_read(tmp_path):
     np.testing.assert_allclose(depth.T_color_depth, transform(np.eye(3), [0.015, 0.0, 0.0]))
     path.write_text(own)
     assert read_calibration(path).depth is None
+    path.write_text(own + lens)
+    assert read_calibration(path).needs_depth_pose
     for wrong in (
-        lens,
         pose,
         lens + "depth_in_color = [0, 0, 0, 0, 0, 0, 0]\n",
         "depth_distortion = [0, 0, 0, 0, 0]\n",

@@ -216,8 +216,11 @@ def test_depth_of_a_camera_of_its_own_is_registered_by_the_calibration_or_by_set
     own, pose = (53.0, 53.0, 52.4, 30.1), tuple(row_of_pose(BESIDE).tolist())
     by_settings = CameraConfig(depth_intrinsics_px=own, depth_in_color=pose)
     found = [open_source(log, SourceConfig(camera=by_settings))]
-    for partial in ({"depth_intrinsics_px": own}, {"depth_in_color": pose}):
-        with pytest.raises(SourceError, match="want depth_intrinsics_px and depth_in_color"):
+    for partial, missing in (
+        ({"depth_intrinsics_px": own}, "0 of its frames .*depth_in_color"),
+        ({"depth_in_color": pose}, "depth_intrinsics_px"),
+    ):
+        with pytest.raises(SourceError, match=missing):
             open_source(log, SourceConfig(camera=CameraConfig(**partial)))
     lines = f"depth_intrinsics_px = {list(own)}\ndepth_in_color = {list(pose)}\n"
     edit(log / "calibration.toml", lambda text: text + lines)

@@ -1,6 +1,7 @@
 """Logs of a depth camera beside the colour camera, made from logs whose depth is registered to colour."""
 
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from rosbags.rosbag2 import StoragePlugin, Writer
@@ -86,17 +87,18 @@ def write_unregistered(
     depth_camera: PinholeCamera = D435,
     T_color_depth: Transform = BESIDE,
     *,
-    is_in_tf: bool = True,
+    stated_in: Literal["tf", "topic"] | None = "tf",
     also_topic: Transform | None = None,
 ) -> None:
     """Write a log as the RealSense driver records it without alignment: a ROS 2 bag.
 
     Raw colour and depth in millimetres with a CameraInfo each, and the pose of the depth camera in
-    /tf_static, or else in the driver's own /camera/extrinsics/depth_to_color; ``also_topic`` is another
-    pose for that topic.
+    /tf_static, or in the driver's own /camera/extrinsics/depth_to_color, or nowhere; ``also_topic`` is
+    another pose for that topic.
     """
     color, depth = "camera_color_optical_frame", "camera_depth_optical_frame"
-    messages = [transforms((color, depth, T_color_depth))] if is_in_tf else [extrinsics(T_color_depth)]
+    messages = [transforms((color, depth, T_color_depth))] if stated_in == "tf" else []
+    messages += [extrinsics(T_color_depth)] if stated_in == "topic" else []
     messages += [extrinsics(also_topic)] if also_topic is not None else []
     for entry in log.entries():
         frame = entry.load()

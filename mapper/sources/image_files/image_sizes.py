@@ -164,13 +164,22 @@ def is_same_view(colour_px: Size, depth_px: Size) -> bool:
     return abs(ratio - 1.0) <= _SAME_VIEW
 
 
-def _registration(depth: DepthCamera, depth_px: Size, camera: PinholeCamera) -> DepthRegistration:
+def depth_rays(depth: DepthCamera, depth_px: Size) -> NDArray[np.float32]:
+    """Return the (H, W, 2) x/z and y/z of every pixel's ray of a depth camera.
+
+    Raises:
+        SourceError: Its calibration holds for another size, or is none of a camera.
+    """
     if depth.tangents is not None:
-        return DepthRegistration(depth.tangents, camera, depth.T_color_depth)
+        return depth.tangents
     width_px, height_px = depth_px
     own, lens = depth.calibration.camera(width_px=width_px, height_px=height_px), depth.calibration.lens
-    rays = ray_table(own) if lens is None else lens.rays(own)
-    return DepthRegistration(rays, camera, depth.T_color_depth)
+    return ray_table(own) if lens is None else lens.rays(own)
+
+
+def _registration(depth: DepthCamera, depth_px: Size, camera: PinholeCamera) -> DepthRegistration:
+    T_color_depth = np.eye(4) if depth.T_color_depth is None else depth.T_color_depth
+    return DepthRegistration(depth_rays(depth, depth_px), camera, T_color_depth)
 
 
 def _undistortion(

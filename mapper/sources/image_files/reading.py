@@ -123,8 +123,7 @@ def read_array_m(path: ImageFile, units_per_m: float, float_units_per_m: float) 
     if array.dtype == np.uint16:
         return depth_m_from(array, units_per_m)
     unit = float_units_per_m if array.dtype.kind == "f" else units_per_m
-    with np.errstate(all="ignore"):  # a damaged file's numbers may be too large, or signalling NaN
-        return valid_depth(array, unit, where=f"{path}")
+    return valid_depth(array, unit, where=f"{path}")
 
 
 def has_floats(path: ImageFile) -> bool:
@@ -189,8 +188,9 @@ def valid_depth(depth: NDArray[np.number], units_per_m: float, *, where: str) ->
     Raises:
         FrameError: All of it is beyond that reach.
     """
-    valid: DepthImage = np.array(depth, dtype=np.float32)  # aligned, which a message need not be
-    valid /= np.float32(units_per_m)
+    with np.errstate(all="ignore"):  # damaged numbers may be too large, or signalling NaN
+        valid: DepthImage = np.array(depth, dtype=np.float32)  # aligned, which a message need not be
+        valid /= np.float32(units_per_m)
     is_measured = valid > 0.0
     is_near = is_measured & (valid < MAX_RANGE_M)
     if not is_near.any() and (is_far := is_measured & np.isfinite(valid)).any():

@@ -23,6 +23,7 @@ from mapper.sources.calibration import (
 )
 from mapper.sources.calibration_file import calibration_files, read_calibration
 from mapper.sources.config import CameraConfig
+from mapper.sources.depth_camera_pose import with_depth_pose
 from mapper.sources.image_files.decoded import DecodedColour, DecodedDepth
 from mapper.sources.image_files.image_sizes import RecordedCamera, Size, recorded_camera
 from mapper.sources.image_files.reading import (
@@ -84,6 +85,15 @@ class RgbdEntry:
         """
         return self.recorded.scan(self._depth_m(), f"{self.encoded.depth}", stamp_ns=self.stamp_ns)
 
+    def pair(self) -> tuple[Image, DepthImage]:
+        """Read the brightness, as the camera sees it, and the depth image as recorded.
+
+        Raises:
+            FrameError: As ``load``.
+        """
+        grey = self.recorded.image(read_grey(self.encoded.colour), f"{self.encoded.colour}")
+        return grey, self._depth_m()
+
     def _depth_m(self) -> DepthImage:
         return read_depth_m(self.encoded.depth, self.encoded.depth_units_per_m)
 
@@ -142,10 +152,9 @@ def rgbd_log(
     array = next((pair.depth for pair in pairs if pair.depth.suffix in ARRAYS), None)
     recorded_units_per_m = (float_units_per_m if has_floats(array) else units_per_m) if array else None
     pairs = [_with_array(pair, units_per_m, float_units_per_m) for pair in pairs]
-    camera = _camera_of(pairs, calibration, depth_units_per_m=units_per_m, path=path)
     accelerations, acceleration_notes = read_accelerations(folder)
 
-    def entry_at(index: int) -> RgbdEntry:
+    def entry_of(camera: RecordedCamera, index: int) -> RgbdEntry:
         pair = pairs[index]
         files = ImageFiles(
             pair.colour,
@@ -158,13 +167,20 @@ def rgbd_log(
         )
         return RgbdEntry(pair.stamp_ns, files, camera)
 
+    camera = _camera_of(pairs, calibration, depth_units_per_m=units_per_m, path=path)
+    if calibration.needs_depth_pose:
+        unplaced = partial(entry_of, camera)
+        calibration = with_depth_pose(
+            calibration, camera, lambda index: unplaced(index).pair(), len(pairs), where=f"{path}"
+        )
+        camera = _camera_of(pairs, calibration, depth_units_per_m=units_per_m, path=path)
     return Log(
         path=path,
         name=name,
         kind=kind,
         sensor="rgbd",
         stamps_ns=np.array([pair.stamp_ns for pair in pairs], dtype=np.int64),
-        entry_at=entry_at,
+        entry_at=partial(entry_of, camera),
         truth=poses,
         accelerations=accelerations,
         notes=[*notes, *camera.notes(), *calibration.notes(), *acceleration_notes],
@@ -219,7 +235,7 @@ def depth_camera(stated: DepthCamera | None, config: CameraConfig | None) -> Dep
     """Return the depth camera that is not colour's: the user's numbers before those of a file.
 
     Raises:
-        SourceError: Only a part of it is known.
+        SourceError: Its intrinsics are unknown.
     """
     intrinsics, T_color_depth = configured_depth_intrinsics(config), configured_depth_pose(config)
     if intrinsics is None and T_color_depth is None:
@@ -229,10 +245,8 @@ def depth_camera(stated: DepthCamera | None, config: CameraConfig | None) -> Dep
         tangents = stated.tangents if intrinsics is None else None
         intrinsics = intrinsics or stated.calibration
         T_color_depth = stated.T_color_depth if T_color_depth is None else T_color_depth
-    if intrinsics is None or T_color_depth is None:
-        raise SourceError(
-            "source.camera: want depth_intrinsics_px and depth_in_color: the log's files state neither"
-        )
+    if intrinsics is None:
+        raise SourceError("source.camera: want depth_intrinsics_px too: the log's files do not state them")
     return DepthCamera(intrinsics, T_color_depth, "source.camera", tangents)
 
 

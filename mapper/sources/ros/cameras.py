@@ -62,7 +62,7 @@ def calibrate(
 
     Raises:
         SourceError: The colour camera's intrinsics are unknown or of an unknown lens, or depth is not
-            registered to colour and its intrinsics or its pose are unknown.
+            registered to colour and its intrinsics are unknown.
     """
     calibration = _colour_calibration(reader, topics, topics.info, config, colour_px)
     own = calibration
@@ -161,7 +161,10 @@ def _depth_camera(
     colour_px: Size,
     depth_px: Size,
 ) -> tuple[DepthCamera | None, list[str]]:
-    """Return the depth camera, None if depth is registered to colour, and notes."""
+    """Return the depth camera, None if depth is registered to colour, and notes.
+
+    Its pose is None where the recording does not state it.
+    """
     name, color_name = topics.depth.topic.name, topics.color.topic.name
     info = _first_info(reader, topics.depth_info)
     info = _windowed(info, depth_px) if info is not None and info.K.shape == (9,) and info.K[0] > 0 else None
@@ -186,8 +189,6 @@ def _depth_camera(
         )
     if intrinsics is None:
         missing = "its intrinsics are not in the log: --set source.camera.depth_intrinsics_px=[fx,fy,cx,cy]"
-    elif T_color_depth is None:
-        missing = f"the log does not say where its camera is: record /tf_static too, or {_SETTING}"
     elif (turned_deg := _turned_deg(np.eye(4), T_color_depth)) > _MOST_TURNED_DEG:
         missing = f"{origin} turns it by {turned_deg:.0f}°, so one frame is no optical one: {_SETTING}"
     else:
@@ -268,8 +269,8 @@ def _is_same_pose(T_a: Transform, T_b: Transform) -> bool:
     return bool(apart_m < _SAME_POSE_M) and _turned_deg(T_a, T_b) < _SAME_POSE_DEG
 
 
-def _turned_deg(T_a: Transform, T_b: Transform) -> float:
-    return float(np.degrees(angle_between(T_a[:3, :3], T_b[:3, :3])))
+def _turned_deg(T_a: Transform, T_b: Transform | None) -> float:
+    return 0.0 if T_b is None else float(np.degrees(angle_between(T_a[:3, :3], T_b[:3, :3])))
 
 
 def _first_info(reader: RecordingReader, series: Series | None) -> CameraMessage | None:

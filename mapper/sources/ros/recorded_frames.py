@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -12,9 +13,11 @@ from mapper.core.units import MM_PER_M
 from mapper.sensing.config import DepthNoiseConfig
 from mapper.sources.base import FrameRef
 from mapper.sources.config import SourceConfig
-from mapper.sources.image_files.image_sizes import recorded_camera
+from mapper.sources.depth_camera_pose import with_depth_pose
+from mapper.sources.image_files.image_sizes import RecordedCamera, recorded_camera
 from mapper.sources.image_files.reading import TUM_UNITS_PER_M
 from mapper.sources.image_folders.pairing import depth_offset_ns
+from mapper.sources.image_folders.rgbd import RgbdEntry
 from mapper.sources.laser_scan import MAX_TILT_RAD, tilt_rad
 from mapper.sources.point_times import counted_on, relative_times_s, time_field
 from mapper.sources.ros.cameras import calibrate
@@ -114,19 +117,12 @@ def rgbd_frames(reader: RecordingReader, topics: CameraTopics, config: SourceCon
     calibration, camera_notes = calibrate(
         reader, topics, config.camera, frames=(frame, depth_frame), colour_px=colour_px, depth_px=depth_px
     )
-    camera = recorded_camera(
-        calibration,
-        colour_px=colour_px,
-        depth_px=depth_px,
-        where=f"{where}: {color.topic.name}, {depth.topic.name}",
-    )
-    notes += [*camera_notes, *camera.notes(), *calibration.notes()]
     factor = None if config.camera is None else config.camera.depth_factor
     float_units_per_m = (factor or 1.0) if has_float_depth(first_depth) else None
     units_per_m = (factor or MM_PER_M) if float_units_per_m is None else TUM_UNITS_PER_M
     is_jpeg = isinstance(first_color, FileMessage) and bytes(first_color.data[:2]) == _JPEG_START
 
-    def entry_at(index: int) -> FrameRef:
+    def entry_of(camera: RecordedCamera, index: int) -> RgbdEntry:
         return rgbd_entry(
             reader.located(color, int(i[index])),
             reader.located(depth, int(j[index])),
@@ -136,7 +132,21 @@ def rgbd_frames(reader: RecordingReader, topics: CameraTopics, config: SourceCon
             colour_suffix=".jpg" if is_jpeg else ".png",
         )
 
-    return RecordedFrames("rgbd", frame, color.stamps_ns[i], entry_at, notes)
+    camera_of = partial(
+        recorded_camera,
+        colour_px=colour_px,
+        depth_px=depth_px,
+        where=f"{where}: {color.topic.name}, {depth.topic.name}",
+    )
+    camera = camera_of(calibration)
+    if calibration.needs_depth_pose:
+        unplaced = partial(entry_of, camera)
+        calibration = with_depth_pose(
+            calibration, camera, lambda index: unplaced(index).pair(), len(i), where=where
+        )
+        camera = camera_of(calibration)
+    notes += [*camera_notes, *camera.notes(), *calibration.notes()]
+    return RecordedFrames("rgbd", frame, color.stamps_ns[i], partial(entry_of, camera), notes)
 
 
 def lidar_frames(reader: RecordingReader, clouds: Series, config: SourceConfig) -> RecordedFrames:

@@ -10,7 +10,13 @@ from hypothesis.extra.numpy import arrays
 
 from mapper.core.errors import DataError, FrameError
 from mapper.sources.image_files import jpeg, png
-from mapper.sources.image_files.reading import read_array_m, read_colour, read_depth_m, read_grey
+from mapper.sources.image_files.reading import (
+    read_array_m,
+    read_colour,
+    read_depth_m,
+    read_grey,
+    valid_depth,
+)
 from tests.support.tum_logs import picture
 
 FILTERS = {
@@ -237,5 +243,8 @@ def test_numbers_that_are_no_depth_are_0_in_an_array(tmp_path):
     signalling = np.array([0x7FA00000], np.uint32).view(np.float32)[0]
     for kind, strange in ((np.float32, [signalling, np.inf, -1.0]), (np.float64, [1e300, np.nan, -1.0])):
         np.save(tmp_path / "d.npy", np.array([[*strange, 2.0]], kind))
-        depth_m = read_array_m(tmp_path / "d.npy", 1000.0, 1.0)
-        np.testing.assert_array_equal(depth_m, [[0.0, 0.0, 0.0, 2.0]])
+        for depth_m in (
+            read_array_m(tmp_path / "d.npy", 1000.0, 1.0),
+            valid_depth(np.load(tmp_path / "d.npy"), 1.0, where="a message"),
+        ):
+            np.testing.assert_array_equal(depth_m, [[0.0, 0.0, 0.0, 2.0]])

@@ -1,16 +1,18 @@
 """Recordings whose depth comes from a camera of its own: registered as they are read, or refused."""
 
 import struct
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from mapper.core.errors import DataError, SourceError
-from mapper.core.frames import PinholeCamera
+from mapper.core.frames import PinholeCamera, RgbdFrame
 from mapper.core.geometry import apply, exp, inverse
 from mapper.core.rotations import row_of_pose
 from mapper.sources import open_source
+from mapper.sources.base import Log
 from mapper.sources.config import CameraConfig, SourceConfig
 from mapper.sources.inspection import inspect_log
 from mapper.sources.ros.decode import decode
@@ -19,13 +21,28 @@ from mapper.sources.ros.recording import Topic
 from mapper.sources.ros.topic_ranks import is_called_rectified
 from mapper.sources.ros.typestore import make_message, serialize
 from mapper.sources.writers import write_log
-from tests.support.depth_cameras import BESIDE, extrinsics, write_unregistered
+from tests.support.depth_cameras import BESIDE, D435, extrinsics, write_unregistered
 from tests.support.recordings import CAMERA, COLOR, camera_info, changed, image, shots, transforms, write
 from tests.support.tum_logs import FIRST_NS, picture
 
 WIDE = PinholeCamera(106, 60, 53.0, 53.0, 52.4, 30.1)
-IN_TF, IN_TOPIC = True, False
 DEPTH = "/cam/depth/image_rect_raw"
+
+
+@dataclass(frozen=True, slots=True)
+class OtherDepth:
+    """A frame with the depth of one half the log later."""
+
+    log: Log
+    index: int
+
+    @property
+    def stamp_ns(self) -> int:
+        return self.log.entry_at(self.index).stamp_ns
+
+    def load(self) -> RgbdFrame:
+        other = self.log[(self.index + len(self.log) // 2) % len(self.log)]
+        return replace(self.log[self.index], depth_m=other.depth_m)
 
 
 @pytest.fixture
@@ -49,9 +66,9 @@ def opened(path, messages, **config):
     return open_source(write(path, messages), SourceConfig(**config))
 
 
-@pytest.mark.parametrize("source", [IN_TF, IN_TOPIC])
+@pytest.mark.parametrize("source", ["tf", "topic"])
 def test_depth_of_a_camera_beside_is_that_of_the_registered_log(tmp_path, room, source):
-    write_unregistered(tmp_path / "bag", room, WIDE, BESIDE, is_in_tf=source)
+    write_unregistered(tmp_path / "bag", room, WIDE, BESIDE, stated_in=source)
     log = open_source(tmp_path / "bag")
     assert len(log) == len(room)
     for found, wanted in zip(log, room, strict=True):
@@ -63,7 +80,7 @@ def test_depth_of_a_camera_beside_is_that_of_the_registered_log(tmp_path, room, 
         assert np.abs(found.depth_m - wanted.depth_m)[both].max() < 0.02
         assert abs((found.depth_m - wanted.depth_m)[both].mean()) < 0.001
         assert found.depth_delay_s == pytest.approx(wanted.depth_delay_s, abs=1e-9)
-    origin = "(tf)" if source is IN_TF else "(/camera/extrinsics/depth_to_color)"
+    origin = "(tf)" if source == "tf" else "(/camera/extrinsics/depth_to_color)"
     notes = [note for note in inspect_log(tmp_path / "bag", SourceConfig()).log.notes if "registered" in note]
     assert len(notes) == 1
     assert "15.0 mm" in notes[0]
@@ -131,9 +148,31 @@ def test_a_rotation_that_is_none_is_a_damaged_message():
             decode(topic, damaged)
 
 
+def test_a_pose_that_is_not_stated_is_estimated_by_outlines(tmp_path, desk_log):
+    """A tilted camera, as an Azure Kinect's."""
+    registered = open_source(desk_log)[::2]
+    T_color_depth = exp(np.radians([6.0, 0.3, -0.2]), np.array([-0.032, -0.002, 0.004]))
+    camera = PinholeCamera(320, 288, 252.0, 252.0, 160.3, 150.1)
+    write_unregistered(tmp_path / "bag", registered, camera, T_color_depth, stated_in=None)
+    log = open_source(tmp_path / "bag")
+    assert sum("estimated by outlines" in note for note in log.notes) == 1
+    found, wanted = log[10], registered[10]
+    both = (found.depth_m > 0.0) & (wanted.depth_m > 0.0)
+    assert both.mean() > 0.8
+    assert (np.abs(found.depth_m - wanted.depth_m) < 0.02 * wanted.depth_m)[both].mean() > 0.95
+
+
+def test_depth_of_another_time_tells_no_pose(tmp_path, desk_log):
+    registered = open_source(desk_log)[::2]
+    late = replace(registered, entry_at=lambda index: OtherDepth(registered, index))
+    write_unregistered(tmp_path / "bag", late, D435, stated_in=None)
+    with pytest.raises(SourceError, match=r"standard deviations .*depth_in_color"):
+        open_source(tmp_path / "bag")
+
+
 def test_depth_without_a_pose_or_intrinsics_is_refused_with_the_setting(tmp_path):
     path = write(tmp_path / "a.mcap", unregistered(T=None))
-    with pytest.raises(SourceError, match=r"\(106×60 px, focal length 53\.0 px\) .*\.depth_in_color"):
+    with pytest.raises(SourceError, match=r"0 of its frames .*\.depth_in_color"):
         open_source(path)
     beside = CameraConfig(depth_in_color=tuple(row_of_pose(BESIDE).tolist()))
     (note,) = (one for one in open_source(path, SourceConfig(camera=beside)).notes if "registered" in one)
@@ -166,7 +205,7 @@ def test_frames_that_tf_turns_against_each_other_are_not_optical(tmp_path):
 
 
 def test_a_pose_of_the_topic_that_contradicts_tf_is_noted(tmp_path, room):
-    write_unregistered(tmp_path / "bag", room, WIDE, inverse(BESIDE), is_in_tf=IN_TF, also_topic=BESIDE)
+    write_unregistered(tmp_path / "bag", room, WIDE, inverse(BESIDE), also_topic=BESIDE)
     log = open_source(tmp_path / "bag")
     (note,) = (note for note in log.notes if "another pose" in note)
     numbers = [float(word) for word in note[note.index("=[") + 2 : -1].split(",")]
@@ -246,7 +285,7 @@ def test_a_calibration_of_p_alone_tells_the_depth_camera_from_colours(tmp_path):
         for one in unregistered(T=None)
     ]
     assert without_k != unregistered(T=None)
-    with pytest.raises(SourceError, match=r"focal length 53\.0 px\) is not registered"):
+    with pytest.raises(SourceError, match=r"where its depth camera is"):
         opened(tmp_path / "a.mcap", without_k)
 
 
