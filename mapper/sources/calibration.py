@@ -88,7 +88,7 @@ class Calibration:
             width, height = self.size_px or (0, 0)
             raise SourceError(
                 f"{self.origin}: holds for {width}×{height} px, but the images have {width_px}×{height_px}; "
-                "give theirs in a calibration.toml beside the log"
+                "give theirs with --set source.camera.fx_px=… and so on"
             )
         self._refuse_disorder(width_px, height_px)
         numbers = (self.fx_px, self.fy_px, self.cx_px, self.cy_px)

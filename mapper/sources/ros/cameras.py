@@ -16,6 +16,7 @@ from mapper.sources.calibration import (
     configured_depth_intrinsics,
     configured_depth_pose,
 )
+from mapper.sources.calibration_file import calibration_files, read_calibration
 from mapper.sources.config import CameraConfig
 from mapper.sources.image_files.image_sizes import Size, is_same_view, recorded_camera
 from mapper.sources.lens import FISHEYE_MODELS, POLYNOMIAL_MODELS, Lens, lens_model
@@ -69,7 +70,9 @@ def calibrate(
     if topics.own_info is not None and topics.own_info is not topics.info:
         own = _colour_calibration(reader, topics, topics.own_info, config, colour_px)
     depth, notes = _depth_camera(reader, topics, own, config, frames, colour_px, depth_px)
-    if topics.info is not None and configured(config) is None:
+    if configured(config) is None and calibration.origin not in reader.series:
+        notes.append(f"{topics.color.topic.name}: no camera info; intrinsics of {calibration.origin}")
+    elif topics.info is not None and configured(config) is None:
         notes += _doubts_about(reader, topics.info, images_frame=frames[0])
     if depth is not None:
         return replace(calibration, depth=depth), notes
@@ -136,18 +139,22 @@ def _colour_calibration(
     config: CameraConfig | None,
     colour_px: Size,
 ) -> Calibration:
-    """Return the colour camera's intrinsics: the user's, else the recording's."""
+    """Return the colour camera's intrinsics: the user's, else the recording's, else those of a file beside it."""
     chosen = configured(config)
     if chosen is not None:
         return chosen
-    name = topics.color.topic.name
+    name, path = topics.color.topic.name, reader.recording.path
     info = _first_info(reader, series)
+    if info is None or not info.K.any():
+        files, first_counts = calibration_files(path if path.is_dir() else path.parent)
+        if first_counts:
+            return read_calibration(files[0])
     if series is None or info is None:
         infos = [one for one in reader.series if reader.series[one].topic.type in CAMERAS]
         others = f" of {listed(infos)}" if infos else ""
         raise SourceError(
-            f"{reader.recording.path}: no camera info for {name}; choose one{others} with "
-            "source.topics.camera_info=… or --set source.camera.fx_px=… and so on"
+            f"{path}: no camera info for {name}; choose one{others} with source.topics.camera_info=…, "
+            "put a calibration.toml or camera.yaml beside it, or --set source.camera.fx_px=… and so on"
         )
     return calibration_of(info, colour_px, is_rectified=is_called_rectified(name), name=series.topic.name)
 

@@ -119,7 +119,8 @@ def rgbd_frames(reader: RecordingReader, topics: CameraTopics, config: SourceCon
     )
     factor = None if config.camera is None else config.camera.depth_factor
     float_units_per_m = (factor or 1.0) if has_float_depth(first_depth) else None
-    units_per_m = (factor or MM_PER_M) if float_units_per_m is None else TUM_UNITS_PER_M
+    stated = factor or calibration.depth_units_per_m
+    units_per_m = (stated or MM_PER_M) if float_units_per_m is None else TUM_UNITS_PER_M
     is_jpeg = isinstance(first_color, FileMessage) and bytes(first_color.data[:2]) == _JPEG_START
 
     def entry_of(camera: RecordedCamera, index: int) -> RgbdEntry:
