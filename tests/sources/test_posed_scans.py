@@ -5,6 +5,7 @@ import json
 import os
 import sys
 
+import cv2
 import numpy as np
 import pytest
 
@@ -59,6 +60,17 @@ def test_layouts_of_every_way_of_reading_are_mapped(shots, tmp_path, kind):
     run = build(log, load_config(None), tmp_path / "run")
     assert run.manifest.counts.tracked == len(shots.frames)
     assert evaluate(run.trajectory, log.device_poses if kind in DEVICE else log.truth).ate_m < 0.02
+
+
+def test_depth_of_early_stray_scanner_exports_is_arrays(shots, tmp_path):
+    folder = WRITERS["stray-scanner"][0](tmp_path / "scan", shots)
+    expected = [frame.depth_m for frame in open_source(folder)]
+    for path in folder.glob("depth/*.png"):
+        np.save(path.with_suffix(".npy"), cv2.imread(str(path), cv2.IMREAD_UNCHANGED))
+        path.unlink()
+    log = open_source(folder)
+    assert log.kind == "stray-scanner"
+    np.testing.assert_array_equal([frame.depth_m for frame in log], expected)
 
 
 def test_damaged_poses_and_stamps_of_a_sens_file(shots, tmp_path):

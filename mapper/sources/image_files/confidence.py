@@ -12,7 +12,7 @@ from mapper.core.errors import FrameError
 from mapper.core.frames import DepthImage
 from mapper.sources.base import ImageFile
 from mapper.sources.image_files.decoded import DecodedDepth
-from mapper.sources.image_files.reading import read_depth_m, read_grey
+from mapper.sources.image_files.reading import ARRAYS, read_array_m, read_depth_m, read_grey
 from mapper.sources.listed_files import present
 
 NOTE = "depth of low confidence is left out"
@@ -26,7 +26,7 @@ def confident_depths(
     ARKit's confidence is 0 (low), 1 or 2; Polycam stores it as 0, 127, 255.
 
     Args:
-        depths: 16-bit depth images.
+        depths: 16-bit depth images, or arrays.
         confidences: 8-bit images for each, which may not exist.
         units_per_m: Units of depth per metre.
     """
@@ -54,4 +54,6 @@ def without_low_confidence(depth_m: DepthImage, confidence: NDArray[np.uint8], w
 
 
 def _read(depth: Path, confidence: Path, units_per_m: float) -> DepthImage:
-    return without_low_confidence(read_depth_m(depth, units_per_m), read_grey(confidence), f"{confidence}")
+    is_array = depth.suffix in ARRAYS
+    depth_m = read_array_m(depth, units_per_m, units_per_m) if is_array else read_depth_m(depth, units_per_m)
+    return without_low_confidence(depth_m, read_grey(confidence), f"{confidence}")

@@ -1,7 +1,8 @@
-"""Stray Scanner's exports (iOS): rgb.mp4, depth/ and confidence/ of numbered PNG, odometry.csv.
+"""Stray Scanner's exports (iOS): rgb.mp4, depth/ and confidence/ of numbered images, odometry.csv.
 
 Lines of ``odometry.csv`` are ``timestamp, frame, x, y, z, qx, qy, qz, qw``, by later versions also ``fx, fy,
-cx, cy``; ``camera_matrix.csv`` has three rows of the matrix of the video's frames. Depth is in millimetres.
+cx, cy``; ``camera_matrix.csv`` has three rows of the matrix of the video's frames. Depth is in
+millimetres, in 16-bit PNG, or in arrays of NumPy by the first versions.
 """
 
 from pathlib import Path
@@ -18,7 +19,7 @@ from mapper.sources.listed_files import refuse_links_out
 from mapper.sources.text import parse_count, parse_numbers, parse_stamp, pose_from_numbers, rows
 
 _VIDEO = "rgb.mp4"
-FILES = (_VIDEO, "odometry.csv", "depth/*.png")
+FILES = (_VIDEO, "odometry.csv", "depth/*.[pn][np][gy]")
 _COLUMNS = ("timestamp", "frame", "x", "y", "z", "qx", "qy", "qz", "qw")
 _INTRINSICS = ("fx", "fy", "cx", "cy")
 
@@ -52,8 +53,10 @@ def read_frames(folder: Path, config: SourceConfig) -> PosedFrames:
     camera, notes = median_camera(np.array(intrinsics), origin=path.name)
     camera = camera_of(folder, config, camera)
     names = [f"{number:06}.png" for number in numbers]
+    images = [folder / "depth" / name for name in names]
+    arrays = [image.with_suffix(".npy") for image in images]
     depths, depth_notes = confident_depths(
-        [folder / "depth" / name for name in names],
+        arrays if any(map(Path.is_file, arrays)) else images,
         [folder / "confidence" / name for name in names],
         camera.depth_units_per_m or MM_PER_M,
     )
