@@ -139,7 +139,7 @@ def _colour_calibration(
     config: CameraConfig | None,
     colour_px: Size,
 ) -> Calibration:
-    """Return the colour camera's intrinsics: the user's, else the recording's, else those of a file beside it."""
+    """Return the colour camera's intrinsics: the user's, the recording's, or those of a file beside it."""
     chosen = configured(config)
     if chosen is not None:
         return chosen

@@ -220,7 +220,7 @@ def choose(
         frames = points
         kind = "laser scans" if points.topic.type in LASERS else "point clouds"
         choices = [_choice_note(f"{kind} {points.topic.name}", "points", others=len(clouds) > 1)]
-        image_reason = "point clouds are mapped" if camera else "colour has no depth, or depth no colour"
+        image_reason = "point clouds are mapped" if camera else "they have neither depth nor camera info"
         beside += _clouds_beside(pick.all(CLOUDS), firsts, tracked=[points])
         beside += [camera] if camera else []
         if points.topic.type not in LASERS:
