@@ -340,6 +340,8 @@ def _calibration(info: CameraMessage, *, is_rectified: bool, name: str) -> Calib
         raise SourceError(
             f"{name}: the camera is not calibrated, K is {K}; --set source.camera.fx_px=… and so on"
         )
+    if is_rectified:
+        return Calibration(name, K[0], K[4], K[2], K[5], size_px=size_px)
     model = lens_model(info.model, len(D))
     if any(D) and (model not in POLYNOMIAL_MODELS or any(D[5:])):
         lens = Lens(model, D)

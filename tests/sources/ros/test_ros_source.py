@@ -19,7 +19,17 @@ from mapper.sources.ros.encode_ros import (
 )
 from mapper.sources.ros.typestore import make_header, make_message, serialize
 from mapper.sources.writers import write_log
-from tests.support.recordings import CAMERA, COLOR, DEPTH, camera_info, image, shots, transforms, write
+from tests.support.recordings import (
+    CAMERA,
+    COLOR,
+    DEPTH,
+    camera_info,
+    changed,
+    image,
+    shots,
+    transforms,
+    write,
+)
 from tests.support.tum_logs import FIRST_NS, PERIOD_NS, picture
 
 RVL = "16UC1; compressedDepth rvl"
@@ -376,13 +386,14 @@ def test_angular_velocities_come_from_the_topic_that_has_them(tmp_path):
     assert opened(tmp_path / "b.mcap", messages[:-9]).gyroscope is None
 
 
-def test_a_camera_of_rectified_images_has_no_distortion(tmp_path):
+@pytest.mark.parametrize("P", [{}, {"p": np.zeros(12)}], ids=["by P", "by K"])
+def test_a_camera_of_rectified_images_has_no_distortion(tmp_path, P):
     t = stamps(1)[0]
     rgb, units = picture(0)
     messages = [
         image(t, "/cam/image_rect_color", rgb, "rgb8"),
         image(t, "/cam/depth", units, "16UC1"),
-        camera_info(t, "/cam/camera_info"),
+        changed(camera_info(t, "/cam/camera_info"), **P),
     ]
     camera = next(opened(tmp_path / "a.mcap", messages).entries()).load().camera
     assert camera == PinholeCamera(64, 48, CAMERA.fx_px, CAMERA.fy_px, CAMERA.cx_px, CAMERA.cy_px)
