@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 
 from mapper.core.errors import SourceError
-from mapper.core.frames import Scan
+from mapper.core.frames import PinholeCamera, Scan
 from mapper.sources import open_source
+from mapper.sources.calibration_file import calibration_text
 from mapper.sources.config import SourceConfig, TopicsConfig
 from mapper.sources.inspection import inspect_log
 from mapper.sources.ros.encode_ros import cloud_message
 from tests.support.recordings import CAMERA, COLOR, DEPTH, camera_info, image, shots, write
-from tests.support.tum_logs import FIRST_NS, PERIOD_NS
+from tests.support.tum_logs import FIRST_NS, PERIOD_NS, picture
 
 STAMPS_NS = [FIRST_NS + i * PERIOD_NS for i in range(3)]
 
@@ -31,6 +32,17 @@ def test_a_calibration_of_another_camera_that_is_chosen_skips_no_check(tmp_path)
     config = SourceConfig(topics=TopicsConfig(camera_info="/other/camera_info"))
     log = open_source(write(tmp_path / "b.mcap", [*shots(2), same]), config)
     assert sum("/other/camera_info" in note for note in log.notes) == 1
+
+
+def test_intrinsics_of_a_file_beside_stand_in_for_those_that_were_not_recorded(tmp_path):
+    other = PinholeCamera(64, 48, 50.0, 51.0, 31.5, 23.5)
+    (tmp_path / "calibration.toml").write_text(calibration_text(other, depth_units_per_m=5000.0))
+    assert open_source(write(tmp_path / "a.mcap", shots(2)))[0].camera == CAMERA
+    images = [message for message in shots(2) if not message.topic.endswith("camera_info")]
+    log = open_source(write(tmp_path / "b.mcap", images))
+    assert log[0].camera == other
+    np.testing.assert_array_equal(log[0].depth_m, picture(0)[1] / np.float32(5000))
+    assert sum("calibration.toml" in note for note in log.notes) == 1
 
 
 @pytest.mark.parametrize("value", [0.0, 0.05])

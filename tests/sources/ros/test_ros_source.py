@@ -7,7 +7,6 @@ from mapper.core.errors import FrameError, SourceError
 from mapper.core.frames import PinholeCamera, Scan
 from mapper.core.geometry import exp, inverse
 from mapper.sources import open_source
-from mapper.sources.calibration_file import calibration_text
 from mapper.sources.config import CameraConfig, SourceConfig, TopicsConfig
 from mapper.sources.image_files.reading import decode_depth_units
 from mapper.sources.ros.encode_ros import (
@@ -214,16 +213,6 @@ def only(topic):
 def test_what_is_missing_is_named(tmp_path, messages, why):
     with pytest.raises(SourceError, match=why):
         opened(tmp_path / "a.mcap", messages)
-
-
-def test_intrinsics_of_a_file_beside_stand_in_for_those_that_were_not_recorded(tmp_path):
-    other = PinholeCamera(64, 48, 50.0, 51.0, 31.5, 23.5)
-    (tmp_path / "calibration.toml").write_text(calibration_text(other, depth_units_per_m=5000.0))
-    assert opened(tmp_path / "a.mcap", shots(2))[0].camera == CAMERA
-    log = opened(tmp_path / "b.mcap", [message for message in shots(2) if message.topic != INFO])
-    assert log[0].camera == other
-    np.testing.assert_array_equal(log[0].depth_m, picture(0)[1] / np.float32(5000))
-    assert sum("calibration.toml" in note for note in log.notes) == 1
 
 
 def test_depth_that_is_not_registered_is_refused(tmp_path):
