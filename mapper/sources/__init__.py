@@ -71,12 +71,10 @@ def open_source(path: Path, config: SourceConfig = _DEFAULTS) -> "Log":
             has no frame such as is to be its body.
         DependencyError: A library that decodes it is not installed.
     """
-    from mapper.sources.gnss_files import read_gnss
-    from mapper.sources.imu_files import read_imu
     from mapper.sources.listed_files import unused_note
+    from mapper.sources.readings_beside import with_readings
     from mapper.sources.scan_folders.scan_folder import most_clouds
     from mapper.sources.selection import selected
-    from mapper.sources.wheel_files import read_wheels
 
     if not path.exists():
         if address := _ADDRESS.match(f"{path}"):  # of whose two slashes a path keeps one
@@ -93,17 +91,8 @@ def open_source(path: Path, config: SourceConfig = _DEFAULTS) -> "Log":
             )
         with reads() as read:
             log: Log = import_module(f"mapper.sources.{name}").read_log(path, config)
-            if log.wheels is None and path.is_dir():
-                wheels, used, notes = read_wheels(path, config.wheels, sensor=log.sensor)
-                log = replace(log, wheels=wheels, choices=[*log.choices, *used], notes=[*log.notes, *notes])
-            if log.gyroscope is None and path.is_dir():
-                gyroscope, accelerations, notes = read_imu(path)
-                log = replace(log, gyroscope=gyroscope, notes=[*log.notes, *notes])
-                if log.accelerations is None:
-                    log = replace(log, accelerations=accelerations)
-            if log.gnss is None and path.is_dir():
-                gnss, notes = read_gnss(log.path)
-                log = replace(log, gnss=gnss, notes=[*log.notes, *notes])
+            if path.is_dir():
+                log = with_readings(log, path, config)
         if name != RECORDING:
             log = replace(log, notes=[*log.notes, *unused_note(path, read)])
         return selected(log, config)

@@ -129,7 +129,7 @@ class DepthCamera:
     Attributes:
         calibration: Its intrinsics.
         T_color_depth: (4, 4) its pose in the colour camera's frame; None until it is estimated from the log.
-        origin: Source of the pose, for messages.
+        origin: Source of the pose, for messages; of an unknown one, why depth is not colour's.
         tangents: (H, W, 2) x/z and y/z of every pixel's ray where the log states these, and the intrinsics
             are about theirs.
     """

@@ -220,7 +220,7 @@ def _depth_camera(found: _Numbers, origin: str) -> DepthCamera | None:
         )
     fx, fy, cx, cy = intrinsics
     calibration = Calibration(f"{origin}: depth", fx, fy, cx, cy, distortion=distortion, lens=lens)
-    return DepthCamera(calibration, T_color_depth, origin)
+    return DepthCamera(calibration, T_color_depth, origin if pose else f"depth has its own camera ({origin})")
 
 
 def _is_by_axis(first: float, second: float, third: float, _: float) -> bool:

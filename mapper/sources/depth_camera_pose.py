@@ -77,8 +77,8 @@ def with_depth_pose(
             f"deviations above its mean, want {SOUND_SCORE}, and {apart}, want {_MOST_APART_PX}"
         )
     raise SourceError(
-        f"{where}: the log does not say where its depth camera is beside colour's, and outlines in depth do "
-        f"not tell it: {why}; record /tf_static too, or "
+        f"{where}: {calibration.depth.origin}; the log does not say where its camera is, and outlines in "
+        f"depth do not tell it: {why}; record /tf_static too, or "
         "--set source.camera.depth_in_color=[x,y,z,qx,qy,qz,qw]"
     )
 

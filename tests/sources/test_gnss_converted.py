@@ -18,6 +18,7 @@ from mapper.simulation.gnss_config import SynthGnssConfig
 from mapper.simulation.lidar import LidarSimulator, write_lidar_log
 from mapper.sources import open_source
 from mapper.sources.config import SourceConfig, TopicsConfig
+from mapper.sources.gnss_files import read_gnss
 from mapper.sources.nmea import fixes_from_sentences
 from mapper.sources.ros.encode_ros import SerializedMessage, fix_message
 from mapper.sources.writers import left_out, write_log
@@ -190,22 +191,21 @@ SENTENCES = [
 
 
 def test_sentences_beside_a_log_are_fixes_with_times_of_utc(tmp_path):
-    write_lidar_log(tmp_path / "log", SHORT.model_copy(update={"gnss": None}))
-    (tmp_path / "log" / "receiver.nmea").write_text("\r\n".join(SENTENCES) + "\r\n")
-    log = open_source(tmp_path / "log")
+    (tmp_path / "receiver.nmea").write_text("\r\n".join(SENTENCES) + "\r\n")
+    gnss, notes = read_gnss(tmp_path)
     midnight_s = datetime(2027, 1, 1, tzinfo=UTC).timestamp()
-    assert (log.gnss.stamps_ns / NS_PER_S).tolist() == [midnight_s - 0.5, midnight_s + 0.5]
+    assert (gnss.stamps_ns / NS_PER_S).tolist() == [midnight_s - 0.5, midnight_s + 0.5]
     np.testing.assert_allclose(
-        log.gnss.geodetic, [[47.5, 19 + 2 / 60, 143.5], [-47.51, -19 - 2 / 60, 144.5]], atol=1e-9
+        gnss.geodetic, [[47.5, 19 + 2 / 60, 143.5], [-47.51, -19 - 2 / 60, 144.5]], atol=1e-9
     )
-    assert log.gnss.status.tolist() == [2, 0]
-    np.testing.assert_allclose(np.sqrt(log.gnss.covariances_enu[0].diagonal()), [0.03, 0.02, 0.05])
-    assert np.isnan(log.gnss.covariances_enu[1]).all()
-    assert sum("1 damaged" in note for note in log.notes) == 1
-    (tmp_path / "log" / "receiver.nmea").write_text("\n".join(SENTENCES[1:]))
-    undated = open_source(tmp_path / "log")
-    assert undated.gnss is None
-    assert sum("date" in note for note in undated.notes) == 1
+    assert gnss.status.tolist() == [2, 0]
+    np.testing.assert_allclose(np.sqrt(gnss.covariances_enu[0].diagonal()), [0.03, 0.02, 0.05])
+    assert np.isnan(gnss.covariances_enu[1]).all()
+    assert sum("1 damaged" in note for note in notes) == 1
+    (tmp_path / "receiver.nmea").write_text("\n".join(SENTENCES[1:]))
+    gnss, notes = read_gnss(tmp_path)
+    assert gnss is None
+    assert sum("date" in note for note in notes) == 1
 
 
 @pytest.mark.parametrize(

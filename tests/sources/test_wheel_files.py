@@ -1,5 +1,7 @@
 """Wheel odometry beside a log: poses, encoders, mountings, malformed files."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -10,6 +12,7 @@ from mapper.sources import open_source
 from mapper.sources.config import SourceConfig, WheelsConfig
 from mapper.sources.trajectory_files import write_tum
 from tests.support.planar import arc
+from tests.support.tum_logs import FIRST_NS
 
 R_BASE_OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
@@ -17,6 +20,7 @@ R_BASE_OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 def test_poses_beside_a_log_are_led_to_a_camera_that_looks_forward(tiny_tum_log):
     log = tiny_tum_log(3)
     base = arc(4, turn_rad=0.2)
+    base = replace(base, stamps_ns=base.stamps_ns - base.stamps_ns[0] + FIRST_NS)
     write_tum(log / "wheels.txt", base)
     source = open_source(log)
     assert (source.choices[-1], source.notes) == ("wheels.txt: wheel odometry, 4 poses", [])
@@ -30,11 +34,13 @@ def test_poses_beside_a_log_are_led_to_a_camera_that_looks_forward(tiny_tum_log)
 
 def test_encoders_beside_a_log_want_a_wheelbase(tiny_tum_log):
     log = tiny_tum_log(3)
-    (log / "encoders.txt").write_text("# stamp path_m steering_rad\n2.0 1.5 0.0\n1.0 0.5 0.0\n")
+    first_s, second_s = FIRST_NS // S, FIRST_NS // S + 1
+    lines = f"{second_s} 1.5 0.0\n{first_s} 0.5 0.0\n"
+    (log / "encoders.txt").write_text(f"# stamp path_m steering_rad\n{lines}")
     with pytest.raises(SourceError, match=r"encoders.txt: .*--set source.wheels.wheelbase_m"):
         open_source(log)
     source = open_source(log, SourceConfig(wheels=WheelsConfig(wheelbase_m=0.5)))
-    assert source.wheels.stamps_ns.tolist() == [S, 2 * S]
+    assert source.wheels.stamps_ns.tolist() == [first_s * S, second_s * S]
     np.testing.assert_allclose(source.wheels.positions_world, [[0, 0, 0], [1, 0, 0]], atol=1e-12)
 
 

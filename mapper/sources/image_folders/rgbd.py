@@ -247,7 +247,9 @@ def depth_camera(stated: DepthCamera | None, config: CameraConfig | None) -> Dep
         T_color_depth = stated.T_color_depth if T_color_depth is None else T_color_depth
     if intrinsics is None:
         raise SourceError("source.camera: want depth_intrinsics_px too: the log's files do not state them")
-    return DepthCamera(intrinsics, T_color_depth, "source.camera", tangents)
+    is_known = T_color_depth is not None
+    origin = "source.camera" if is_known else "depth has its own camera (source.camera.depth_intrinsics_px)"
+    return DepthCamera(intrinsics, T_color_depth, origin, tangents)
 
 
 def assumed_camera_note(camera: Calibration) -> str:

@@ -194,12 +194,6 @@ def _depth_camera(
         intrinsics = _calibration(
             info, is_rectified=is_called_rectified(name), name=topics.depth_info.topic.name
         )
-    if intrinsics is None:
-        missing = "its intrinsics are not in the log: --set source.camera.depth_intrinsics_px=[fx,fy,cx,cy]"
-    elif (turned_deg := _turned_deg(np.eye(4), T_color_depth)) > _MOST_TURNED_DEG:
-        missing = f"{origin} turns it by {turned_deg:.0f}°, so one frame is no optical one: {_SETTING}"
-    else:
-        return DepthCamera(intrinsics, T_color_depth, origin), notes
     if is_other_view:
         size = f"{depth_px[0]}×{depth_px[1]} px"
         why = (
@@ -209,6 +203,12 @@ def _depth_camera(
     else:
         apart_mm = _apart_m(T_color_depth) * 1e3
         why = f"{name} is not registered to {color_name}, {apart_mm:.0f} mm beside it by {origin}"
+    if intrinsics is None:
+        missing = "its intrinsics are not in the log: --set source.camera.depth_intrinsics_px=[fx,fy,cx,cy]"
+    elif (turned_deg := _turned_deg(np.eye(4), T_color_depth)) > _MOST_TURNED_DEG:
+        missing = f"{origin} turns it by {turned_deg:.0f}°, so one frame is no optical one: {_SETTING}"
+    else:
+        return DepthCamera(intrinsics, T_color_depth, why if T_color_depth is None else origin), notes
     raise SourceError(f"{reader.recording.path}: {why}; {missing}")
 
 

@@ -172,7 +172,7 @@ def test_depth_of_another_time_tells_no_pose(tmp_path, desk_log):
 
 def test_depth_without_a_pose_or_intrinsics_is_refused_with_the_setting(tmp_path):
     path = write(tmp_path / "a.mcap", unregistered(T=None))
-    with pytest.raises(SourceError, match=r"0 of its frames .*\.depth_in_color"):
+    with pytest.raises(SourceError, match=r"\(106×60 px, focal length 53\.0 px\) .*\.depth_in_color"):
         open_source(path)
     beside = CameraConfig(depth_in_color=tuple(row_of_pose(BESIDE).tolist()))
     (note,) = (one for one in open_source(path, SourceConfig(camera=beside)).notes if "registered" in one)
@@ -285,7 +285,7 @@ def test_a_calibration_of_p_alone_tells_the_depth_camera_from_colours(tmp_path):
         for one in unregistered(T=None)
     ]
     assert without_k != unregistered(T=None)
-    with pytest.raises(SourceError, match=r"where its depth camera is"):
+    with pytest.raises(SourceError, match=r"focal length 53\.0 px\) is not registered"):
         opened(tmp_path / "a.mcap", without_k)
 
 

@@ -1,0 +1,76 @@
+"""Readings beside a log's frames: wheels, inertial readings and GNSS fixes in files of its folder."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+
+from mapper.core.timebase import Stamps, seconds_text_from_ns
+from mapper.core.trajectory import Trajectory
+from mapper.sensing.gnss import GnssFixes
+from mapper.sensing.gyroscope import Gyroscope
+from mapper.sources.base import Accelerations, Log
+from mapper.sources.config import SourceConfig
+from mapper.sources.gnss_files import read_gnss
+from mapper.sources.imu_files import read_imu
+from mapper.sources.wheel_files import read_wheels
+
+_LONGER_NS = {"µs": 1_000, "ms": 1_000_000, "s": 1_000_000_000}
+"""Units in which files have stamps that should be nanoseconds."""
+
+Readings = TypeVar("Readings", Trajectory, Gyroscope, Accelerations, GnssFixes)
+
+
+def with_readings(log: Log, folder: Path, config: SourceConfig) -> Log:
+    """Return a log with the readings of files in its folder, of each kind that the log itself has not.
+
+    Args:
+        log: The log.
+        folder: Folder that was opened.
+        config: Settings of the wheels.
+
+    Raises:
+        SourceError: A file is malformed.
+    """
+    if log.wheels is None:
+        wheels, used, notes = read_wheels(folder, config.wheels, sensor=log.sensor)
+        wheels, more = _of_the_log(wheels, log.stamps_ns, "wheel odometry")
+        if wheels is not None and not np.ptp(wheels.T_world_body, axis=0).any():
+            wheels, more = None, [*more, "wheel odometry: it stands still all the time; not used"]
+        choices = log.choices if wheels is None else [*log.choices, *used]
+        log = replace(log, wheels=wheels, choices=choices, notes=[*log.notes, *notes, *more])
+    if log.gyroscope is None:
+        gyroscope, accelerations, notes = read_imu(folder)
+        gyroscope, more = _of_the_log(gyroscope, log.stamps_ns, "angular velocities")
+        log = replace(log, gyroscope=gyroscope, notes=[*log.notes, *notes, *more])
+        if log.accelerations is None:
+            accelerations, more = _of_the_log(accelerations, log.stamps_ns, "accelerations")
+            log = replace(log, accelerations=accelerations, notes=[*log.notes, *more])
+    if log.gnss is None:
+        gnss, notes = read_gnss(log.path)
+        gnss, more = _of_the_log(gnss, log.stamps_ns, "GNSS fixes")
+        log = replace(log, gnss=gnss, notes=[*log.notes, *notes, *more])
+    return log
+
+
+def _of_the_log(readings: Readings | None, frames_ns: Stamps, name: str) -> tuple[Readings | None, list[str]]:
+    """Return readings with stamps of the frames' time, and a note on stamps in another unit, or of no use."""
+    if readings is None or not len(readings.stamps_ns) or _overlap(readings.stamps_ns, frames_ns):
+        return readings, []
+    for unit, longer_ns in _LONGER_NS.items():
+        if readings.stamps_ns[-1] <= np.iinfo(np.int64).max // longer_ns:
+            stamps_ns = readings.stamps_ns * longer_ns
+            if _overlap(stamps_ns, frames_ns):
+                note = f"{name}: stamps are taken in {unit}, as in ns none is of the frames' time"
+                return replace(readings, stamps_ns=stamps_ns), [note]
+    first_s, frames_s = (
+        seconds_text_from_ns(int(stamps_ns[0])) for stamps_ns in (readings.stamps_ns, frames_ns)
+    )
+    return None, [
+        f"{name}: they begin at {first_s} s and frames at {frames_s} s, so none is of their time; not used"
+    ]
+
+
+def _overlap(readings_ns: Stamps, frames_ns: Stamps) -> bool:
+    return bool(readings_ns[0] <= frames_ns[-1] and frames_ns[0] <= readings_ns[-1])
