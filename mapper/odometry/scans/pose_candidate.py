@@ -178,4 +178,5 @@ def _shown_given(shown: Array, corrections_m: Array, predicted_m: Array, voxel_m
     sigmas_m = _WHEEL_SIGMAS * predicted_m
     if_shown = np.exp(-0.5 * (corrections_m / sigmas_m) ** 2) / (np.sqrt(2.0 * np.pi) * sigmas_m)
     if_not = 1.0 / (2.0 * _SLIDING_VOXELS * voxel_m)
-    return np.where(shown >= 1.0, shown, shown * if_shown / (shown * if_shown + (1.0 - shown) * if_not))
+    chance = shown * if_shown + (1.0 - shown) * if_not
+    return np.where(shown >= 1.0, shown, shown * if_shown / np.where(shown >= 1.0, 1.0, chance))

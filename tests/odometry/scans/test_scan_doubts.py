@@ -283,11 +283,14 @@ def test_a_prediction_fills_only_what_surfaces_do_not_show():
 
     pose, open_m = fuse_with_prediction(fit, predicted, found, Spread(0.001, 0.05), voxel_m=0.4)
     near, _ = fuse_with_prediction(fit, predicted, found, Spread(0.5, 2.0), voxel_m=0.4)
+    wheels = Spread(1e-5, 1e-5, is_by_wheels=True)  # so sure that a correction as large has no chance
+    rolled, _ = fuse_with_prediction(fit, predicted, found, wheels, voxel_m=0.4)
 
     assert fit.unobservable.startswith("translation along x")
     np.testing.assert_allclose(pose[:3, 3], [1.0, 0.02, 0.0], atol=0.02)
     assert open_m.max() == pytest.approx(0.05, rel=0.3)
     assert near[0, 3] > 2.5  # where predictions are bad, an uncertain measurement is better
+    assert rolled[0, 3] == pytest.approx(1.0, abs=0.02)
 
 
 def test_the_covariance_covers_what_noise_does():
