@@ -14,7 +14,7 @@ from mapper.core.errors import DependencyError, FrameError, SourceError
 from mapper.evaluators.metrics.evaluate import evaluate
 from mapper.pipeline.build import build
 from mapper.sources import open_source
-from mapper.sources.config import SourceConfig
+from mapper.sources.config import CameraConfig, SourceConfig
 from mapper.sources.inspection import inspect_log
 from mapper.sources.writers import write_log
 from tests.support.posed_scans import WRITERS, Shots, shots_of, write_record3d
@@ -71,6 +71,15 @@ def test_depth_of_early_stray_scanner_exports_is_arrays(shots, tmp_path):
     log = open_source(folder)
     assert log.kind == "stray-scanner"
     np.testing.assert_array_equal([frame.depth_m for frame in log], expected)
+
+
+def test_a_missing_camera_of_stray_scanner_can_be_set(shots, tmp_path):
+    folder = WRITERS["stray-scanner"][0](tmp_path / "scan", Shots(shots.camera, shots.frames[:2]))
+    (folder / "camera_matrix.csv").unlink()
+    with pytest.raises(SourceError, match=r"source\.camera\.fx_px"):
+        open_source(folder)
+    camera = CameraConfig(fx_px=250.0, fy_px=251.0, cx_px=160.0, cy_px=120.0)
+    assert open_source(folder, SourceConfig(camera=camera))[0].camera.fx_px == 250.0
 
 
 def test_damaged_poses_and_stamps_of_a_sens_file(shots, tmp_path):

@@ -48,10 +48,11 @@ def read_frames(folder: Path, config: SourceConfig) -> PosedFrames:
         )
         if set(_INTRINSICS) <= set(header):
             intrinsics.append(parse_numbers([words[at[name]] for name in _INTRINSICS], where=where))
-    if not intrinsics:
-        intrinsics = [_matrix(folder / "camera_matrix.csv")]
-    camera, notes = median_camera(np.array(intrinsics), origin=path.name)
-    camera = camera_of(folder, config, camera)
+    matrix = folder / "camera_matrix.csv"
+    if not intrinsics and matrix.is_file():
+        intrinsics = [_matrix(matrix)]
+    stated, notes = median_camera(np.array(intrinsics), origin=path.name) if intrinsics else (None, [])
+    camera = camera_of(folder, config, stated)
     names = [f"{number:06}.png" for number in numbers]
     images = [folder / "depth" / name for name in names]
     arrays = [image.with_suffix(".npy") for image in images]
