@@ -26,7 +26,7 @@ def test_a_calibration_of_another_camera_that_is_chosen_skips_no_check(tmp_path)
     other = replace(CAMERA, fx_px=40.0, fy_px=40.0)
     depth_info = camera_info(FIRST_NS, "/cam/aligned_depth/camera_info", other)
     config = SourceConfig(topics=TopicsConfig(camera_info="/cam/aligned_depth/camera_info"))
-    with pytest.raises(SourceError, match=r"where its depth camera is"):
+    with pytest.raises(SourceError, match=r"focal length 40\.0 px\) is not registered"):
         open_source(write(tmp_path / "a.mcap", [*shots(2), depth_info]), config)
     same = camera_info(FIRST_NS, "/other/camera_info", CAMERA)
     config = SourceConfig(topics=TopicsConfig(camera_info="/other/camera_info"))

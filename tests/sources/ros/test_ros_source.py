@@ -218,7 +218,8 @@ def test_what_is_missing_is_named(tmp_path, messages, why):
 def test_depth_that_is_not_registered_is_refused(tmp_path):
     other = PinholeCamera(64, 48, 45.0, 45.0, 31.5, 23.5)
     messages = [*shots(2), camera_info(FIRST_NS, "/cam/aligned_depth/camera_info", other)]
-    with pytest.raises(SourceError, match=r"where its depth camera is"):
+    why = r"aligned_depth/image_raw \(64×48 px, focal length 45.0 px\) is not registered to /cam/color"
+    with pytest.raises(SourceError, match=why):
         opened(tmp_path / "a.mcap", messages)
     cropped = [image(FIRST_NS, DEPTH, np.ones((20, 32), np.uint16), "16UC1"), *shots(1)[1:]]
     why = r"/cam/aligned_depth/image_raw: colour has 64×48 px and depth 32×20, which is another aspect ratio"
@@ -237,7 +238,8 @@ def test_depth_of_another_size_is_brought_to_colours(tmp_path):
     other = camera_info(FIRST_NS, "/cam/aligned_depth/camera_info", CAMERA)  # a copy of colour's
     wide = PinholeCamera(32, 24, 20.0, 20.0, 15.5, 11.5)
     assert opened(tmp_path / "b.mcap", [*small, other])[0].camera == CAMERA
-    with pytest.raises(SourceError, match=r"where its depth camera is"):
+    why = r"\(32×24 px, focal length 20.0 px\) is not registered to /cam/color/image_raw .focal length 30.0"
+    with pytest.raises(SourceError, match=why):
         opened(tmp_path / "c.mcap", [*small, camera_info(FIRST_NS, "/cam/aligned_depth/camera_info", wide)])
 
 
