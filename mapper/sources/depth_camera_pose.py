@@ -93,14 +93,16 @@ class _Estimate:
 
 
 def _estimate(frames: Sequence["_Outlined"], camera: PinholeCamera) -> _Estimate:
-    coarse, *finer = [_Alignment(frames, camera, blur) for blur in _BLURS]
+    coarse, *finer = _BLURS
+    alignment = _Alignment(frames, camera, coarse)
     tried = product(_FIRST_TILT_RAD, _FIRST_X_M)
     starts = [np.array([tilt_rad, 0.0, 0.0, x_m, 0.0, 0.0]) for tilt_rad, x_m in tried]
-    numbers = min(starts, key=coarse.cost)
-    for alignment in (coarse, *finer):
+    numbers = alignment.refine(min(starts, key=alignment.cost))
+    for blur in finer:
+        alignment = _Alignment(frames, camera, blur)
         numbers = alignment.refine(numbers)
-    first, second = (_Alignment(frames[k::2], camera, _BLURS[-1]).refine(numbers) for k in (0, 1))
-    return _Estimate(numbers, finer[-1].score(numbers), _distance_px(first, second, camera))
+    first, second = (_Alignment(frames[k::2], camera, finer[-1]).refine(numbers) for k in (0, 1))
+    return _Estimate(numbers, alignment.score(numbers), _distance_px(first, second, camera))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
