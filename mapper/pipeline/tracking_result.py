@@ -116,7 +116,7 @@ def refuse_a_fragment(
     doubtful = len(tracking.placed) - tracked
     found = f"only {tracked} of {read} frames read could be tracked"
     if doubtful:
-        found += f", {doubtful} more are doubtful"
+        found += f", {doubtful} more with doubts"
     unseen = [track for track in tracking.placed if track.doubts and track.diagnostics.unobservable]
     if 2 * len(unseen) > read and not implausible:
         found = f"{found} ({unseen[-1].doubts[-1].text})"
