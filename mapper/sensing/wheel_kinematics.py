@@ -3,10 +3,18 @@
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 
-from mapper.core.geometry import Array, Transform, exp
-from mapper.core.timebase import Stamps
+from mapper.core.geometry import Array, Transform, exp, inverse, log
+from mapper.core.timebase import NS_PER_S, Stamps
 from mapper.core.trajectory import Trajectory
+
+_TIMES_FASTER = 10.0
+"""A step that is this many times as long and as fast as 95 % of all steps is no motion of wheels, which speed
+up over many steps."""
+_LEAST_JUMP = {"m": 0.2, "rad": 0.2}
+_LEAST_SPEED = {"m": 5.0, "rad": 10.0}
+"""Per second, of robots that stand still for nearly all of the log."""
 
 
 def driven(stamps_ns: Stamps, path_m: Array, steering_rad: Array, *, wheelbase_m: float) -> Trajectory:
@@ -42,18 +50,59 @@ def pose_at(wheels: Trajectory, stamp_ns: int, *, max_gap_ns: int) -> Transform 
     return wheels.at(stamp_ns)
 
 
+def without_jumps(wheels: Trajectory) -> tuple[Trajectory, list[str]]:
+    """Return odometry without its jumps, as it has them where it was restarted, and a note on these.
+
+    A step that jumps gets the velocity of the step before.
+    """
+    seconds = np.diff(wheels.stamps_ns) / NS_PER_S
+    steps_m, steps_rad = _step_sizes(wheels)
+    jumps = np.flatnonzero(_jumps(steps_m, seconds, "m") | _jumps(steps_rad, seconds, "rad"))
+    poses = wheels.T_world_body.copy()
+    for i in jumps.tolist():
+        step = np.eye(4)
+        if i > 0:
+            rotation_rad, translation_m = log(inverse(poses[i - 1]) @ poses[i])
+            ratio = seconds[i] / seconds[i - 1]
+            step = exp(ratio * rotation_rad, ratio * translation_m)
+        poses[i + 1 :] = poses[i] @ step @ inverse(poses[i + 1]) @ poses[i + 1 :]
+    if not len(jumps):
+        return wheels, []
+    first = jumps[0]
+    return Trajectory(wheels.stamps_ns, poses), [
+        f"wheel odometry: it jumps {len(jumps)} times, first by {steps_m[first]:.2f} m and "
+        f"{np.degrees(steps_rad[first]):.0f}° within {seconds[first]:.3f} s, as if restarted; jumps are "
+        "left out"
+    ]
+
+
+def _jumps(sizes: Array, seconds: Array, unit: str) -> NDArray[np.bool_]:
+    speeds = sizes / seconds
+    longest, fastest = (
+        _TIMES_FASTER * np.percentile(one, 95.0) if len(one) else 0.0 for one in (sizes, speeds)
+    )
+    is_jump: NDArray[np.bool_] = (sizes > max(longest, _LEAST_JUMP[unit])) & (
+        speeds > max(fastest, _LEAST_SPEED[unit])
+    )
+    return is_jump
+
+
+def _step_sizes(wheels: Trajectory) -> tuple[Array, Array]:
+    """Return the metres and the radians between consecutive poses."""
+    steps_m = np.linalg.norm(np.diff(wheels.positions_world, axis=0), axis=1)
+    chords = np.linalg.norm(np.diff(wheels.T_world_body[:, :3, :3], axis=0), axis=(1, 2))
+    # |R_a − R_b|_F = √8 sin(angle / 2)
+    return steps_m, 2.0 * np.arcsin(np.minimum(chords / np.sqrt(8.0), 1.0))
+
+
 class Odometer:
     """Path length and total turn of the wheels' poses, in either direction."""
 
     def __init__(self, wheels: Trajectory) -> None:
         """Sum the distances and angles between consecutive poses."""
-        steps_m = np.linalg.norm(np.diff(wheels.positions_world, axis=0), axis=1)
-        chords = np.linalg.norm(np.diff(wheels.T_world_body[:, :3, :3], axis=0), axis=(1, 2))
-        # |R_a − R_b|_F = √8 sin(angle / 2)
-        steps_rad = 2.0 * np.arcsin(np.minimum(chords / np.sqrt(8.0), 1.0))
         self._start_ns = int(wheels.stamps_ns[0])  # nanoseconds since 1970 are too many for a float
         self._since_start_ns = (wheels.stamps_ns - self._start_ns).astype(np.float64)
-        self._counts = [np.concatenate([[0.0], np.cumsum(steps)]) for steps in (steps_m, steps_rad)]
+        self._counts = [np.concatenate([[0.0], np.cumsum(steps)]) for steps in _step_sizes(wheels)]
 
     def between(self, begin_ns: int, end_ns: int) -> tuple[float, float]:
         """Return the metres driven and the radians turned from one time to a later one."""
