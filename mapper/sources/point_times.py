@@ -31,9 +31,9 @@ _USUAL_SWEEP_NS = NS_PER_S // 10
 """A sweep whose returns all lie to one side is shorter, but begins no later after its stamp."""
 _MAX_WRONG_SHARE = 0.05
 """Share of the points whose times may be damaged; with more of them nothing tells which times are right."""
-_LEAST_UNSET_SHARE, _MOST_UNSET_SHARE, _UNSET_RATIO = 0.01, 0.25, 5
+_LEAST_UNSET_SHARE, _MOST_UNSET_SHARE, _UNSET_RATIO = 0.01, 0.7, 5
 """Shares of points whose time 0 may mean that there is none, and their ratio to those of any other time: a
-spinning LiDAR's first column has as many as the others. A quarter of them may be a LiDAR's without times."""
+spinning LiDAR's first column has as many as the others. With more of them the field holds no times."""
 _SAMPLED = 1000
 _PERIODS = (float(1 << 32), *(s * unit for s in (1, 3600, 86_400, 604_800) for unit in UNITS_PER_S))
 """Counts after which times begin anew: 32 bits; a second, an hour, a day and a week in every unit."""
@@ -72,7 +72,7 @@ def relative_times_s(values: NDArray[np.number], stamp_ns: int) -> NDArray[np.fl
 
     Returns:
         (N,) float32 seconds, negative before the stamp, NaN where damaged; None where the values are no
-        times: none, all the same, not finite, or further apart than a sweep lasts.
+        times: none, all or most of them the same, not finite, or further apart than a sweep lasts.
     """
     if len(values) == 0:
         return None
@@ -87,9 +87,11 @@ def relative_times_s(values: NDArray[np.number], stamp_ns: int) -> NDArray[np.fl
         return None
     times_s = _after_stamp_s(values, first, units_per_s, stamp_ns)
     is_zero = values == 0
-    if _LEAST_UNSET_SHARE < is_zero.mean() < _MOST_UNSET_SHARE:
+    if is_zero.mean() > _LEAST_UNSET_SHARE:
         _, counts = np.unique(values[~is_zero], return_counts=True)
         if is_zero.sum() > _UNSET_RATIO * counts.max():
+            if is_zero.mean() > _MOST_UNSET_SHARE:
+                return None
             times_s[is_zero] = np.nan
     return times_s
 

@@ -126,8 +126,12 @@ def test_zeros_of_returns_without_a_time_are_none_but_those_of_a_first_column_st
     columns = np.repeat(np.linspace(0.0, 0.0999, 100), 10)
     times_s = np.round(columns * 1e9).astype(np.uint32)
     np.testing.assert_allclose(relative_times_s(times_s, STAMP_NS), columns, atol=1e-6)
-    times_s[::9] = 0
-    found_s = relative_times_s(times_s, STAMP_NS)
-    assert np.isnan(found_s).sum() == (times_s == 0).sum()
-    known = times_s > 0
-    np.testing.assert_allclose(found_s[known], columns[known], atol=1e-6)
+    for every in (9, 2):
+        some_s = times_s.copy()
+        some_s[::every] = 0
+        found_s = relative_times_s(some_s, STAMP_NS)
+        assert np.isnan(found_s).sum() == (some_s == 0).sum()
+        known = some_s > 0
+        np.testing.assert_allclose(found_s[known], columns[known], atol=1e-6)
+    times_s[np.arange(len(times_s)) % 5 > 0] = 0
+    assert relative_times_s(times_s, STAMP_NS) is None
