@@ -15,9 +15,12 @@ from mapper.core.frames import Scan
 from mapper.core.timebase import check_stamps
 from mapper.core.trajectory import Trajectory
 from mapper.mapping.levelling import Level, axes_of, find_level, level_in_plane
+from mapper.mapping.sensor_agreement import mounting_warnings
 from mapper.navigation.reachable_floor import MAX_SENSOR_HEIGHT_M
 from mapper.odometry.base import Odometry
 from mapper.odometry.gyroscope_calibration import with_body_rates
+from mapper.odometry.scans.adapted_lengths import adapted_to
+from mapper.odometry.scans.config import AnyScanOdometryConfig
 from mapper.pipeline.checkpoint_identity import identity_of, kept_from_before
 from mapper.pipeline.checkpoints import (
     EVERY_S,
@@ -195,6 +198,9 @@ class _Steps:
         if implausible := _height_warning(self.source, tracking.tracked_trajectory()):
             self.progress.note(implausible)
             self.writer.warn([RunWarning(kind="depth", sentence=implausible, weight="doubt")])
+        for sentence in _mounting_warnings(self.source, tracking, self.config):
+            self.progress.note(sentence)
+            self.writer.warn([RunWarning(kind="mounting", sentence=sentence, weight="doubt")])
         for warning in solved.georeferenced.warnings:
             self.progress.note(warning.text)
         self.writer.warn(solved.georeferenced.warnings)
@@ -231,6 +237,17 @@ def _height_warning(source: Log, trajectory: Trajectory) -> str:
     if source.sensor != "rgbd" or height_m <= MAX_SENSOR_HEIGHT_M:
         return ""
     return f"the camera is {height_m:.1f} m above the floor; is source.camera.depth_factor right?"
+
+
+def _mounting_warnings(source: Log, tracking: TrackingResult, config: BuildConfig) -> list[str]:
+    """Return which sensors beside a LiDAR are not where they are said to be, in a sentence for each."""
+    if not (source.beside and isinstance(config.odometry, AnyScanOdometryConfig)):
+        return []
+    odometry = adapted_to(config.odometry, source)
+    assert isinstance(odometry, AnyScanOdometryConfig)
+    return mounting_warnings(
+        with_body_rates(source, tracking.gyroscope), tracking.tracked_trajectory(), voxel_m=odometry.voxel_m
+    )
 
 
 def level_of(source: Log, tracking: TrackingResult, config: BuildConfig) -> Level:

@@ -40,6 +40,7 @@ INPUT_KINDS = frozenset(
         "frozen",
         "far returns",
         "conflict",
+        "mounting",
         "level",
         FLOOR,
     }
