@@ -76,6 +76,9 @@ def recording_log(reader: RecordingReader, config: SourceConfig) -> Log:
     if reader.tree.contradicted:
         told = listed(reader.tree.contradicted)
         tf_notes.append(f"tf contradicts itself; of static frames the last is used, as in tf2: {told}")
+    base, T_base_body = reader.base_of(frames.body), reader.mounting(frames.body)
+    if base is not None and T_base_body is None:
+        tf_notes.append(f"tf moves {frames.body} on {base}: poses of the robot are not written (base.tum)")
     cameras = [images_beside(reader, camera, body=frames.body) for camera in choice.cameras]
     images = [one for one in cameras if isinstance(one, CameraImages)]
     beside, beside_choices = sensors_beside(reader, choice.beside, frames, config)
@@ -92,8 +95,8 @@ def recording_log(reader: RecordingReader, config: SourceConfig) -> Log:
         gnss=gnss,
         images=images,
         beside=beside,
-        T_base_body=reader.mounting(frames.body),
-        base_frame=reader.base_of(frames.body) or "",
+        T_base_body=T_base_body,
+        base_frame=base or "",
         body_frame=frames.body,
         wheels=wheels,
         depth_noise=frames.depth_noise,
