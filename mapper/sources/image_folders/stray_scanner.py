@@ -19,7 +19,7 @@ from mapper.sources.listed_files import refuse_links_out
 from mapper.sources.text import parse_count, parse_numbers, parse_stamp, pose_from_numbers, rows
 
 _VIDEO = "rgb.mp4"
-FILES = (_VIDEO, "odometry.csv", "depth/*.[pn][np][gy]")
+FILES = (_VIDEO, "odometry.csv", "depth/*")
 _COLUMNS = ("timestamp", "frame", "x", "y", "z", "qx", "qy", "qz", "qw")
 _INTRINSICS = ("fx", "fy", "cx", "cy")
 
