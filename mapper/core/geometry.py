@@ -264,6 +264,11 @@ def _is_rigid_rows(rows: list[list[float]], tolerance: float) -> bool:
     return orthogonal and proper and affine and all(abs(value) < FARTHEST_M for value in (x, y, z))
 
 
+def spread_indices(count: int, most: int) -> NDArray[np.intp]:
+    """Return the indices of at most ``most`` of some rows, evenly spread from the first to the last."""
+    return np.unique(np.linspace(0, count - 1, min(most, count)).astype(np.intp))
+
+
 def stride_for(count: int, most: int) -> int:
     """Return the smallest step, from the first row on, at which at most ``most`` of the rows are taken."""
     return max(1, -(-count // most))

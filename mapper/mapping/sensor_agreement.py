@@ -7,7 +7,8 @@ import numpy as np
 
 from mapper.core.errors import FrameError
 from mapper.core.frames import Scan
-from mapper.core.geometry import Array, apply, inverse, log
+from mapper.core.geometry import Array, apply, inverse, log, spread_indices
+from mapper.core.running_median import SIGMAS_PER_MAD
 from mapper.core.trajectory import Trajectory
 from mapper.mapping.placed_frames import PlacedFrame, placed_frames, sensor_paths
 from mapper.registration.config import GicpConfig
@@ -23,7 +24,7 @@ _AROUND, _NEAR_VOXELS = 7, 60.0
 """Tracked scans to which one is registered, spread over those nearby: a sensor that looks back sees what one
 that looks forward saw before."""
 _LEAST_M, _LEAST_RAD = 0.15, np.radians(1.5)
-_LEAST_SIGMAS, _SIGMAS_PER_MAD = 5.0, 1.4826
+_LEAST_SIGMAS = 5.0
 _TIMES_BETTER = 1.25
 """Points that agree, in those at the stated mounting: 1.0 to 1.05 of right ones even where a motion is open,
 as along tunnels, and 1.4 to 4 of those 0.3 m off."""
@@ -36,12 +37,10 @@ def mounting_warnings(source: Log, trajectory: Trajectory, *, voxel_m: float) ->
     views do not overlap, 2D lasers, and sensors beside a tracked camera are not judged.
 
     Args:
-        source: The log, with the sensors beside it.
+        source: The log of a 3D LiDAR, with the sensors beside it.
         trajectory: Final poses of the tracked sensor.
         voxel_m: Edge of the voxels to which scans are reduced, small enough for the surroundings.
     """
-    if source.sensor != "lidar" or not source.beside:
-        return []
     (_, path), *others = sensor_paths(source, trajectory)
     tracked = list(placed_frames(source, path))
     warnings = []
@@ -51,7 +50,7 @@ def mounting_warnings(source: Log, trajectory: Trajectory, *, voxel_m: float) ->
             continue
         offsets, shares = np.split(np.array(fits), [6], axis=1)
         median, (stated, found) = np.median(offsets, axis=0), np.median(shares, axis=0)
-        sigma = _SIGMAS_PER_MAD * np.median(np.abs(offsets - median), axis=0) / np.sqrt(len(offsets))
+        sigma = SIGMAS_PER_MAD * np.median(np.abs(offsets - median), axis=0) / np.sqrt(len(offsets))
         sure = np.where(np.abs(median) > _LEAST_SIGMAS * sigma, median, 0.0)
         turned_rad, moved_m = (float(np.linalg.norm(part)) for part in (sure[:3], sure[3:]))
         if found > _TIMES_BETTER * stated and (turned_rad > _LEAST_RAD or moved_m > _LEAST_M):
@@ -67,14 +66,11 @@ def _fits(tracked: list[PlacedFrame], other: Log, path: Trajectory, voxel_m: flo
     """Yield what ``_fit`` finds for scans of another sensor, in its own frame."""
     positions = np.array([frame.T_world_body[:3, 3] for frame in tracked]).reshape(-1, 3)
     frames = list(placed_frames(other, path))
-    for index in np.unique(
-        np.linspace(0, len(frames) - 1, min(_LOOKED_AT, len(frames))).astype(int)
-    ).tolist():
+    for index in spread_indices(len(frames), _LOOKED_AT).tolist():
         frame = frames[index]
         distances_m = np.linalg.norm(positions - frame.T_world_body[:3, 3], axis=1)
         near = np.flatnonzero(distances_m < _NEAR_VOXELS * voxel_m)
-        chosen = np.unique(np.linspace(0, len(near) - 1, min(_AROUND, len(near))).astype(int))
-        around = [tracked[k] for k in near[chosen].tolist()]
+        around = [tracked[k] for k in near[spread_indices(len(near), _AROUND)].tolist()]
         with suppress(FrameError):
             T_sensor_world = inverse(frame.T_world_body)
             points = [

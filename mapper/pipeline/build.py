@@ -241,10 +241,11 @@ def _height_warning(source: Log, trajectory: Trajectory) -> str:
 
 def _mounting_warnings(source: Log, tracking: TrackingResult, config: BuildConfig) -> list[str]:
     """Return which sensors beside a LiDAR are not where they are said to be, in a sentence for each."""
-    if not (source.beside and isinstance(config.odometry, AnyScanOdometryConfig)):
+    if source.sensor != "lidar" or not source.beside:
         return []
     odometry = adapted_to(config.odometry, source)
-    assert isinstance(odometry, AnyScanOdometryConfig)
+    if not isinstance(odometry, AnyScanOdometryConfig):
+        return []
     return mounting_warnings(
         with_body_rates(source, tracking.gyroscope), tracking.tracked_trajectory(), voxel_m=odometry.voxel_m
     )

@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from mapper.core.geometry import Array, Transform, exp, interpolate, inverse, log
+from mapper.core.geometry import Array, Transform, exp, interpolate, inverse, log, spread_indices
 from mapper.core.rotations import pose_of_row
 from mapper.core.timebase import NS_PER_S
 from mapper.core.trajectory import Trajectory
@@ -168,7 +168,7 @@ class _MotionAround:
         windows = np.column_stack([begins, middles, ends])[usable]
         if len(windows) < _MIN_WINDOWS or stamps_ns[windows[-1, 0]] - stamps_ns[windows[0, 0]] < gap_ns:
             return None
-        chosen = windows[np.unique(np.linspace(0, len(windows) - 1, _WINDOWS).astype(int))]
+        chosen = windows[spread_indices(len(windows), _WINDOWS)]
         squares = [
             [np.square(np.concatenate(log(inverse(T) @ self._poses[middle]))) for T in moved]
             for begin, middle, end in chosen.tolist()

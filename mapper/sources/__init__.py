@@ -71,7 +71,6 @@ def open_source(path: Path, config: SourceConfig = _DEFAULTS) -> "Log":
             has no frame such as is to be its body.
         DependencyError: A library that decodes it is not installed.
     """
-    from mapper.sensing.wheel_kinematics import without_jumps
     from mapper.sources.listed_files import unused_note
     from mapper.sources.readings_beside import with_readings
     from mapper.sources.scan_folders.scan_folder import most_clouds
@@ -94,9 +93,6 @@ def open_source(path: Path, config: SourceConfig = _DEFAULTS) -> "Log":
             log: Log = import_module(f"mapper.sources.{name}").read_log(path, config)
             if path.is_dir():
                 log = with_readings(log, path, config)
-            if log.wheels is not None:
-                wheels, jump_notes = without_jumps(log.wheels)
-                log = replace(log, wheels=wheels, notes=[*log.notes, *jump_notes])
         if name != RECORDING:
             log = replace(log, notes=[*log.notes, *unused_note(path, read)])
         return selected(log, config)

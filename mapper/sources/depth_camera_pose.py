@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mapper.core.errors import FrameError, SourceError
 from mapper.core.frames import DepthImage, Image, PinholeCamera, undistortion_maps
-from mapper.core.geometry import Array, Points, Transform, apply, exp
+from mapper.core.geometry import Array, Points, Transform, apply, exp, spread_indices, stride_for
 from mapper.sources.calibration import Calibration
 from mapper.sources.depth_outlines import OUTLINE_STEP, SOUND_SCORE
 from mapper.sources.image_files.image_sizes import RecordedCamera, depth_rays
@@ -59,9 +59,8 @@ def with_depth_pose(
         SourceError: Too few frames have outlines, or these do not tell the pose.
     """
     assert calibration.depth is not None
-    spread = np.unique(np.linspace(0, frames - 1, _MOST_FRAMES).astype(int)).tolist()
     rays = depth_rays(calibration.depth, recorded.depth_px)
-    found = list(_outlined(read_pair, spread, recorded.camera, rays))
+    found = list(_outlined(read_pair, spread_indices(frames, _MOST_FRAMES).tolist(), recorded.camera, rays))
     why = f"{len(found)} of its frames have some, want {_FEWEST_FRAMES}"
     if len(found) >= _FEWEST_FRAMES:
         estimate = _estimate(found, recorded.camera)
@@ -129,7 +128,7 @@ def _outlined(
             is_before = cv2.dilate(depth_m, np.ones((3, 3), np.uint8)) > OUTLINE_STEP * nearest_m
             rows, columns = np.nonzero(is_before)
             if len(rows) >= _FEWEST_POINTS:
-                kept = slice(None, None, -(-len(rows) // _MOST_POINTS))
+                kept = slice(None, None, stride_for(len(rows), _MOST_POINTS))
                 rows, columns = rows[kept], columns[kept]
                 z = depth_m[rows, columns].astype(np.float64)
                 yield _Outlined(grey, np.column_stack([rays[rows, columns] * z[:, np.newaxis], z]))

@@ -7,7 +7,7 @@ import numpy as np
 
 from mapper.core.errors import FrameError
 from mapper.core.frames import RgbdFrame
-from mapper.core.geometry import Array
+from mapper.core.geometry import Array, spread_indices
 from mapper.core.timebase import NS_PER_S
 from mapper.sources.base import Log
 
@@ -81,7 +81,7 @@ def _unlikeness(log: Log) -> float | None:
         return _view(log, index)
 
     for places in (_PLACES, _ALL_PLACES):
-        first = np.unique(np.linspace(0, len(log) - 2, places).astype(int)).tolist()
+        first = spread_indices(len(log) - 1, places).tolist()
         pairs = [(k, k + 1) for k in first if view(k) is not None and view(k + 1) is not None]
         if len(pairs) < _PLACES - 1:
             return None

@@ -7,6 +7,7 @@ from mapper.core.errors import DataError
 from mapper.core.frames import Scan
 from mapper.core.geometry import Array, Transform, apply
 from mapper.core.trajectory import Trajectory
+from mapper.sensing.wheel_kinematics import without_jumps
 
 MAX_TILT_RAD = np.radians(5.0)
 """A plane tilted by less is taken as parallel to the floor: what is measured 10 m away is 4 cm nearer."""
@@ -87,9 +88,9 @@ def planar(scan: Scan) -> Scan:
 
 
 def rolling(wheels: Trajectory | None) -> tuple[Trajectory | None, list[str]]:
-    """Return wheel odometry that moves, and a note where there is none, or it stands still as in a hand."""
+    """Return wheel odometry that moves, without its jumps, and a note on these, or where it does not move."""
     if wheels is not None and wheels.path_length_m > 0.0:
-        return wheels, []
+        return without_jumps(wheels)
     what = "no wheel odometry" if wheels is None else "the wheel odometry stands still"
     return None, [f"{what}: it would show motions that walls do not; record /odom or /tf"]
 

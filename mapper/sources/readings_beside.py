@@ -16,7 +16,7 @@ from mapper.sources.gnss_files import read_gnss
 from mapper.sources.imu_files import read_imu
 from mapper.sources.wheel_files import read_wheels
 
-_LONGER_NS = {"µs": 1_000, "ms": 1_000_000, "s": 1_000_000_000}
+_UNITS_NS = {"µs": 1_000, "ms": 1_000_000, "s": 1_000_000_000}
 """Units in which files have stamps that should be nanoseconds."""
 
 Readings = TypeVar("Readings", Trajectory, Gyroscope, Accelerations, GnssFixes)
@@ -35,32 +35,32 @@ def with_readings(log: Log, folder: Path, config: SourceConfig) -> Log:
     """
     if log.wheels is None:
         wheels, used, notes = read_wheels(folder, config.wheels, sensor=log.sensor)
-        wheels, more = _of_the_log(wheels, log.stamps_ns, "wheel odometry")
-        if wheels is not None and not np.ptp(wheels.T_world_body, axis=0).any():
-            wheels, more = None, [*more, "wheel odometry: it stands still all the time; not used"]
+        wheels, more = _in_log_time(wheels, log.stamps_ns, "wheel odometry")
         choices = log.choices if wheels is None else [*log.choices, *used]
         log = replace(log, wheels=wheels, choices=choices, notes=[*log.notes, *notes, *more])
     if log.gyroscope is None:
         gyroscope, accelerations, notes = read_imu(folder)
-        gyroscope, more = _of_the_log(gyroscope, log.stamps_ns, "angular velocities")
+        gyroscope, more = _in_log_time(gyroscope, log.stamps_ns, "angular velocities")
         log = replace(log, gyroscope=gyroscope, notes=[*log.notes, *notes, *more])
         if log.accelerations is None:
-            accelerations, more = _of_the_log(accelerations, log.stamps_ns, "accelerations")
+            accelerations, more = _in_log_time(accelerations, log.stamps_ns, "accelerations")
             log = replace(log, accelerations=accelerations, notes=[*log.notes, *more])
     if log.gnss is None:
         gnss, notes = read_gnss(log.path)
-        gnss, more = _of_the_log(gnss, log.stamps_ns, "GNSS fixes")
+        gnss, more = _in_log_time(gnss, log.stamps_ns, "GNSS fixes")
         log = replace(log, gnss=gnss, notes=[*log.notes, *notes, *more])
     return log
 
 
-def _of_the_log(readings: Readings | None, frames_ns: Stamps, name: str) -> tuple[Readings | None, list[str]]:
+def _in_log_time(
+    readings: Readings | None, frames_ns: Stamps, name: str
+) -> tuple[Readings | None, list[str]]:
     """Return readings with stamps of the frames' time, and a note on stamps in another unit, or of no use."""
     if readings is None or not len(readings.stamps_ns) or _overlap(readings.stamps_ns, frames_ns):
         return readings, []
-    for unit, longer_ns in _LONGER_NS.items():
-        if readings.stamps_ns[-1] <= np.iinfo(np.int64).max // longer_ns:
-            stamps_ns = readings.stamps_ns * longer_ns
+    for unit, unit_ns in _UNITS_NS.items():
+        if readings.stamps_ns[-1] <= np.iinfo(np.int64).max // unit_ns:
+            stamps_ns = readings.stamps_ns * unit_ns
             if _overlap(stamps_ns, frames_ns):
                 note = f"{name}: stamps are taken in {unit}, as in ns none is of the frames' time"
                 return replace(readings, stamps_ns=stamps_ns), [note]

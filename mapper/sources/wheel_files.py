@@ -10,7 +10,7 @@ from mapper.core.errors import DataError, SourceError
 from mapper.core.frames import Sensor
 from mapper.core.geometry import Transform, inverse, transform
 from mapper.core.trajectory import Trajectory
-from mapper.sensing.wheel_kinematics import driven
+from mapper.sensing.wheel_kinematics import driven, without_jumps
 from mapper.sources.config import WheelsConfig
 from mapper.sources.text import parse_numbers, parse_stamp, pose_from_numbers, rows, table, time_order
 from mapper.sources.trajectory_files import read_tum, write_tum
@@ -57,8 +57,10 @@ def read_wheels(
     path = next((folder / name for name in (POSES, READINGS) if (folder / name).is_file()), None)
     if path is None:
         return None, [], []
-    wheels, notes = read_wheels_file(path, config, sensor=sensor)
-    return wheels, [f"{path.name}: wheel odometry, {len(wheels)} poses"], notes
+    read, notes = read_wheels_file(path, config, sensor=sensor)
+    wheels, more = usable(read)
+    used = [] if wheels is None else [f"{path.name}: wheel odometry, {len(wheels)} poses"]
+    return wheels, used, [*notes, *more]
 
 
 def read_wheels_file(
@@ -89,6 +91,15 @@ def read_wheels_file(
         T_odom_base, notes = _integrated(path, config.wheelbase_m, wheelbase_by)
     wheels = replace(T_odom_base, T_world_body=T_odom_base.T_world_body @ mounting(config, sensor))
     return wheels, notes
+
+
+def usable(wheels: Trajectory | None) -> tuple[Trajectory | None, list[str]]:
+    """Return a log's wheel odometry without its jumps, None if it stands still all the time, and notes."""
+    if wheels is None or not len(wheels):
+        return wheels, []
+    if not np.ptp(wheels.T_world_body, axis=0).any():
+        return None, ["wheel odometry: it stands still all the time; not used"]
+    return without_jumps(wheels)
 
 
 def write_wheels(folder: Path, wheels: Trajectory, *, sensor: Sensor) -> None:

@@ -1,11 +1,15 @@
 """Readings in files beside a log's frames: used by the frames' time, or named."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from mapper.core.timebase import NS_PER_S, seconds_text_from_ns
+from mapper.core.trajectory import Trajectory
 from mapper.sources import open_source
 from mapper.sources.imu_files import BOTH_HEADER
+from mapper.sources.writers import write_log
 from tests.support.tum_logs import FIRST_NS
 
 OTHER_YEAR_NS = FIRST_NS - 40_000_000 * NS_PER_S
@@ -59,3 +63,12 @@ def test_wheels_that_stand_still_are_not_used(tiny_tum_log):
     assert log.wheels is None
     assert not any("wheels.txt" in choice for choice in log.choices)
     assert sum("stands still" in note for note in log.notes) == 1
+
+
+def test_wheels_of_a_recording_that_stand_still_are_not_used(tiny_tum_log, tmp_path):
+    log = open_source(tiny_tum_log(3))
+    still = Trajectory(log.stamps_ns, np.repeat(np.eye(4)[None], len(log), axis=0))
+    assert write_log(replace(log, wheels=still), tmp_path / "log.mcap", kind="mcap") == []
+    again = open_source(tmp_path / "log.mcap")
+    assert again.wheels is None
+    assert sum("stands still" in note for note in again.notes) == 1

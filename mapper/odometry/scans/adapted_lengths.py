@@ -4,6 +4,7 @@ import numpy as np
 
 from mapper.core.errors import FrameError
 from mapper.core.frames import Scan
+from mapper.core.geometry import spread_indices
 from mapper.core.voxel_grid import thin
 from mapper.odometry.config import OdometryConfig
 from mapper.odometry.scans.config import AnyScanOdometryConfig
@@ -46,7 +47,7 @@ def spaciousness_m(scan: Scan) -> float:
 def _median_distance_m(log: Log) -> float | None:
     """Return the median over some scans; None if none of them can be read."""
     distances_m = []
-    for index in np.unique(np.linspace(0, len(log) - 1, _SCANS).astype(np.intp)).tolist():
+    for index in spread_indices(len(log), _SCANS).tolist():
         try:
             scan = log.entry_at(index).scan()
         except FrameError:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mapper.core.errors import DataError, FrameError
 from mapper.core.frames import Sensor
-from mapper.core.geometry import FARTHEST_M, Transform
+from mapper.core.geometry import FARTHEST_M, Transform, spread_indices
 from mapper.core.rotations import pose_of_row
 from mapper.core.timebase import NS_PER_S
 from mapper.core.trajectory import Trajectory
@@ -83,8 +83,7 @@ class RecordingReader:
 
     def spread_messages(self, series: Series, *, most: int) -> list[Message]:
         """Return a topic's first message, its last, and others between them; damaged ones are left out."""
-        indices = np.unique(np.linspace(0, len(series) - 1, most).astype(np.intp))
-        return [message for _, message in self._messages(series, indices)]
+        return [message for _, message in self._messages(series, spread_indices(len(series), most))]
 
     def truth(self, series: Series | None, *, body: str) -> tuple[Trajectory | None, list[str]]:
         """Return the poses of a topic as those of the body, and notes."""

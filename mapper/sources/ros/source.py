@@ -16,6 +16,7 @@ from mapper.sources.ros.reader import SAME_CLOCK_NS, RecordingReader
 from mapper.sources.ros.recorded_frames import lidar_frames, rgbd_frames, stereo_frames
 from mapper.sources.ros.sensors_beside import sensors_beside
 from mapper.sources.ros.topics import CameraTopics, Choice, StereoTopics, choose
+from mapper.sources.wheel_files import usable
 
 
 def recording_log(reader: RecordingReader, config: SourceConfig) -> Log:
@@ -66,9 +67,8 @@ def recording_log(reader: RecordingReader, config: SourceConfig) -> Log:
     )
     if choice.wheels is None and frames.sensor == "lidar-2d":
         wheels, wheel_notes = reader.wheels_by_tf(frames.body)
-    if frames.sensor == "lidar-2d":
-        wheels, still_notes = rolling(wheels)
-        wheel_notes = [*wheel_notes, *still_notes]
+    wheels, use_notes = (rolling if frames.sensor == "lidar-2d" else usable)(wheels)
+    wheel_notes = [*wheel_notes, *use_notes]
     gnss, gnss_notes = reader.gnss(choice.gnss, body=frames.body)
     tf_notes = [
         f"tf {link}: its poses are not finite or have no direction; left out" for link in reader.tree.damaged

@@ -5,10 +5,8 @@ from collections.abc import Iterable, Sequence
 from fnmatch import fnmatch
 from pathlib import Path
 
-import numpy as np
-
 from mapper.core.errors import SourceError
-from mapper.core.geometry import Transform, inverse
+from mapper.core.geometry import Transform, inverse, spread_indices
 from mapper.core.timebase import Stamps
 from mapper.core.trajectory import Trajectory
 from mapper.sources.base import Log
@@ -135,7 +133,7 @@ def _why_no_points(paths: Sequence[Path]) -> str | None:
     if not paths or paths[0].suffix.lower() not in _TEXT_ENDINGS:
         return None
     reason, paths = None, sorted(paths)
-    for index in np.unique(np.linspace(0, len(paths) - 1, _SAMPLED).astype(int)):
+    for index in spread_indices(len(paths), _SAMPLED):
         found = why_no_points(paths[index])
         if found is None:
             return None
