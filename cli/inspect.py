@@ -16,9 +16,13 @@ if TYPE_CHECKING:
 
 def inspect(
     log: Annotated[Path, typer.Argument(metavar="LOG", help="Recorded log: a folder, .mbag, .mcap or .bag.")],
+    time_offset: Annotated[
+        bool,
+        typer.Option("--time-offset", help="Track the log; show how late depth, IMU, wheels and truth are."),
+    ] = False,
     set_: Overrides = None,
     *,
-    output: Output,  # noqa: ARG001
+    output: Output,
 ) -> Answer:
     """Show what is in a log: topics, rates, gaps, calibration, truth, and what mapper build would do.
 
@@ -33,7 +37,7 @@ def inspect(
     from mapper.sources.selection import too_few_text
 
     settings = settings_of({}, set_)
-    found = inspect_log(log, settings=settings)
+    found = inspect_log(log, settings=settings, time_offset=time_offset, progress=output.progress())
     problem, plan = found.problem, ""
     if found.log is not None:
         config = load_config(settings, sensor=found.log.sensor)
@@ -54,6 +58,7 @@ def _lines(found: "Inspection", plan: str) -> Iterator[str]:
     rows = [("log", str(found.path))]
     if found.log is not None:
         rows += _log_rows(found.log)
+    rows += [(f"time, {offset.sensor}", offset.text) for offset in found.time_offsets or ()]
     rows.append(("mapper build", plan))
     width = max(len(name) for name, _ in rows)
     yield from (f"{name:<{width}}  {text}" for name, text in rows)

@@ -1,8 +1,10 @@
 """Recorded logs, and single frames, by name."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from mapper.api.progress import AnyProgress, receiver_of
 from mapper.config.loading import Settings, load_config, load_source_config
 from mapper.core.errors import SourceError
 from mapper.core.frames import Frame, Sensor
@@ -48,12 +50,21 @@ def open_log(path: AnyPath, *, config: AnyPath | None = None, settings: Settings
     return open_source(Path(path), load_source_config(config, settings=settings))
 
 
-def inspect(path: AnyPath, *, settings: Settings | None = None) -> "Inspection":
+def inspect(
+    path: AnyPath,
+    *,
+    settings: Settings | None = None,
+    time_offset: bool = False,
+    progress: AnyProgress = None,
+) -> "Inspection":
     """Return what is in a log, as ``mapper inspect`` shows it: topics, rates, gaps, calibration, truth.
 
     Args:
         path: As of :func:`open_log`.
         settings: Values by dotted name.
+        time_offset: Measure how late the stamps of depth, gyroscope, wheels and truth are, too: the log is
+            tracked for that.
+        progress: Receives the stage of tracking: a function of lines, such as ``print``; None is silence.
 
     Returns:
         The findings; their ``problem`` says why nothing can be mapped, or is None.
@@ -77,7 +88,15 @@ def inspect(path: AnyPath, *, settings: Settings | None = None) -> "Inspection":
         return scan_observation.why_untrackable(log, odometry)
 
     config = load_source_config(settings=settings)
-    return inspect_log(Path(path), config, check=why_untrackable)
+    found = inspect_log(Path(path), config, check=why_untrackable)
+    if not time_offset or found.log is None or found.problem is not None:
+        return found
+    from mapper.pipeline.time_offsets import measure_time_offsets
+
+    log = open_source(Path(path), config)
+    tracked_by = load_config(settings={**(settings or {}), "loops.kind": "none"}, sensor=log.sensor)
+    offsets = measure_time_offsets(log, tracked_by, progress=receiver_of(progress))
+    return replace(found, time_offsets=offsets)
 
 
 def read_frame(name: AnyPath, config: SourceConfig) -> tuple[Frame, Sensor]:

@@ -35,6 +35,7 @@ from mapper.pipeline.georeference import Georeferenced, georeference
 from mapper.pipeline.inertial_bridging import bridge, check_accelerations
 from mapper.pipeline.lidar_adjustment import adjust_tracking
 from mapper.pipeline.solve import solve
+from mapper.pipeline.time_offsets import depth_time_offset
 from mapper.pipeline.track import first_session, noted_log_warnings, track_log
 from mapper.pipeline.tracking_checkpoints import TrackingCheckpoints
 from mapper.pipeline.tracking_result import TrackingResult, from_tracking, refuse_a_fragment, save_places
@@ -43,6 +44,7 @@ from mapper.run.folder import Run, open_run
 from mapper.run.manifest import Levelling, RunWarning, Solve, Weight
 from mapper.run.observers import NULL_OBSERVER, Observer
 from mapper.run.stored_tracking import save_solved, save_tracking
+from mapper.run.verdict import MAX_SHARE
 from mapper.run.writer import RunWriter, first_manifest, write_run
 from mapper.runtime.progress import SILENT, Progress
 from mapper.sensing.sweep_motion import motion_during
@@ -153,7 +155,7 @@ class _Steps:
 
     def accept(self, tracking: TrackingResult) -> TrackingResult:
         """Write the result of tracking, unless too little was tracked for a map."""
-        self.writer.warn(tracking.warnings)
+        self.writer.warn([*tracking.warnings, *self._late_depth(tracking)])
         save_tracking(self.writer, from_tracking(tracking, self.source.truth))
         if tracking.gyroscope is not None:
             self.writer.record_gyroscope(tracking.gyroscope)
@@ -161,6 +163,14 @@ class _Steps:
             tracking, self.config, sensor=self.source.sensor, known=self.writer.manifest.warnings
         )
         return tracking
+
+    def _late_depth(self, tracking: TrackingResult) -> list[RunWarning]:
+        """Return that depth is late or early, where more frames are not tracked for sure than is harmless."""
+        unsure = len(tracking.tracks) - len(tracking.tracked)
+        if self.source.sensor != "rgbd" or unsure <= MAX_SHARE * len(tracking.tracks):
+            return []
+        late = depth_time_offset(self.source, self.config.source)
+        return [RunWarning(kind="log", sentence=f"depth: {late.text}")] if late.remedy else []
 
     def solve(self, tracking: TrackingResult) -> _Solved:
         """Solve the graph, keep its largest component, and level the world."""

@@ -49,7 +49,7 @@ INPUT_KINDS = frozenset(
 
 _ORDER: tuple[Weight, ...] = ("break", "doubt", "note")
 _LEAST_GAP_S = 0.5
-_MAX_SHARE, _BROKEN_SHARE, _FEW_FRAMES = 0.05, 0.25, 2
+MAX_SHARE, _BROKEN_SHARE, _FEW_FRAMES = 0.05, 0.25, 2
 """Frames that may be without a sure pose: those around them hold the path where they are single ones. Good
 logs have up to 5 %; paths that were wrong had 8 % and more."""
 _LONG_FRAMES = 3
@@ -159,10 +159,10 @@ def _not_localised(records: Sequence[FrameRecord], timeline: TimeLine) -> Iterat
         kind="not localised",
         sentence=f"{sum(is_lost)} of {len(records)} frames are not localised, {share:.1%}, for "
         f"{timeline.duration_s(first, last):.1f} s at the longest: lost, or in a part of the path in which "
-        f"too little of the map was recognised (at most {_MAX_SHARE:.0%} is harmless)",
+        f"too little of the map was recognised (at most {MAX_SHARE:.0%} is harmless)",
         suggestion="come by places that the map shows, seen from where it was recorded",
         where=timeline.place(first, last),
-        weight="break" if share > _BROKEN_SHARE else "doubt" if share > _MAX_SHARE else "note",
+        weight="break" if share > _BROKEN_SHARE else "doubt" if share > MAX_SHARE else "note",
     )
 
 
@@ -204,8 +204,8 @@ def _skipped(records: Sequence[FrameRecord], manifest: Manifest) -> Iterator[Run
         kind="skipped",
         sentence=f"{len(manifest.skipped)} of {len(records)} frames could not be read; the first: "
         f"{manifest.skipped[0].reason}",
-        suggestion="repair the log, or record it again" if share > _MAX_SHARE else "",
-        weight="doubt" if share > _MAX_SHARE else "note",
+        suggestion="repair the log, or record it again" if share > MAX_SHARE else "",
+        weight="doubt" if share > MAX_SHARE else "note",
     )
 
 
@@ -248,13 +248,13 @@ def _lost(results: RunResults, timeline: TimeLine) -> Iterator[RunWarning]:
     yield RunWarning(
         kind="lost",
         sentence=f"{lost} of {len(records)} frames were lost, {share:.1%}, for "
-        f"{timeline.duration_s(first, last):.1f} s at the longest (at most {_MAX_SHARE:.0%} and "
+        f"{timeline.duration_s(first, last):.1f} s at the longest (at most {MAX_SHARE:.0%} and "
         f"{MAX_GAP_NS / NS_PER_S:g} s are harmless)",
         where=timeline.place(first, last),
         weight="break"
         if share > _BROKEN_SHARE or is_long
         else "doubt"
-        if lost > _FEW_FRAMES and share > _MAX_SHARE
+        if lost > _FEW_FRAMES and share > MAX_SHARE
         else "note",
     )
 
@@ -268,7 +268,7 @@ def _doubtful(results: RunResults, timeline: TimeLine) -> Iterator[RunWarning]:
     placed = sum(record.node is not None for record in records)
     counted = len(doubtful) - _repeated(records, is_doubtful)
     first, last = _longest(is_doubtful, timeline)
-    are_too_many = counted > max(_FEW_FRAMES, _MAX_SHARE * placed) or _is_long(first, last, timeline)
+    are_too_many = counted > max(_FEW_FRAMES, MAX_SHARE * placed) or _is_long(first, last, timeline)
     unseen = sum(bool(record.diagnostics.unobservable) for record in doubtful)
     doubts = [doubt for record in doubtful for doubt in record.doubts]
     examples = {doubt.kind: doubt.text for doubt in reversed(doubts)}
@@ -278,7 +278,7 @@ def _doubtful(results: RunResults, timeline: TimeLine) -> Iterator[RunWarning]:
     yield RunWarning(
         kind="doubtful",
         sentence=f"{len(doubtful)} of {placed} placed frames are doubtful, {len(doubtful) / placed:.1%}, for "
-        f"{timeline.duration_s(first, last):.1f} s at the longest (at most {_MAX_SHARE:.0%} and "
+        f"{timeline.duration_s(first, last):.1f} s at the longest (at most {MAX_SHARE:.0%} and "
         f"{MAX_GAP_NS / NS_PER_S:g} s are harmless): {'; '.join(texts)}",
         suggestion=see_more(has_wheels=results.graph.has_wheels) if is_unseen else "",
         where=timeline.place(first, last),

@@ -56,7 +56,7 @@ def without_jumps(wheels: Trajectory) -> tuple[Trajectory, list[str]]:
     A step that jumps gets the velocity of the step before.
     """
     seconds = np.diff(wheels.stamps_ns) / NS_PER_S
-    steps_m, steps_rad = _step_sizes(wheels)
+    steps_m, steps_rad = step_sizes(wheels)
     jumps = np.flatnonzero(_jumps(steps_m, seconds, "m") | _jumps(steps_rad, seconds, "rad"))
     poses = wheels.T_world_body.copy()
     for i in jumps.tolist():
@@ -87,8 +87,8 @@ def _jumps(sizes: Array, seconds: Array, unit: str) -> NDArray[np.bool_]:
     return is_jump
 
 
-def _step_sizes(wheels: Trajectory) -> tuple[Array, Array]:
-    """Return the metres and the radians between consecutive poses."""
+def step_sizes(wheels: Trajectory) -> tuple[Array, Array]:
+    """Return the (N - 1,) metres and the radians between consecutive poses of N."""
     steps_m = np.linalg.norm(np.diff(wheels.positions_world, axis=0), axis=1)
     chords = np.linalg.norm(np.diff(wheels.T_world_body[:, :3, :3], axis=0), axis=(1, 2))
     # |R_a − R_b|_F = √8 sin(angle / 2)
@@ -102,7 +102,7 @@ class Odometer:
         """Sum the distances and angles between consecutive poses."""
         self._start_ns = int(wheels.stamps_ns[0])  # nanoseconds since 1970 are too many for a float
         self._since_start_ns = (wheels.stamps_ns - self._start_ns).astype(np.float64)
-        self._counts = [np.concatenate([[0.0], np.cumsum(steps)]) for steps in _step_sizes(wheels)]
+        self._counts = [np.concatenate([[0.0], np.cumsum(steps)]) for steps in step_sizes(wheels)]
 
     def between(self, begin_ns: int, end_ns: int) -> tuple[float, float]:
         """Return the metres driven and the radians turned from one time to a later one."""

@@ -136,7 +136,13 @@ class SourceConfig(Config):
     the camera moves slowly; frames without a partner are left out."""
     depth_offset_s: float = 0.0
     """Added to the stamps of depth images before they are paired with colour images: how much later they show
-    the scene than their stamps say. The warning ``camera`` reports it if it was measured."""
+    the scene than their stamps say. ``mapper inspect --time-offset`` measures it, and the next three."""
+    imu_offset_s: float = 0.0
+    """Added to the stamps of accelerations and angular velocities."""
+    wheels_offset_s: float = 0.0
+    """Added to the stamps of wheel odometry."""
+    truth_offset_s: float = 0.0
+    """Added to the stamps of the true poses."""
     rate_hz: PositiveFloat | None = None
     """Frames per second of numbered files without stamps; None is the format's own (30, Poznań, scans 10)."""
     camera: CameraConfig | None = None

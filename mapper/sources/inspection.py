@@ -24,6 +24,7 @@ from mapper.sources.ros.reader import RecordingReader
 from mapper.sources.ros.source import recording_log
 from mapper.sources.scan_frame import scan_frame_warnings
 from mapper.sources.selection import selected
+from mapper.sources.time_offsets import TimeOffset
 from mapper.sources.valid_returns import FARTHEST_M
 from mapper.sources.vehicle_box import Box, vehicle_box
 
@@ -117,12 +118,14 @@ class Inspection:
         topics: Every topic, of a recording.
         log: Its frames; None if it has none.
         problem: Why nothing can be mapped; None if something can.
+        time_offsets: How late the stamps of its sensors are; None if that was not measured.
     """
 
     path: Path
     topics: Sequence[TopicFacts]
     log: LogFacts | None
     problem: str | None
+    time_offsets: Sequence[TimeOffset] | None = None
 
 
 def inspect_log(

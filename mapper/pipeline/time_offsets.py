@@ -1,0 +1,147 @@
+"""Time offsets of all that a log has beside its frames, by the motion that its odometry tracks."""
+
+from collections.abc import Sequence
+from math import inf
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapper.config.build import BuildConfig
+from mapper.core.geometry import Array
+from mapper.core.timebase import GAP_INTERVALS, NS_PER_S, Stamps
+from mapper.core.trajectory import Trajectory
+from mapper.pipeline.track import track_log
+from mapper.runtime.progress import SILENT, Progress
+from mapper.sensing.gyroscope import Gyroscope
+from mapper.sensing.wheel_kinematics import step_sizes
+from mapper.sources.base import Log
+from mapper.sources.config import SourceConfig
+from mapper.sources.depth_outlines import depth_offsets_s
+from mapper.sources.time_offsets import TimeOffset, peak_of, time_offset
+
+_STEP_NS = NS_PER_S // 10
+"""Least time over which motion is compared: in less, noise of poses is as large."""
+_OFFSETS_S = 0.01 * np.arange(-100, 101)
+_AROUND = 20
+"""Offsets on either side of the log's best among which that of a part of it is searched."""
+_MOST_PARTS, _FEWEST_STEPS = 8, 10
+_LEAST_CORRELATION = 0.5
+
+
+class _Motion(NamedTuple):
+    """Motion up to (N,) times, nanoseconds, in any unit: metres travelled, or radians turned."""
+
+    stamps_ns: Stamps
+    travelled: Array
+
+    def during(self, begins_ns: Stamps, ends_ns: Stamps) -> Array:
+        """Return the motion from some times to later ones; NaN where that is not known."""
+        origin_ns = self.stamps_ns[0]  # nanoseconds since 1970 are too many for a float
+        known_ns = (self.stamps_ns - origin_ns).astype(np.float64)
+        begun, ended = (
+            np.interp(at_ns - origin_ns, known_ns, self.travelled, left=np.nan, right=np.nan)
+            for at_ns in (begins_ns, ends_ns)
+        )
+        moved: Array = ended - begun
+        return moved
+
+
+def measure_time_offsets(log: Log, config: BuildConfig, *, progress: Progress = SILENT) -> list[TimeOffset]:
+    """Return how late the stamps of depth, gyroscope, wheels, truth and a device's poses are.
+
+    That of depth puts its outlines on edges of the images, and is searched within 0.3 s. All others are
+    searched within 1 s: at the true offset, what a sensor turns or travels in steps of 0.1 s correlates best
+    with what the tracked frames do, whatever its mounting and unit.
+
+    Args:
+        log: The log.
+        config: Settings of its odometry, and the offsets that are applied already.
+        progress: Receives the stage of tracking.
+
+    Raises:
+        ConfigError: The odometry needs wheels or poses and there are none.
+    """
+    source = config.source
+    found = [depth_time_offset(log, source)] if log.sensor == "rgbd" else []
+    others: list[tuple[str, Trajectory | Gyroscope | None, str, float]] = [
+        ("gyroscope", log.gyroscope, "source.imu_offset_s", source.imu_offset_s),
+        ("wheels", log.wheels, "source.wheels_offset_s", source.wheels_offset_s),
+        ("truth", log.truth, "source.truth_offset_s", source.truth_offset_s),
+        ("device poses", log.device_poses, "", 0.0),
+    ]
+    present = [(name, other, setting, set_s) for name, other, setting, set_s in others if other is not None]
+    if not present:
+        return found
+    path = track_log(log, config, progress=progress).tracked_trajectory()
+    for name, other, setting, set_s in present:
+        tried = [
+            time_offset(name, late_s, setting=setting, set_s=set_s) for late_s in _estimates(path, other)
+        ]
+        found.append(min(tried, key=lambda one: inf if one.sigma_s is None else one.sigma_s))
+    return found
+
+
+def depth_time_offset(log: Log, config: SourceConfig) -> TimeOffset:
+    """Return how late the stamps of an RGB-D log's depth are, from its images alone."""
+    late_s = -depth_offsets_s(log)
+    return time_offset("depth", late_s, setting="source.depth_offset_s", set_s=config.depth_offset_s)
+
+
+def _estimates(path: Trajectory, other: Trajectory | Gyroscope) -> list[Sequence[float]]:
+    """Return a sensor's delays in parts of the log: by turns, by ways travelled, or both."""
+    if isinstance(other, Gyroscope):
+        speeds = np.linalg.norm(other.rates_radps, axis=1)
+        turned = np.concatenate(
+            [[0.0], np.cumsum(np.diff(other.stamps_ns) * 0.5 * (speeds[1:] + speeds[:-1]))]
+        )
+        return [_delays_s(_motions(path)[1], _Motion(other.stamps_ns, turned))]
+    both = zip(_motions(path), _motions(other), strict=True)
+    return [_delays_s(own, others) for own, others in both]
+
+
+def _motions(path: Trajectory) -> tuple[_Motion, _Motion]:
+    """Return the metres travelled and the radians turned, at poses at least 0.1 s apart."""
+    kept = [0] if len(path) else []
+    for k, stamp_ns in enumerate(path.stamps_ns.tolist()):
+        if stamp_ns - path.stamps_ns[kept[-1]] >= _STEP_NS:
+            kept.append(k)
+    apart = path[np.array(kept, np.intp)]
+    metres, radians = (np.concatenate([[0.0], np.cumsum(steps)]) for steps in step_sizes(apart))
+    return _Motion(apart.stamps_ns, metres), _Motion(apart.stamps_ns, radians)
+
+
+def _delays_s(own: _Motion, other: _Motion) -> list[float]:
+    """Return how much later the other's stamps are, in parts of the log; none if its motion is another."""
+    steps_ns = np.diff(own.stamps_ns)
+    if len(steps_ns) < 2 * _FEWEST_STEPS or len(other.stamps_ns) < 2:
+        return []
+    is_step = steps_ns <= GAP_INTERVALS * np.median(steps_ns)
+    begins_ns, ends_ns = own.stamps_ns[:-1][is_step], own.stamps_ns[1:][is_step]
+    moved = np.diff(own.travelled)[is_step]
+    shifts_ns = np.round(_OFFSETS_S * NS_PER_S).astype(np.int64)
+    others = np.array([other.during(begins_ns + ns, ends_ns + ns) for ns in shifts_ns])
+    everywhere = np.arange(len(moved))
+    correlations = _correlations(moved, others, everywhere)
+    best = int(correlations.argmax())
+    if correlations[best] < _LEAST_CORRELATION:
+        return []
+    near = slice(max(best - _AROUND, 0), best + _AROUND + 1)
+    found = []
+    for part in np.array_split(everywhere, min(len(moved) // _FEWEST_STEPS, _MOST_PARTS)):
+        scores = _correlations(moved, others[near], part)
+        if 0 < scores.argmax() < len(scores) - 1:
+            found.append(peak_of(_OFFSETS_S[near], scores))
+    return found
+
+
+def _correlations(moved: Array, others: Array, part: NDArray[np.intp]) -> Array:
+    """Return the correlations of (N,) steps with each of (M, N) others, in a part of them; 0 of few steps."""
+    own, known = moved[part], np.isfinite(others[:, part])
+    fewest = max(_FEWEST_STEPS // 2, known.sum(axis=1).max() // 2)
+    correlations = np.zeros(len(others))
+    for k, is_known in enumerate(known):
+        a, b = own[is_known], others[k, part][is_known]
+        if len(a) >= fewest and a.std() > 0.0 and b.std() > 0.0:
+            correlations[k] = np.corrcoef(a, b)[0, 1]
+    return correlations

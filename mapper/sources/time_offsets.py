@@ -1,0 +1,101 @@
+"""Time offsets of a log's sensors against its frames: as they are estimated, and as settings correct them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from math import sqrt
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapper.core.geometry import Array
+from mapper.core.timebase import NS_PER_S, Stamps
+from mapper.core.trajectory import Trajectory
+from mapper.sources.base import Log
+from mapper.sources.config import SourceConfig
+
+_FEWEST, _MOST_SIGMA_S = 3, 0.02
+"""Estimates of parts of a log: fewer, or a median less sure, do not tell an offset."""
+_RESOLUTION_S, _SURE_SIGMAS = 0.002, 3.0
+"""Error that estimates share (shutters, delays of filters), and standard deviations that are no chance."""
+
+
+@dataclass(frozen=True, slots=True)
+class TimeOffset:
+    """Time offset of one of a log's sensors.
+
+    Attributes:
+        sensor: "depth", "gyroscope", "wheels", "truth" or "device poses".
+        late_s: How much later its stamps are than those of frames of the same moment; None if that cannot be
+            told.
+        sigma_s: Standard deviation of it.
+        remedy: What corrects it, as an option or in words; empty where nothing need.
+    """
+
+    sensor: str
+    late_s: float | None
+    sigma_s: float | None
+    remedy: str = ""
+
+    @property
+    def text(self) -> str:
+        """The offset in words."""
+        if self.late_s is None or self.sigma_s is None:
+            return "cannot be told: too little motion, too few frames, or no agreement"
+        side = "late" if self.late_s >= 0.0 else "early"
+        found = f"stamps are {1e3 * abs(self.late_s):.0f} ± {1e3 * self.sigma_s:.0f} ms {side}"
+        return f"{found}; {self.remedy}" if self.remedy else found
+
+
+def time_offset(
+    sensor: str, estimates_s: Sequence[float] | Array, *, setting: str, set_s: float
+) -> TimeOffset:
+    """Return a sensor's time offset, from estimates of parts of a log.
+
+    Args:
+        sensor: Name of the sensor.
+        estimates_s: How much later its stamps are, seconds.
+        setting: Setting that is added to its stamps; empty if there is none.
+        set_s: What that is now.
+    """
+    if len(estimates_s) < _FEWEST:
+        return TimeOffset(sensor, None, None)
+    late_s = float(np.median(estimates_s))
+    deviation_s = 1.4826 * float(np.median(np.abs(np.asarray(estimates_s) - late_s)))
+    sigma_s = sqrt(deviation_s**2 / len(estimates_s) + _RESOLUTION_S**2)
+    if sigma_s > _MOST_SIGMA_S:
+        return TimeOffset(sensor, None, None)
+    is_sure = abs(late_s) > _SURE_SIGMAS * sigma_s
+    remedy = f"--set {setting}={round(set_s - late_s, 3):g} corrects that" if is_sure and setting else ""
+    return TimeOffset(sensor, late_s, sigma_s, remedy)
+
+
+def peak_of(at_s: NDArray[np.floating], score: NDArray[np.floating]) -> float:
+    """Return the time of the largest of (N,) scores, on a parabola through it and its neighbours."""
+    k = int(np.argmax(score))
+    if not 0 < k < len(score) - 1:
+        return float(at_s[k])
+    before, most, after = score[k - 1 : k + 2].tolist()
+    bend = before - 2.0 * most + after
+    steps = 0.5 * (before - after) / bend if bend < 0.0 else 0.0
+    return float(at_s[k] + steps * 0.5 * (at_s[k + 1] - at_s[k - 1]))
+
+
+def with_time_offsets(log: Log, config: SourceConfig) -> Log:
+    """Return a log whose readings and poses have the settings' offsets added to their stamps."""
+    if not (config.truth_offset_s or config.wheels_offset_s or config.imu_offset_s):
+        return log
+
+    def moved(stamps_ns: Stamps, offset_s: float) -> Stamps:
+        return stamps_ns + round(offset_s * NS_PER_S)
+
+    truth, wheels = log.truth, log.wheels
+    gyroscope, accelerations = log.gyroscope, log.accelerations
+    if truth is not None:
+        truth = Trajectory(moved(truth.stamps_ns, config.truth_offset_s), truth.T_world_body)
+    if wheels is not None:
+        wheels = Trajectory(moved(wheels.stamps_ns, config.wheels_offset_s), wheels.T_world_body)
+    if gyroscope is not None:
+        gyroscope = replace(gyroscope, stamps_ns=moved(gyroscope.stamps_ns, config.imu_offset_s))
+    if accelerations is not None:
+        accelerations = replace(accelerations, stamps_ns=moved(accelerations.stamps_ns, config.imu_offset_s))
+    return replace(log, truth=truth, wheels=wheels, gyroscope=gyroscope, accelerations=accelerations)

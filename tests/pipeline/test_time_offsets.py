@@ -1,0 +1,122 @@
+"""Time offsets of a log's sensors: found by motion and by outlines in depth, and corrected by settings."""
+
+import re
+
+import numpy as np
+import pytest
+
+from mapper import inspect
+from mapper.config.loading import load_config
+from mapper.core.frames import Scan
+from mapper.core.geometry import exp, log, rotation_exp
+from mapper.core.timebase import NS_PER_S
+from mapper.core.trajectory import Trajectory
+from mapper.pipeline.time_offsets import measure_time_offsets
+from mapper.sensing.gyroscope import Gyroscope
+from mapper.sources.config import SourceConfig
+from mapper.sources.selection import selected
+from mapper.sources.trajectory_files import write_tum
+from tests.support.command_line import mapper
+from tests.support.logs import MemoryEntry, log_in_memory
+from tests.support.paths import DATA
+
+FR1_XYZ = DATA / "tum_fr1_xyz"
+real = pytest.mark.skipif(not FR1_XYZ.exists(), reason=f"{FR1_XYZ} is not there")
+
+
+def path_at(seconds, *, turns=True):
+    """Poses of a walk whose speed changes all the time, at (N,) seconds."""
+    x = 0.8 * seconds + 0.5 * np.sin(1.1 * seconds) + 0.2 * np.sin(2.9 * seconds)
+    yaw = 0.9 * np.sin(0.7 * seconds) + 0.3 * np.sin(2.3 * seconds) if turns else 0.0 * seconds
+    poses = [exp(np.array([0.0, 0.0, a]), np.array([b, 0.3 * a, 0.0])) for a, b in zip(yaw, x, strict=True)]
+    return Trajectory(np.round((seconds + 5.0) * NS_PER_S).astype(np.int64), np.array(poses))
+
+
+def late(path, offset_s):
+    return Trajectory(path.stamps_ns + round(offset_s * NS_PER_S), path.T_world_body)
+
+
+def gyroscope_of(path, *, mounting_rad=(0.4, -1.0, 0.3)):
+    """Angular velocities of a path in a unit that is mounted askew, in degrees per second."""
+    R = rotation_exp(np.array(mounting_rad))
+    inverses = np.linalg.inv(path.T_world_body[:-1])
+    turns = np.array([log(step)[0] for step in inverses @ path.T_world_body[1:]])
+    rates = np.degrees(turns / (np.diff(path.stamps_ns) / NS_PER_S)[:, None]) @ R
+    return Gyroscope("imu", (path.stamps_ns[:-1] + path.stamps_ns[1:]) // 2, rates)
+
+
+def walk(tmp_path, *, turns=True, seconds=30.0, **facts):
+    """A log whose odometry is known: 10 scans per second."""
+    frames = path_at(np.arange(0.0, seconds, 0.1), turns=turns)
+    point = np.ones((1, 3), np.float32)
+    entries = [MemoryEntry(stamp_ns, Scan(stamp_ns, point)) for stamp_ns in frames.stamps_ns.tolist()]
+    write_tum(tmp_path / "known.tum", frames)
+    settings = ["odometry.kind=given", f"odometry.path={tmp_path / 'known.tum'}", "loops.kind=none"]
+    return log_in_memory(entries, sensor="lidar", **facts), load_config(None, settings, sensor="lidar")
+
+
+@pytest.mark.parametrize("offset_s", [0.0, 0.123, -0.4])
+@pytest.mark.parametrize("turns", [True, False])
+def test_late_poses_are_found_by_turns_or_by_ways_travelled(tmp_path, offset_s, turns):
+    known = late(path_at(np.arange(-2.0, 32.0, 0.02), turns=turns), offset_s)
+    source, config = walk(tmp_path, turns=turns, truth=known, wheels=late(known, 0.05))
+    truth, wheels = sorted(measure_time_offsets(source, config), key=lambda one: one.sensor)
+    assert (truth.sensor, wheels.sensor) == ("truth", "wheels")
+    assert truth.late_s == pytest.approx(offset_s, abs=0.003)
+    assert wheels.late_s == pytest.approx(offset_s + 0.05, abs=0.003)
+    assert bool(truth.remedy) == (offset_s != 0.0)
+
+
+@pytest.mark.parametrize("offset_s", [0.007, -0.25, 0.7])
+def test_a_late_gyroscope_is_found_whatever_its_mounting_and_unit(tmp_path, offset_s):
+    readings = gyroscope_of(late(path_at(np.arange(-2.0, 32.0, 0.005)), offset_s))
+    (found,) = measure_time_offsets(*walk(tmp_path, gyroscope=readings))
+    assert found.late_s == pytest.approx(offset_s, abs=0.003)
+
+
+@pytest.mark.parametrize("facts", ["another walk", "too short", "at rest"])
+def test_an_offset_that_cannot_be_told_is_not_guessed(tmp_path, facts):
+    moments = np.arange(-2.0, 32.0, 0.02)
+    known = path_at(moments)
+    if facts == "another walk":
+        known = Trajectory(known.stamps_ns, known.T_world_body[np.random.default_rng(3).permutation(1700)])
+    elif facts == "at rest":
+        known = Trajectory(known.stamps_ns, np.tile(np.eye(4), (len(known), 1, 1)))
+    (found,) = measure_time_offsets(
+        *walk(tmp_path, truth=known, seconds=1.5 if facts == "too short" else 30.0)
+    )
+    assert (found.late_s, found.sigma_s, found.remedy) == (None, None, "")
+
+
+def test_settings_move_the_stamps_before_frames_are_selected(tmp_path):
+    known = late(path_at(np.arange(0.0, 30.0, 0.1)), 60.0)
+    source, _ = walk(tmp_path, truth=known, wheels=known, gyroscope=gyroscope_of(known))
+    config = SourceConfig(truth_offset_s=-60.0, wheels_offset_s=0.25, imu_offset_s=-0.5, require_truth=True)
+    moved = selected(source, config)
+    assert len(moved) == len(source)
+    assert np.array_equal(moved.truth.stamps_ns, source.stamps_ns)
+    assert np.array_equal(moved.wheels.stamps_ns, known.stamps_ns + 250_000_000)
+    assert np.array_equal(moved.gyroscope.stamps_ns, source.gyroscope.stamps_ns - 500_000_000)
+
+
+@real
+def test_late_depth_is_found_in_real_images():
+    def depth_late_s(offset_s):
+        settings = {"source.depth_offset_s": offset_s, "source.last_frame": 300}
+        found = inspect(FR1_XYZ, settings=settings, time_offset=True).time_offsets
+        (depth,) = [one for one in found if one.sensor == "depth"]
+        return depth.late_s
+
+    as_recorded_s = depth_late_s(0.0)
+    assert depth_late_s(0.1) - as_recorded_s == pytest.approx(0.1, abs=0.006)
+
+
+@real
+def test_the_proposed_setting_leaves_no_offset():
+    def shown(*settings):
+        result = mapper("inspect", FR1_XYZ, "--time-offset", "--set", "source.last_frame=300", *settings)
+        return next(line for line in result.output.splitlines() if line.startswith("time, depth"))
+
+    proposed = re.search(r"--set (source.depth_offset_s=\S+)", shown("--set", "source.depth_offset_s=0.1"))
+    assert proposed is not None
+    assert "--set" not in shown("--set", proposed[1])
