@@ -11,6 +11,7 @@ from mapper.cli.options import Overrides, settings_of
 from mapper.core.errors import DataError
 
 if TYPE_CHECKING:
+    from mapper.sources.image_quality import ImageQuality
     from mapper.sources.inspection import Inspection, LogFacts, Timing, TopicFacts
 
 
@@ -73,6 +74,10 @@ def _log_rows(log: "LogFacts") -> list[tuple[str, str]]:
         ("frames", f"{log.frames.count}: {_timing_text(log.frames)}"),
         ("content", log.content),
     ]
+    if log.point_times is not None:
+        rows.append(("point times", log.point_times))
+    if log.images is not None:
+        rows += _image_rows(log.images)
     if log.calibration is not None:
         rows.append(("camera", log.calibration))
     rows.append(("truth", log.truth or "none"))
@@ -100,7 +105,23 @@ def _log_rows(log: "LogFacts") -> list[tuple[str, str]]:
             ("own vehicle", f"returns that stay in place near the sensor: --set source.body.box=[{numbers}]")
         )
     rows += [("note", note) for note in log.notes]
-    return rows + [("warning", warning) for warning in log.warnings]
+    rows += [("warning", warning) for warning in log.warnings]
+    return rows + [("next time", advice) for advice in (log.images.advice if log.images else ())]
+
+
+def _image_rows(images: "ImageQuality") -> Iterator[tuple[str, str]]:
+    edges = "no edges" if images.edges_px is None else f"edges {images.edges_px:.1f} px wide (median)"
+    yield (
+        "images",
+        f"{edges}, {images.blurred or 'none'} of {images.looked_at} blurred; {images.saturated:.0%} of the "
+        f"pixels saturated, the brightest twentieth from level {images.brightest:.0f} of 255",
+    )
+    if images.overlap is not None:
+        yield (
+            "overlap",
+            f"neighbouring images have {images.overlap:.0%} of the view in common (median), those from frame "
+            f"{images.least_overlap_frame} {images.least_overlap:.0%}, the least",
+        )
 
 
 def _timing_text(timing: "Timing") -> str:

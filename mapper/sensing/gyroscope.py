@@ -11,7 +11,19 @@ from mapper.core.timebase import GAP_INTERVALS, NS_PER_S, Stamps
 _LEAST_GAP_NS = 20_000_000
 """Readings farther apart than this, and than ``GAP_INTERVALS`` of their usual ones, have a gap between."""
 _SATURATED_READINGS, _LEAST_SATURATED = 5, 1.0
-"""Readings that have exactly the largest number of the log, beyond 1 rad/s, are at the end of their range."""
+"""Readings that have exactly the largest number of the log are at the end of their range; angular velocities
+beyond 1 rad/s."""
+
+
+def range_end(readings: Array, *, beyond: float) -> tuple[float, NDArray[np.bool_]] | None:
+    """Return the end of a unit's range and which of (N, 3) readings are there, on any axis.
+
+    None where too few readings are the largest, or where that is not beyond a number.
+    """
+    largest = np.abs(readings).max(axis=1, initial=0.0)
+    limit = float(largest.max(initial=0.0))
+    at_end = largest == limit
+    return (limit, at_end) if at_end.sum() >= _SATURATED_READINGS and limit > beyond else None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,11 +64,9 @@ class Gyroscope:
         The unit turned faster than a reading at the end of its range says; what is left has a gap there.
         """
         notes = []
-        largest = np.abs(self.rates_radps).max(axis=1, initial=0.0)
-        limit = float(largest.max(initial=0.0))
-        saturated = largest == limit
         kept = self
-        if saturated.sum() >= _SATURATED_READINGS and limit > _LEAST_SATURATED:
+        if (found := range_end(self.rates_radps, beyond=_LEAST_SATURATED)) is not None:
+            limit, saturated = found
             notes.append(
                 f"{self.name}: {saturated.sum()} of {len(self)} angular velocities are at the end of the "
                 f"gyroscope's range, {limit:g}; left out"

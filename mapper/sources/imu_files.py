@@ -8,13 +8,15 @@ import numpy as np
 from mapper.core.errors import SourceError
 from mapper.core.geometry import Array
 from mapper.core.timebase import Stamps, seconds_text_from_ns
-from mapper.sensing.gyroscope import Gyroscope
+from mapper.sensing.gyroscope import Gyroscope, range_end
 from mapper.sources.base import Accelerations
 from mapper.sources.text import parse_numbers, parse_stamp, read_lines, rows, table, time_order
 
 BOTH, RATES = "imu.csv", "gyroscope.txt"
 _COLUMNS = np.dtype([("stamp_ns", "<i8"), ("rates", "<f8", 3), ("accelerations", "<f8", 3)])
 _STRAY_COLUMNS = ("timestamp", "a_x", "a_y", "a_z", "alpha_x", "alpha_y", "alpha_z")
+_SHAKEN = 1.2
+"""The end of a range is beyond this many times gravity: of those at rest many are the largest."""
 BOTH_HEADER = (
     "#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],"
     "a_RS_S_x [m s^-2],a_RS_S_y [m s^-2],a_RS_S_z [m s^-2]"
@@ -131,7 +133,21 @@ def accelerations_of(
 ) -> tuple[Accelerations | None, list[str]]:
     """Return the finite readings in time order, None without any, and notes; arguments as above."""
     stamps_ns, acceleration_mps2, notes = _finite(name, stamps_ns, acceleration_mps2, what="accelerations")
-    return Accelerations(stamps_ns, acceleration_mps2) if len(stamps_ns) else None, notes
+    if not len(stamps_ns):
+        return None, [*notes, f"{name}: no accelerations"]
+    return Accelerations(stamps_ns, acceleration_mps2), [*notes, *saturation_notes(name, acceleration_mps2)]
+
+
+def saturation_notes(name: str, accelerations: Array) -> list[str]:
+    """Return a sentence on the (N, 3) accelerations at the end of the unit's range, if there are any."""
+    at_rest = float(np.median(np.linalg.norm(accelerations, axis=1)))
+    if (found := range_end(accelerations, beyond=_SHAKEN * at_rest)) is None:
+        return []
+    limit, saturated = found
+    return [
+        f"{name}: {saturated.sum()} of {len(accelerations)} accelerations are at the end of the "
+        f"accelerometer's range, {limit:g}; record with a wider range, or mount it where it shakes less"
+    ]
 
 
 def _finite(name: str, stamps_ns: Stamps, values: Array, *, what: str) -> tuple[Stamps, Array, list[str]]:

@@ -17,6 +17,7 @@ from mapper.sources.config import SourceConfig
 from mapper.sources.depth_outlines import outline_warnings
 from mapper.sources.depth_scale import depth_warnings, read_spread, why_no_depth
 from mapper.sources.image_order import time_warnings
+from mapper.sources.image_quality import ImageChecks, ImageQuality
 from mapper.sources.reading_checks import ReadingChecks
 from mapper.sources.ros import files as recordings
 from mapper.sources.ros.message_index import Series
@@ -73,6 +74,8 @@ class LogFacts:
         sensor: "rgbd", "lidar" or "lidar-2d".
         frames: Timing of its frames.
         content: The first frame that can be read, in words, or that none can.
+        images: Blur, exposure and overlap of the images; None of a LiDAR, and of small ones.
+        point_times: The times of the first scan's points, in words; None without.
         calibration: The camera, in words; None of a LiDAR.
         truth: Description of its truth; None without.
         device_poses: Description of a phone's own estimate of its path; None without.
@@ -94,6 +97,8 @@ class LogFacts:
     sensor: Sensor
     frames: Timing
     content: str
+    images: ImageQuality | None
+    point_times: str | None
     calibration: str | None
     truth: str | None
     device_poses: str | None
@@ -177,15 +182,19 @@ def _inspected(
     path: Path, topics: Sequence[TopicFacts], source: Log, check: Callable[[Log], str | None]
 ) -> Inspection:
     checks = ReadingChecks(source)
-    damage = list(_damage(checks))  # loads grey images, before the first is loaded in colour
+    images = ImageChecks(len(source))
+    damage = list(_damage(checks, images))  # loads grey images, before the first is loaded in colour
     first, problem = _first_frame(checks.log)
     frames = read_spread(source)
+    timing = timing_of(source.stamps_ns)
     log = LogFacts(
         name=source.name,
         kind=source.kind,
         sensor=source.sensor,
-        frames=timing_of(source.stamps_ns),
+        frames=timing,
         content=problem if first is None else _content_text(first),
+        images=images.quality(),
+        point_times=_times_text(first, timing) if isinstance(first, Scan) else None,
         calibration=_calibration_text(first.camera) if isinstance(first, RgbdFrame) else None,
         truth=None if source.truth is None else _truth_text(source.truth, source.stamps_ns),
         device_poses=None
@@ -240,6 +249,17 @@ def _first_frame(source: Log) -> tuple[Frame | None, str]:
     return None, f"no frame can be read: {reason}"
 
 
+def _times_text(scan: Scan, timing: Timing) -> str | None:
+    """Return when a scan's points were measured, and how much of the time to the next scan that covers."""
+    if scan.times_s is None or not len(scan.times_s):
+        return None
+    first_ms, last_ms = (1e3 * float(extreme) for extreme in (scan.times_s.min(), scan.times_s.max()))
+    text = f"{first_ms:.1f} … {last_ms:.1f} ms after the stamp"
+    if timing.rate_hz == 0.0:
+        return text
+    return f"{text}, {(last_ms - first_ms) / 1e3 * timing.rate_hz:.0%} of the time between scans"
+
+
 def _content_text(frame: Frame) -> str:
     if isinstance(frame, Scan):
         far_m = float(np.linalg.norm(frame.points_body, axis=1).max(initial=0.0))
@@ -257,31 +277,35 @@ def _calibration_text(camera: PinholeCamera) -> str:
     return f"fx fy cx cy {numbers} px, distortion {distortion}"
 
 
-def _damage(checks: ReadingChecks) -> Iterator[str]:
+def _damage(checks: ReadingChecks, images: ImageChecks) -> Iterator[str]:
     """Load frames from all over an RGB-D log, and yield a note if some cannot be read.
 
-    Around images that repeat all frames are loaded, so that the checks find where that begins and ends. Scans
-    are not loaded: as text, a single one may take seconds.
+    Around images that repeat all frames are loaded, so that the checks find where that begins and ends; and
+    some beside those looked at, which share their view. Scans are not loaded: as text, a single one may take
+    seconds.
     """
     if checks.log.sensor != "rgbd":
         return
     step = -(-len(checks.log) // _MOST_LOADED)
     looked_at = range(0, len(checks.log), step)
-    if reasons := _unreadable(checks.log, looked_at):
+    if reasons := _unreadable(checks.log, looked_at, images):
         yield f"{len(reasons)} of {len(looked_at)} frames looked at cannot be read; the first: {reasons[0]}"
     for run in (*checks.repeated("image", fewest=2), *checks.repeated("depth", fewest=2)):
         _unreadable(checks.log, range(max(run.start - step, 0), run.start))
         _unreadable(checks.log, range(run.stop, min(run.stop + step, len(checks.log))))
+    _unreadable(checks.log, images.missing, images)
 
 
-def _unreadable(log: Log, indices: Iterable[int]) -> list[str]:
-    """Load some frames and return why others cannot be loaded."""
+def _unreadable(log: Log, indices: Iterable[int], images: ImageChecks | None = None) -> list[str]:
+    """Load some frames, whose images are measured, and return why others cannot be loaded."""
 
     def reason(index: int) -> str | None:
         try:
-            log.entry_at(index).load(colour=False)
+            frame = log.entry_at(index).load(colour=False)
         except FrameError as error:
             return str(error)
+        if images is not None and isinstance(frame, RgbdFrame):
+            images.add(index, frame)
         return None
 
     reasons = ordered_map(reason, indices)

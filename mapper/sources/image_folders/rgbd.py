@@ -35,8 +35,9 @@ from mapper.sources.image_files.reading import (
     read_depth_m,
     read_grey,
 )
+from mapper.sources.imu_files import accelerations_of
 from mapper.sources.listed_files import refuse_links_out
-from mapper.sources.text import parse_numbers, parse_stamp, table, time_order
+from mapper.sources.text import parse_numbers, parse_stamp, table
 
 _MIRROR_Y = np.diag([1.0, -1.0, 1.0, 1.0])
 
@@ -317,8 +318,6 @@ def read_accelerations(folder: Path) -> tuple[Accelerations | None, list[str]]:
         else:
             dropped += 1
     notes = [f"{path.name}: {dropped} readings are not finite; dropped"] if dropped else []
-    if not stamps_ns:
-        return None, [*notes, f"{path.name}: no readings"]
-    stamps = np.array(stamps_ns, dtype=np.int64)
-    order, more = time_order(stamps, what=path.name)
-    return Accelerations(stamps[order], np.array(readings)[order]), [*notes, *more]
+    stamps = np.array(stamps_ns, np.int64)
+    accelerations, more = accelerations_of(path.name, stamps, np.array(readings).reshape(-1, 3))
+    return accelerations, [*notes, *more]

@@ -19,6 +19,7 @@ from mapper.sensing.gnss import GnssFixes
 from mapper.sensing.gyroscope import Gyroscope
 from mapper.sources.base import Accelerations
 from mapper.sources.config import WheelsConfig
+from mapper.sources.imu_files import saturation_notes
 from mapper.sources.nmea import fixes_from_sentences
 from mapper.sources.ros.decode import decode
 from mapper.sources.ros.entries import Located
@@ -141,6 +142,7 @@ class RecordingReader:
             name = "g" if unit == GRAVITY_MPS2 else "mg"
             at_rest = GRAVITY_MPS2 / unit
             notes.append(f"{series.topic.name}: accelerations are about {at_rest:g} at rest: taken as {name}")
+        notes += saturation_notes(series.topic.name, acceleration_imu)
         imu = frame_of(self.firsts.get(series.topic.name))
         tree = self.tree_of(body, imu)
         known, T_body_imu = tree.find_each(body, imu, stamps_ns)
