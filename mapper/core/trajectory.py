@@ -182,6 +182,19 @@ def trajectory_from(poses: Iterable[tuple[int, Transform]]) -> Trajectory:
     return Trajectory(stamps_ns, np.array([T for _, T in pairs]).reshape(-1, 4, 4))
 
 
+NO_POSES = Trajectory(np.empty(0, np.int64), np.empty((0, 4, 4)))
+
+
+def carried(trajectory: Trajectory, T_body_other: Transform | Trajectory) -> Trajectory:
+    """Return the poses of a frame on the body; where it moves there, at the stamps that both have."""
+    if not isinstance(T_body_other, Trajectory):
+        return Trajectory(trajectory.stamps_ns, trajectory.T_world_body @ T_body_other)
+    stamps_ns, i, j = np.intersect1d(
+        trajectory.stamps_ns, T_body_other.stamps_ns, assume_unique=True, return_indices=True
+    )
+    return Trajectory(stamps_ns, trajectory.T_world_body[i] @ T_body_other.T_world_body[j])
+
+
 def start_to_end(trajectory: Trajectory) -> Transform:
     """Return T_start_end, the last pose in the frame of the first."""
     T_start_end: Transform = inverse(trajectory.T_world_body[0]) @ trajectory.T_world_body[-1]

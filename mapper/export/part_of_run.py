@@ -20,6 +20,7 @@ from mapper.octree.grid import OccupancyGrid
 from mapper.octree.map import OctreeMap
 from mapper.run.folder import Run
 from mapper.run.map_folder import MapFolder
+from mapper.run.stored_tracking import base_poses
 
 
 @dataclass(frozen=True, repr=False)
@@ -115,12 +116,12 @@ def part_of(run: MapFolder, frame: str, box_m: Sequence[float] | None) -> MapFol
         raise ConfigError(f"{run.path}: a merged map is exported whole; crop or move its runs")
     if frame not in ("map", "start", "base"):
         raise ConfigError(f"frame {frame!r}: want map, start or base")
-    T_frame_map, manifest, robot = np.eye(4), run.manifest, run.manifest.input.robot_of_all
+    T_frame_map, manifest = np.eye(4), run.manifest
     if frame != "map":
-        if frame == "base" and robot is None:
+        poses = base_poses(run) if frame == "base" else run.trajectory
+        if not poses:
             raise ConfigError(f"{run.path}: frame base: its log has no base_link; start is the sensor itself")
-        first = robot.trajectory_of_base(run.trajectory) if frame == "base" and robot else run.trajectory
-        T_frame_map = inverse(first[0])
+        T_frame_map = inverse(poses[0])
         manifest = manifest.model_copy(update={"georeference": None})  # which is that of the levelled world
     region = None if box_m is None else checked_config({"box_m": (box_m[:3], box_m[3:])}, Region, "crop")
     return PartOfRun(run.path, run.config, manifest, T_frame_map, region)

@@ -6,7 +6,7 @@ from itertools import chain
 from pathlib import Path
 
 from mapper.core.frames import Cloud, Scan
-from mapper.core.geometry import stride_for
+from mapper.core.geometry import Transform, stride_for
 from mapper.export.export_folders import export_folder
 from mapper.export.mcap_messages import OCCUPANCY_GRID, encode_occupancy_grid
 from mapper.export.run_maps import maps_of, snapshots_of
@@ -16,6 +16,7 @@ from mapper.mapping.fusion import Snapshot
 from mapper.octree.grid import OccupancyGrid
 from mapper.octree.octomap_file import bt_words
 from mapper.run.folder import Run
+from mapper.run.stored_tracking import base_in_body
 from mapper.runtime.progress import Progress
 from mapper.sources.ros.encode_ros import (
     SerializedMessage,
@@ -58,7 +59,9 @@ def rosbag2(run: Run, path: Path, _progress: Progress) -> None:
 
 def _latched_messages(run: Run, image: Snapshot | None) -> Iterator[SerializedMessage]:
     begin_ns, maps, robot = int(run.trajectory.stamps_ns[0]), maps_of(run), run.manifest.input.robot_of_all
-    mounted = [] if robot is None else [(robot.base, robot.body, robot.mounting)]
+    mounted: list[tuple[str, str, Transform]] = []
+    if robot is not None and robot.mounting is not None and robot.base != robot.body:
+        mounted.append((robot.base, robot.body, robot.mounting))
     if image is not None:
         mounted.append((BODY if robot is None else robot.body, CAMERA, image.T_body_camera))
     if mounted:
@@ -91,11 +94,15 @@ def _cloud_message(stamp_ns: int, topic: str, cloud: Cloud) -> SerializedMessage
 
 
 def _pose_messages(run: Run) -> Iterator[SerializedMessage]:
-    robot = run.manifest.input.robot_of_all
-    moving = run.trajectory if robot is None else robot.trajectory_of_base(run.trajectory)
-    for stamp_ns, T_world_moving in moving.items():
-        child = BODY if robot is None else robot.base
-        yield transforms_message(stamp_ns, "/tf", [(MAP, child, T_world_moving)])
+    robot, T_body_base = run.manifest.input.robot_of_all, dict(base_in_body(run).items())
+    poses, child = run.trajectory, BODY if robot is None else robot.body
+    if robot is not None and robot.mounting is not None:
+        poses, child = robot.trajectory_of_base(poses), robot.base
+    for stamp_ns, T_world_child in poses.items():
+        told = [(MAP, child, T_world_child)]
+        if robot is not None and stamp_ns in T_body_base:
+            told.append((robot.body, robot.base, T_body_base[stamp_ns]))
+        yield transforms_message(stamp_ns, "/tf", told)
 
 
 def _image_messages(image: Snapshot) -> Iterator[SerializedMessage]:

@@ -97,7 +97,7 @@ def append(
             tracking = component_of(tracking, next(iter(known)), progress=progress)
             solved = solve(tracking.graph, tracking.loops, config.graph)
         _refuse_unconnected(second, run, solved.loops, known)
-        later = from_tracking(replace(tracking, graph=solved.graph, loops=solved.loops), None)
+        later = from_tracking(replace(tracking, graph=solved.graph, loops=solved.loops), session)
         both = before.solved(solved.graph, solved.loops).then(later, truth=source.truth)
         rotating = writer.manifest.with_body_rates(source)
         with writer.clock.stage("solve"):

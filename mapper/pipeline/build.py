@@ -156,7 +156,7 @@ class _Steps:
     def accept(self, tracking: TrackingResult) -> TrackingResult:
         """Write the result of tracking, unless too little was tracked for a map."""
         self.writer.warn([*tracking.warnings, *self._late_depth(tracking)])
-        save_tracking(self.writer, from_tracking(tracking, self.source.truth))
+        save_tracking(self.writer, from_tracking(tracking, self.source))
         if tracking.gyroscope is not None:
             self.writer.record_gyroscope(tracking.gyroscope)
         refuse_a_fragment(
@@ -215,7 +215,7 @@ class _Steps:
             self.progress.note(warning.text)
         self.writer.warn(solved.georeferenced.warnings)
         with self.writer.clock.stage("solve"):
-            save_solved(self.writer, from_tracking(tracking, self.source.truth))
+            save_solved(self.writer, from_tracking(tracking, self.source))
             save_places(self.writer, tracking)
         report = solved.georeferenced.report
         detail = level.detail if report is None else f"{level.detail}; then x was turned to east by GNSS"

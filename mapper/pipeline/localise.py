@@ -346,7 +346,7 @@ def _unconfirmed(
 
 def _write(writer: RunWriter, source: Log, known: KnownMap, tracking: TrackingResult) -> None:
     folder, held = writer.folder, accepted_loops(tracking.loops)
-    stored = from_tracking(tracking, source.truth)
+    stored = from_tracking(tracking, source)
     poses = uncertain_poses(stored.trajectory, stored.graph, stored.records)
     save_frames(writer, stored, nodes=len(stored.graph.T_world_node) - 1)
     write_poses(folder / files.POSES, poses)

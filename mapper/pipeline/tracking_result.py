@@ -18,7 +18,7 @@ from mapper.run.frame_outcomes import records_of
 from mapper.run.manifest import RunWarning
 from mapper.run.stored_tracking import StoredTracking
 from mapper.run.writer import RunWriter
-from mapper.sources.base import Skipped
+from mapper.sources.base import Log, Skipped
 from mapper.sources.selection import too_few_text
 
 BY_POSES = ("wheels", "given")
@@ -134,8 +134,8 @@ def save_places(writer: RunWriter, tracking: TrackingResult) -> None:
         write_places(writer.folder / files.PLACES, tracking.places, nodes)
 
 
-def from_tracking(tracking: TrackingResult, truth: Trajectory | None) -> StoredTracking:
-    """Return the result as a run stores it: doubtful frames are placed by their neighbours."""
+def from_tracking(tracking: TrackingResult, source: Log) -> StoredTracking:
+    """Return the result of a log as a run stores it: doubtful frames are placed by their neighbours."""
     records = records_of(tracking.tracks, tracking.skipped)
     return StoredTracking(
         records=records,
@@ -144,5 +144,6 @@ def from_tracking(tracking: TrackingResult, truth: Trajectory | None) -> StoredT
         trajectory=placed_by_neighbours(tracking.trajectory(), tracking.graph, records),
         graph=tracking.graph,
         loops=tracking.loops,
-        truth=truth,
+        truth=source.truth,
+        T_body_base=source.T_body_base,
     )

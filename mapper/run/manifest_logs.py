@@ -1,7 +1,6 @@
 """Logs of a run as its manifest keeps them: where they are, what was noted, and where the sensors were."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Self
 
@@ -11,7 +10,7 @@ from mapper.core.config import Config
 from mapper.core.errors import RunError
 from mapper.core.geometry import Transform, inverse
 from mapper.core.rotations import pose_of_row, row_of_pose
-from mapper.core.trajectory import Trajectory
+from mapper.core.trajectory import NO_POSES, Trajectory, carried
 from mapper.odometry.gyroscope_calibration import GyroscopeCalibration, with_body_rates
 from mapper.sources.base import Log
 from mapper.sources.config import SourceConfig
@@ -56,25 +55,32 @@ class RobotFrames(Config):
     """Name of the robot's base, e.g. base_link."""
     body: str
     """Name of the frame whose poses are the run's trajectory."""
-    body_in_base: tuple[float, float, float, float, float, float, float]
-    """x y z (metres) qx qy qz qw."""
+    body_in_base: tuple[float, float, float, float, float, float, float] | None = None
+    """x y z (metres) qx qy qz qw; None where it moves there."""
 
     @classmethod
     def of(cls, log: Log) -> Self | None:
         """Return those of a log; None where it does not say where the sensor is on the robot."""
-        if log.T_base_body is None:
+        if log.T_base_body is None and not log.T_body_base:
             return None
-        row = row_of_pose(log.T_base_body).tolist()
+        row = None if log.T_base_body is None else row_of_pose(log.T_base_body).tolist()
         return cls(base=log.base_frame, body=log.body_frame, body_in_base=row)
 
     @property
-    def mounting(self) -> Transform:
-        """T_base_body, (4, 4)."""
-        return pose_of_row(np.array(self.body_in_base))
+    def mounting(self) -> Transform | None:
+        """T_base_body, (4, 4); None where the body moves on the base."""
+        return None if self.body_in_base is None else pose_of_row(np.array(self.body_in_base))
 
-    def trajectory_of_base(self, trajectory: Trajectory) -> Trajectory:
-        """Return the poses of the base for those of the body."""
-        return replace(trajectory, T_world_body=trajectory.T_world_body @ inverse(self.mounting))
+    def trajectory_of_base(self, trajectory: Trajectory, T_body_base: Trajectory = NO_POSES) -> Trajectory:
+        """Return the poses of the base for those of the body.
+
+        Args:
+            trajectory: Poses of the body.
+            T_body_base: Poses of the base in the body, where they move.
+        """
+        if self.mounting is not None:
+            return carried(trajectory, inverse(self.mounting))
+        return carried(trajectory, T_body_base)
 
 
 class InputLog(Config):

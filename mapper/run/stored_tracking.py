@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mapper.core.geometry import inverse
-from mapper.core.trajectory import Trajectory, trajectory_from
+from mapper.core.trajectory import NO_POSES, Trajectory, trajectory_from
 from mapper.graph.g2o import write_g2o
 from mapper.graph.model import PoseGraph
 from mapper.loops.closure import LoopClosure, accepted_loops, write_closures
@@ -19,7 +19,7 @@ from mapper.run.manifest import SkippedFrame
 from mapper.run.pose_covariances import uncertain_poses, write_poses
 from mapper.run.writer import RunWriter
 from mapper.sources.base import Skipped
-from mapper.sources.trajectory_files import write_tum
+from mapper.sources.trajectory_files import read_tum, write_tum
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -34,6 +34,7 @@ class StoredTracking:
         graph: Nodes at their current estimates.
         loops: Every loop candidate with its verdict.
         truth: True body poses, if the log has them.
+        T_body_base: Poses of the robot's base in the body, where they move by the log.
     """
 
     records: Sequence[FrameRecord]
@@ -43,6 +44,7 @@ class StoredTracking:
     graph: PoseGraph
     loops: Sequence[LoopClosure]
     truth: Trajectory | None
+    T_body_base: Trajectory = NO_POSES
 
     def solved(self, graph: PoseGraph, loops: Sequence[LoopClosure]) -> "StoredTracking":
         """Return the same frames with the graph at another solution: each moves along with its node.
@@ -76,7 +78,24 @@ class StoredTracking:
             graph=later.graph,
             loops=later.loops,
             truth=truth,
+            T_body_base=trajectory_from([*self.T_body_base.items(), *later.T_body_base.items()]),
         )
+
+
+def base_in_body(run: Run) -> Trajectory:
+    """Return T_body_base of a run in whose log they move, at the stamps of ``base.tum``; else no poses."""
+    robot = run.manifest.input.robot_of_all
+    if robot is None or robot.mounting is not None or not (run.path / files.BASE).is_file():
+        return NO_POSES
+    T_world_body = dict(read_tum(run.file(files.TRAJECTORY)).items())
+    base = read_tum(run.file(files.BASE))
+    return trajectory_from((stamp_ns, inverse(T_world_body[stamp_ns]) @ T) for stamp_ns, T in base.items())
+
+
+def base_poses(run: Run) -> Trajectory:
+    """Return the poses of the robot's base for those of a run's trajectory, where its log tells them."""
+    robot = run.manifest.input.robot_of_all
+    return NO_POSES if robot is None else robot.trajectory_of_base(run.trajectory, base_in_body(run))
 
 
 def load_tracking(run: Run) -> StoredTracking:
@@ -89,6 +108,7 @@ def load_tracking(run: Run) -> StoredTracking:
         graph=run.graph,
         loops=run.loops,
         truth=run.truth,
+        T_body_base=base_in_body(run),
     )
 
 
@@ -104,8 +124,8 @@ def save_tracking(writer: RunWriter, tracked: StoredTracking) -> None:
     folder, graph = writer.folder, tracked.graph
     save_frames(writer, tracked, nodes=len(graph.T_world_node))
     robot = writer.manifest.input.robot_of_all
-    if robot is not None:
-        write_tum(folder / files.BASE, robot.trajectory_of_base(tracked.trajectory))
+    if robot is not None and (base := robot.trajectory_of_base(tracked.trajectory, tracked.T_body_base)):
+        write_tum(folder / files.BASE, base)
     if graph.T_world_node:
         write_g2o(folder / files.GRAPH, graph)
         if graph.fixes:

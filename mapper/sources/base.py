@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from mapper.core.errors import DataError, FrameError
 from mapper.core.frames import Frame, Image, PinholeCamera, RgbdFrame, Scan, Sensor
-from mapper.core.geometry import Array, Transform
+from mapper.core.geometry import Array, Transform, inverse
 from mapper.core.timebase import Stamps
-from mapper.core.trajectory import Trajectory
+from mapper.core.trajectory import NO_POSES, Trajectory, carried
 from mapper.sensing.config import DepthNoiseConfig
 from mapper.sensing.gnss import GnssFixes
 from mapper.sensing.gyroscope import Gyroscope
@@ -179,6 +179,12 @@ class SensorBeside:
     T_body_sensor: Transform
 
 
+FOOTPRINT = "base_footprint"
+"""Frame of a robot on the floor (REP 120)."""
+BASES = ("base_link", FOOTPRINT)
+"""Frames of a robot's base (REP 105, REP 120); with several robots each has a namespace before them."""
+
+
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Log:
     """A recorded log: the same frames in time order, however often it is read.
@@ -198,8 +204,10 @@ class Log:
         images: Images of the cameras beside a LiDAR, which colour its cloud.
         beside: Sensors whose frames are fused too; no two frames, nor one of the log, have the same stamp.
         T_base_body: Mounting of the body on the robot, whose base has x forward and z up (REP 103), if the
-            log states it.
+            log states it and it does not move there.
+        T_body_base: Poses of the base in the body, at the frames' stamps, where they move and it is known.
         base_frame: Name of the robot's base in the log.
+        base_height_m: Height of its origin above the floor, if the log states it.
         body_frame: Name of the body in the log.
         wheels: T_odom_body by wheel odometry, in a frame of its own that drifts, if the log has it.
         depth_noise: Noise of its depth, if what made it states it.
@@ -223,7 +231,9 @@ class Log:
     images: Sequence[CameraImages] = ()
     beside: Sequence[SensorBeside] = ()
     T_base_body: Transform | None = None
+    T_body_base: Trajectory = NO_POSES
     base_frame: str = ""
+    base_height_m: float | None = None
     body_frame: str = ""
     wheels: Trajectory | None = None
     depth_noise: DepthNoiseConfig | None = None
@@ -244,6 +254,11 @@ class Log:
     def has_colours(self) -> bool:
         """Whether points of the cloud have the colours of images."""
         return self.sensor == "rgbd" or len(self.images) > 0
+
+    def base_poses(self, trajectory: Trajectory) -> Trajectory:
+        """Return the poses of the robot's base for those of the body, where the log tells them."""
+        T_body_base = self.T_body_base if self.T_base_body is None else inverse(self.T_base_body)
+        return carried(trajectory, T_body_base)
 
     def __enter__(self) -> Self:
         """Return the log itself: nothing stays open between its frames."""
@@ -304,10 +319,12 @@ class Log:
 
     def subset(self, indices: NDArray[np.intp]) -> "Log":
         """Return the log with only the frames of some increasing indices; all else stays as it is."""
+        stamps_ns = self.stamps_ns[indices]
         return replace(
             self,
-            stamps_ns=self.stamps_ns[indices],
+            stamps_ns=stamps_ns,
             entry_at=lambda index: self.entry_at(int(indices[index])),
+            T_body_base=self.T_body_base[np.isin(self.T_body_base.stamps_ns, stamps_ns)],
         )
 
 

@@ -152,7 +152,8 @@ class SourceConfig(Config):
     body: BodyConfig = BodyConfig()
     body_frame: str | None = None
     """Frame in a recording's tf that is a LiDAR's body, e.g. base_link; None is the cloud's own frame.
-    The body of RGB-D frames is the camera."""
+    The body of RGB-D frames is the camera: there it is the frame whose poses are in base.tum; None is
+    base_link or base_footprint, where tf has it."""
     pattern: str | None = None
     """Glob of the names of a LiDAR log's clouds, e.g. ``os1_*.bin``; None is all with the usual ending."""
     stamps_file: Path | None = None

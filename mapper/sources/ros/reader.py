@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 
 from mapper.core.errors import DataError, FrameError
 from mapper.core.frames import Sensor
-from mapper.core.geometry import FARTHEST_M, Transform, spread_indices
+from mapper.core.geometry import FARTHEST_M, spread_indices
 from mapper.core.rotations import pose_of_row
 from mapper.core.timebase import NS_PER_S
 from mapper.core.trajectory import Trajectory
 from mapper.core.units import GRAVITY_MPS2, unit_of_gravity
 from mapper.sensing.gnss import GnssFixes
 from mapper.sensing.gyroscope import Gyroscope
-from mapper.sources.base import Accelerations
+from mapper.sources.base import BASES, FOOTPRINT, Accelerations
 from mapper.sources.config import WheelsConfig
 from mapper.sources.imu_files import saturation_notes
 from mapper.sources.nmea import fixes_from_sentences
@@ -41,8 +41,6 @@ from mapper.sources.text import ROUNDING, time_order
 from mapper.sources.wheel_files import mounting
 
 _MAX_TRANSFORMS = 1_000
-_BASES = ("base_link", "base_footprint")
-"""Frames of a robot's base (REP 105, REP 120); with several robots each has a namespace before them."""
 SAME_CLOCK_NS = 60 * NS_PER_S
 """Messages are recorded within seconds of their stamps."""
 
@@ -205,16 +203,19 @@ class RecordingReader:
         kept, more = time_order(fixes.stamps_ns, what=series.topic.name)
         return fixes.of(kept), [*notes, *more]
 
-    def base_of(self, frame: str) -> str | None:
+    def base_of(self, frame: str, *, names: Sequence[str] = BASES) -> str | None:
         """Return the frame of the robot that carries a frame; None where tf names none."""
-        bases = (one for base in _BASES for one in self.tree.frames if one.rpartition("/")[2] == base)
+        bases = (one for base in names for one in self.tree.frames if one.rpartition("/")[2] == base)
         tied = [base for base in bases if self.tree.find(base, frame) is not None]
         return max(tied, key=lambda base: shared_namespaces(base, frame), default=None)
 
-    def mounting(self, body: str) -> Transform | None:
-        """Return T_base_body, the pose of the body on the robot; None where tf names none, or it moves."""
-        base = self.base_of(body)
-        return None if base is None or self.tree.moves(base, body) else self.tree.find(base, body)
+    def height_of(self, frame: str) -> float | None:
+        """Return how high a frame is above the robot's footprint, metres; None where tf states none."""
+        floor = self.base_of(frame, names=(FOOTPRINT,))
+        if floor is None or self.tree.moves(floor, frame):
+            return None
+        T_floor_frame = self.tree.find(floor, frame)
+        return None if T_floor_frame is None else float(T_floor_frame[2, 3])
 
     def _carried(self, poses: Trajectory, child: str, body: str) -> Trajectory:
         """Return the poses of the body for those of the frame that carries it."""

@@ -65,21 +65,12 @@ class RecordedFrames:
     depth_noise: DepthNoiseConfig | None = None
 
 
-def _refuse_body_frame(reader: RecordingReader, config: SourceConfig) -> None:
-    if config.body_frame is not None:
-        raise SourceError(
-            f"{reader.recording.path}: source.body_frame={config.body_frame}: the body of RGB-D frames is "
-            "the camera; leave it out, or choose clouds with source.topics.points=…"
-        )
-
-
 def stereo_frames(reader: RecordingReader, topics: StereoTopics, config: SourceConfig) -> RecordedFrames:
     """Return the frames of a stereo pair, whose depth is computed as they are read.
 
     Raises:
         SourceError: They cannot be mapped, or their camera is unknown.
     """
-    _refuse_body_frame(reader, config)
     refuse_settings(config.camera)
     left, right, where = topics.left, topics.right, f"{reader.recording.path}"
     i, j, notes = paired(left, right, max_gap_s=config.max_pair_gap_s, where=where)
@@ -103,7 +94,6 @@ def rgbd_frames(reader: RecordingReader, topics: CameraTopics, config: SourceCon
     Raises:
         SourceError: They cannot be mapped, or their camera is unknown.
     """
-    _refuse_body_frame(reader, config)
     color, depth = topics.color, topics.depth
     depth = replace(depth, stamps_ns=depth.stamps_ns + depth_offset_ns(config))
     where = f"{reader.recording.path}"
@@ -249,9 +239,20 @@ def _body_of(
             "moves; build from the driver's own topic (source.topics.points), or if they are around the "
             f"sensor all the same, --set source.body_frame={frame}"
         )
+    refuse_body_frame(reader, body, frame)
+    return body, notes
+
+
+def refuse_body_frame(reader: RecordingReader, body: str, frame: str) -> None:
+    """Refuse a frame that tf does not connect to a sensor's, or that stays while the sensor moves.
+
+    Raises:
+        SourceError: It is such a frame.
+    """
+    path, tree = reader.recording.path, reader.tree
     if tree.find(body, frame) is None:
         raise SourceError(
-            f"{path}: source.body_frame={body}: tf does not connect it to the clouds' frame {frame}; its "
+            f"{path}: source.body_frame={body}: tf does not connect it to the sensor's frame {frame}; its "
             f"frames: {', '.join(tree.frames) or 'no frames'}"
         )
     if is_fixed(body) and body != frame:
@@ -259,7 +260,6 @@ def _body_of(
             f"{path}: source.body_frame={body}: it stays where it is while the sensor moves; want a frame "
             f"of the robot: {', '.join(one for one in tree.frames if not is_fixed(one))}"
         )
-    return body, notes
 
 
 def _first_of(reader: RecordingReader, series: Series) -> Message:

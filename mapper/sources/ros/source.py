@@ -1,11 +1,13 @@
 """Logs of MCAP files and ROS bags."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from mapper.core.errors import SourceError, listed
 from mapper.core.timebase import NS_PER_S
+from mapper.core.trajectory import Trajectory
 from mapper.sources.base import CameraImages, Log
 from mapper.sources.config import SourceConfig
 from mapper.sources.laser_scan import rolling
@@ -13,7 +15,13 @@ from mapper.sources.ros.cameras import images_beside
 from mapper.sources.ros.message_index import Series, why_unread
 from mapper.sources.ros.messages import READ
 from mapper.sources.ros.reader import SAME_CLOCK_NS, RecordingReader
-from mapper.sources.ros.recorded_frames import lidar_frames, rgbd_frames, stereo_frames
+from mapper.sources.ros.recorded_frames import (
+    RecordedFrames,
+    lidar_frames,
+    refuse_body_frame,
+    rgbd_frames,
+    stereo_frames,
+)
 from mapper.sources.ros.sensors_beside import sensors_beside
 from mapper.sources.ros.topics import CameraTopics, Choice, StereoTopics, choose
 from mapper.sources.wheel_files import usable
@@ -76,9 +84,7 @@ def recording_log(reader: RecordingReader, config: SourceConfig) -> Log:
     if reader.tree.contradicted:
         told = listed(reader.tree.contradicted)
         tf_notes.append(f"tf contradicts itself; of static frames the last is used, as in tf2: {told}")
-    base, T_base_body = reader.base_of(frames.body), reader.mounting(frames.body)
-    if base is not None and T_base_body is None:
-        tf_notes.append(f"tf moves {frames.body} on {base}: poses of the robot are not written (base.tum)")
+    mounting, mounting_notes = _mounting(reader, frames, config)
     cameras = [images_beside(reader, camera, body=frames.body) for camera in choice.cameras]
     images = [one for one in cameras if isinstance(one, CameraImages)]
     beside, beside_choices = sensors_beside(reader, choice.beside, frames, config)
@@ -95,9 +101,8 @@ def recording_log(reader: RecordingReader, config: SourceConfig) -> Log:
         gnss=gnss,
         images=images,
         beside=beside,
-        T_base_body=T_base_body,
-        base_frame=base or "",
         body_frame=frames.body,
+        **mounting,
         wheels=wheels,
         depth_noise=frames.depth_noise,
         choices=[
@@ -111,12 +116,41 @@ def recording_log(reader: RecordingReader, config: SourceConfig) -> Log:
             *clock_notes,
             *frames.notes,
             *tf_notes,
+            *mounting_notes,
             *truth_notes,
             *wheel_notes,
             *imu_notes,
             *gnss_notes,
         ],
     )
+
+
+def _mounting(
+    reader: RecordingReader, frames: RecordedFrames, config: SourceConfig
+) -> tuple[dict[str, Any], list[str]]:
+    """Return the fields of a log that say where the body is on the robot, and notes.
+
+    Raises:
+        SourceError: The frame that the settings name is none of the robot's.
+    """
+    body = frames.body
+    base = reader.base_of(body)
+    if frames.sensor == "rgbd" and config.body_frame is not None:  # a LiDAR's body is that frame itself
+        base = config.body_frame.lstrip("/")
+        refuse_body_frame(reader, base, body)
+    if base is None:
+        return {}, []
+    fields = {"base_frame": base, "base_height_m": reader.height_of(base)}
+    if not reader.tree.moves(base, body):
+        return {**fields, "T_base_body": reader.tree.find(base, body)}, []
+    known, T_body_base = reader.tree_of(base, body).find_each(body, base, frames.stamps_ns)
+    notes = []
+    if not known.all():
+        notes.append(
+            f"tf moves {body} on {base}, and says where at {known.sum()} of {len(known)} frames: only of "
+            "these are the robot's poses written (base.tum)"
+        )
+    return {**fields, "T_body_base": Trajectory(frames.stamps_ns[known], T_body_base)}, notes
 
 
 def _on_clock_of(main: Series, choice: Choice) -> tuple[Choice, list[str]]:
