@@ -13,7 +13,7 @@ from mapper.core.errors import FrameError, WriteError
 from mapper.core.geometry import Array, Transform, apply
 from mapper.export.figures import ESTIMATE, FREE_CELL, OCCUPIED_CELL, START, STRAY_PERCENT, Rgb
 from mapper.features.frame_view import ImageView
-from mapper.mapping.levelling import AXES
+from mapper.mapping.body_axes import AXES
 from mapper.run.observers import Step
 from mapper.runtime.atomic import atomic_file
 from mapper.sources.base import Log

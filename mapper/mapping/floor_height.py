@@ -1,7 +1,7 @@
 """The floor that levelling puts at z = 0: a surface that patches show, or what lies below the sensor."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -28,12 +28,14 @@ class Floor:
     Attributes:
         height_m: Height along up; None is that of the first pose.
         detail: Source of the height; part of a sentence.
-        is_seen: Whether a surface shows it; else it is a guess.
+        is_seen: Whether a surface shows it, or tf states it; else it is a guess.
+        conflict: Sentence on what tf states otherwise; empty without a contradiction.
     """
 
     height_m: float | None
     detail: str
     is_seen: bool
+    conflict: str = ""
 
 
 def floor_of(patches: Patches, heights_m: Array, *, up_world: Array, tolerance_m: float) -> Floor:
@@ -79,3 +81,23 @@ def floor_below(scans: Sequence[tuple[Scan, Transform]], up_world: Array, *, tol
             return Floor(height_m, f"floor {-floor_m:.2f} m below the sensor", is_seen=True)
     detail = "no floor seen below the sensor: the floor is put at the first pose"
     return Floor(None, detail, is_seen=False)
+
+
+def weighed(floor: Floor, stated_m: Array) -> Floor:
+    """Return the floor that scans show; where they show none, the one that the log states below the robot.
+
+    Args:
+        floor: What the scans show.
+        stated_m: (N,) heights along up of the floor below the robot, along the path; at least one.
+    """
+    if floor.height_m is None or not floor.is_seen:
+        return Floor(float(stated_m[0]), "no floor seen: it is the robot's footprint by tf", is_seen=True)
+    above_m = floor.height_m - float(np.clip(floor.height_m, stated_m.min(), stated_m.max()))
+    if abs(above_m) <= _NEAR_FLOOR_M:
+        return floor
+    side = "above" if above_m > 0.0 else "below"
+    conflict = (
+        f"the floor seen is {abs(above_m):.2f} m {side} the robot's footprint by tf, and is taken; is "
+        "base_footprint right?"
+    )
+    return replace(floor, conflict=conflict)

@@ -1,18 +1,19 @@
 """Levelling: up and the floor, which give the world frame of the maps."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import permutations, product
 
 import numpy as np
 
 from mapper.core.errors import DataError
-from mapper.core.frames import Scan, Sensor
+from mapper.core.frames import Scan
 from mapper.core.geometry import Array, Points, Transform, exp, stride_for, transform
 from mapper.core.timebase import nearest
 from mapper.core.trajectory import Trajectory
+from mapper.mapping.body_axes import AXES, BodyAxes, mean_up
 from mapper.mapping.config import LevelConfig
-from mapper.mapping.floor_height import floor_below, floor_of, heights_of
+from mapper.mapping.floor_height import floor_below, floor_of, heights_of, weighed
 from mapper.mapping.wall_direction import WallHeading, wall_heading
 from mapper.registration.planes import (
     MAX_TILT_RAD,
@@ -24,33 +25,7 @@ from mapper.registration.planes import (
     vertical_of,
 )
 from mapper.registration.surfaces import prepared
-from mapper.sources.base import Accelerations, Log
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class BodyAxes:
-    """Rough attitude of a sensor's body.
-
-    Attributes:
-        up: (3,) unit vector that roughly points up, body frame.
-        forward: (3,) unit vector along the body's heading, body frame.
-        stands_on_floor: The floor is the surface below the sensor, not the lowest surface around: a street
-            may fall away in range, and reflections lie below it.
-        are_stated: The log says how the body is mounted.
-    """
-
-    up: Array
-    forward: Array
-    stands_on_floor: bool = False
-    are_stated: bool = False
-
-
-AXES: Mapping[Sensor, BodyAxes] = {
-    "rgbd": BodyAxes(up=np.array([0.0, -1.0, 0.0]), forward=np.array([0.0, 0.0, 1.0])),
-    "lidar": BodyAxes(up=np.array([0.0, 0.0, 1.0]), forward=np.array([1.0, 0.0, 0.0]), stands_on_floor=True),
-    "lidar-2d": BodyAxes(up=np.array([0.0, 0.0, 1.0]), forward=np.array([1.0, 0.0, 0.0])),
-}
-
+from mapper.sources.base import Accelerations
 
 _IN_LAYER = 1.0 / 3.0  # of a voxel
 _MAX_READING_GAP_NS = 50_000_000
@@ -69,8 +44,9 @@ class Level:
             x = y = 0 and heads along +x, or up to 45° from it where x and y lie along walls.
         method: Source of the vertical: "accelerometer", "planes", "camera" or "laser plane".
         detail: Quality of the vertical, source of the floor and of x; a sentence for the manifest.
-        has_floor: The floor was seen; else its height is a guess.
-        conflict: Sentence on an accelerometer or a mounting that contradicts the up taken; else empty.
+        has_floor: The floor was seen, or tf states its height; else this is a guess.
+        conflict: Sentence on an accelerometer or a mounting that contradicts the up or the floor taken; else
+            empty.
         is_decided: A floor below the sensor says which is right; true without a conflict.
     """
 
@@ -80,14 +56,6 @@ class Level:
     has_floor: bool
     conflict: str = ""
     is_decided: bool = True
-
-
-def axes_of(log: Log) -> BodyAxes:
-    """Return the axes of a log's body: by its mounting on the robot if that is stated, else by its sensor."""
-    if log.T_base_body is None:
-        return AXES[log.sensor]
-    forward, _, up = log.T_base_body[:3, :3]
-    return replace(AXES[log.sensor], up=up, forward=forward, are_stated=True)
 
 
 def find_level(
@@ -129,12 +97,15 @@ def find_level(
     else:
         heights_m = heights_of(scans, up_world)
         floor = floor_of(patches, heights_m, up_world=up_world, tolerance_m=tolerance_m)
+    if axes.floor_world is not None:
+        floor = weighed(floor, axes.floor_world @ up_world)
     T_level_world = _frame(trajectory.T_world_body[0], up_world, floor.height_m, axes)
     details = [up_detail, floor.detail]
     if config.heading == "walls":
         T_level_world, heading = _turned_along_walls(T_level_world, patches)
         details.append(heading)
-    return Level(T_level_world, method, "; ".join(details), floor.is_seen, rough.conflict, rough.is_decided)
+    conflict = "; ".join(filter(None, [rough.conflict, floor.conflict]))
+    return Level(T_level_world, method, "; ".join(details), floor.is_seen, conflict, rough.is_decided)
 
 
 def level_in_plane(
@@ -145,9 +116,10 @@ def level_in_plane(
     axes: BodyAxes,
     resolution_m: float,
 ) -> Level:
-    """Return the level frame of planar scans: up is the normal of their plane, the floor the robot's z = 0.
+    """Return the level frame of planar scans: up is the normal of their plane.
 
-    A laser in or below that is taken to be on the floor. Its plane is a third of a voxel above the border of
+    The floor is the robot's footprint, or where the log states none, the robot's z = 0. A laser in or below
+    that is taken to be on the floor. Its plane is a third of a voxel above the border of
     a layer, so that no rounding puts a scan into the layer below, at this resolution or at half of it.
 
     Args:
@@ -163,10 +135,13 @@ def level_in_plane(
     if not len(trajectory):
         raise DataError("levelling: the trajectory has no poses")
     T_world_first = trajectory.T_world_body[0]
-    laser_m = float(np.median([scan.origin_body[2] for scan, _ in scans])) if scans else 0.0
+    on_body_m = float(np.median([scan.origin_body[2] for scan, _ in scans])) if scans else 0.0
+    laser_m = on_body_m
+    if axes.floor_world is not None:
+        laser_m += float((T_world_first[:3, 3] - axes.floor_world[0]) @ T_world_first[:3, 2])
     layer_m = (np.floor(max(laser_m, 0.0) / resolution_m + 1e-6) + _IN_LAYER) * resolution_m
     T_level_world = _frame(T_world_first, T_world_first[:3, 2], None, axes)
-    T_level_world[2, 3] += layer_m - laser_m
+    T_level_world[2, 3] += layer_m - on_body_m
     stated = "as the log states" if laser_m > 0.0 else "as the log states no height of it"
     details = [f"up is the normal of the laser's plane, {max(laser_m, 0.0):.2f} m above the floor {stated}"]
     if config.heading == "walls":
@@ -204,14 +179,14 @@ def _rough_up(
     which a floor is seen: drivers turn the clouds of an inverted LiDAR, but may leave tf and accelerometer as
     they are.
     """
-    up_sensor = _mean_up(trajectory, axes.up)
+    up_sensor = axes.up_in(trajectory)
     if not axes.stands_on_floor:
         return _RoughUp(up_sensor)
     mounted = _Candidate("the mounting in tf" if axes.are_stated else "the sensor's z axis", up_sensor)
     candidates = [_Candidate("the accelerometer", up) for up in _felt(accelerations, trajectory)]
     candidates.insert(0 if axes.are_stated else len(candidates), mounted)
     if axes.are_stated:
-        candidates.append(_Candidate("the sensor's z axis", _mean_up(trajectory, AXES["lidar"].up)))
+        candidates.append(_Candidate("the sensor's z axis", mean_up(trajectory, AXES["lidar"].up)))
     chosen, is_decided = candidates[0], True
     if any(chosen.contradicts(other) for other in candidates):
         with_floor = [
@@ -361,15 +336,6 @@ def _right_angled_frames() -> list[Array]:
             if np.linalg.det(R) > 0.0:
                 frames.append(R)
     return frames
-
-
-def _mean_up(trajectory: Trajectory, up_body: Array) -> Array:
-    """Return the mean of the body's up direction; the first one if the body turns over."""
-    ups_world = trajectory.T_world_body[:, :3, :3] @ up_body
-    mean: Array = ups_world.mean(axis=0)
-    length = float(np.linalg.norm(mean))
-    first: Array = ups_world[0]
-    return mean / length if length > 0.3 else first
 
 
 def _frame(T_world_first: Transform, up_world: Array, floor_m: float | None, axes: BodyAxes) -> Transform:

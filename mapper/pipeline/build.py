@@ -14,7 +14,8 @@ from mapper.core.errors import FrameError
 from mapper.core.frames import Scan
 from mapper.core.timebase import check_stamps
 from mapper.core.trajectory import Trajectory
-from mapper.mapping.levelling import Level, axes_of, find_level, level_in_plane
+from mapper.mapping.body_axes import axes_of
+from mapper.mapping.levelling import Level, find_level, level_in_plane
 from mapper.mapping.sensor_agreement import mounting_warnings
 from mapper.navigation.reachable_floor import MAX_SENSOR_HEIGHT_M
 from mapper.odometry.base import Odometry
@@ -277,7 +278,7 @@ def level_of(source: Log, tracking: TrackingResult, config: BuildConfig) -> Leve
             placed,
             trajectory=trajectory,
             config=config.level,
-            axes=axes_of(source),
+            axes=axes_of(source, trajectory),
             resolution_m=config.octree.resolution_m,
         )
     return find_level(
@@ -285,7 +286,7 @@ def level_of(source: Log, tracking: TrackingResult, config: BuildConfig) -> Leve
         trajectory=trajectory,
         accelerations=source.accelerations,
         config=config.level,
-        axes=axes_of(source),
+        axes=axes_of(source, trajectory),
     )
 
 

@@ -1,4 +1,4 @@
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -9,10 +9,12 @@ from mapper.core.frames import PinholeCamera, RgbdFrame, Scan, ray_table
 from mapper.core.geometry import apply, exp, inverse, rotation_exp, transform
 from mapper.core.timebase import nearest, ns_from_seconds_text
 from mapper.core.trajectory import Trajectory
+from mapper.mapping.body_axes import AXES, BodyAxes, axes_of
 from mapper.mapping.config import LevelConfig
-from mapper.mapping.levelling import AXES, BodyAxes, find_level
+from mapper.mapping.levelling import find_level, level_in_plane
 from mapper.sources.base import Accelerations
 from mapper.sources.trajectory_files import read_tum
+from tests.support.logs import log_in_memory
 from tests.support.paths import FR1_XYZ
 
 CAMERA = PinholeCamera(width_px=160, height_px=120, fx_px=130.0, fy_px=130.0, cx_px=79.5, cy_px=59.5)
@@ -332,6 +334,52 @@ def test_the_user_can_say_which_way_is_up(up, z_up):
     scans, trajectory, readings = street(is_inverted=True, imu_is_inverted=True)
     level = level_of(scans, trajectory, readings, LevelConfig(up=up), axes=AXES["lidar"])
     assert level.T_level_world[2, 2] == pytest.approx(z_up, abs=0.05)
+
+
+def on_robot(scene, T_room_cameras, *, footprint_m=0.0, known=slice(None), base_frame="a/base_link"):
+    """Level by a camera that tf moves on a robot at rest, and the pose of the room."""
+    scans, trajectory, T_world_room = log_of(scene, T_room_cameras)
+    T_world_base = T_world_room @ exp(np.zeros(3), np.array([0.4, -0.3, footprint_m + 0.2]))
+    T_body_base = Trajectory(trajectory.stamps_ns, np.linalg.inv(trajectory.T_world_body) @ T_world_base)
+    log = log_in_memory([], T_body_base=T_body_base[known], base_frame=base_frame, base_height_m=0.2)
+    return level_of(scans, trajectory, axes=axes_of(log, trajectory)), T_world_room
+
+
+@pytest.mark.parametrize("known", [slice(None), slice(6, None)])
+def test_a_floor_that_is_not_seen_is_the_robot_s_footprint(known):
+    level, T_world_room = on_robot(WALLS, around(down_deg=15.0), known=known)
+    assert level.has_floor
+    assert abs(floor_height_m(level, T_world_room)) < 0.02
+
+
+@pytest.mark.parametrize("footprint_m", [0.0, 0.1, -0.4, 0.4])
+def test_a_floor_that_is_seen_goes_before_the_robot_s_footprint(footprint_m):
+    level, T_world_room = on_robot(ROOM, around(), footprint_m=footprint_m)
+    assert abs(floor_height_m(level, T_world_room)) < 0.02
+    assert bool(level.conflict) == (abs(footprint_m) > 0.3)
+    assert level.is_decided
+
+
+@pytest.mark.parametrize(("base_frame", "tilt"), [("base_link", 0.0), ("gripper", 50.0)])
+def test_without_any_plane_up_is_the_robot_s_below_a_camera_that_tilts(base_frame, tilt):
+    poses = [pose(0.0, 0.0, 1.4, yaw_deg=0.0, down_deg=d) for d in np.linspace(40.0, 60.0, 5)]
+    level, T_world_room = on_robot([], poses, base_frame=base_frame)
+    assert level.method == "camera"
+    assert tilt_deg(level, T_world_room) == pytest.approx(tilt, abs=1.0)
+
+
+@pytest.mark.parametrize(("footprint_m", "layer_m"), [(0.0, 0.2), (-0.14, 0.35)])
+def test_a_laser_s_plane_is_as_high_as_it_is_above_the_robot_s_footprint(footprint_m, layer_m):
+    path = Trajectory(np.arange(2) * MS, np.array([np.eye(4)] * 2))
+    ring = Scan(0, np.zeros((1, 3), np.float32), origin_body=np.array([0.1, 0.0, 0.22]), is_planar=True)
+    level = level_in_plane(
+        [(ring, path[0])],
+        trajectory=path,
+        config=LevelConfig(heading="start"),
+        axes=replace(AXES["lidar-2d"], floor_world=np.array([[0.0, 0.0, footprint_m]])),
+        resolution_m=0.05,
+    )
+    assert level.T_level_world[2, 3] + 0.22 == pytest.approx(layer_m + 0.05 / 3.0)
 
 
 def test_the_same_log_gives_the_same_frame_to_the_bit():
