@@ -33,6 +33,7 @@ from mapper.sources.base import FrameRef, Log, Skipped
 from mapper.sources.depth_outlines import outline_warnings
 from mapper.sources.depth_scale import depth_warnings, read_spread, why_no_depth
 from mapper.sources.image_order import time_warnings
+from mapper.sources.merged_scans import with_merged_scans
 from mapper.sources.reading_checks import ReadingChecks
 from mapper.sources.scan_frame import scan_frame_warnings
 
@@ -110,7 +111,8 @@ def track_log(
         ConfigError: The odometry needs wheels or poses and there are none, or the loops need feature counts.
     """
     start = start or first_session(source, config)
-    odometry, checks = start.odometry, ReadingChecks(source)
+    read = with_merged_scans(source) if config.source.topics.others == "tracked" else source
+    odometry, checks = start.odometry, ReadingChecks(read)
     known: Sequence[FrameCheckpoint] = ()
     if checkpoints is not None:
         state = checkpoints.restore(odometry, checks)

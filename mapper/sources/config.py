@@ -74,9 +74,10 @@ class TopicsConfig(Config):
     """True poses (Odometry, PoseStamped, TransformStamped); None is /ground_truth, if there is one."""
     wheels: str | None = None
     """Wheel odometry (Odometry, PoseStamped, TransformStamped); None is /wheel_odometry, if there is one."""
-    others: Literal["fused", "unused"] = "fused"
+    others: Literal["tracked", "fused", "unused"] = "fused"
     """Whether other LiDARs and the RGB-D camera beside the sensor that is tracked are fused into the maps, at
-    the poses of its path, where tf says how they are mounted."""
+    the poses of its path, where tf says how they are mounted. "tracked" also merges the scans of 3D LiDARs
+    into those of the tracked one, for tracking: for narrow views, in directions of their own."""
 
 
 class WheelsConfig(Config):

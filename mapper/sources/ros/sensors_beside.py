@@ -46,9 +46,9 @@ def sensors_beside(
             continue
         taken_ns = [tracked.stamps_ns, *(sensor.log.stamps_ns for sensor in found)]
         found.append(SensorBeside(_log(reader, name, frames, np.concatenate(taken_ns)), T_body_sensor))
-        sentences.append(
-            f"{name}: fused too, at the poses of the path; source.topics.others=unused leaves it out"
-        )
+        is_tracked = config.topics.others == "tracked" and tracked.sensor == frames.sensor == "lidar"
+        how = "tracked with the others, and fused" if is_tracked else "fused too, at the poses of the path"
+        sentences.append(f"{name}: {how}; source.topics.others=unused leaves it out")
         sentences += frames.notes
     return found, sentences
 

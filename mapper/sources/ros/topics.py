@@ -211,7 +211,7 @@ def choose(
         used, image_reason = [color, depth, points], "one camera is mapped"
         beside += _clouds_beside(pick.all(CLOUDS), firsts, tracked=[camera.color, camera.depth])
         if points is not None:
-            what = "there are" if points in beside and config.others == "fused" else "not used are the"
+            what = "there are" if points in beside and config.others != "unused" else "not used are the"
             choices.append(
                 f"{what} point clouds {points.topic.name}: to track those, "
                 f"source.topics.points={points.topic.name}"

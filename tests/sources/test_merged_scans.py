@@ -1,0 +1,109 @@
+"""Scans of several LiDARs that are tracked as one."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from mapper.config.loading import load_config
+from mapper.core.errors import FrameError
+from mapper.core.frames import Scan
+from mapper.core.geometry import apply, inverse, rotation_exp, transform
+from mapper.evaluators.metrics.trajectory_errors import ate_rmse_m
+from mapper.pipeline.track import track_log
+from mapper.runtime.progress import SILENT
+from mapper.simulation.config import LidarSensorConfig, LidarSynthConfig
+from mapper.simulation.lidar import LidarSimulator
+from mapper.sources.base import SensorBeside, WrappedEntry
+from mapper.sources.merged_scans import with_merged_scans
+from tests.support.logs import MemoryEntry, log_in_memory
+
+MS = 1_000_000
+T_BODY_REAR = transform(rotation_exp(np.array([0.0, 0.0, np.pi])), np.array([-1.0, 0.0, 0.0]))
+
+
+def scans(*stamps_ms, times_s=None):
+    """A log of scans of two points, whose x is the scan's time in milliseconds."""
+    entries = []
+    for at in stamps_ms:
+        points = np.array([[at, 0.0, 0.0], [at, 1.0, 0.0]], np.float32)
+        times = None if times_s is None else np.array(times_s, np.float32)
+        entries.append(MemoryEntry(at * MS, Scan(at * MS, points, times_s=times)))
+    return log_in_memory(entries, sensor="lidar")
+
+
+def merged(log, *others):
+    return with_merged_scans(replace(log, beside=[SensorBeside(one, T_BODY_REAR) for one in others]))
+
+
+def test_points_are_moved_to_the_body_and_keep_their_times():
+    both = merged(scans(0, 100, times_s=(0.0, 0.1)), scans(30, 130, times_s=(-0.1, 0.0))).entry_at(1).load()
+    assert both.stamp_ns == 100 * MS
+    assert both.points_body == pytest.approx(
+        np.array([[100.0, 0.0, 0.0], [100.0, 1.0, 0.0], [-131.0, 0.0, 0.0], [-131.0, -1.0, 0.0]]), abs=1e-4
+    )
+    assert both.times_s == pytest.approx([0.0, 0.1, -0.07, 0.03], abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("others_ms", "taken_ms"),
+    [
+        ([10, 60, 110, 160], [10, 110]),  # twice as fast: the nearest
+        ([90], [None, 90]),
+        ([151, 300], [None, None]),  # too far away
+        ([45, 55], [45, 55]),
+    ],
+)
+def test_each_scan_is_in_the_nearest_alone(others_ms, taken_ms):
+    log = merged(scans(0, 100), scans(*others_ms))
+    taken = [frame.points_body[2:, 0] for frame in log]
+    assert [None if not len(x) else round(-x[0] - 1.0) for x in taken] == taken_ms
+
+
+def test_three_sensors_and_a_scan_that_cannot_be_read():
+    damaged = log_in_memory(
+        [MemoryEntry(0, FrameError("damaged")), *map(scans(100).entry_at, [0])], sensor="lidar"
+    )
+    log = merged(scans(0, 100), scans(0, 100), damaged)
+    assert [len(frame.points_body) for frame in log] == [4, 6]
+
+
+@pytest.mark.parametrize("facts", [{"sensor": "rgbd"}, {"sensor": "lidar-2d"}, {"beside": []}])
+def test_other_logs_stay_as_they_are(facts):
+    log = replace(scans(0, 100), **({"beside": [SensorBeside(scans(0), np.eye(4))]} | facts))
+    assert with_merged_scans(log) is log
+
+
+@dataclass(frozen=True, slots=True)
+class View(WrappedEntry):
+    """The part of a scan that a LiDAR with a view of 70° sees, in the frame of that LiDAR."""
+
+    T_body_sensor: np.ndarray
+
+    def load(self, *, colour=True):
+        scan = self.entry.load(colour=colour)
+        points = apply(inverse(self.T_body_sensor), scan.points_body.astype(np.float64)).astype(np.float32)
+        azimuth_rad = np.arctan2(points[:, 1], points[:, 0])
+        return replace(scan, points_body=points).select(np.abs(azimuth_rad) < np.radians(35.0))
+
+    def scan(self):
+        return self.load()
+
+
+def test_two_narrow_views_track_better_than_one():
+    sensor = LidarSensorConfig(rings=24, azimuth_steps=600)
+    whole = LidarSimulator(LidarSynthConfig(seed=6, loop_m=60.0, duration_s=6.0, sensor=sensor)).log()
+    front, rear = (
+        replace(whole, entry_at=lambda index, T=T: View(whole.entry_at(index), T))
+        for T in (np.eye(4), T_BODY_REAR)
+    )
+    log = replace(front, beside=[SensorBeside(rear, T_BODY_REAR)])
+
+    def error_m(others):
+        config = load_config(None, [f"source.topics.others={others}", "loops.kind=none"], sensor="lidar")
+        tracked = track_log(log, config, progress=SILENT).tracked_trajectory()
+        return ate_rmse_m(tracked, log.truth), len(tracked)
+
+    (both_m, both), (front_m, alone) = error_m("tracked"), error_m("fused")
+    assert both == len(log) > alone
+    assert both_m < 0.7 * front_m
