@@ -21,6 +21,7 @@ from tests.support.stereo_rig import (
     RECTIFIED,
     SIZE_PX,
     T_IMU_LEFT,
+    camera_chain,
     poses_world,
     projections,
     recorded,
@@ -169,6 +170,25 @@ def test_tf_says_where_the_right_camera_is(tmp_path):
     assert_shows_wall(open_source(write(tmp_path / "with.mcap", [place, *messages])), poses_world(2))
     with pytest.raises(SourceError, match="tf"):
         open_source(write(tmp_path / "without.mcap", messages))
+
+
+@pytest.mark.parametrize(
+    ("cameras", "has_imu", "topics"),
+    [
+        (BARREL, True, ("/cam0", "/cam1")),
+        (FISHEYE, False, ("/cam0", "/cam1")),
+        (BARREL, False, ("/other0", "/other1")),  # recorded under other names: by the order of the file
+        (BARREL, True, ("/cam1", "/cam0")),
+    ],
+)
+def test_kalibrs_file_describes_the_cameras_of_a_recording(tmp_path, cameras, has_imu, topics):
+    names = ("/cam0/image_raw", "/cam1/image_raw")
+    messages = recorded(cameras, names, projections=projections(0.1))
+    write(tmp_path / "a.bag", [one for one in messages if one.topic in names])
+    described = cameras[::-1] if topics == ("/cam1", "/cam0") else cameras
+    (tmp_path / "my-camchain-imucam.yaml").write_text(camera_chain(described, has_imu=has_imu, topics=topics))
+    log = open_source(tmp_path / "a.bag")
+    assert_shows_wall(log, [T @ turned_by_rectifying(cameras) for T in poses_world(2)])
 
 
 def test_what_is_missing_or_swapped_is_named(tmp_path):

@@ -103,7 +103,6 @@ def write_euroc(
     """Write a folder in EuRoC's layout; the cameras are described as by EuRoC or by Kalibr."""
     stamps_ns = [FIRST_NS + k * PERIOD_NS for k in range(count)]
     lists = "".join(f"{stamp_ns},{stamp_ns}.png\r\n" for stamp_ns in stamps_ns)
-    chain = ""
     for k, camera in enumerate(cameras):
         place = folder / "mav0" / f"cam{k}"
         (place / "data").mkdir(parents=True)
@@ -113,12 +112,6 @@ def write_euroc(
         T_imu_camera = T_IMU_LEFT @ camera.T_left_camera
         K = [float(camera.matrix[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2))]
         if kalibr:
-            rows = "".join(f"  - {row}\n" for row in inverse(T_imu_camera).tolist())
-            chain += (
-                f"cam{k}:\n  T_cam_imu:\n{rows}  camera_model: pinhole\n"
-                f"  distortion_coeffs: {list(camera.distortion)}\n  distortion_model: equidistant\n"
-                f"  intrinsics: {K}\n  resolution: {list(SIZE_PX)}\n  rostopic: /cam{k}/image_raw\n"
-            )
             continue
         (place / "sensor.yaml").write_text(
             "#General sensor definitions.\nsensor_type: camera\ncomment: VI-Sensor cam (MT9M034)\n\n"
@@ -129,7 +122,7 @@ def write_euroc(
         )
     if kalibr:
         (folder / "dso").mkdir()
-        (folder / "dso" / "camchain.yaml").write_text(chain)
+        (folder / "dso" / "camchain.yaml").write_text(camera_chain(cameras))
     truth = folder / "mav0" / "state_groundtruth_estimate0"
     truth.mkdir()
     lines = [
@@ -140,6 +133,26 @@ def write_euroc(
         lines.append(f"{stamp_ns},{x},{y},{z},{qw},{qx},{qy},{qz}")
     (truth / "data.csv").write_text("\n".join(lines) + "\n")
     return folder
+
+
+def camera_chain(
+    cameras: tuple[RigCamera, ...], *, has_imu: bool = True, topics: tuple[str, ...] = ("/cam0", "/cam1")
+) -> str:
+    """Return the text of Kalibr's camchain.yaml, with poses of the IMU or of the camera before."""
+    text = ""
+    for k, camera in enumerate(cameras):
+        T_before_camera = inverse(cameras[max(k - 1, 0)].T_left_camera) @ camera.T_left_camera
+        T = inverse(T_IMU_LEFT @ camera.T_left_camera if has_imu else T_before_camera)
+        rows = "".join(f"  - {row}\n" for row in T.tolist())
+        pose = f"  {'T_cam_imu' if has_imu else 'T_cn_cnm1'}:\n{rows}" if has_imu or k else ""
+        model = "equidistant" if camera.is_fisheye else "radtan"
+        text += (
+            f"cam{k}:\n{pose}  cam_overlaps: [{1 - k}]\n  camera_model: pinhole\n"
+            f"  distortion_coeffs: {list(camera.distortion)}\n  distortion_model: {model}\n"
+            f"  intrinsics: {[float(camera.matrix[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2))]}\n"
+            f"  resolution: {list(SIZE_PX)}\n  rostopic: {topics[k]}/image_raw\n"
+        )
+    return text
 
 
 def write_imu(folder: Path, count: int) -> None:

@@ -4,9 +4,8 @@
 by ``sensor.yaml`` in each or by Kalibr's ``*camchain*.yaml``.
 """
 
-import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -15,10 +14,8 @@ import numpy as np
 from mapper.core.errors import SourceError
 from mapper.core.geometry import Transform, inverse
 from mapper.core.trajectory import Trajectory
-from mapper.runtime.regular_files import read_text
 from mapper.sources.base import Accelerations, Log
-from mapper.sources.calibration import Calibration
-from mapper.sources.calibration_file import read_yaml
+from mapper.sources.camera_chain import UnitCamera, chain_beside, read_sensor_yaml
 from mapper.sources.config import SourceConfig
 from mapper.sources.image_files.reading import read_view
 from mapper.sources.image_folders.pairing import ImageList, pair_images
@@ -26,13 +23,10 @@ from mapper.sources.image_folders.rgbd import FramePair, first_size, rgbd_log
 from mapper.sources.imu_files import read_euroc_imu
 from mapper.sources.listed_files import within
 from mapper.sources.stereo import StereoCamera, rectify, refuse_settings
-from mapper.sources.text import parse_stamp, pose_from_matrix, rows, time_order
+from mapper.sources.text import parse_stamp, rows, time_order
 from mapper.sources.trajectory_files import read_tum
 
 _TRUTH = ("state_groundtruth_estimate0", "mocap0")
-_CAMERA_SECTION = re.compile(r"^cam(\d):[ \t]*\n((?:[ \t]+.*\n?|\s*\n)+)", re.MULTILINE)
-_POSES = {"T_BS": False, "T_cam_imu": True}
-"""Keys of a camera's pose in the unit's body, and whether it is the inverse."""
 
 
 def recognise(path: Path) -> bool:
@@ -107,9 +101,10 @@ def _euroc_log(path: Path, folder: Path, config: SourceConfig) -> Log:
         raise SourceError(
             f"{folder / 'cam0'}: none of {len(left.paths)} images can be read; the first: {reason}"
         )
-    (left_camera, T_imu_left), (right_camera, T_imu_right) = _euroc_cameras(path, folder)
-    camera = rectify(left_camera, right_camera, inverse(T_imu_left) @ T_imu_right, size_px)
-    T_imu_body = T_imu_left @ camera.T_left_rectified
+    left_camera, right_camera = _euroc_cameras(path, folder)
+    T_left_right = inverse(left_camera.T_unit_camera) @ right_camera.T_unit_camera
+    camera = rectify(left_camera.calibration, right_camera.calibration, T_left_right, size_px)
+    T_imu_body = left_camera.T_unit_camera @ camera.T_left_rectified
     truth, truth_notes = _euroc_truth(folder, T_imu_body)
     log = stereo_log(
         left, right, camera, config, path=path, kind="euroc", truth=(truth, truth_notes), notes=notes
@@ -145,45 +140,15 @@ def _listed(folder: Path, notes: list[str]) -> ImageList:
     return ImageList(stamps[order], [paths[i] for i in order])
 
 
-@dataclass(frozen=True, slots=True)
-class _Described:
-    """Text that describes a camera, and its place for messages."""
-
-    text: str
-    where: str
-
-
-def _euroc_cameras(path: Path, folder: Path) -> list[tuple[Calibration, Transform]]:
+def _euroc_cameras(path: Path, folder: Path) -> list[UnitCamera]:
     """Return both cameras and their poses in the body of the recording unit."""
     files = [folder / f"cam{k}" / "sensor.yaml" for k in (0, 1)]
     if all(file.is_file() for file in files):
-        described = [_Described(read_text(file, error=SourceError), f"{file}") for file in files]
-    else:
-        chains = [found for place in dict.fromkeys((path, folder, path / "dso")) for found in _chains(place)]
-        if not chains:
-            raise SourceError(f"{path}: no cam0/sensor.yaml and cam1/sensor.yaml, and no *camchain*.yaml")
-        sections = dict(_CAMERA_SECTION.findall(read_text(chains[0], error=SourceError)))
-        if not {"0", "1"} <= sections.keys():
-            raise SourceError(f"{chains[0]}: want cameras cam0 and cam1")
-        described = [_Described(sections[k], f"{chains[0]}: cam{k}") for k in ("0", "1")]
-    return [(read_yaml(one.text, one.where), _pose_in_unit(one)) for one in described]
-
-
-def _chains(folder: Path) -> list[Path]:
-    return sorted(path for path in folder.glob("*camchain*.yaml") if path.is_file())
-
-
-def _pose_in_unit(described: _Described) -> Transform:
-    for key, is_inverse in _POSES.items():
-        _, found, rest = described.text.partition(f"{key}:")
-        if not found:
-            continue
-        numbers = re.findall(r"[-+]?\d+\.?\d*(?:[eE][-+]?\d+)?", re.sub(r"(?:cols|rows):\s*\d+", "", rest))
-        T = pose_from_matrix(np.array(numbers[:16], np.float64).reshape(4, 4)) if len(numbers) >= 16 else None
-        if T is None:
-            raise SourceError(f"{described.where}: {key} is no rigid motion of 16 numbers")
-        return inverse(T) if is_inverse else T
-    raise SourceError(f"{described.where}: want the camera's pose, {' or '.join(_POSES)}")
+        return [read_sensor_yaml(file) for file in files]
+    cameras = chain_beside(path, folder, path / "dso")
+    if not cameras:
+        raise SourceError(f"{path}: no cam0/sensor.yaml and cam1/sensor.yaml, and no *camchain*.yaml")
+    return cameras[:2]
 
 
 def _euroc_truth(folder: Path, T_imu_body: Transform) -> tuple[Trajectory | None, list[str]]:

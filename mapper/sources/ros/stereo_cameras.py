@@ -1,9 +1,10 @@
-"""Stereo cameras of a recording, by their calibrations and tf."""
+"""Stereo cameras of a recording, by their calibrations and tf, or by Kalibr's file beside it."""
 
 import numpy as np
 
 from mapper.core.errors import SourceError
-from mapper.core.geometry import Array, nearest_rotation, transform
+from mapper.core.geometry import Array, inverse, nearest_rotation, transform
+from mapper.sources.camera_chain import UnitCamera, chain_beside
 from mapper.sources.image_files.image_sizes import Size
 from mapper.sources.ros.cameras import calibration_of
 from mapper.sources.ros.message_index import Series
@@ -18,18 +19,22 @@ def stereo_camera(reader: RecordingReader, topics: StereoTopics, *, size_px: Siz
     """Return the camera of a pair's frames: the rectified left one.
 
     The right camera's place is that of its projection (CameraInfo's P), or else of tf. Images of a topic
-    without "rect" in its name are raw, and are rectified.
+    without "rect" in its name are raw, and are rectified. Without CameraInfo, Kalibr's file counts.
 
     Raises:
         SourceError: A camera or its place is unknown, or the cameras do not lie side by side.
     """
     where, name = reader.recording.path, topics.left.topic.name
+    if topics.left_info is None and (chain := _chain_of(reader, topics)) is not None:
+        left_unit, right_unit = chain
+        T_left_right = inverse(left_unit.T_unit_camera) @ right_unit.T_unit_camera
+        return rectify(left_unit.calibration, right_unit.calibration, T_left_right, size_px)
     left, right = (_info(reader, one) for one in (topics.left_info, topics.right_info))
     if left is None or right is None or topics.left_info is None or topics.right_info is None:
         missing = topics.left if left is None else topics.right
         raise SourceError(
             f"{where}: stereo images {name} and {topics.right.topic.name}: no camera info for "
-            f"{missing.topic.name}; record both, or depth images"
+            f"{missing.topic.name}; record both, or put Kalibr's camchain.yaml beside the recording"
         )
     is_rectified = is_called_rectified(name)
     left_camera, right_camera = (
@@ -55,6 +60,17 @@ def stereo_camera(reader: RecordingReader, topics: StereoTopics, *, size_px: Siz
     else:
         T_left_right = of_tf
     return rectify(left_camera, right_camera, T_left_right, size_px)
+
+
+def _chain_of(reader: RecordingReader, topics: StereoTopics) -> tuple[UnitCamera, UnitCamera] | None:
+    """Return both cameras by Kalibr's file beside the recording, by its topics or else its order."""
+    path = reader.recording.path
+    cameras = chain_beside(path if path.is_dir() else path.parent)
+    if not cameras:
+        return None
+    by_topic = {camera.topic: camera for camera in cameras}
+    left, right = (by_topic.get(one.topic.name) for one in (topics.left, topics.right))
+    return (cameras[0], cameras[1]) if left is None or right is None else (left, right)
 
 
 def _info(reader: RecordingReader, series: Series | None) -> CameraMessage | None:
