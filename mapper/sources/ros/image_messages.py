@@ -20,6 +20,7 @@ from mapper.sources.image_files.reading import (
     depth_m_from,
     valid_depth,
 )
+from mapper.sources.image_files.rvl import decode_rvl
 from mapper.sources.ros.messages import FileMessage, ImageMessage, PixelsMessage
 
 
@@ -173,17 +174,19 @@ def _is_float_tiff(message: FileMessage) -> bool:
 def _depth_m_of_file(
     message: FileMessage, *, units_per_m: float, float_units_per_m: float, where: str
 ) -> DepthImage:
-    """Decode a PNG or a TIFF.
+    """Decode a PNG, a TIFF or RVL.
 
     compressedDepth stores 32-bit depth as A / depth + B in 16 bits, with A and B in its header.
     """
-    if "compressedDepth" in message.format and "rvl" in message.format:
-        raise FrameError(f"{where}: depth compressed as RVL is not read; record it as PNG or raw")
     if "compressedDepth" in message.format and len(message.data) < DEPTH_HEADER.size:
         raise FrameError(f"{where}: compressedDepth of {len(message.data)} bytes")
-    file = bytes(_without_header(message))
-    _refuse_video(file, message.format, where=where)
-    units = decode_depth(file, where)
+    if "compressedDepth" in message.format and "rvl" in message.format:
+        file = bytes(message.data[DEPTH_HEADER.size :])
+        units: NDArray[Any] = decode_rvl(file, where)
+    else:
+        file = bytes(_without_header(message))
+        _refuse_video(file, message.format, where=where)
+        units = decode_depth(file, where)
     if units.dtype == np.float32:
         return valid_depth(units.astype(np.float32), float_units_per_m, where=where)
     if not message.format.startswith("32FC1") or len(file) == len(message.data):

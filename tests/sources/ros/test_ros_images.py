@@ -1,5 +1,6 @@
 import struct
 from dataclasses import replace
+from itertools import groupby
 
 import cv2
 import numpy as np
@@ -37,6 +38,29 @@ def file(data, format_):
 
 def encoded(array, ending):
     return cv2.imencode(ending, array)[1].tobytes()
+
+
+def rvl(units):
+    """RVL as its paper's code writes it: counts and differences in nibbles of three bits, eight to a word."""
+    nibbles, before, values = [], 0, units.ravel().tolist()
+
+    def write(number):
+        while number > 7:
+            nibbles.append(number & 7 | 8)
+            number >>= 3
+        nibbles.append(number)
+
+    for is_measured, run in groupby([0, *values] if values[0] else values, key=bool):
+        measured = list(run)
+        write(0 if values[0] and not is_measured and not nibbles else len(measured))
+        for value in measured if is_measured else ():
+            write(2 * (value - before) if value >= before else 2 * (before - value) - 1)
+            before = value
+    if not values[-1]:
+        write(0)
+    nibbles += [0] * (-len(nibbles) % 8)
+    words = [int("".join(f"{nibble:x}" for nibble in word), 16) for word in np.reshape(nibbles, (-1, 8))]
+    return struct.pack("<II", *units.shape[::-1]) + struct.pack(f"<{len(words)}I", *words)
 
 
 ALPHA = np.full((*RGB.shape[:2], 1), 255, np.uint8)
@@ -204,12 +228,31 @@ def test_what_is_no_image_is_refused(message, why):
         image_of(message, colour=True, where="m")
 
 
+NOISE = np.random.default_rng(0).integers(0, 65536, (48, 64)).astype(np.uint16)
+
+
+@pytest.mark.parametrize("units", [UNITS, np.zeros((48, 64), np.uint16), NOISE, np.maximum(NOISE, 1)])
+def test_rvl_has_the_units_of_png(units):
+    a, b = 120.0, -3.0
+    header = struct.pack("<iff", 0, a, b)
+    for kind in ("16UC1", "32FC1"):
+        as_png, as_rvl = (
+            depth_m_of(file(header + data, f"{kind}; compressedDepth {name}"), units_per_m=1000.0, where="m")
+            for name, data in (("png", encoded(units, ".png")), ("rvl", rvl(units)))
+        )
+        np.testing.assert_array_equal(as_png, as_rvl)
+
+
 @pytest.mark.parametrize(
     ("message", "why"),
     [
         (pixels(RGB, "rgb8"), "depth encoded as rgb8; known are 16UC1"),
         (file(bytes(4), "16UC1; compressedDepth png"), "compressedDepth of 4 bytes"),
-        (file(bytes(40), "16UC1; compressedDepth rvl"), "RVL is not read; record it as PNG or raw"),
+        (file(bytes(40), "16UC1; compressedDepth rvl"), "RVL of 0×0 px"),
+        (file(bytes(16), "16UC1; compressedDepth rvl"), "RVL of 4 bytes"),
+        (file(bytes(12) + rvl(UNITS)[:-40], "16UC1; compressedDepth rvl"), "64×48 px is damaged, from pixel"),
+        (file(bytes(12) + rvl(UNITS)[:8] + b"\xff" * 99, "16UC1; compressedDepth rvl"), "from pixel 0 on"),
+        (file(bytes(12) + b"\xff" * 99, "16UC1; compressedDepth rvl"), "want 1 to"),
         (file(b"\0\0\0\1\x40" + bytes(40), "h265"), "video is not read"),
         (file(encoded(GREY, ".png"), "16UC1; png"), "want one channel of 16 bits"),
     ],

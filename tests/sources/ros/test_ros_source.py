@@ -202,7 +202,7 @@ def only(topic):
                     for t in stamps(3)
                 ),
             ],
-            r"neither depth .*/cam/aligned_depth/image_raw/compressedDepth: .* RVL is not",
+            r"neither depth .*/cam/aligned_depth/image_raw/compressedDepth: RVL of 0",
         ),
         (
             [m._replace(cdr=m.cdr[:40]) if m.topic == COLOR else m for m in shots(3)],
