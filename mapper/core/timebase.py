@@ -12,6 +12,8 @@ from mapper.core.errors import DataError
 NS_PER_S = 1_000_000_000
 UNITS_PER_S = (1, 1_000, 1_000_000, NS_PER_S)
 """Seconds, milliseconds, microseconds and nanoseconds."""
+GPS_EPOCH_S = 315_964_800 - 18
+"""Unix time at which GPS time is 0, seconds: 1980-01-06, less the leap seconds that it has not had since."""
 LATEST_NS = 1 << 62
 """In the year 2116; differences of earlier stamps fit into 64 bits."""
 GAP_INTERVALS = 3.0

@@ -38,6 +38,7 @@ FORMATS = (
     "scan_folders.velodyne_pcap",
     "scan_folders.e57",
     "scan_folders.carmen",
+    "scan_folders.las_strips",
     "scan_folders.clouds",
 )
 """Modules, imported one after the other when a log is opened, until one recognises it."""

@@ -172,4 +172,5 @@ class SourceConfig(Config):
     count backwards, 0.1 for shares of sweeps of 0.1 s. The warning ``sweep`` reports which fits."""
     sweep_s: PositiveFloat | None = None
     """Duration of one turn of a spinning LiDAR whose points have no times: they get times by their azimuth
-    from the first point of the file, and are deskewed. The warning ``sweep`` reports it if scans are bent."""
+    from the first point of the file, and are deskewed. The warning ``sweep`` reports it if scans are bent. Of
+    a LAS strip, the duration of the sweeps that it is cut into; None is that of a turn, or 0.1 s."""

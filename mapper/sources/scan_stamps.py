@@ -1,7 +1,7 @@
 """Stamps of the clouds in a folder: by their names, by a list beside them, or by their numbers and a rate."""
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -56,6 +56,7 @@ def scan_stamps(
     beside: Path | None,
     rate_hz: float | None,
     wording: Wording = Wording(),
+    recorded: Callable[[], Stamps | None] = lambda: None,
 ) -> tuple[Stamps, list[str]]:
     """Return when each cloud was taken, nanoseconds, and a note where that is assumed.
 
@@ -65,6 +66,7 @@ def scan_stamps(
         beside: List of stamps found by its own name; it comes after them.
         rate_hz: Scans a second without any stamps; None is 10.
         wording: Words of the message, for files that are no clouds.
+        recorded: Returns the stamps that the files' own contents have, used where nothing else states any.
 
     Raises:
         SourceError: The list is malformed, or has not one stamp for every cloud.
@@ -75,6 +77,8 @@ def scan_stamps(
         return named, [UNPADDED_NOTE] if is_unpadded else []
     if listed := chosen or beside:
         return _listed(listed, files, wording), []
+    if rate_hz is None and (stamps_ns := recorded()) is not None:
+        return stamps_ns, []
     rate_hz = rate_hz or RATE_HZ
     numbers = numbers_of(files)
     step = 1 if numbers is None else int(np.gcd.reduce(numbers - numbers.min()))

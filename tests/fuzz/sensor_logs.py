@@ -8,6 +8,7 @@ import numpy as np
 from tests.support.driver_recordings import street, write_pcap, write_vlp16
 from tests.support.e57_files import fields as e57_fields
 from tests.support.e57_files import write as write_e57
+from tests.support.las_files import write_las
 from tests.support.ouster_packets import imu_packet, simulated, write_capture, write_recording
 from tests.support.planar_drives import Drive, Laser, drive, hall, write_carmen, write_ros
 from tests.support.recordings import write
@@ -61,6 +62,10 @@ def _e57(folder: Path) -> Path:
     return write_e57(folder / "log.e57", *(e57_fields(seed)[1] for seed in range(3)))
 
 
+def _las(folder: Path) -> Path:
+    return write_las(folder / "log.laz", street(azimuth_steps=30, duration_s=2.5).log())
+
+
 def _laser() -> Drive:
     walls, way = hall()
     return drive((walls, np.array([way[0], 0.9 * way[0] + 0.1 * way[1]])), Laser(beams=61))
@@ -77,6 +82,7 @@ SENSOR_LOGS: Mapping[str, Callable[[Path], Path]] = {
     "kitti, stereo": lambda folder: write_kitti(folder / "log"),
     "kitti, stereo drive": _kitti_drive,
     "e57": _e57,
+    "las": _las,
     "bag, laser": lambda folder: write_ros(folder / "log.bag", _laser()),
     "carmen": lambda folder: write_carmen(folder / "log.log", _laser()),
     "carmen, later": lambda folder: write_carmen(folder / "log.clf", _laser(), message="ROBOTLASER1"),

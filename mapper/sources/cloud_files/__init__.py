@@ -28,13 +28,20 @@ _READERS: Mapping[str, Callable[[Path], Columns]] = {
 ENDINGS = tuple(_READERS)
 
 
-def read_cloud(path: Path, *, scale: float | None = None, bin_columns: int | None = None) -> RawCloud:
+def read_cloud(
+    path: Path,
+    *,
+    scale: float | None = None,
+    bin_columns: int | None = None,
+    rows: tuple[int, int] | None = None,
+) -> RawCloud:
     """Return the cloud of a file, without missing returns.
 
     Args:
         path: A file; its ending determines the format.
         scale: Metres per unit of the file. None is 1, and refuses what looks like millimetres.
         bin_columns: Numbers of a record in a .bin file. None is KITTI's four, and refuses others.
+        rows: First point of a LAS file that is read, and the one after the last; None is the whole file.
 
     Raises:
         FrameError: The file cannot be read or is damaged, holds too few points, or its points are not in
@@ -47,6 +54,8 @@ def read_cloud(path: Path, *, scale: float | None = None, bin_columns: int | Non
         raise FrameError(f"{path}: not the ending of a cloud; want one of {' '.join(ENDINGS)}")
     try:
         size = path.stat().st_size
+        if rows is not None:
+            return cloud_from(read_las(path, rows), path=path, scale=scale)
         if size > MOST_BYTES:
             raise FrameError(f"{path}: {size} bytes, want {MOST_BYTES} at most; split it")
         return cloud_from(reader(path), path=path, scale=scale)

@@ -13,7 +13,7 @@ from mapper.core.errors import FrameError, SourceError
 from mapper.core.frames import Cloud, Scan
 from mapper.core.geometry import Transform
 from mapper.core.rotations import pose_of_row
-from mapper.core.timebase import NS_PER_S, Stamps
+from mapper.core.timebase import GPS_EPOCH_S, NS_PER_S, Stamps
 from mapper.runtime.atomic import atomic_file
 from mapper.runtime.extras import extra, require
 from mapper.sources.base import ImageFiles, Log
@@ -25,8 +25,6 @@ from mapper.sources.text import time_order, truth_from
 from mapper.sources.valid_returns import FARTHEST_M, valid_returns
 
 _EXTRA, _PURPOSE = "e57", "reading E57 files"
-_GPS_EPOCH_S, _LEAP_S = 315_964_800, 18
-"""Of the dates in a file: GPS time, whose epoch is 1980-01-06 and which has had no leap seconds since."""
 _XYZ = ("cartesianX", "cartesianY", "cartesianZ")
 _SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
 _RGB = ("colorRed", "colorGreen", "colorBlue")
@@ -150,7 +148,7 @@ def _stations(path: Path) -> list[_Station]:
         for index in range(file.scan_count):
             header = file.get_header(index)
             date = header["acquisitionStart"]["dateTimeValue"].value() if _has_date(header) else 0.0
-            stamp_ns = round((date + _GPS_EPOCH_S - _LEAP_S) * NS_PER_S) if date > 0.0 else None
+            stamp_ns = round((date + GPS_EPOCH_S) * NS_PER_S) if date > 0.0 else None
             T = None
             if header.has_pose():
                 w, x, y, z = header.rotation

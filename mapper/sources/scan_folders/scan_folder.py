@@ -2,15 +2,19 @@
 
 import os
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from fnmatch import fnmatch
 from pathlib import Path
 
-from mapper.core.errors import SourceError
+import numpy as np
+
+from mapper.core.errors import FrameError, SourceError
 from mapper.core.geometry import Transform, inverse, spread_indices
-from mapper.core.timebase import Stamps
+from mapper.core.timebase import NS_PER_S, Stamps
 from mapper.core.trajectory import Trajectory
 from mapper.sources.base import Log
 from mapper.sources.cloud_files import EMPTY, ENDINGS, why_no_points
+from mapper.sources.cloud_files.las import LAS_ENDINGS, first_time_s
 from mapper.sources.config import SourceConfig
 from mapper.sources.image_folders.tum import read_truth
 from mapper.sources.listed_files import refuse_links_out
@@ -101,7 +105,11 @@ def scan_log(
     """
     refuse_links_out(filter(None, [*files, stamps_file, truth_file]), log=path)
     stamps_ns, stamp_notes = scan_stamps(
-        files, chosen=_chosen(path, config.stamps_file), beside=stamps_file, rate_hz=config.rate_hz
+        files,
+        chosen=_chosen(path, config.stamps_file),
+        beside=stamps_file,
+        rate_hz=config.rate_hz,
+        recorded=lambda: _las_stamps(files),
     )
     truth, truth_notes = _read_truth(
         _chosen(path, config.truth_file) or truth_file, files, stamps_ns, T_posed_lidar
@@ -119,6 +127,24 @@ def scan_log(
         truth=truth,
         notes=[*notes, *stamp_notes, *order_notes, *truth_notes],
     )
+
+
+def _las_stamps(files: Sequence[Path]) -> Stamps | None:
+    """Return the time of each LAS file's first point; None of other files, and where they do not increase.
+
+    Files that cannot be read, which are told later, get times between those of their neighbours.
+    """
+    if any(path.suffix.lower() not in LAS_ENDINGS for path in files):
+        return None
+    times_s = np.full(len(files), np.nan)
+    for index, path in enumerate(files):
+        with suppress(FrameError):
+            times_s[index] = first_time_s(path)
+    known = np.flatnonzero(times_s >= 0.0)
+    if not len(known):
+        return None
+    times_s = np.interp(np.arange(len(files)), known, times_s[known])
+    return np.round(times_s * NS_PER_S).astype(np.int64) if (np.diff(times_s) > 0.0).all() else None
 
 
 def _by_ending(folder: Path) -> dict[str, list[Path]]:
