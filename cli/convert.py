@@ -101,6 +101,13 @@ def export(
             help="Frame of poses and points: the map, or the body (start) or base_link at its first pose."
         ),
     ] = "map",
+    poses_of: Annotated[
+        str | None,
+        typer.Option(
+            metavar="FRAME",
+            help="With --as tum, kitti: whose poses, base or a frame in the manifest.  [default: body]",
+        ),
+    ] = None,
     crop: Annotated[
         tuple[float, float, float, float, float, float] | None,
         typer.Option(metavar="X0 Y0 Z0 X1 Y1 Z1", help="Write what lies in this box of the map, metres."),
@@ -130,6 +137,7 @@ def export(
         out,
         settings=settings_of({"octomap.level": level}, set_),
         frame=frame,
+        poses_of=poses_of,
         box_m=crop,
         overwrite=overwrite,
         progress=output.progress(),

@@ -62,6 +62,7 @@ class Exporter:
         return found
 
 
+_TRAJECTORIES = ("tum", "kitti")
 _MESH_ENDINGS = (".ply", ".obj", ".glb", ".stl")
 _GRID = (".yaml", ".yml"), (".pgm", ".png")
 _Part = partial(Exporter, crops=True)
@@ -118,6 +119,7 @@ def export(
     *,
     settings: Mapping[str, Any] | None = None,
     frame: Frame = "map",
+    poses_of: str | None = None,
     box_m: Sequence[float] | None = None,
     overwrite: bool = False,
     progress: Progress = SILENT,
@@ -130,13 +132,15 @@ def export(
         out: The file; None keeps it in the run, under the name that this kind has there.
         settings: Values by dotted name that the kind reads, such as ``{"mesh.voxel_m": 0.01}``.
         frame: Frame of its poses and points.
+        poses_of: Of a trajectory whose poses it has: "base", or the name of a frame in the manifest; None is
+            the body.
         box_m: Lowest and highest corner of what is written, x y z x y z in the levelled world; None is all.
         overwrite: Replace what is at OUT.
         progress: Receives stages, counts and notes.
 
     Raises:
         ConfigError: No such kind, a name that does not end like one, settings that the kind does not read, or
-            a frame or box that it cannot have.
+            a frame, poses or a box that it cannot have.
         RunError: OUT is there already, or a file of the run is missing.
     """
     if kind not in EXPORTERS:
@@ -152,7 +156,7 @@ def export(
         config = overridden(run.config, settings=settings)
         _refuse_idle_settings(run, config, kind=kind)
         run = run.with_config(config)
-    whole, run = run, _part_of(run, kind, out, frame=frame, box_m=box_m)
+    whole, run = run, _part_of(run, kind, out, frame=frame, box_m=box_m, poses_of=poses_of)
     if out is None:
         if not exporter.file_name:
             raise ConfigError(f"{kind}: is a folder beside the run; name it with --out")
@@ -167,10 +171,18 @@ def export(
 
 
 def _part_of(
-    run: "MapFolder", kind: str, out: Path | None, *, frame: Frame, box_m: Sequence[float] | None
+    run: "MapFolder",
+    kind: str,
+    out: Path | None,
+    *,
+    frame: Frame,
+    box_m: Sequence[float] | None,
+    poses_of: str | None,
 ) -> "MapFolder":
-    if frame == "map" and box_m is None:
+    if frame == "map" and box_m is None and poses_of is None:
         return run
+    if poses_of is not None and kind not in _TRAJECTORIES:
+        raise ConfigError(f"{kind}: has no poses of {poses_of}; {', '.join(_TRAJECTORIES)} have")
     for given, name in ((frame != "map", "moves"), (box_m is not None, "crops")):
         if given and not getattr(EXPORTERS[kind], name):
             kinds = ", ".join(known for known, exporter in EXPORTERS.items() if getattr(exporter, name))
@@ -179,7 +191,7 @@ def _part_of(
         raise ConfigError(f"{kind}: the run keeps what is whole; name a file beside it with --out")
     from mapper.export.part_of_run import part_of
 
-    return part_of(run, frame, box_m)
+    return part_of(run, frame, box_m, poses_of)
 
 
 def _refuse_merged(run: "MapFolder", kind: str) -> None:

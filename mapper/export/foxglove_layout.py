@@ -5,8 +5,8 @@ from pathlib import Path
 import foxglove.layouts as fl
 
 from mapper.export.figures import ESTIMATE, PLAN, TRUTH, Rgb, hex_of
-from mapper.export.mcap_messages import WORLD
-from mapper.export.run_mcap import BODY
+from mapper.export.transforms import root_of
+from mapper.run import files
 from mapper.run.folder import Run
 from mapper.runtime.atomic import write_text
 from mapper.runtime.progress import Progress
@@ -20,11 +20,18 @@ _CURVES = (
 
 def layout(run: Run, path: Path, _progress: Progress) -> None:
     """Write the layout of a run: the map at the left, the images, the curves and the loops at the right."""
-    write_text(path, layout_json(voxel_m=run.config.octree.resolution_m) + "\n")
+    map_frame, body = root_of(run.file(files.MCAP))
+    write_text(path, layout_json(run.config.octree.resolution_m, map_frame=map_frame, body=body) + "\n")
 
 
-def layout_json(*, voxel_m: float) -> str:
-    """Return the layout as JSON, for a map whose voxels have this edge."""
+def layout_json(voxel_m: float, *, map_frame: str, body: str) -> str:
+    """Return the layout as JSON.
+
+    Args:
+        voxel_m: Edge of the map's voxels.
+        map_frame: Name of the levelled world.
+        body: Name of the frame that moves in it.
+    """
     right = fl.SplitContainer(
         direction="column",
         items=[
@@ -36,7 +43,7 @@ def layout_json(*, voxel_m: float) -> str:
     content = fl.SplitContainer(
         direction="row",
         items=[
-            fl.SplitItem(proportion=3, content=_map(voxel_m)),
+            fl.SplitItem(proportion=3, content=_map(voxel_m, map_frame, body)),
             fl.SplitItem(proportion=2, content=right),
         ],
     )
@@ -44,7 +51,7 @@ def layout_json(*, voxel_m: float) -> str:
     return text
 
 
-def _map(voxel_m: float) -> fl.ThreeDeePanel:
+def _map(voxel_m: float, map_frame: str, body: str) -> fl.ThreeDeePanel:
     hidden = fl.BaseRendererPointCloudTopicSettings(visible=False)
     topics = {
         "/map/octree": fl.BaseRendererPointCloudTopicSettings(
@@ -73,8 +80,8 @@ def _map(voxel_m: float) -> fl.ThreeDeePanel:
     return fl.ThreeDeePanel(
         title="map",
         config=fl.ThreeDeeConfig(
-            fixed_frame=WORLD,
-            follow_tf=BODY,
+            fixed_frame=map_frame,
+            follow_tf=body,
             follow_mode="follow-none",
             camera_state=fl.ThreeDeeCameraState(distance=12.0, phi=50.0, theta_offset=30.0, perspective=True),
             layers={"grid": fl.BaseRendererGridLayerSettings(visible=True, size=20.0, divisions=20.0)},

@@ -6,6 +6,7 @@ What each viewer makes of the topics (Foxglove's documentation; Rerun 0.41's imp
 topic                  schema                        Foxglove            Rerun
 =====================  ============================  ==================  ===========================
 /tf                    foxglove.FrameTransform       transform tree      Transform3D
+/tf_static             foxglove.FrameTransforms      transform tree      Transform3D
 /pose                  geometry_msgs/msg/            pose with an        a bare record
                        PoseWithCovarianceStamped     ellipsoid
 /camera/image          foxglove.CompressedImage      image               EncodedImage
@@ -63,20 +64,19 @@ from mapper.core.timebase import check_stamp
 from mapper.core.trajectory import Trajectory
 from mapper.export.figures import ESTIMATE, FACTORS, PLAN, Rgb
 from mapper.export.mcap_messages import (
+    MAP,
     OCCUPANCY_GRID,
     UNCERTAIN_POSE,
-    WORLD,
     Value,
     encode_occupancy_grid,
     encode_record,
     encode_uncertain_pose,
     lines_of,
     pose_of,
-    quaternion_of,
     record_definition,
     sample_segments,
     timestamp_of,
-    vector_of,
+    transform_of,
 )
 from mapper.graph.model import BetweenFactor
 from mapper.octree.grid import OccupancyGrid
@@ -127,17 +127,16 @@ class McapLog:
 
     def transform(self, stamp_ns: int, T_parent_child: Transform, *, parent: str, child: str) -> None:
         """Log the pose of a frame in its parent on /tf."""
-        self._publish(
-            "/tf",
-            messages.FrameTransform(
-                timestamp=timestamp_of(stamp_ns),
-                parent_frame_id=parent,
-                child_frame_id=child,
-                translation=vector_of(T_parent_child),
-                rotation=quaternion_of(T_parent_child),
-            ),
-            stamp_ns,
-        )
+        self._publish("/tf", transform_of(stamp_ns, T_parent_child, parent=parent, child=child), stamp_ns)
+
+    def static_transforms(self, stamp_ns: int, links: Iterable[tuple[str, str, Transform]]) -> None:
+        """Log (parent, child, T_parent_child) that hold from a stamp on, on /tf_static.
+
+        They are one message, since a viewer that jumps to a time reads the last message of a topic.
+        """
+        told = [transform_of(stamp_ns, T, parent=parent, child=child) for parent, child, T in links]
+        if told:
+            self._publish("/tf_static", messages.FrameTransforms(transforms=told), stamp_ns)
 
     def image(self, stamp_ns: int, jpeg: bytes, *, frame: str) -> None:
         """Log a JPEG on /camera/image, as :func:`mapper.mapping.thumbnails.encode_jpeg` makes it."""
@@ -204,7 +203,7 @@ class McapLog:
     def cloud(
         self, stamp_ns: int, points_world: NDArray[np.floating], *, colors: NDArray[np.uint8], name: str
     ) -> None:
-        """Log (N, 3) points in metres with (N, 3) RGB bytes on /map/NAME, in the world frame."""
+        """Log (N, 3) points in metres with (N, 3) RGB bytes on /map/NAME, in the map's frame."""
         if points_world.ndim != 2 or points_world.shape[1] != 3 or colors.shape != points_world.shape:
             raise DataError(
                 f"/map/{name}: points {points_world.shape} and colors {colors.shape}, want two of (N, 3)"
@@ -217,22 +216,27 @@ class McapLog:
         """Log (N, 3) points in metres with (N, 3) RGB bytes on /scan, in a frame that moves."""
         self._points("/scan", stamp_ns, points, colors, frame=frame)
 
-    def plan(self, stamp_ns: int, waypoints_world: Points) -> None:
+    def plan(self, stamp_ns: int, waypoints_world: Points, *, frame: str = MAP) -> None:
         """Log a planned path through (N, 3) points on /plan, and as dots below that.
 
         The poses have no rotation: a path has positions only.
+
+        Args:
+            stamp_ns: The messages' time.
+            waypoints_world: The points, metres.
+            frame: Name of the levelled world in the file.
         """
         T_world_waypoint = np.tile(np.eye(4), (len(waypoints_world), 1, 1))
         T_world_waypoint[:, :3, 3] = waypoints_world
-        self._path(_PLAN, stamp_ns, T_world_waypoint, PLAN)
+        self._path(_PLAN, stamp_ns, T_world_waypoint, PLAN, frame=frame)
 
-    def _path(self, topic: str, stamp_ns: int, T_world_path: Array, color: Rgb) -> None:
+    def _path(self, topic: str, stamp_ns: int, T_world_path: Array, color: Rgb, *, frame: str = MAP) -> None:
         """Log (N, 4, 4) poses on a topic, and the lines between them as dots below that."""
         poses = [pose_of(T) for T in T_world_path]
-        message = messages.PosesInFrame(timestamp=timestamp_of(stamp_ns), frame_id=WORLD, poses=poses)
+        message = messages.PosesInFrame(timestamp=timestamp_of(stamp_ns), frame_id=frame, poses=poses)
         self._publish(topic, message, stamp_ns)
         points = sample_segments(T_world_path[:-1, :3, 3], T_world_path[1:, :3, 3])
-        self._points(f"{topic}{_DOTS}", stamp_ns, points, np.array(color, np.uint8))
+        self._points(f"{topic}{_DOTS}", stamp_ns, points, np.array(color, np.uint8), frame=frame)
 
     def copy(self, path: Path, *, without: Container[str]) -> None:
         """Log every message of another MCAP file, in its order, except those on some topics.
@@ -279,13 +283,13 @@ class McapLog:
     def grid(self, stamp_ns: int, grid: OccupancyGrid, *, name: str = "slice") -> None:
         """Log a 2D grid on /map/NAME, in the world's z = 0 plane."""
         check_stamp(stamp_ns)
-        data = encode_occupancy_grid(grid, stamp_ns=stamp_ns, frame_id=WORLD)
+        data = encode_occupancy_grid(grid, stamp_ns=stamp_ns, frame_id=MAP)
         self._publish_ros(f"/map/{name}", OCCUPANCY_GRID, data, stamp_ns)
 
     def pose(self, stamp_ns: int, T_world_body: Transform, covariance: Array) -> None:
         """Log a pose with its (6, 6) covariance in the body's tangent (rotation, translation) on /pose."""
         check_stamp(stamp_ns)
-        data = encode_uncertain_pose(T_world_body, covariance, stamp_ns=stamp_ns, frame_id=WORLD)
+        data = encode_uncertain_pose(T_world_body, covariance, stamp_ns=stamp_ns, frame_id=MAP)
         self._publish_ros("/pose", UNCERTAIN_POSE, data, stamp_ns)
 
     def diagnostics(self, stamp_ns: int, record: Mapping[str, Value]) -> None:
@@ -327,7 +331,7 @@ class McapLog:
         points: NDArray[np.floating],
         colors: NDArray[np.uint8],
         *,
-        frame: str = WORLD,
+        frame: str = MAP,
     ) -> None:
         packed = np.empty(len(points), _POINT)
         packed["position"] = points

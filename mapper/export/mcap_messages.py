@@ -27,7 +27,8 @@ from mapper.sources.ros.typestore import (
 _DOT_SPACING_M = 0.01
 _MAX_DOTS = 100_000
 _LINE_WIDTH_PX = 2.0
-WORLD = "world"
+MAP = "map"
+"""Name of the levelled world (REP 105)."""
 
 
 def sample_segments(starts: Points, ends: Points) -> Points:
@@ -69,6 +70,19 @@ def pose_of(T: Transform) -> messages.Pose:
     return messages.Pose(position=vector_of(T), orientation=quaternion_of(T))
 
 
+def transform_of(
+    stamp_ns: int, T_parent_child: Transform, *, parent: str, child: str
+) -> messages.FrameTransform:
+    """Return the (4, 4) pose of a frame in its parent as Foxglove's transform."""
+    return messages.FrameTransform(
+        timestamp=timestamp_of(stamp_ns),
+        parent_frame_id=parent,
+        child_frame_id=child,
+        translation=vector_of(T_parent_child),
+        rotation=quaternion_of(T_parent_child),
+    )
+
+
 def lines_of(points: Points, color: Rgb, *, stamp_ns: int, name: str) -> messages.SceneEntity:
     """Return an entity of separate lines: points 2k and 2k + 1 are the ends of line k."""
     red, green, blue = (channel / 255.0 for channel in color)
@@ -80,7 +94,7 @@ def lines_of(points: Points, color: Rgb, *, stamp_ns: int, name: str) -> message
         points=[messages.Point3(x=x, y=y, z=z) for x, y, z in points.tolist()],
         color=messages.Color(r=red, g=green, b=blue, a=1.0),
     )
-    return messages.SceneEntity(timestamp=timestamp_of(stamp_ns), frame_id=WORLD, id=name, lines=[line])
+    return messages.SceneEntity(timestamp=timestamp_of(stamp_ns), frame_id=MAP, id=name, lines=[line])
 
 
 Value = int | float | str

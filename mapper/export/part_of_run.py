@@ -20,7 +20,7 @@ from mapper.octree.grid import OccupancyGrid
 from mapper.octree.map import OctreeMap
 from mapper.run.folder import Run
 from mapper.run.map_folder import MapFolder
-from mapper.run.stored_tracking import base_poses
+from mapper.run.stored_tracking import poses_of
 
 
 @dataclass(frozen=True, repr=False)
@@ -30,15 +30,18 @@ class PartOfRun(Run):
     Attributes:
         T_frame_map: (4, 4) pose of the levelled world in the frame; octree and grids stay in the world.
         region: What the maps are cropped to, in the levelled world; None leaves them whole.
+        poses_map: Poses of another frame on the robot than the body, in the levelled world.
     """
 
     T_frame_map: Transform = field(default_factory=lambda: np.eye(4))
     region: Region | None = None
+    poses_map: Trajectory | None = None
 
     @cached_property
     def trajectory(self) -> Trajectory:
         """Poses of all placed frames."""
-        return super().trajectory.moved(self.T_frame_map)
+        poses = super().trajectory if self.poses_map is None else self.poses_map
+        return poses.moved(self.T_frame_map)
 
     @cached_property
     def octree(self) -> OctreeMap:
@@ -99,18 +102,19 @@ class PartOfRun(Run):
         return replace(grid, cells=cells, origin_world_m=grid.origin_world_m + begin * grid.resolution_m)
 
 
-def part_of(run: MapFolder, frame: str, box_m: Sequence[float] | None) -> MapFolder:
+def part_of(run: MapFolder, frame: str, box_m: Sequence[float] | None, poses: str | None = None) -> MapFolder:
     """Return a run as an export takes it; the run itself if it is to be whole and in the levelled world.
 
     Args:
         run: The run.
         frame: Frame of poses and points: "map", or "start" or "base", the body or the base at its first pose.
         box_m: Lowest and highest corner, x y z x y z, in the levelled world; None crops nothing.
+        poses: Whose poses the trajectory has, as of ``poses_of``; None is the body.
 
     Raises:
         ConfigError: It is a merged map, no such frame, a run whose log has no base, or no box.
     """
-    if frame == "map" and box_m is None:
+    if frame == "map" and box_m is None and poses is None:
         return run
     if not isinstance(run, Run):
         raise ConfigError(f"{run.path}: a merged map is exported whole; crop or move its runs")
@@ -118,13 +122,11 @@ def part_of(run: MapFolder, frame: str, box_m: Sequence[float] | None) -> MapFol
         raise ConfigError(f"frame {frame!r}: want map, start or base")
     T_frame_map, manifest = np.eye(4), run.manifest
     if frame != "map":
-        poses = base_poses(run) if frame == "base" else run.trajectory
-        if not poses:
-            raise ConfigError(f"{run.path}: frame base: its log has no base_link; start is the sensor itself")
-        T_frame_map = inverse(poses[0])
+        T_frame_map = inverse(poses_of(run, "base" if frame == "base" else "body")[0])
         manifest = manifest.model_copy(update={"georeference": None})  # which is that of the levelled world
     region = None if box_m is None else checked_config({"box_m": (box_m[:3], box_m[3:])}, Region, "crop")
-    return PartOfRun(run.path, run.config, manifest, T_frame_map, region)
+    poses_map = None if poses is None else poses_of(run, poses)
+    return PartOfRun(run.path, run.config, manifest, T_frame_map, region, poses_map)
 
 
 def in_map(run: Run) -> Run:

@@ -10,6 +10,7 @@ from mapper.core.errors import RunError
 from mapper.core.geometry import Points
 from mapper.export.mcap_log import PLAN_TOPICS, McapLog
 from mapper.export.picture import write_path
+from mapper.export.transforms import root_of
 from mapper.navigation.planner import Plan, point_text
 from mapper.octree.grid import OccupancyGrid
 from mapper.run import files
@@ -36,7 +37,7 @@ def write_plan(run: Run, plan: Plan, *, grid: OccupancyGrid) -> None:
     with run.changing({files.PLAN, files.PLAN_VIEW, files.MCAP}):
         with McapLog(log_path) as log:
             log.copy(log_path, without=PLAN_TOPICS)
-            log.plan(stamp_ns, _in_space(plan))
+            log.plan(stamp_ns, _in_space(plan), frame=root_of(log_path)[0])
         draw_plan(run.path, plan, grid=grid)
 
 

@@ -6,17 +6,16 @@ from itertools import chain
 from pathlib import Path
 
 from mapper.core.frames import Cloud, Scan
-from mapper.core.geometry import Transform, stride_for
+from mapper.core.geometry import stride_for
 from mapper.export.export_folders import export_folder
-from mapper.export.mcap_messages import OCCUPANCY_GRID, encode_occupancy_grid
+from mapper.export.mcap_messages import MAP, OCCUPANCY_GRID, encode_occupancy_grid
 from mapper.export.run_maps import maps_of, snapshots_of
-from mapper.export.run_mcap import BODY, CAMERA
+from mapper.export.transforms import Transforms, transforms_of
 from mapper.mapping.cloud import MOST_TO_VIEW
 from mapper.mapping.fusion import Snapshot
 from mapper.octree.grid import OccupancyGrid
 from mapper.octree.octomap_file import bt_words
 from mapper.run.folder import Run
-from mapper.run.stored_tracking import base_in_body
 from mapper.runtime.progress import Progress
 from mapper.sources.ros.encode_ros import (
     SerializedMessage,
@@ -29,8 +28,6 @@ from mapper.sources.ros.encode_ros import (
 )
 from mapper.sources.ros.message_writers import rosbag2_writer
 
-MAP = "map"
-"""Name of the levelled world in ROS (REP 105)."""
 _NAME = "results"
 
 
@@ -42,30 +39,31 @@ def rosbag2(run: Run, path: Path, _progress: Progress) -> None:
     Raises:
         RunError: PATH holds something else, or a file of the run is missing.
     """
-    images = snapshots_of(run)
+    images, transforms = snapshots_of(run), transforms_of(run)
     first = next(images, None)
     with (
         export_folder(run, path, "rosbag2", files=("metadata.yaml", f"{_NAME}.mcap")) as folder,
         rosbag2_writer(folder, name=_NAME) as writer,
     ):
-        for message in _latched_messages(run, first):
+        for message in _latched_messages(run, transforms, first):
             writer.write(message._replace(is_latched=True))
-        timed = map(_image_messages, chain([first] if first else [], images))
-        for message in heapq.merge(
-            _pose_messages(run), chain.from_iterable(timed), key=lambda message: message.stamp_ns
-        ):
+        timed = (
+            _image_messages(image, transforms.camera_of(image))
+            for image in chain([first] if first else [], images)
+        )
+        poses = (transforms_message(stamp_ns, "/tf", links) for stamp_ns, links in transforms.moving)
+        for message in heapq.merge(poses, chain.from_iterable(timed), key=lambda message: message.stamp_ns):
             writer.write(message)
 
 
-def _latched_messages(run: Run, image: Snapshot | None) -> Iterator[SerializedMessage]:
-    begin_ns, maps, robot = int(run.trajectory.stamps_ns[0]), maps_of(run), run.manifest.input.robot_of_all
-    mounted: list[tuple[str, str, Transform]] = []
-    if robot is not None and robot.mounting is not None and robot.base != robot.body:
-        mounted.append((robot.base, robot.body, robot.mounting))
-    if image is not None:
-        mounted.append((BODY if robot is None else robot.body, CAMERA, image.T_body_camera))
-    if mounted:
-        yield transforms_message(begin_ns, "/tf_static", mounted)
+def _latched_messages(
+    run: Run, transforms: Transforms, image: Snapshot | None
+) -> Iterator[SerializedMessage]:
+    begin_ns, maps, static = int(run.trajectory.stamps_ns[0]), maps_of(run), [*transforms.static]
+    if image is not None and (camera := transforms.camera_of(image)) != transforms.body:
+        static.append((transforms.body, camera, image.T_body_camera))
+    if static:
+        yield transforms_message(begin_ns, "/tf_static", static)
     yield path_message(begin_ns, "/path", run.trajectory, frame=MAP)
     if (truth := run.results.truth) is not None:
         yield path_message(begin_ns, "/ground_truth", truth, frame=MAP)
@@ -93,20 +91,8 @@ def _cloud_message(stamp_ns: int, topic: str, cloud: Cloud) -> SerializedMessage
     return cloud_message(topic, scan, frame=MAP)
 
 
-def _pose_messages(run: Run) -> Iterator[SerializedMessage]:
-    robot, T_body_base = run.manifest.input.robot_of_all, dict(base_in_body(run).items())
-    poses, child = run.trajectory, BODY if robot is None else robot.body
-    if robot is not None and robot.mounting is not None:
-        poses, child = robot.trajectory_of_base(poses), robot.base
-    for stamp_ns, T_world_child in poses.items():
-        told = [(MAP, child, T_world_child)]
-        if robot is not None and stamp_ns in T_body_base:
-            told.append((robot.body, robot.base, T_body_base[stamp_ns]))
-        yield transforms_message(stamp_ns, "/tf", told)
-
-
-def _image_messages(image: Snapshot) -> Iterator[SerializedMessage]:
-    yield camera_info_message(image.stamp_ns, "/camera/camera_info", image.camera, frame=CAMERA)
+def _image_messages(image: Snapshot, frame: str) -> Iterator[SerializedMessage]:
+    yield camera_info_message(image.stamp_ns, "/camera/camera_info", image.camera, frame=frame)
     yield compressed_image_message(
-        image.stamp_ns, "/camera/image_raw/compressed", image.jpeg, format_="jpeg", frame=CAMERA
+        image.stamp_ns, "/camera/image_raw/compressed", image.jpeg, format_="jpeg", frame=frame
     )

@@ -8,8 +8,9 @@ import numpy as np
 
 from mapper.core.errors import DataError
 from mapper.core.frames import PinholeCamera
+from mapper.export.mcap_messages import MAP
 from mapper.export.part_of_run import part_of_cloud
-from mapper.export.run_mcap import BODY, CAMERA
+from mapper.export.transforms import CAMERA
 from mapper.mapping.config import edits_of
 from mapper.mapping.edits import MapEditor
 from mapper.mapping.fusion import Maps, Snapshot
@@ -20,9 +21,9 @@ from mapper.run import files
 from mapper.run.cloud import read_cloud
 from mapper.run.folder import Run
 from mapper.sources.ros.decode import decode
-from mapper.sources.ros.frame_tree import FrameTree
 from mapper.sources.ros.mcap_file import open_mcap
 from mapper.sources.ros.messages import CameraMessage, FileMessage
+from mapper.sources.text import pose_from_numbers
 
 
 def maps_of(run: Run) -> Maps:
@@ -90,7 +91,8 @@ def read_snapshots(path: Path) -> Iterator[Snapshot]:
             continue
         message = decode(topic, data)
         if isinstance(message, list):
-            T_found = FrameTree(message).find(BODY, CAMERA)
+            mounted = [told for told in message if told.child == CAMERA and told.parent != MAP]
+            T_found = pose_from_numbers(np.array(mounted[0].numbers)) if mounted else None
             T_body_camera = T_body_camera if T_found is None else T_found
         elif isinstance(message, CameraMessage):
             camera = _camera(message)

@@ -9,18 +9,15 @@ import numpy as np
 from mapper.core.doubts import doubts_text
 from mapper.export.figures import TRUTH
 from mapper.export.mcap_log import McapLog
-from mapper.export.mcap_messages import WORLD
+from mapper.export.transforms import Transforms
 from mapper.loops.closure import Discrepancy, LoopClosure
 from mapper.mapping.cloud import height_colors, thinned_to_view
 from mapper.mapping.fusion import Maps, ScanSnapshot, Snapshot
 from mapper.run.frame_outcomes import FrameRecord
 from mapper.run.results import RunResults
 
-BODY = "body"
-CAMERA = "camera"
 
-
-def log_results(log: McapLog, results: RunResults) -> None:
+def log_results(log: McapLog, results: RunResults, transforms: Transforms) -> None:
     """Log the transforms, diagnostics, trajectories and factors.
 
     What belongs to the whole log is logged at its first stamp, as :class:`McapLog` advises.
@@ -30,8 +27,10 @@ def log_results(log: McapLog, results: RunResults) -> None:
     if results.truth is not None:
         log.trajectory(begin_ns, results.truth, name="truth", color=TRUTH)
     log.factors(begin_ns, results.graph.factors, T_world_node=results.graph.T_world_node)
-    for stamp_ns, T_world_body in results.trajectory.items():
-        log.transform(stamp_ns, T_world_body, parent=WORLD, child=BODY)
+    log.static_transforms(begin_ns, transforms.static)
+    for stamp_ns, links in transforms.moving:
+        for parent, child, T_parent_child in links:
+            log.transform(stamp_ns, T_parent_child, parent=parent, child=child)
     poses = results.poses
     for (stamp_ns, T_world_body), covariance in zip(poses.trajectory.items(), poses.covariances, strict=True):
         if np.isfinite(covariance).all():
@@ -42,15 +41,18 @@ def log_results(log: McapLog, results: RunResults) -> None:
         log.loop(loop.stamp_j_ns, _loop_fields(loop))
 
 
-def log_snapshot(log: McapLog, snapshot: Snapshot | ScanSnapshot) -> None:
+def log_snapshot(log: McapLog, transforms: Transforms, snapshot: Snapshot | ScanSnapshot) -> None:
     """Log an image with its camera and where that sits on the body, or a scan by height."""
+    body = transforms.body
     if isinstance(snapshot, ScanSnapshot):
         points_body = snapshot.points_body
-        log.scan(snapshot.stamp_ns, points_body, colors=height_colors(points_body[:, 2]), frame=BODY)
+        log.scan(snapshot.stamp_ns, points_body, colors=height_colors(points_body[:, 2]), frame=body)
         return
-    log.transform(snapshot.stamp_ns, snapshot.T_body_camera, parent=BODY, child=CAMERA)
-    log.calibration(snapshot.stamp_ns, snapshot.camera, frame=CAMERA)
-    log.image(snapshot.stamp_ns, snapshot.jpeg, frame=CAMERA)
+    camera = transforms.camera_of(snapshot)
+    if camera != body:
+        log.transform(snapshot.stamp_ns, snapshot.T_body_camera, parent=body, child=camera)
+    log.calibration(snapshot.stamp_ns, snapshot.camera, frame=camera)
+    log.image(snapshot.stamp_ns, snapshot.jpeg, frame=camera)
 
 
 def log_maps(log: McapLog, maps: Maps, *, stamp_ns: int) -> None:

@@ -19,6 +19,7 @@ from mapper.export.mcap_log import McapLog
 from mapper.export.mesh_files import write_cloud
 from mapper.export.picture import write_summary
 from mapper.export.run_mcap import log_maps, log_results, log_snapshot
+from mapper.export.transforms import transforms_of
 from mapper.mapping.config import Edits
 from mapper.mapping.depth_noise_estimation import measure_noise
 from mapper.mapping.fusion import Maps, fuse_log
@@ -192,7 +193,8 @@ def fuse_into(
     Raises:
         DataError: The edits leave nothing of the map, or nothing in the height of the slice.
     """
-    results = Run(writer.folder, config, writer.manifest).results
+    run = Run(writer.folder, config, writer.manifest)
+    results, transforms = run.results, transforms_of(run)
     if not config.mcap.frame_times:
         results = replace(results, frame_ms={})
     make_writer = ScanUpdateWriter if checkpoints is None else partial(MarkedUpdates, checkpoints=checkpoints)
@@ -211,13 +213,13 @@ def fuse_into(
                 results.tracked,
                 settings,
                 progress=progress,
-                on_snapshot=lambda snapshot: log_snapshot(log, snapshot),
+                on_snapshot=partial(log_snapshot, log, transforms),
                 cached=known,
                 updates=updates,
                 edits=edits or Edits(),
             )
         with writer.clock.stage("write"):
-            log_results(log, results)
+            log_results(log, results, transforms)
             log_maps(log, maps, stamp_ns=int(results.trajectory.stamps_ns[0]))
             _write_maps(writer.folder, maps)
             _write_pictures(writer, maps, results, has_colors=source.has_colours)

@@ -201,6 +201,7 @@ class Run:
         *,
         settings: Mapping[str, Any] | None = None,
         frame: Literal["map", "start", "base"] = "map",
+        poses_of: str | None = None,
         crop: Sequence[float] | None = None,
         overwrite: bool = False,
         progress: "Progress | Callable[[str], object] | None" = None,
@@ -213,6 +214,8 @@ class Run:
             settings: Values by dotted name that this kind reads, such as ``{"mesh.voxel_m": 0.01}``.
             frame: Frame of poses and points: "map", or "start" or "base", the body or the robot's base at its
                 first pose.
+            poses_of: With "tum" and "kitti", whose poses: "base", or a frame that the manifest names; None is
+                the body.
             crop: Lowest and highest corner of what is written, x y z x y z, metres in the map; None is all.
             overwrite: Replace what is at PATH.
             progress: As for ``mapper.build``.
@@ -222,15 +225,9 @@ class Run:
                 this kind cannot have.
             RunError: PATH is there already, or a file or the log that the kind needs is missing.
         """
+        wanted = {"settings": settings, "frame": frame, "poses_of": poses_of, "box_m": crop}
         written: Path = import_module("mapper.api.runs").export(
-            self,
-            kind,
-            path,
-            settings=settings,
-            frame=frame,
-            box_m=crop,
-            overwrite=overwrite,
-            progress=progress,
+            self, kind, path, overwrite=overwrite, progress=progress, **wanted
         )
         return written
 

@@ -48,27 +48,51 @@ class GyroscopeFit(Config):
         return with_body_rates(log, self.calibration)
 
 
-class RobotFrames(Config):
-    """Coordinate frames of a robot in a log, and where its sensor is."""
+PoseNumbers = tuple[float, float, float, float, float, float, float]
+"""x y z (metres) qx qy qz qw."""
 
-    base: str
-    """Name of the robot's base, e.g. base_link."""
-    body: str
-    """Name of the frame whose poses are the run's trajectory."""
-    body_in_base: tuple[float, float, float, float, float, float, float] | None = None
-    """x y z (metres) qx qy qz qw; None where it moves there."""
+
+class SensorFrame(Config):
+    """Coordinate frame of a sensor that stays on the robot."""
+
+    name: str
+    parent: str
+    """The body's name, or the base's where the body moves on that."""
+    pose_in_parent: PoseNumbers
+
+    @property
+    def mounting(self) -> Transform:
+        """T_parent_sensor, (4, 4)."""
+        return pose_of_row(np.array(self.pose_in_parent))
+
+
+class RobotFrames(Config):
+    """Coordinate frames of a robot in a log, and where its sensors are."""
+
+    base: str = ""
+    """Name of the robot's base, e.g. base_link; empty where the log does not say where the body is on it."""
+    body: str = ""
+    """Name of the frame whose poses are the run's trajectory; empty where the log does not name it."""
+    body_in_base: PoseNumbers | None = None
+    """None where it moves there."""
+    sensors: tuple[SensorFrame, ...] = ()
 
     @classmethod
     def of(cls, log: Log) -> Self | None:
-        """Return those of a log; None where it does not say where the sensor is on the robot."""
-        if log.T_base_body is None and not log.T_body_base:
-            return None
+        """Return those of a log; None where it names none."""
         row = None if log.T_base_body is None else row_of_pose(log.T_base_body).tolist()
-        return cls(base=log.base_frame, body=log.body_frame, body_in_base=row)
+        base = log.base_frame if row or log.T_body_base else ""
+        sensors = tuple(
+            SensorFrame(name=s.frame, parent=s.parent, pose_in_parent=row_of_pose(s.T_parent_sensor).tolist())
+            for s in log.sensors
+            if s.parent in (log.body_frame, base)
+        )
+        found = cls(base=base, body=log.body_frame, body_in_base=row, sensors=sensors)
+        return None if found == cls() else found
 
     @property
     def mounting(self) -> Transform | None:
-        """T_base_body, (4, 4); None where the body moves on the base."""
+        """T_base_body, (4, 4); None where the body moves on the base, or its place there is not known."""
         return None if self.body_in_base is None else pose_of_row(np.array(self.body_in_base))
 
     def trajectory_of_base(self, trajectory: Trajectory, T_body_base: Trajectory = NO_POSES) -> Trajectory:
@@ -97,7 +121,7 @@ class InputLog(Config):
     images: tuple[str, ...] = ()
     """Names of the images beside a LiDAR, which colour the cloud."""
     robot: RobotFrames | None = None
-    """None where the log does not say where its sensor is on a robot."""
+    """None where the log names no coordinate frame."""
 
 
 class AppendedLog(InputLog):
@@ -120,8 +144,12 @@ class Input(InputLog):
 
     @property
     def robot_of_all(self) -> RobotFrames | None:
-        """The robot's frames where they are the same in all logs."""
-        return self.robot if all(log.robot == self.robot for log in self.appended) else None
+        """The robot's frames where base and body are the same in all logs, with the sensors of all."""
+        robots = [log.robot or RobotFrames() for log in (self, *self.appended)]
+        if self.robot is None or len({(one.base, one.body, one.body_in_base) for one in robots}) > 1:
+            return None
+        sensors = (one for one in self.robot.sensors if all(one in robot.sensors for robot in robots))
+        return self.robot.model_copy(update={"sensors": tuple(sensors)})
 
     @property
     def title(self) -> str:

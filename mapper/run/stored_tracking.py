@@ -5,8 +5,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from mapper.core.errors import ConfigError
 from mapper.core.geometry import inverse
-from mapper.core.trajectory import NO_POSES, Trajectory, trajectory_from
+from mapper.core.trajectory import NO_POSES, Trajectory, carried, trajectory_from
 from mapper.graph.g2o import write_g2o
 from mapper.graph.model import PoseGraph
 from mapper.loops.closure import LoopClosure, accepted_loops, write_closures
@@ -16,6 +17,7 @@ from mapper.run.folder import Run
 from mapper.run.frame_outcomes import FrameRecord, write_frame_ms, write_records
 from mapper.run.gnss_file import write_fixes
 from mapper.run.manifest import SkippedFrame
+from mapper.run.manifest_logs import RobotFrames
 from mapper.run.pose_covariances import uncertain_poses, write_poses
 from mapper.run.writer import RunWriter
 from mapper.sources.base import Skipped
@@ -84,18 +86,38 @@ class StoredTracking:
 
 def base_in_body(run: Run) -> Trajectory:
     """Return T_body_base of a run in whose log they move, at the stamps of ``base.tum``; else no poses."""
-    robot = run.manifest.input.robot_of_all
-    if robot is None or robot.mounting is not None or not (run.path / files.BASE).is_file():
+    robot = run.manifest.input.robot_of_all or RobotFrames()
+    if not robot.base or robot.mounting is not None or not (run.path / files.BASE).is_file():
         return NO_POSES
     T_world_body = dict(read_tum(run.file(files.TRAJECTORY)).items())
     base = read_tum(run.file(files.BASE))
     return trajectory_from((stamp_ns, inverse(T_world_body[stamp_ns]) @ T) for stamp_ns, T in base.items())
 
 
-def base_poses(run: Run) -> Trajectory:
-    """Return the poses of the robot's base for those of a run's trajectory, where its log tells them."""
-    robot = run.manifest.input.robot_of_all
-    return NO_POSES if robot is None else robot.trajectory_of_base(run.trajectory, base_in_body(run))
+def poses_of(run: Run, frame: str) -> Trajectory:
+    """Return the poses of a frame on the robot for those of a run's trajectory, where its log tells them.
+
+    Args:
+        run: The run.
+        frame: "body", "base", or a frame's name in the manifest.
+
+    Raises:
+        ConfigError: The log does not say where such a frame is.
+    """
+    robot = run.manifest.input.robot_of_all or RobotFrames()
+    if frame in ("base", robot.base):
+        poses = robot.trajectory_of_base(run.trajectory, base_in_body(run))
+        if poses:
+            return poses
+    if frame in ("body", robot.body):
+        return run.trajectory
+    for sensor in robot.sensors:
+        if sensor.name == frame:
+            return carried(poses_of(run, sensor.parent), sensor.mounting)
+    known = filter(None, (robot.body, robot.base, *(sensor.name for sensor in robot.sensors)))
+    raise ConfigError(
+        f"{run.path}: frame {frame}: its log does not say where that is; known: {', '.join(['body', *known])}"
+    )
 
 
 def load_tracking(run: Run) -> StoredTracking:

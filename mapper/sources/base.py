@@ -179,6 +179,21 @@ class SensorBeside:
     T_body_sensor: Transform
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class MountedSensor:
+    """Where a sensor is on the robot, by the log.
+
+    Attributes:
+        frame: Name of its coordinate frame.
+        parent: Name of the frame on which it stays: the body, or the base where the body moves on that.
+        T_parent_sensor: (4, 4) its pose there.
+    """
+
+    frame: str
+    parent: str
+    T_parent_sensor: Transform
+
+
 FOOTPRINT = "base_footprint"
 """Frame of a robot on the floor (REP 120)."""
 BASES = ("base_link", FOOTPRINT)
@@ -209,6 +224,7 @@ class Log:
         base_frame: Name of the robot's base in the log.
         base_height_m: Height of its origin above the floor, if the log states it.
         body_frame: Name of the body in the log.
+        sensors: Where its other sensors are on the robot, used or not.
         wheels: T_odom_body by wheel odometry, in a frame of its own that drifts, if the log has it.
         depth_noise: Noise of its depth, if what made it states it.
         are_units_assumed: Nothing says how many units of its depth images a metre has.
@@ -235,6 +251,7 @@ class Log:
     base_frame: str = ""
     base_height_m: float | None = None
     body_frame: str = ""
+    sensors: Sequence[MountedSensor] = ()
     wheels: Trajectory | None = None
     depth_noise: DepthNoiseConfig | None = None
     are_units_assumed: bool = False

@@ -95,6 +95,7 @@ def chained(first: Log, second: Log, *, shift_ns: int | None = None) -> Log:
         base_frame=logs[0].base_frame,
         base_height_m=logs[0].base_height_m,
         body_frame=logs[0].body_frame,
+        sensors=logs[0].sensors,
         choices=[f"{log.name}: {choice}" for log in logs for choice in log.choices],
         notes=notes,
         sessions=sessions,

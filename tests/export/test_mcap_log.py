@@ -53,6 +53,9 @@ COVARIANCE[0, 5] = COVARIANCE[5, 0] = 1e-3
 GRID = OccupancyGrid(np.array([[-1, 0, 100], [0, 0, -1]], np.int8), np.array([-1.5, 2.25]), resolution_m=0.05)
 
 
+T_CAMERA_LIDAR = exp(np.array([0.3, -0.2, 0.1]), np.array([0.1, 0.2, 0.3]))
+
+
 def write_run(path):
     trajectory = trajectory_of(FRAMES)
     noise = np.random.default_rng(0).integers(0, 256, (48, 64, 3), dtype=np.uint8)
@@ -62,11 +65,12 @@ def write_run(path):
     with McapLog(path) as log:
         for i, (stamp, T) in enumerate(zip(trajectory.stamps_ns, trajectory.T_world_body, strict=True)):
             stamp_ns = int(stamp)
-            log.transform(stamp_ns, T, parent="world", child="camera")
+            log.transform(stamp_ns, T, parent="map", child="camera")
             log.image(stamp_ns, encode_jpeg(image, width_px=320), frame="camera")
             log.calibration(stamp_ns, shrunk_camera(CAMERA, width_px=320), frame="camera")
             log.diagnostics(stamp_ns, record_of(i))
             log.pose(stamp_ns, T, COVARIANCE)
+        log.static_transforms(FIRST_NS, [("camera", "lidar", T_CAMERA_LIDAR), ("camera", "imu", np.eye(4))])
         log.trajectory(FIRST_NS, trajectory, name="estimate")
         log.factors(FIRST_NS, factors_of(trajectory), T_world_node=dict(enumerate(trajectory.T_world_body)))
         log.cloud(FIRST_NS, points, colors=colors, name="octree")
@@ -126,8 +130,18 @@ def test_transforms_carry_the_poses_and_the_exact_stamps(run):
         messages_on(path, "/tf"), trajectory.stamps_ns, trajectory.T_world_body, strict=True
     ):
         assert log_ns == message.timestamp.seconds * 10**9 + message.timestamp.nanos == stamp_ns
-        assert (message.parent_frame_id, message.child_frame_id) == ("world", "camera")
+        assert (message.parent_frame_id, message.child_frame_id) == ("map", "camera")
         np.testing.assert_allclose(matrix_of(message.translation, message.rotation), T, atol=1e-12)
+
+
+def test_transforms_that_stay_are_one_message(run):
+    path, *_ = run
+    [(log_ns, message)] = messages_on(path, "/tf_static")
+    assert log_ns == FIRST_NS
+    told = {(one.parent_frame_id, one.child_frame_id): one for one in message.transforms}
+    assert told.keys() == {("camera", "lidar"), ("camera", "imu")}
+    lidar = told["camera", "lidar"]
+    np.testing.assert_allclose(matrix_of(lidar.translation, lidar.rotation), T_CAMERA_LIDAR, atol=1e-12)
 
 
 def test_trajectory_holds_every_pose_and_a_gapless_dotted_path(run):
@@ -180,7 +194,7 @@ def test_ros_messages_are_what_a_ros_library_reads(run):
     store = get_typestore(Stores.ROS2_HUMBLE)
     [(schema, message)] = raw_on(path, "/map/slice")
     grid = store.deserialize_cdr(message.data, schema.name)
-    assert grid.header.frame_id == "world"
+    assert grid.header.frame_id == "map"
     assert grid.header.stamp.sec * 10**9 + grid.header.stamp.nanosec == FIRST_NS
     assert (grid.info.width, grid.info.height) == (3, 2)
     assert grid.info.resolution == np.float32(0.05)
@@ -190,7 +204,7 @@ def test_ros_messages_are_what_a_ros_library_reads(run):
 
     for (schema, message), T in zip(raw_on(path, "/pose"), trajectory.T_world_body, strict=True):
         stamped = store.deserialize_cdr(message.data, schema.name)
-        assert stamped.header.frame_id == "world"
+        assert stamped.header.frame_id == "map"
         assert stamped.pose.pose.position.x == T[0, 3]
         covariance = stamped.pose.covariance.reshape(6, 6)  # (x, y, z, about x, y, z) of the world
         R = T[:3, :3]
@@ -209,7 +223,7 @@ def test_ros_messages_are_what_a_ros_library_reads(run):
 def test_a_broken_off_run_leaves_no_file(tmp_path):
     def break_off():
         with McapLog(tmp_path / "run.mcap") as log:
-            log.transform(FIRST_NS, np.eye(4), parent="world", child="camera")
+            log.transform(FIRST_NS, np.eye(4), parent="map", child="camera")
             raise RuntimeError("interrupted")
 
     with pytest.raises(RuntimeError, match="interrupted"):
@@ -230,7 +244,7 @@ def test_empty_products_are_valid(tmp_path):
 def test_refuses_stamps_that_the_messages_cannot_hold(tmp_path, stamp_ns):
     with McapLog(tmp_path / "run.mcap") as log:
         with pytest.raises(DataError, match="shift the log"):
-            log.transform(stamp_ns, np.eye(4), parent="world", child="camera")
+            log.transform(stamp_ns, np.eye(4), parent="map", child="camera")
         with pytest.raises(DataError, match="shift the log"):
             log.diagnostics(stamp_ns, record_of(0))
 
@@ -293,6 +307,7 @@ def test_rerun_imports_every_topic_as_something_it_draws(run, tmp_path):
 
     for entity, component in {
         "/tf": "Transform3D:translation",
+        "/tf_static": "Transform3D:child_frame",
         "/camera/image": "EncodedImage:blob",
         "/camera/calibration": "Pinhole:image_from_camera",
         "/trajectory/estimate": "InstancePoses3D:translations",

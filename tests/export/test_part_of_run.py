@@ -94,7 +94,10 @@ def test_folders_are_cropped(run, box, tmp_path, kind):
     [
         ("octomap", "a.bt", {"frame": "start"}, "no frame"),
         ("g2o", "a.g2o", {"box_m": [0, 0, 0, 1, 1, 1]}, "no crop"),
-        ("ply", "a.ply", {"frame": "base"}, "no base_link"),
+        ("ply", "a.ply", {"frame": "base"}, "frame base: .* known: body$"),
+        ("tum", "a.tum", {"poses_of": "wheel"}, "frame wheel: .* known: body$"),
+        ("tum", None, {"poses_of": "body"}, "--out"),
+        ("ply", "a.ply", {"poses_of": "body"}, "tum, kitti have"),
         ("ply", "a.ply", {"frame": "odom"}, "want map, start or base"),
         ("ply", "a.ply", {"box_m": [1, 0, 0, 0, 1, 1]}, "lowest corner"),
         ("ply", "a.ply", {"box_m": [0, 0, 0]}, "crop"),

@@ -13,7 +13,6 @@ from mapper.octree.map import read_octree
 
 TYPES = {
     "/tf": "tf2_msgs/msg/TFMessage",
-    "/tf_static": "tf2_msgs/msg/TFMessage",
     "/path": "nav_msgs/msg/Path",
     "/ground_truth": "nav_msgs/msg/Path",
     "/map": "nav_msgs/msg/OccupancyGrid",
@@ -173,9 +172,7 @@ def test_images_are_those_of_the_run_with_their_camera(desk_run, bag):
     images, cameras = bag["/camera/image_raw/compressed"], bag["/camera/camera_info"]
     for (log_ns, image), (_, info), ours in zip(images, cameras, snapshots_of(desk_run), strict=True):
         assert ns(image.header.stamp) == ns(info.header.stamp) == log_ns == ours.stamp_ns
-        assert (image.format, image.header.frame_id, info.header.frame_id) == ("jpeg", "camera", "camera")
+        assert (image.format, image.header.frame_id, info.header.frame_id) == ("jpeg", "body", "body")
         assert image.data.tobytes() == ours.jpeg
         assert cv2.imdecode(image.data, cv2.IMREAD_COLOR).shape[:2] == (info.height, info.width)
         np.testing.assert_array_equal(info.k.reshape(3, 3), ours.camera.matrix)
-    (tf,) = only(bag["/tf_static"]).transforms
-    assert (tf.header.frame_id, tf.child_frame_id) == ("body", "camera")

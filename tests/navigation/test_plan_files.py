@@ -3,12 +3,14 @@ import json
 import numpy as np
 import pytest
 from mcap.reader import make_reader
+from mcap_protobuf.decoder import DecoderFactory
 
 from mapper.config.build import BuildConfig
 from mapper.core.errors import DataError, RunError
 from mapper.core.trajectory import Trajectory
 from mapper.export.mcap_log import McapLog
 from mapper.export.plan import write_plan
+from mapper.export.transforms import root_of
 from mapper.navigation.config import PlanConfig
 from mapper.navigation.planner import plan_2d
 from mapper.octree.grid import FREE, OccupancyGrid
@@ -78,6 +80,16 @@ def test_a_plan_joins_the_log_and_leaves_the_rest_alone(run, plan, grid):
         ("/plan", START_NS),
         ("/plan/dots", START_NS),
     ]
+
+
+def test_a_plan_is_in_the_frame_of_the_log_s_poses(run, plan, grid):
+    """It was called world before it was called map."""
+    write_plan(run, plan, grid=grid)
+    assert root_of(run.path / "run.mcap") == ("world", "body")
+    with (run.path / "run.mcap").open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        plans = [decoded for *_, decoded in reader.iter_decoded_messages(topics=["/plan", "/plan/dots"])]
+    assert [one.frame_id for one in plans] == ["world", "world"]
 
 
 def test_a_new_plan_replaces_the_old_one_and_the_same_plan_gives_the_same_bytes(run, plan, grid):

@@ -143,7 +143,7 @@ def test_the_log_holds_the_whole_story(run):
         summary.channels[channel].topic: count
         for channel, count in summary.statistics.channel_message_counts.items()
     }
-    assert topics["/tf"] == 31 + 4
+    assert topics["/tf"] == 31
     assert topics["/pose"] == 31
     assert topics["/diagnostics"] == 31
     assert topics["/camera/image"] == 4

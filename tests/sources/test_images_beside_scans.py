@@ -66,6 +66,9 @@ def test_kitti_s_left_colour_camera_is_where_the_calibration_says(tmp_path, is_r
     assert log.has_colours
     assert images.camera == CAMERA
     np.testing.assert_allclose(images.T_body_camera, inverse(T_CAMERA_LIDAR), atol=1e-6)
+    (sensor,) = log.sensors
+    assert (sensor.frame, sensor.parent) == (images.name, log.body_frame)
+    np.testing.assert_array_equal(sensor.T_parent_sensor, images.T_body_camera)
     np.testing.assert_array_equal(images.stamps_ns, log.stamps_ns)
     np.testing.assert_array_equal(images.image_at(3), picture(3))
 

@@ -8,12 +8,13 @@ import numpy as np
 from mapper.core.errors import SourceError, listed
 from mapper.core.timebase import NS_PER_S
 from mapper.core.trajectory import Trajectory
-from mapper.sources.base import CameraImages, Log
+from mapper.sources.base import CameraImages, Log, MountedSensor
 from mapper.sources.config import SourceConfig
 from mapper.sources.laser_scan import rolling
 from mapper.sources.ros.cameras import images_beside
+from mapper.sources.ros.frame_tree import is_fixed
 from mapper.sources.ros.message_index import Series, why_unread
-from mapper.sources.ros.messages import READ
+from mapper.sources.ros.messages import READ, frame_of
 from mapper.sources.ros.reader import SAME_CLOCK_NS, RecordingReader
 from mapper.sources.ros.recorded_frames import (
     RecordedFrames,
@@ -102,6 +103,7 @@ def recording_log(reader: RecordingReader, config: SourceConfig) -> Log:
         images=images,
         beside=beside,
         body_frame=frames.body,
+        sensors=_sensors(reader, frames.body, mounting.get("base_frame", frames.body)),
         **mounting,
         wheels=wheels,
         depth_noise=frames.depth_noise,
@@ -151,6 +153,20 @@ def _mounting(
             "these are the robot's poses written (base.tum)"
         )
     return {**fields, "T_body_base": Trajectory(frames.stamps_ns[known], T_body_base)}, notes
+
+
+def _sensors(reader: RecordingReader, body: str, base: str) -> list[MountedSensor]:
+    """Return the frames of messages that stay on the body or on the robot's base by tf."""
+    found = []
+    told = {frame_of(message) for message in reader.firsts.values()}
+    told.update(frame for series in reader.series.values() for frame in series.frames)
+    for frame in sorted(one for one in told - {"", body, base} if not is_fixed(one)):
+        for parent in dict.fromkeys((body, base)):
+            T_parent_sensor = reader.tree.find(parent, frame)
+            if T_parent_sensor is not None and not reader.tree.moves(parent, frame):
+                found.append(MountedSensor(frame, parent, T_parent_sensor))
+                break
+    return found
 
 
 def _on_clock_of(main: Series, choice: Choice) -> tuple[Choice, list[str]]:

@@ -8,7 +8,7 @@ import numpy as np
 from mapper.core.errors import SourceError
 from mapper.core.frames import Image
 from mapper.core.geometry import Array, Transform, inverse
-from mapper.sources.base import CameraImages, Log
+from mapper.sources.base import CameraImages, Log, MountedSensor
 from mapper.sources.calibration import Calibration
 from mapper.sources.image_files.image_sizes import recorded_camera
 from mapper.sources.image_files.reading import read_colour, read_grey
@@ -62,10 +62,10 @@ def with_images(log: Log, sequence: Path) -> Log:
         return recorded.image(read_colour(files[index]), f"{files[index]}")
 
     name = folder.relative_to(sequence).as_posix()
-    images = CameraImages(
-        name, np.array(stamps_ns, np.int64), recorded.camera, inverse(T_camera_lidar), image_at
-    )
-    return replace(log, images=[images], choices=[*log.choices, images.choice])
+    T_lidar_camera = inverse(T_camera_lidar)
+    images = CameraImages(name, np.array(stamps_ns, np.int64), recorded.camera, T_lidar_camera, image_at)
+    sensors = [MountedSensor(name, log.body_frame, T_lidar_camera)]
+    return replace(log, images=[images], sensors=sensors, choices=[*log.choices, images.choice])
 
 
 def _camera(sequence: Path, *, is_raw: bool) -> tuple[Array, Transform]:

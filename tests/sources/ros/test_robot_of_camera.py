@@ -4,10 +4,12 @@ import numpy as np
 import pytest
 
 from mapper.core.errors import SourceError
+from mapper.core.frames import Scan
 from mapper.core.geometry import exp, inverse
 from mapper.sources import open_source
 from mapper.sources.config import SourceConfig
 from mapper.sources.multi_session_log import shifted
+from mapper.sources.ros.encode_ros import cloud_message
 from tests.support.recordings import shots, transforms, write
 from tests.support.tum_logs import FIRST_NS, PERIOD_NS
 
@@ -85,6 +87,14 @@ def test_body_frame_can_be_the_camera_s_own(tmp_path):
         log = opened(tmp_path / f"{len(messages)}.mcap", messages, body_frame="optical")
         assert log.base_frame == "optical"
         np.testing.assert_array_equal(log.T_base_body, np.eye(4))
+
+
+def test_a_sensor_that_stays_on_the_base_only_is_told_there(tmp_path):
+    laser = transforms(("base_link", "laser", T_FOOT_BASE))
+    scan = cloud_message("/scan", Scan(FIRST_NS, np.ones((3, 3), np.float32)), frame="laser")
+    (sensor,) = opened(tmp_path / "log.mcap", [laser, *robot(), scan]).sensors
+    assert (sensor.frame, sensor.parent) == ("laser", "base_link")
+    np.testing.assert_allclose(sensor.T_parent_sensor, T_FOOT_BASE, atol=1e-12)
 
 
 def test_footprint_alone_is_the_base(tmp_path):

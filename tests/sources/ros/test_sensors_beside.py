@@ -10,7 +10,7 @@ from mapper.pipeline.build import build
 from mapper.sources import open_source
 from mapper.sources.config import SourceConfig
 from mapper.sources.multi_session_log import chained
-from mapper.sources.ros.encode_ros import camera_info_message, cloud_message, image_message
+from mapper.sources.ros.encode_ros import camera_info_message, cloud_message, image_message, imu_message
 from tests.support.recordings import COLOR, DEPTH, shots, transforms, write
 from tests.support.tum_logs import FIRST_NS, PERIOD_NS
 
@@ -80,6 +80,21 @@ def test_packets_of_a_driver_whose_clouds_are_used_are_not_fused_again(tmp_path)
     packets = [*clouds("/lidar/packets", "sensor"), *clouds("/rear/packets", "rear")]
     log = opened(tmp_path / "a.mcap", [mounted, *shots(), *clouds(), *packets])
     assert [one.log.name for one in log.beside] == ["/lidar/points", "/rear/packets"]
+
+
+def test_sensors_that_stay_on_the_body_are_told_used_or_not(tmp_path):
+    T_lidar_imu = transform(np.eye(3), np.array([0.0, 0.0, -0.04]))
+    tf = [
+        transforms(("optical", "lidar", T_OPTICAL_LIDAR), ("lidar", "imu", T_lidar_imu)),
+        transforms(("optical", "map", np.eye(4)), ("optical", "unseen", np.eye(4))),
+    ]
+    at_rest = imu_message(FIRST_NS, "/imu", rates_radps=None, acceleration_mps2=np.full(3, 5.7), frame="/imu")
+    others = [at_rest, *clouds(), *clouds("/global", "map"), *clouds("/far", "nowhere")]
+    log = opened(tmp_path / "a.mcap", [*tf, *shots(), *others], others="unused")
+    expected = {"imu": T_OPTICAL_LIDAR @ T_lidar_imu, "lidar": T_OPTICAL_LIDAR}
+    assert {(one.frame, one.parent) for one in log.sensors} == {(name, "optical") for name in expected}
+    for one in log.sensors:
+        np.testing.assert_allclose(one.T_parent_sensor, expected[one.frame], atol=1e-12)
 
 
 @pytest.fixture(scope="module")
