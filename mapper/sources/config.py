@@ -71,7 +71,8 @@ class TopicsConfig(Config):
     """Fixes of a GNSS receiver (NavSatFix, GPSFix, or sentences of NMEA); None is guessed: a receiver's
     rather than a filter's."""
     truth: str | None = None
-    """True poses (Odometry, PoseStamped, TransformStamped); None is /ground_truth, if there is one."""
+    """True poses (Odometry, PoseStamped, TransformStamped), or ``tf:FRAME``: the body's in a frame of tf, as
+    motion capture has them; None is /ground_truth, if there is one."""
     wheels: str | None = None
     """Wheel odometry (Odometry, PoseStamped, TransformStamped); None is /wheel_odometry, if there is one."""
     others: Literal["tracked", "fused", "unused"] = "fused"

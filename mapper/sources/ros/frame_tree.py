@@ -14,6 +14,8 @@ from mapper.sensing.wheel_kinematics import pose_at
 from mapper.sources.ros.messages import PoseMessage
 from mapper.sources.text import poses_from_numbers
 
+BY_TF = "tf:"
+"""Beginning of what names a coordinate frame where a topic is expected."""
 _FIXED_FRAMES = frozenset(
     {"map", "odom", "world", "earth", "utm", "enu", "global", "combined", "init", "origin"}
 )
@@ -113,6 +115,10 @@ class FrameTree:
         stamps_ns = max(links, key=len).stamps_ns
         known, T_fixed_frame = self.find_each(fixed, frame, stamps_ns)
         return Trajectory(stamps_ns[known], T_fixed_frame)
+
+    def moving_above(self, frame: str) -> list[str]:
+        """Return the frames above one in which it moves, the nearest first."""
+        return [above for above in self._ancestors(frame) if self.moves(above, frame)]
 
     def carried_by(self, fixed: str) -> str | None:
         """Return the frame nearest below a fixed one that moves in it; None without one."""

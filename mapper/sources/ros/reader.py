@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.core.errors import DataError, FrameError
+from mapper.core.errors import DataError, FrameError, SourceError
 from mapper.core.frames import Sensor
 from mapper.core.geometry import FARTHEST_M, spread_indices
 from mapper.core.rotations import pose_of_row
@@ -23,7 +23,7 @@ from mapper.sources.imu_files import saturation_notes
 from mapper.sources.nmea import fixes_from_sentences
 from mapper.sources.ros.decode import decode
 from mapper.sources.ros.entries import Located
-from mapper.sources.ros.frame_tree import FrameTree
+from mapper.sources.ros.frame_tree import BY_TF, FrameTree
 from mapper.sources.ros.message_index import Series, first_messages, index_of
 from mapper.sources.ros.message_order import ordered
 from mapper.sources.ros.messages import (
@@ -95,6 +95,21 @@ class RecordingReader:
             note = f"{series.topic.name}: poses of {child}, which tf does not tie to {body}; taken as its own"
             return truth, [*notes, note]
         return self._carried(truth, child, body), notes
+
+    def truth_by_tf(self, frame: str, *, body: str) -> tuple[Trajectory, list[str]]:
+        """Return the body's poses in a frame of tf in which it moves, and a note.
+
+        Raises:
+            SourceError: It does not move in that frame.
+        """
+        path = self.whole_tree.path_in(frame.lstrip("/"), body)
+        if path is None or not len(path):
+            frames = ", ".join(self.tree.moving_above(body)) or "none"
+            raise SourceError(
+                f"{self.recording.path}: source.topics.truth={BY_TF}{frame}: by tf {body} does not move in "
+                f"{frame}; frames in which it does: {frames}"
+            )
+        return path, [f"true poses by tf: {frame} → {body}"]
 
     def wheels(
         self, series: Series | None, *, body: str, config: WheelsConfig, sensor: Sensor

@@ -12,7 +12,7 @@ from mapper.sources.base import CameraImages, Log, MountedSensor
 from mapper.sources.config import SourceConfig
 from mapper.sources.laser_scan import rolling
 from mapper.sources.ros.cameras import images_beside
-from mapper.sources.ros.frame_tree import is_fixed
+from mapper.sources.ros.frame_tree import BY_TF, is_fixed
 from mapper.sources.ros.message_index import Series, why_unread
 from mapper.sources.ros.messages import READ, frame_of
 from mapper.sources.ros.reader import SAME_CLOCK_NS, RecordingReader
@@ -67,7 +67,7 @@ def recording_log(reader: RecordingReader, config: SourceConfig) -> Log:
         frames = stereo_frames(reader, choice.frames, config)
     else:
         frames = lidar_frames(reader, choice.frames, config)
-    truth, truth_notes = reader.truth(choice.truth, body=frames.body)
+    truth, truth_notes = _truth(reader, choice, config, body=frames.body)
     accelerations, imu_notes = reader.accelerations(choice.imu, body=frames.body)
     gyroscope, gyroscope_notes = reader.gyroscope(choice.gyroscope, body=frames.body)
     imu_notes = list(dict.fromkeys([*imu_notes, *gyroscope_notes]))  # of one topic, the same order
@@ -109,6 +109,7 @@ def recording_log(reader: RecordingReader, config: SourceConfig) -> Log:
         depth_noise=frames.depth_noise,
         choices=[
             *choice.choices,
+            *(_offered_truth(reader, frames.body) if truth is None else ()),
             *(one.choice if isinstance(one, CameraImages) else one for one in cameras),
             *beside_choices,
         ],
@@ -125,6 +126,31 @@ def recording_log(reader: RecordingReader, config: SourceConfig) -> Log:
             *gnss_notes,
         ],
     )
+
+
+def _truth(
+    reader: RecordingReader, choice: Choice, config: SourceConfig, *, body: str
+) -> tuple[Trajectory | None, list[str]]:
+    """Return the true poses by their topic or by tf, and notes.
+
+    Raises:
+        SourceError: The body does not move in the frame of tf that the settings name.
+    """
+    wanted = config.topics.truth or ""
+    if wanted.startswith(BY_TF):
+        return reader.truth_by_tf(wanted.removeprefix(BY_TF), body=body)
+    return reader.truth(choice.truth, body=body)
+
+
+def _offered_truth(reader: RecordingReader, body: str) -> list[str]:
+    """Return that tf has poses of the body, in a sentence, unless these are of wheels alone."""
+    frames = [one for one in reader.tree.moving_above(body) if one.rpartition("/")[2] != "odom"]
+    if not frames:
+        return []
+    return [
+        f"tf moves {body} in {', '.join(frames)}: where these are true poses (motion capture), "
+        f"source.topics.truth={BY_TF}{frames[0]} compares with them"
+    ]
 
 
 def _mounting(

@@ -10,7 +10,7 @@ import numpy as np
 
 from mapper.core.errors import SourceError
 from mapper.sources.config import TopicsConfig
-from mapper.sources.ros.frame_tree import is_fixed
+from mapper.sources.ros.frame_tree import BY_TF, is_fixed
 from mapper.sources.ros.image_messages import encoding_of, is_depth, is_mono16
 from mapper.sources.ros.message_index import Series
 from mapper.sources.ros.messages import (
@@ -183,7 +183,8 @@ def choose(
     gnss = pick.one(
         "gnss", config.gnss, FIXES, lambda name: fix_rank(series[name].topic), where=lambda _name: True
     )
-    truth = pick.one("truth", config.truth, POSES, plain_rank, where=lambda name: name == TRUTH)
+    named = None if (config.truth or "").startswith(BY_TF) else config.truth
+    truth = pick.one("truth", named, POSES, plain_rank, where=lambda name: name == TRUTH)
     wheels = pick.one("wheels", config.wheels, POSES, plain_rank, where=lambda name: name == WHEELS)
     if wheels is None and points is not None and points.topic.type in LASERS:
         driven = [

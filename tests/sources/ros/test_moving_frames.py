@@ -1,4 +1,4 @@
-"""Clouds whose frame moves on the robot, or stays while it moves, are turned into the robot's by tf."""
+"""Frames of tf that move: clouds are turned into the robot's by it, and a path in it may be the truth."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from mapper.core.geometry import apply, exp, inverse
 from mapper.sources import open_source
 from mapper.sources.config import SourceConfig, TopicsConfig
 from mapper.sources.ros.encode_ros import cloud_message, imu_message, odometry_message
-from tests.support.recordings import transforms, write
+from tests.support.recordings import shots, transforms, write
 from tests.support.tum_logs import FIRST_NS, PERIOD_NS
 
 STAMPS_NS = [FIRST_NS + i * PERIOD_NS for i in range(6)]
@@ -174,3 +174,31 @@ def test_of_several_robots_the_base_in_the_sensor_s_namespace_carries_it(tmp_pat
     log = opened(tmp_path / "a.mcap", [mounted, *scans])
     assert log.base_frame == "b/base_link"
     np.testing.assert_allclose(log.T_base_body, pan(FIRST_NS), atol=1e-9)
+
+
+def test_truth_is_taken_from_tf_on_request(tmp_path):
+    T_marker_optical = pan(FIRST_NS)
+    times = range(FIRST_NS - 40_000_000, STAMPS_NS[3] + 40_000_000, 10_000_000)
+    T_world_marker = {t: exp(np.zeros(3), np.array([(t - FIRST_NS) / 1e9, 0.0, 0.0])) for t in times}
+    messages = [
+        transforms(("/marker", "/optical", T_marker_optical), topic="/tf", stamp_ns=FIRST_NS),
+        *(transforms(("/world", "/marker", T), topic="/tf", stamp_ns=t) for t, T in T_world_marker.items()),
+        *shots(4),
+    ]
+    without = open_source(write(tmp_path / "a.bag", messages))
+    assert without.truth is None
+    assert any("source.topics.truth=tf:world" in choice for choice in without.choices)
+
+    def by(frame):
+        return open_source(tmp_path / "a.bag", SourceConfig(topics=TopicsConfig(truth=f"tf:{frame}")))
+
+    for frame in ("world", "/world"):
+        truth = by(frame).truth
+        assert truth.stamps_ns.tolist() == list(times)
+        np.testing.assert_allclose(
+            truth.T_world_body, [T @ T_marker_optical for T in T_world_marker.values()], atol=1e-9
+        )
+        assert not any("truth=tf" in choice for choice in by(frame).choices)
+    for frame in ("marker", "map", ""):
+        with pytest.raises(SourceError, match=r"does not move in .*: world$"):
+            by(frame)
