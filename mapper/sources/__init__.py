@@ -52,8 +52,19 @@ _VIDEOS = (".mp4", ".mov", ".avi", ".webm", ".m4v")
 _OTHER_FILES = {
     **dict.fromkeys(_ARCHIVES, "an archive; unpack it, and open the folder"),
     **dict.fromkeys(_VIDEOS, "a video, which has no depth; open the folder of its log"),
-    **dict.fromkeys(_IMAGES, "one image; open the folder of its log"),
+    **dict.fromkeys((*_IMAGES, ".exr"), "one image; open the folder of its log"),
     ".osf": "an Ouster's own format; with pip install ouster-sdk: ouster-cli source X.osf save X.pcap",
+    **dict.fromkeys(
+        (".svo", ".svo2"),
+        "a ZED's own format; export images and depth with its SDK, or record zed-ros2-wrapper's topics",
+    ),
+    **dict.fromkeys(
+        (".lvx", ".lvx2"), "Livox Viewer's own format; convert it to .bag or .las with Livox's tools"
+    ),
+    ".oni": "OpenNI's own format; play it into a recording with openni2_launch, or export its images",
+    ".klg": "Kintinuous' and ElasticFusion's own format; export its images, with their stamps in the names",
+    ".vrs": "Project Aria's own format; it has no depth",
+    ".npz": "arrays of NumPy; write each cloud as .npy, or images as .png, into a folder",
 }
 """What files are that are no logs, and what to do, by their ending."""
 

@@ -111,7 +111,8 @@ def test_data_that_are_no_logs_are_named(tmp_path):
     for name in ("a.jpg", "b.jpg"):
         (images / name).write_bytes(b"")
     named = {images: "depth", images / "a.jpg": "one image"}
-    for name, what in (("walk.mp4", "video"), ("log.zip", "archive"), ("log.tar.gz", "archive")):
+    others = [("a.svo2", "ZED"), ("a.lvx", "Livox"), ("a.oni", "OpenNI"), ("a.klg", "Kintinuous")]
+    for name, what in (("walk.mp4", "video"), ("log.zip", "archive"), ("log.tar.gz", "archive"), *others):
         (tmp_path / name).write_bytes(b"")
         named[tmp_path / name] = what
     named["https://example.org/log.bag"] = "download"
