@@ -211,7 +211,7 @@ def compared(row: Row, log: Log, config: BuildConfig, tracking: TrackingResult, 
     Raises:
         MapperError: The path and the truth have too few times in common.
     """
-    stored = from_tracking(tracking, truth)
+    stored = from_tracking(tracking, log)
     rmse_m = ate_rmse_m(stored.trajectory, truth)
     sure = associate(without_doubtful(stored.trajectory, stored.records), truth)
     sure = align(sure, "se3").moved(sure)

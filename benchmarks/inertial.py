@@ -114,7 +114,7 @@ def row(name: str, log: Log, tracking: TrackingResult, best_m: float) -> tuple[s
     """Return a row of the table, and the ATE of the frames without a doubt, metres."""
     assert log.truth is not None
     trajectory = tracking.tracked_trajectory()
-    stored = from_tracking(tracking, log.truth)
+    stored = from_tracking(tracking, log)
     true = log.truth.positions_world[np.searchsorted(log.truth.stamps_ns, trajectory.stamps_ns)]
     T, _ = fit_rigid(true, trajectory.positions_world)
     off_m = np.linalg.norm(trajectory.positions_world @ T[:3, :3].T + T[:3, 3] - true, axis=1)
