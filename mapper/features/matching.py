@@ -15,6 +15,8 @@ Pairs = NDArray[np.intp]
 """(M, 2) indices into the first and the second image's features."""
 
 _HOMOGRAPHY_POINTS = 4
+TOLERANCE_PX = 4.0
+"""ε of alg. 8, which the thesis leaves open."""
 
 
 class Described(Protocol):
@@ -58,9 +60,7 @@ def match_mutual(a: Described, b: Described, *, max_ratio: float) -> Pairs:
     return nearest
 
 
-def homography_inliers(
-    a: NDArray[np.float32], b: NDArray[np.float32], *, tolerance_px: float, iterations: int, seed: int = 0
-) -> NDArray[np.bool_]:
+def homography_inliers(a: NDArray[np.float32], b: NDArray[np.float32], *, seed: int = 0) -> NDArray[np.bool_]:
     """Return the inliers of the homography that most pairs agree with (Somlyai, PhD thesis, alg. 8).
 
     RANSAC over four pairs (Fischler & Bolles 1981), by OpenCV.
@@ -68,8 +68,6 @@ def homography_inliers(
     Args:
         a: (M, 2) pixels in the first image.
         b: (M, 2) their partners in the second.
-        tolerance_px: Largest distance between a mapped pixel and its partner.
-        iterations: Largest number of samples; fewer are drawn when many pairs agree.
         seed: Seed of the samples; see ``drawing_order``.
 
     Returns:
@@ -79,7 +77,7 @@ def homography_inliers(
     if len(a) < _HOMOGRAPHY_POINTS:
         return agree
     order = drawing_order(len(a), seed)
-    found, mask = cv2.findHomography(a[order], b[order], cv2.RANSAC, tolerance_px, maxIters=iterations)
+    found, mask = cv2.findHomography(a[order], b[order], cv2.RANSAC, TOLERANCE_PX)
     if found is not None:
         agree[order] = mask.ravel()
     return agree

@@ -65,5 +65,3 @@ class GraphConfig(Config):
     gnss: GnssFactorsConfig = GnssFactorsConfig()
     max_iterations: PositiveInt = 100
     """Limit for each connected component's last solve."""
-    relative_error: PositiveFloat = 1e-8
-    """Stop when an iteration reduces the error by less than this share."""

@@ -27,7 +27,7 @@ _MEDIAN_CHI2, _LIMIT_CHI2 = 2.366, 11.345
 """Median and 99 % of χ² with three degrees of freedom."""
 _CAUCHY_WIDTH = 2.385
 """With normal errors Cauchy's kernel of this width has 95 % of the efficiency of least squares."""
-_ALIGNMENT_ROUNDS, _EXACT = 10, Effort(max_iterations=20, relative_error=1e-8)
+_ALIGNMENT_ROUNDS, _EXACT = 10, Effort(max_iterations=20)
 _MAX_HEADING_RAD = 0.1
 _MAX_RATIO = 1.25
 """Residuals of a path that has not drifted are as large as the fixes' stated errors if these are independent,
@@ -189,7 +189,7 @@ def _solved_with(
     now = truncate(solved, now, worst=float(now.chi2.max()), limit=_LIMIT_CHI2)
     inliers = now.chi2 <= _LIMIT_CHI2
     if inliers.any():
-        now = solved(inliers.astype(np.float64), now, Effort(config.max_iterations, config.relative_error))
+        now = solved(inliers.astype(np.float64), now, Effort(config.max_iterations))
     T_world_node = poses_of(now.poses)
     poses = {node: T_world_node[node] for node in graph.T_world_node}
     held_fixes = tuple(fix for fix, holds in zip(fixes, inliers.tolist(), strict=True) if holds)

@@ -33,7 +33,7 @@ class Effort:
     """
 
     max_iterations: int
-    relative_error: float
+    relative_error: float = 1e-8
     report: Report = lambda _done, _total: None
 
 

@@ -173,7 +173,7 @@ def solve_part(part: Part, config: GraphConfig, *, report: Report) -> PartSoluti
     Raises:
         GraphError: The solver fails.
     """
-    effort = Effort(config.max_iterations, config.relative_error, report)
+    effort = Effort(config.max_iterations, report=report)
     kernel = None
     match config.robust:
         case "gnc" if part.loops:

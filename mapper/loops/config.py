@@ -34,18 +34,20 @@ class ImageVerificationConfig(Config):
     """Which of the two tests' motions becomes the constraint."""
 
 
+SLACK_RAD = 0.1
+"""How far a loop may turn a node, however short the path."""
+
+
 class GateConfig(Config):
     """Drift gate: how far a loop may move a node, by the drift of odometry on the path between its ends."""
 
     slack_m: PositiveFloat = 0.2
     """How far a loop may move a node, however short the path. Raise it where the odometry fails in places:
     more true loops are accepted, and more false ones."""
-    slack_rad: PositiveFloat = 0.1
-    """How far a loop may turn a node, however short the path."""
     drift_ratio: NonNegativeFloat = 0.05
-    """Addition to ``slack_m`` per metre of path, and to ``slack_rad`` per radian turned."""
+    """Addition to ``slack_m`` per metre of path, and to ``SLACK_RAD`` per radian turned."""
     drift_rad_per_m: NonNegativeFloat = 0.02
-    """Addition to ``slack_rad`` per metre of path."""
+    """Addition to ``SLACK_RAD`` per metre of path."""
 
 
 class NoLoopsConfig(Config):
@@ -111,8 +113,6 @@ class ScanVerificationConfig(Config):
     voting: VotingConfig = VotingConfig(angles=120, peaks=10)
     pair_distances_m: Annotated[tuple[PositiveFloat, ...], Field(min_length=1)] = (2.0, 0.5)
     """Largest distance between the points of a GICP pair, from coarse to fine."""
-    max_iterations: PositiveInt = 20
-    """Largest number of iterations at each of these distances."""
     margin_m: PositiveFloat = 0.3
     """Margin of the free-space check along a ray, after GICP."""
     min_agreeing_ratio: Ratio = 0.3
@@ -184,9 +184,7 @@ class ThesisLoopsConfig(Config):
     sharp_ratio: PositiveFloat = 1.2
     """A frame is sharp if it has this many times the median number of features of as many last frames."""
     max_distance_m: PositiveFloat = 0.5
-    """Largest distance of a near keyframe; the thesis leaves it open, as it does the angle."""
-    max_angle_rad: PositiveFloat = 0.5
-    """Largest angle between the two viewing directions."""
+    """Largest distance of a near keyframe; the thesis leaves it open."""
     min_gap_s: PositiveFloat = 2.0
     """More recent keyframes are not compared."""
     max_candidates: PositiveInt = 4

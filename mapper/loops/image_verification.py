@@ -137,8 +137,6 @@ class ImageVerifier:
         agree = homography_inliers(
             i.pixels[pairs[:, 0]].astype(np.float32),
             j.pixels[pairs[:, 1]].astype(np.float32),
-            tolerance_px=match.homography_tolerance_px,
-            iterations=match.homography_iterations,
             seed=match.seed,
         )
         return pairs[agree]

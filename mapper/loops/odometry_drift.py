@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from mapper.core.geometry import Array, adjoint, inverse, rotation_log
 from mapper.graph.model import BetweenFactor
 from mapper.loops.closure import Discrepancy
-from mapper.loops.config import GateConfig
+from mapper.loops.config import SLACK_RAD, GateConfig
 
 _MAX_STEP_M, _MAX_STEP_RAD = 1.0, 0.5
 """Largest standard deviations of an odometry's step: a motion that surfaces leave open is still predicted."""
@@ -186,7 +186,5 @@ def allowed(config: GateConfig, path: NodePath) -> Discrepancy:
     """Return the largest discrepancy of two nodes that odometry may have after this path."""
     return Discrepancy(
         translation_m=config.slack_m + config.drift_ratio * path.path_m,
-        rotation_rad=config.slack_rad
-        + config.drift_rad_per_m * path.path_m
-        + config.drift_ratio * path.turned_rad,
+        rotation_rad=SLACK_RAD + config.drift_rad_per_m * path.path_m + config.drift_ratio * path.turned_rad,
     )

@@ -27,6 +27,7 @@ from mapper.registration.surfaces import Prepared, prepared
 
 DIRECTION_RAD = 0.035
 """Resolution of the range image, two degrees: the kept points are thin."""
+_MOST_STEPS = 20  # of GICP at each pair distance
 CACHED_PLACES = 16
 """Places whose descriptions and search trees are kept: keyframes in a row are compared with the same ones."""
 GUESS_MARGIN_M = 1.5
@@ -117,7 +118,7 @@ class ScanVerifier:
             guess,
             kind="gicp",
             pair_distances_m=config.pair_distances_m,
-            max_iterations=config.max_iterations,
+            max_iterations=_MOST_STEPS,
         )
         if not alignment.converged:
             found = self._compared(i, j, guess, self._coarse)

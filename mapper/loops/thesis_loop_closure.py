@@ -18,6 +18,9 @@ from mapper.odometry.base import FrameResult
 from mapper.odometry.sharpest_keyframe import SharpestKeyframes
 from mapper.runtime.archived import Archived, ArchivedMapping, archived
 
+_MAX_ANGLE_RAD = 0.5
+"""Largest angle between two viewing directions, which the thesis leaves open."""
+
 
 class ThesisLoopDetector(LoopDetector):
     """Loop detector of the thesis: sharp frames are compared with the keyframes near their estimate.
@@ -35,7 +38,7 @@ class ThesisLoopDetector(LoopDetector):
             estimator,
             lambda view: view.T_body_camera,
             max_distance_m=config.max_distance_m,
-            max_angle_rad=config.max_angle_rad,
+            max_angle_rad=_MAX_ANGLE_RAD,
             drift_ratio=0.0,
         )
         self._sharpest = SharpestKeyframes(config.keyframe_interval)

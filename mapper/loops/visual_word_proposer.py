@@ -11,6 +11,10 @@ from mapper.places.config import PlacesConfig
 from mapper.places.index import PlaceIndex
 from mapper.places.vocabulary import WordVector, load_vocabulary
 
+_MIN_DEVIATIONS = 3.0
+"""A place of any similarity is proposed that exceeds the median of all by these standard deviations, so that
+images with few features are recognised as well."""
+
 
 class VisualWordProposer:
     """Visual word proposer: similar images at any distance."""
@@ -31,7 +35,7 @@ class VisualWordProposer:
         found = self._index.query(
             self._vector(seen),
             min_similarity=self._config.min_similarity,
-            min_deviations=self._config.min_deviations,
+            min_deviations=_MIN_DEVIATIONS,
             limit=limit,
             before=before,
         )

@@ -28,7 +28,7 @@ from mapper.loops.closure import (
     discrepancy,
     exceeds,
 )
-from mapper.loops.config import GateConfig
+from mapper.loops.config import SLACK_RAD, GateConfig
 from mapper.loops.inter_session_loops import SharedPlace
 from mapper.loops.odometry_drift import NodePath, allowed
 
@@ -131,7 +131,7 @@ def _agreement(places: Sequence[SharedPlace], gate: GateConfig) -> NDArray[np.bo
 
 
 def _are_several(T_world_bodies: Sequence[Transform], gate: GateConfig) -> bool:
-    same = Discrepancy(gate.slack_m, gate.slack_rad)
+    same = Discrepancy(gate.slack_m, SLACK_RAD)
     first = T_world_bodies[0]
     return any(exceeds(discrepancy(np.eye(4), first, other), same) for other in T_world_bodies[1:])
 
@@ -213,7 +213,7 @@ def _spanning_tree(ties: Mapping[tuple[int, int], Sequence[SharedPlace]]) -> _Sp
 def _solve(
     T_map_worlds: Mapping[int, Transform], places: Sequence[SharedPlace], gate: GateConfig
 ) -> dict[int, Transform]:
-    at_body = PoseSigmas(gate.slack_rad, gate.slack_m).information
+    at_body = PoseSigmas(SLACK_RAD, gate.slack_m).information
     factors = []
     for place in places:
         to_body = adjoint(inverse(place.T_second_body))

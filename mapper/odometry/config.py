@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
-from mapper.core.config import Config, Ratio
+from mapper.core.config import Config
 from mapper.features.config import DetectorConfig, OrbConfig, UniformOrbConfig
 from mapper.graph.config import WheelNoiseConfig
 from mapper.odometry.scans.config import AnyScanOdometryConfig
@@ -19,11 +19,7 @@ class MatchConfig(Config):
     filter: Literal["homography", "none"] = "homography"
     """"homography": RANSAC with four pairs, as published; "none": ISVD uses every mutual match."""
     max_ratio: Annotated[float, Field(gt=0.0, le=1.0)] = 0.9
-    """Lowe's ratio between the best and the second-best descriptor distance."""
-    homography_tolerance_px: PositiveFloat = 4.0
-    """ε of alg. 8; the thesis states neither it nor the ratio."""
-    homography_iterations: PositiveInt = 2000
-    """Largest number of RANSAC samples for the homography."""
+    """Lowe's ratio between the best and the second-best descriptor distance, which the thesis leaves open."""
     seed: NonNegativeInt = 0
     """Seed of RANSAC's samples, here and in the verification of loops by P3P."""
 
@@ -71,8 +67,6 @@ class IsvdOdometryConfig(Config):
     keyframe_interval: PositiveInt = 20
     """With ``earlier = "frames"``: one keyframe, the sharpest, in this many frames (Somlyai, PhD thesis,
     §4.1.2), for frames that were lost."""
-    relocalisation_keyframes: PositiveInt = 20
-    """A lost frame is compared with this many of the nearest keyframes and, in turn, of the others."""
 
 
 class KeyframeOdometryConfig(Config):
@@ -88,8 +82,6 @@ class KeyframeOdometryConfig(Config):
     virtual_baseline_px_m: PositiveFloat = 40.0
     """bf: depth z is used as the disparity bf / z (Mur-Artal & Tardós 2017); 40 to 43 for a Kinect. For
     another sensor, set it to the focal length times the baseline."""
-    disparity_sigma_px: PositiveFloat = 1.0
-    """Standard deviation of the virtual disparity relative to that of a pixel."""
     depth_noise: DepthNoiseConfig | None = None
     """Depth noise of the sensor, as measured by ``mapper sensor depth``, which replaces the disparity's."""
     depth_residual: bool = True
@@ -97,9 +89,6 @@ class KeyframeOdometryConfig(Config):
     readout_s: float | None = None
     """Rolling shutter: time from the first row's exposure to the last row's; 0 is a global shutter. None
     estimates it from the log."""
-    local_search_px: PositiveFloat = 4.0
-    """Search radius around the projected landmarks of the local map in the finest octave; raise it for images
-    of higher resolution."""
     local_keyframes: NonNegativeInt = 15
     """Number of covisible keyframes whose landmarks are searched; 0 uses only the first matches."""
     min_matches: Annotated[int, Field(ge=8)] = 12
@@ -107,16 +96,9 @@ class KeyframeOdometryConfig(Config):
     min_inliers: PositiveInt = 15
     """With fewer landmarks that agree with the pose, the frame is lost; with many landmarks in view more have
     to agree, as some do by chance."""
-    weak_inliers: PositiveInt = 150
-    """With fewer inliers, poses from other keyframes and without a prediction are tried as well."""
-    max_lost_frames: NonNegativeInt = 15
-    """A new sub-map begins after this many frames with enough features but no known landmarks; 0: never."""
     keyframe_ratio: Annotated[float, Field(gt=0.0, le=1.0)] = 0.75
     """Keyframe if the inliers fall below this share of their maximum since the last keyframe; raise it for
     more keyframes."""
-    mapped_ratio: Ratio = 0.5
-    """Keyframe if the inliers are less than this share of the features with depth: much of the view is
-    new."""
     max_keyframe_gap: PositiveInt = 20
     """Largest number of frames between keyframes."""
     bundle_keyframes: PositiveInt = 10
@@ -131,10 +113,6 @@ class KeyframeOdometryConfig(Config):
     """Seed of P3P's samples."""
     align_depth: bool = False
     """Where an image has few landmarks, its depth image is aligned to those of the keyframes."""
-    min_agreement_ratio: Ratio = 0.3
-    """A pose with a smaller share of agreeing matches is rejected: repeated structure gave 0.28."""
-    relocalisation_keyframes: PositiveInt = 5
-    """A lost frame is compared with this many of the most similar keyframes and of the nearest."""
 
 
 class LocalMapConfig(KeyframeOdometryConfig):

@@ -24,7 +24,7 @@ from mapper.loops.closure import (
     discrepancy,
     exceeds,
 )
-from mapper.loops.config import GateConfig, PlaceLoopsConfig
+from mapper.loops.config import SLACK_RAD, GateConfig, PlaceLoopsConfig
 from mapper.loops.image_verification import verify_wide
 from mapper.odometry.base import FrameResult
 from mapper.odometry.config import IsvdOdometryConfig
@@ -183,7 +183,7 @@ def _agreed(links: Sequence[_Link], graph: PoseGraph, gate: GateConfig) -> LoopC
     best = max(links, key=lambda link: link.found.inliers)
     carried = [_between_nodes_of(best, link, graph) for link in links]
     reach_m = float(np.linalg.norm(best.T_i_j[:3, 3]))
-    limit = Discrepancy(gate.slack_m + gate.drift_ratio * reach_m, gate.slack_rad)
+    limit = Discrepancy(gate.slack_m + gate.drift_ratio * reach_m, SLACK_RAD)
     agreeing = [
         (T_i_j, information)
         for T_i_j, information in carried

@@ -28,7 +28,7 @@ from mapper.loops.closure import (
     exceeds,
     why_none_accepted,
 )
-from mapper.loops.config import GateConfig, PlaceLoopsConfig, ScanLoopsConfig
+from mapper.loops.config import SLACK_RAD, GateConfig, PlaceLoopsConfig, ScanLoopsConfig
 from mapper.loops.map_constraints import build_map_constraint_detector
 from mapper.loops.odometry_drift import NodePath, allowed
 from mapper.odometry.renumbered_nodes import NodeOffset
@@ -298,7 +298,7 @@ def _doubtful_unless_confirmed(
     for nodes in components(graph.without_loops()):
         if not held.isdisjoint(nodes):
             doubts |= _unconfirmed(graph, sorted(nodes), held, failed, loops.agreement_path_m)
-    slack = Discrepancy(loops.gate.slack_m, loops.gate.slack_rad)
+    slack = Discrepancy(loops.gate.slack_m, SLACK_RAD)
     contradicting = {
         loop.j
         for loop in tracking.loops

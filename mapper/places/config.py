@@ -33,9 +33,6 @@ class PlacesConfig(Config):
     min_similarity: Ratio = 0.32
     """Similarity of two images' words (eq. 10), as published. It suits images of about 1000 features; 0.22
     suits 500, 0.45 suits 2000."""
-    min_deviations: PositiveFloat = 3.0
-    """A place of any similarity is proposed if it exceeds the median of all by this many standard deviations,
-    so that images with few features are recognised as well."""
 
 
 class ScanContextConfig(Config):
@@ -49,7 +46,5 @@ class ScanContextConfig(Config):
     """Radius of the outermost ring; 80 m as published, but loop detection keeps no farther points."""
     max_height_m: PositiveFloat = 15.0
     """Higher points count as this high."""
-    shortlist: PositiveInt = 50
-    """Number of places with the nearest ring keys that are compared at all headings."""
     min_similarity: Ratio = 0.4
     """Smallest mean cosine between the sectors of two places for a proposal."""

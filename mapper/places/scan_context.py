@@ -9,6 +9,9 @@ from mapper.core.errors import DataError
 from mapper.core.geometry import Points
 from mapper.places.config import ScanContextConfig
 
+SHORTLIST = 50
+"""Places with the nearest ring keys, which are compared at all headings."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScanContext:
@@ -88,7 +91,7 @@ class ScanContexts:
         """
         rows = np.flatnonzero(among)
         apart = np.linalg.norm(self._keys[rows] - context.ring_key, axis=1)
-        rows = rows[np.argsort(apart, kind="stable")[: self._config.shortlist]]
+        rows = rows[np.argsort(apart, kind="stable")[:SHORTLIST]]
         similarity = self._similarities(context, rows)
         best = np.lexsort((rows, -similarity))[:limit]
         return [

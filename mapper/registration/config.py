@@ -94,23 +94,18 @@ class IsvdConfig(Config):
 
     kind: Literal["isvd"] = "isvd"
     threshold: Literal["power", "halving"] = "power"
-    """How the largest pair distance shrinks: α·j^β (alg. 7), or by half from ``start_error_mm`` (alg. 6)."""
+    """How the largest pair distance shrinks: α·j^β (alg. 7), or by half (alg. 6)."""
     alpha_mm: PositiveFloat = 1200.0
     """α of the power law, as published: the first limit. Raise it where frames are farther apart."""
     beta: Annotated[float, Field(lt=0.0)] = -2.6
     """β of the power law, as published. Nearer to 0 the limit shrinks more slowly, for frames that are
     farther apart."""
-    start_error_mm: PositiveFloat = 1000.0
-    """e_start of the halving threshold, which the thesis leaves open. Raise it where frames are farther
-    apart."""
     step: Literal["svd", "icp"] = "svd"
     """The motion in each iteration: the SVD of the pairs (alg. 6, 7), or ICP on their points (alg. 5)."""
     max_iterations: PositiveInt = 25
     """Largest number of iterations."""
     min_error_mm: NonNegativeFloat = 0.0
     """Stop once the threshold falls below this (e_min of alg. 5, 6)."""
-    min_pairs: PositiveInt = 100
-    """Stop before fewer pairs than this, or than half of a smaller set, would remain ("Auto")."""
     agreement_mm: PositiveFloat = 50.0
     """Pairs this close after the motion agree with it."""
     min_agreeing: Annotated[int, Field(ge=3)] = 20

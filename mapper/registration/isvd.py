@@ -14,6 +14,9 @@ from mapper.registration.config import IsvdConfig
 _MIN_SPREAD_M = 0.01  # about a common line, points nearer to it than this leave the rotation unobservable
 _MIN_SIGMA_M = 1e-3  # trimming must not make the pairs better than the sensor
 _ICP_STEPS = 20
+_MIN_PAIRS = 100
+"""Trimming stops before fewer than these, or than half of a smaller set, would remain ("Auto")."""
+_START_ERROR_MM = 1000.0  # e_start of the halving threshold, which the thesis leaves open
 
 
 class Isvd:
@@ -71,7 +74,7 @@ class Isvd:
             source: (N, 3) their partners, metres.
         """
         config = self._config
-        enough = max(min(config.min_pairs, len(target) // 2), 3)
+        enough = max(min(_MIN_PAIRS, len(target) // 2), 3)
         if config.step == "icp":
             return self._trim_by_icp(target, source, enough)
         R, t, used = trim(
@@ -103,7 +106,7 @@ class Isvd:
             if config.threshold == "power":
                 yield config.alpha_mm * j**config.beta / MM_PER_M  # eq. 4.2
             else:
-                yield config.start_error_mm * 0.5 ** (j - 1) / MM_PER_M
+                yield _START_ERROR_MM * 0.5 ** (j - 1) / MM_PER_M
 
 
 def rigid_fit_information(source: Points, distances_m: Array) -> Array:

@@ -208,7 +208,7 @@ def test_turning_one_knob_leaves_the_others_of_its_part():
     default = load_config().loops.verification.match
     turned = load_config(None, ["loops.verification.match.max_ratio=0.7"]).loops.verification.match
     assert turned == default.model_copy(update={"max_ratio": 0.7})
-    fallback = load_config(None, ["odometry.kind=isvd", "odometry.fallback.homography_iterations=7"]).odometry
+    fallback = load_config(None, ["odometry.kind=isvd", "odometry.fallback.seed=7"]).odometry
     assert (fallback.fallback.filter, fallback.fallback.max_ratio) == ("none", 0.95)
 
 

@@ -89,7 +89,7 @@ def test_two_runs_find_the_same():
     assert runs[0] == runs[1]
 
 
-TIGHT = GateConfig(slack_m=0.01, slack_rad=0.01, drift_ratio=0.0, drift_rad_per_m=0.0)
+TIGHT = GateConfig(slack_m=0.01, drift_ratio=0.0, drift_rad_per_m=0.0)
 
 
 @pytest.mark.parametrize(

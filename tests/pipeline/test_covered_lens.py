@@ -9,6 +9,7 @@ import pytest
 from mapper.config.loading import load_config, overridden
 from mapper.core.geometry import angle_between, exp, inverse
 from mapper.core.trajectory import Trajectory
+from mapper.odometry.keyframes.tracking import MOST_LOST_FRAMES
 from mapper.pipeline.disconnected_components import largest_component
 from mapper.pipeline.solve import solve
 from mapper.pipeline.track import track_log
@@ -53,7 +54,7 @@ def test_wheels_connect_what_is_before_and_after_a_covered_lens(interrupted):
     config = load_config(None, ["loops.kind=none"])
     alone = mapped(interrupted, overridden(config, ["graph.wheels.use=false"]))
     connected = mapped(interrupted, config)
-    covered, begun_anew_after = 50, config.odometry.max_lost_frames
+    covered, begun_anew_after = 50, MOST_LOST_FRAMES
     assert len(alone) < 30
     assert len(connected) == len(interrupted) - covered - begun_anew_after
     first, last = (np.searchsorted(interrupted.truth.stamps_ns, connected.stamps_ns[k]) for k in (0, -1))

@@ -66,10 +66,11 @@ def test_only_those_asked_for_take_part():
     assert len(index.query(seen, np.ones(3, np.bool_), limit=1)) == 1
 
 
-def test_the_shortlist_is_of_the_nearest_ring_keys():
+def test_the_shortlist_is_of_the_nearest_ring_keys(monkeypatch):
     rng = np.random.default_rng(0)
     flat, high = (rng.uniform([-40, -40, 0], [40, 40, top], (5000, 3)) for top in (1.0, 10.0))
-    index = ScanContexts(ScanContextConfig(shortlist=1, min_similarity=0.0))
+    monkeypatch.setattr("mapper.places.scan_context.SHORTLIST", 1)
+    index = ScanContexts(ScanContextConfig(min_similarity=0.0))
     index.add(0, scan_context(high, CONFIG))
     index.add(1, scan_context(flat, CONFIG))
     ((node, _),) = index.query(scan_context(flat * 1.01, CONFIG), np.ones(2, np.bool_), limit=5)

@@ -98,12 +98,12 @@ def test_thresholds_are_those_of_equation_4_2():
     assert 1 not in kept_by_three
 
 
-def test_the_halving_threshold_begins_at_its_start_error():
+def test_the_halving_threshold_begins_at_a_metre():
     source = room(np.random.default_rng(2), 4000)
     target = source.copy()
     target[0, 0] += 0.300
-    for start_error_mm, is_kept in ((1000.0, True), (250.0, False)):
-        config = IsvdConfig(threshold="halving", start_error_mm=start_error_mm, max_iterations=2)
+    for max_iterations, is_kept in ((2, True), (4, False)):  # 500 and 125 mm
+        config = IsvdConfig(threshold="halving", max_iterations=max_iterations)
         _, kept = Isvd(config).trim_pairs(target, source)
         assert (0 in kept) == is_kept
 
@@ -111,10 +111,10 @@ def test_the_halving_threshold_begins_at_its_start_error():
 def test_auto_stops_before_too_few_pairs_remain():
     target, source, _ = pairs_with_outliers(3, wrong=0, noise_m=0.01)
 
-    _, kept = Isvd(IsvdConfig(min_pairs=80)).trim_pairs(target, source)
-    _, kept_of_few = Isvd(IsvdConfig(min_pairs=80)).trim_pairs(target[:60], source[:60])
+    _, kept = Isvd(IsvdConfig()).trim_pairs(target, source)
+    _, kept_of_few = Isvd(IsvdConfig()).trim_pairs(target[:60], source[:60])
 
-    assert 80 <= len(kept) < 200
+    assert 100 <= len(kept) < 200
     assert 30 <= len(kept_of_few) < 60
 
 

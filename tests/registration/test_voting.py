@@ -3,7 +3,7 @@ import pytest
 
 from mapper.core.geometry import apply
 from mapper.registration.hough.config import VotingConfig
-from mapper.registration.hough.voting import vote
+from mapper.registration.hough.voting import DISTINCT_RAD, vote
 
 
 def turned(centres, alpha_rad):
@@ -99,7 +99,7 @@ def test_peaks_are_distinct_and_descending(rng):
             turn = a.alpha_rad - b.alpha_rad
             turn = abs(np.arctan2(np.sin(turn), np.cos(turn)))
             apart_m = np.hypot(a.dx_m - b.dx_m, a.dy_m - b.dy_m)
-            assert apart_m > config.width_m or turn > config.distinct_rad
+            assert apart_m > config.width_m or turn > DISTINCT_RAD
 
 
 def test_nothing_votes_for_nothing():

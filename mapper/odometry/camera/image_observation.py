@@ -198,7 +198,7 @@ def observe_image(
     )
     bits = pack(features.descriptors[order])
     sigma_px = detector.scale_factor ** octave.astype(np.float64)
-    disparity_sigma_px = sigma_px * config.disparity_sigma_px
+    disparity_sigma_px = sigma_px
     if config.depth_noise is not None:
         sigma_m = feature_depth_sigma_m(
             frame.depth_m, column, row, sigma_px=sigma_px, noise=config.depth_noise

@@ -150,8 +150,6 @@ def matched_pairs(target: IsvdObservation, source: IsvdObservation, match: Match
             homography_inliers(
                 target.features.pixels[pairs[:, 0]],
                 source.features.pixels[pairs[:, 1]],
-                tolerance_px=match.homography_tolerance_px,
-                iterations=match.homography_iterations,
                 seed=match.seed,
             )
         ]

@@ -58,6 +58,8 @@ _DEPTH_SHARE = 0.01
 _NEW_VIEW, _NEAR_VIEW = 0.15, 0.6
 """Differences of views: from this on a frame is a keyframe, up to this it is registered against one."""
 _HALF_VIEW_RAD = 0.5
+RELOCALISATION_KEYFRAMES = 20
+"""Of the nearest keyframes, and in turn of the others, that a lost frame is compared with."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -316,15 +318,14 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
 
     def _keyframes_to_try(self) -> list[_Keyframe]:
         """Return the keyframes nearest to the last tracked pose, and some of the others in turn."""
-        count = self._config.relocalisation_keyframes
         last_world = self._recent[-1].T_world_body[:3, 3]
         by_distance = sorted(
             self._keyframes, key=lambda k: float(np.linalg.norm(k.T_world_body[:3, 3] - last_world))
         )
-        far = by_distance[count:]
-        in_turn = [far[(self._turn + i) % len(far)] for i in range(min(count, len(far)))]
+        far = by_distance[RELOCALISATION_KEYFRAMES:]
+        in_turn = [far[(self._turn + i) % len(far)] for i in range(min(RELOCALISATION_KEYFRAMES, len(far)))]
         self._turn += len(in_turn)
-        return by_distance[:count] + in_turn
+        return by_distance[:RELOCALISATION_KEYFRAMES] + in_turn
 
     def _add_node(
         self,

@@ -20,7 +20,7 @@ from mapper.odometry.keyframes.depth_alignment import (
 from mapper.odometry.keyframes.depth_comparison import EarlierDepth
 from mapper.odometry.keyframes.landmarks import LandmarkMap
 from mapper.odometry.keyframes.local_search import LocalSearch
-from mapper.odometry.keyframes.pose_tracker import TrackedPose, project, unmatched
+from mapper.odometry.keyframes.pose_tracker import WEAK_INLIERS, TrackedPose, project, unmatched
 
 _MIN_VISIBLE_RATIO = 0.3
 _MIN_WEAKEST_RATIO = 0.5
@@ -82,7 +82,7 @@ class DepthTracker:
             ``found`` itself if its landmarks are many, or if the depth image disagrees with the keyframes;
             None if there is no pose.
         """
-        if found is not None and found.inliers >= self._config.weak_inliers:
+        if found is not None and found.inliers >= WEAK_INLIERS:
             self._observed_ns, self._is_confirmed = observation.stamp_ns, True
             return found
         if found is None and self._unobserved_s(observation) > _MAX_UNOBSERVED_S:

@@ -17,6 +17,8 @@ from mapper.odometry.keyframes.motion_segmentation import refined_by_established
 from mapper.odometry.keyframes.pose_tracker import MAX_HAMMING, TrackedPose, rms_px
 
 _MAX_RATIO = 0.8
+_RADIUS_PX = 4.0
+"""Search radius around projected landmarks in the finest octave."""
 _CHANCE = 0.02
 """Largest share of the landmarks in view that match and agree with a wrong pose by chance."""
 _CHANCE_SIGMAS = 5.0
@@ -84,7 +86,7 @@ class LocalSearch:
             apply(T_camera_world, landmarks["position"][visible])[:, 2],
             octave,
             landmarks["bits"][visible],
-            search_px=config.local_search_px,
+            search_px=_RADIUS_PX,
             taken=moved | (landmark_of_feature >= 0),
             max_ratio=_MAX_RATIO,
         )

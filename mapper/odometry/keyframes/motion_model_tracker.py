@@ -13,7 +13,7 @@ from mapper.odometry.keyframes.depth_comparison import EarlierDepth
 from mapper.odometry.keyframes.landmarks import Ids, LandmarkMap
 from mapper.odometry.keyframes.local_search import LocalSearch
 from mapper.odometry.keyframes.motion_segmentation import agreeing, camera_motion
-from mapper.odometry.keyframes.pose_tracker import TrackedPose, project, unmatched
+from mapper.odometry.keyframes.pose_tracker import WEAK_INLIERS, TrackedPose, project, unmatched
 from mapper.odometry.keyframes.relocalizer import Relocalizer
 
 _MAX_RATIO = 0.9
@@ -40,7 +40,7 @@ class MotionPoseTracker:
     ) -> TrackedPose | None:
         """Try the predicted motion, then the latest keyframes."""
         by_motion = self._by_motion(observation, last, T_predicted)
-        if by_motion is not None and by_motion.inliers >= self._config.weak_inliers:
+        if by_motion is not None and by_motion.inliers >= WEAK_INLIERS:
             return by_motion
         # A pose with few inliers may be wrong, so a pose that does not depend on the prediction competes.
         known, points_world, landmarks = self._known_points(last)
@@ -53,7 +53,7 @@ class MotionPoseTracker:
             method="matched",
         )
         best = self._better(by_motion, by_last)
-        if best is not None and best.inliers >= self._config.weak_inliers:
+        if best is not None and best.inliers >= WEAK_INLIERS:
             return best
         by_keyframe = self._relocalizer.best_among(
             self._map.latest(last.reference), observation, method="fallback", exhaustive=True

@@ -17,6 +17,8 @@ from mapper.registration.reprojection import refine_pose
 MAX_HAMMING = 64
 """Descriptors that differ in more of their 256 bits do not match."""
 
+WEAK_INLIERS = 150
+"""With fewer, a pose may be wrong, and is compared with others: repeated structure has led to a hundred."""
 _MAX_PREDICTED_STEPS = 10.0
 """Over longer gaps, in frame intervals, constant velocity predicts worse than no motion."""
 _LM_ROUNDS, _LM_ITERATIONS = 3, 8

@@ -10,12 +10,22 @@ from mapper.odometry.camera.image_observation import ImageObservation
 from mapper.odometry.config import KeyframeOdometryConfig
 from mapper.odometry.keyframes.landmarks import Ids, LandmarkMap
 from mapper.odometry.keyframes.local_search import LocalSearch
-from mapper.odometry.keyframes.pose_tracker import MAX_HAMMING, TrackedPose, refined, unmatched
+from mapper.odometry.keyframes.pose_tracker import (
+    MAX_HAMMING,
+    WEAK_INLIERS,
+    TrackedPose,
+    refined,
+    unmatched,
+)
 from mapper.places.index import PlaceIndex, match_by_word
 from mapper.places.vocabulary import Vocabulary
 from mapper.registration.reprojection import ransac_p3p
 
 _MAX_RATIO = 0.85
+_CANDIDATES = 5
+"""The most similar keyframes, and the nearest, that a lost frame is compared with."""
+_MIN_AGREEMENT_RATIO = 0.3
+"""Least share of the matches that agree with a pose: repeated structure gave 0.28."""
 _MATCHING_LEVEL = 2
 """Only descriptors under one node this many steps below the vocabulary's root are compared (Zhao et al. 2020,
 §1.1): the toolkit's own vocabulary has 169 such nodes, so that a frame has a few features under each."""
@@ -58,7 +68,7 @@ class Relocalizer:
                 continue
             if best is None or tracked_pose.inliers > best.inliers:
                 best = tracked_pose
-                if best.inliers >= self._config.weak_inliers:
+                if best.inliers >= WEAK_INLIERS:
                     break
         return best
 
@@ -95,12 +105,11 @@ class Relocalizer:
             observation: The frame.
             position_world: (3,) metres: last known position of the camera.
         """
-        limit = self._config.relocalisation_keyframes
         words = self._vocabulary.vector(observation.words)
-        similar = [k for k, _ in self._index.query(words, min_similarity=0.0, limit=limit)]
+        similar = [k for k, _ in self._index.query(words, min_similarity=0.0, limit=_CANDIDATES)]
         T_camera_world = np.array([keyframe.T_camera_world for keyframe in self._map.keyframes])
         position_camera = T_camera_world[:, :3, :3] @ position_world + T_camera_world[:, :3, 3]
-        nearest = np.argsort(np.linalg.norm(position_camera, axis=1), kind="stable")[:limit]
+        nearest = np.argsort(np.linalg.norm(position_camera, axis=1), kind="stable")[:_CANDIDATES]
         return list(dict.fromkeys([*similar, *map(int, nearest)]))
 
     def _match_keyframe(
@@ -151,7 +160,7 @@ class Relocalizer:
         if found is None:
             return None
         T_camera_world, agreeing = found
-        fewest = max(self._config.min_agreement_ratio * len(features), self._config.min_matches // 2)
+        fewest = max(_MIN_AGREEMENT_RATIO * len(features), self._config.min_matches // 2)
         if len(agreeing) < fewest:
             return None
         matches = len(features)

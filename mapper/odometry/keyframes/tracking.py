@@ -15,6 +15,8 @@ from mapper.odometry.motion_prior import MotionPrior
 
 _MIN_START_FEATURES = 100
 """Features with depth that a sub-map's first frame must have: a few times ``min_inliers``."""
+MOST_LOST_FRAMES = 15
+"""Frames in a row with enough features but no known landmarks after which a sub-map begins."""
 
 
 class Tracking:
@@ -39,7 +41,6 @@ class Tracking:
             motion_check: Rules out poses after a gap; None if nothing but the images tells of the motion.
             prior: Rules out poses that contradict a gyroscope.
         """
-        self._config = config
         self._map = landmark_map
         self._relocalizer = relocalizer
         self._tracker = tracker
@@ -74,7 +75,7 @@ class Tracking:
         if not has_features and not (is_first and self._depth.can_start(observation)):
             return False
         self._unknown_frames += 1
-        return is_first or 0 < self._config.max_lost_frames < self._unknown_frames
+        return is_first or self._unknown_frames > MOST_LOST_FRAMES
 
     def begin_sub_map(self, observation: ImageObservation, last: TrackedPose | None) -> TrackedPose:
         """Return the pose of a sub-map's first frame: the world's origin, or the last tracked pose."""
@@ -142,5 +143,5 @@ class Tracking:
         T_begin_end = inverse(since.body_pose) @ tracked_pose.body_pose
         if check is None or not check.contradiction(T_begin_end, since.stamp_ns, tracked_pose.stamp_ns):
             return True
-        self._unknown_frames = self._config.max_lost_frames  # another place, so a sub-map may begin at once
+        self._unknown_frames = MOST_LOST_FRAMES  # another place, so a sub-map may begin at once
         return False

@@ -2,7 +2,7 @@
 
 from typing import Literal, Self
 
-from pydantic import NonNegativeInt, PositiveFloat, PositiveInt
+from pydantic import PositiveFloat
 
 from mapper.core.config import Config, Ratio, scale_length
 from mapper.registration.hough.config import HoughGicpConfig, HoughNdtConfig
@@ -37,8 +37,6 @@ class ScanOdometryConfig(Config):
     lost_ratio: Ratio = 0.5
     """If the overlap is still less than this share of the usual one, the scan is lost if there is any other
     evidence against its pose, and below half of this share in any case; 0 loses none."""
-    max_lost_scans: NonNegativeInt = 10
-    """After this many lost scans in a row a new sub-map begins; 0 disables this."""
     rescue: HoughGicpConfig | None = HoughGicpConfig()
     """Registration without a guess to the last keyframe, for scans with too little overlap."""
     max_pair_distance_m: PositiveFloat = 0.5
@@ -64,8 +62,6 @@ class GicpOdometryConfig(ScanOdometryConfig):
     """Cell size of the map, which has one Gaussian per cell."""
     coarse_cell_m: PositiveFloat = 2.0
     """Cell size of a second map, to which scans are registered first. Larger for fast motion."""
-    max_iterations: PositiveInt = 30
-    """Largest number of iterations at each cell size."""
 
 
 class IcpOdometryConfig(ScanOdometryConfig):
@@ -77,8 +73,6 @@ class IcpOdometryConfig(ScanOdometryConfig):
     (Besl & McKay 1992), which a scanner's rings on the road bias towards no motion."""
     pair_distances_m: tuple[PositiveFloat, ...] = (2.0, 1.0, 0.5)
     """Largest distance between the points of a pair, from coarse to fine."""
-    max_iterations: PositiveInt = 40
-    """Largest number of iterations at each of these distances."""
 
 
 class KissOdometryConfig(ScanOdometryConfig):
@@ -92,8 +86,6 @@ class KissOdometryConfig(ScanOdometryConfig):
     voxels for a smaller scene."""
     min_motion_m: PositiveFloat = 0.1
     """Smaller deviations from the predicted motion do not change the adaptive threshold."""
-    max_iterations: PositiveInt = 500
-    """Largest number of iterations."""
 
 
 class HoughOdometryConfig(ScanOdometryConfig):

@@ -9,6 +9,7 @@ _MAP_KEYFRAMES = 100
 """Cells that this number of keyframes in a row have not touched are removed, so that the map stays local."""
 _STEP_CELLS = 0.01  # shorter steps end the refinement: they are below a scan's noise
 _STEP_RAD = 0.002
+_MOST_STEPS = 30
 
 
 class GicpMatcher:
@@ -49,7 +50,7 @@ class GicpMatcher:
         return cells.align(
             deskewed.prepared,
             T_world_body,
-            max_iterations=self._config.max_iterations,
+            max_iterations=_MOST_STEPS,
             step_rad=_STEP_RAD,
             step_m=_STEP_CELLS * cells.cell_m,
         )

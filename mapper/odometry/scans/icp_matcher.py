@@ -50,7 +50,6 @@ class IcpMatcher:
                 T_world_body,
                 kind=self._kind(deskewed),
                 pair_distances_m=(distance_m,),
-                max_iterations=self._config.max_iterations,
             )
             if not found.converged:
                 return None

@@ -27,7 +27,6 @@ class KissMatcher:
         self._settings.data.max_range = config.max_range_m
         self._settings.mapping.voxel_size = config.map_voxel_m
         self._settings.mapping.max_points_per_voxel = _MAX_POINTS_PER_VOXEL
-        self._settings.registration.max_num_iterations = config.max_iterations
         self._settings.registration.convergence_criterion = _CONVERGENCE
         self._settings.registration.max_num_threads = 1  # more threads would add sums in a varying order
         self._settings.adaptive_threshold.initial_threshold = config.initial_threshold_m

@@ -30,6 +30,8 @@ from mapper.odometry.scans.sweep_registration import PlacedScan, SweepRegistrati
 from mapper.sensing.gyroscope import Gyroscope
 
 _KEYFRAMES = 5  # the last ones, with which a scan is compared
+MOST_LOST_SCANS = 10
+"""Lost scans in a row after which a new map begins."""
 _DISPLACED = 0.5
 """Displacement of a sweep's outer points, in voxels, from which on its pose is doubtful."""
 
@@ -244,7 +246,7 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
     def _not_found(self, observation: ScanObservation) -> FrameResult:
         """Return a lost scan, or begin a new map with it once enough in a row were lost."""
         self._lost_scans += 1
-        if 0 < self._config.max_lost_scans < self._lost_scans:
+        if self._lost_scans > MOST_LOST_SCANS:
             return self._start(observation, self._motion.T_world_last, method="new sub-map")
         scan = observation.scan
         return lost_frame(scan.stamp_ns, self._motion.T_world_last, features=len(scan.points_body))

@@ -37,6 +37,12 @@ MANY_CENTRES = 150
 MAX_CONTRADICTING_RATIO_OF_MANY = 0.03
 """The same where both scans have many centres, whose agreement is no chance: traffic may contradict more.
 Right answers had 0.023 and less, wrong ones 0.1 and more."""
+_CHECKED, _REFINED = 6, 3
+"""Peaks, those with most overlap, that get the free-space check, and candidates of like score that are
+refined."""
+_DISTINCT_RAD = 0.05
+_MIN_LEAD = 0.1
+"""Least lead of the answer's score over that of any other motion."""
 CONTRADICTION_WEIGHT = 5.0
 """A motion's score is the share of obstacles that agree, less this multiple of the share that contradicts."""
 NEAR_SCORE = 0.3
@@ -115,13 +121,13 @@ def rejection(
             f"more than {max_contradicting_ratio:.1%}"
         )
     for other in refined:
-        if best.score - other.score >= acceptance.min_lead or other.ground_ratio < MIN_GROUND_RATIO:
+        if best.score - other.score >= _MIN_LEAD or other.ground_ratio < MIN_GROUND_RATIO:
             continue
         gap_m, turn_rad = best.gap_to(other)
-        if gap_m > overlap.distinct_m or turn_rad > overlap.distinct_rad:
+        if gap_m > overlap.distinct_m or turn_rad > _DISTINCT_RAD:
             return (
                 f"ambiguous: a motion {gap_m:.1f} m and {np.degrees(turn_rad):.0f}° away scores "
-                f"{other.score:.2f}, within {acceptance.min_lead:g} of the best"
+                f"{other.score:.2f}, within {_MIN_LEAD:g} of the best"
             )
     return ""
 
@@ -209,9 +215,9 @@ class HoughAligner:
         chosen = distinct(
             np.array([(fit.dx_m, fit.dy_m) for fit in fits]).reshape(-1, 2),
             np.array([fit.alpha_rad for fit in fits]),
-            overlap.candidates,
+            _CHECKED,
             far_m=overlap.distinct_m,
-            far_rad=overlap.distinct_rad,
+            far_rad=_DISTINCT_RAD,
         )
         candidates = [self._candidate(source, self._in_space(source, fits[k])) for k in chosen]
         return sorted(candidates, key=lambda candidate: -candidate.score)
@@ -235,7 +241,7 @@ class HoughAligner:
         refined: list[Candidate] = []
         reason = ""
         rivals = [c for c in candidates if c.score >= candidates[0].score - NEAR_SCORE]
-        for rival in rivals[: self._config.acceptance.refined]:
+        for rival in rivals[:_REFINED]:
             found = refine_on_points(self._cloud, cloud, rival.T_target_source, self._config)
             if isinstance(found, str):
                 reason = found

@@ -5,7 +5,7 @@ Every length in metres is a setting, also those rarely changed: for depth camera
 
 from typing import Annotated, Literal
 
-from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
+from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt
 
 from mapper.core.config import Config, Ratio
 
@@ -25,8 +25,6 @@ class LevellingConfig(Config):
     """One point per cubic cell is used, so that near ground does not outvote the rest."""
     reach_m: PositiveFloat = 40.0
     """Points farther away along an axis are not used."""
-    samples: PositiveInt = 400
-    """Number of planes that are tried."""
     seed: NonNegativeInt = 0
     """Seed of the random samples."""
 
@@ -96,8 +94,6 @@ class VotingConfig(Config):
     them."""
     peaks: PositiveInt = 20
     """Distinct peaks that are verified."""
-    distinct_rad: PositiveFloat = 0.09
-    """A peak nearer to a higher one than this, and than two bins, is the same peak."""
 
     @property
     def width_m(self) -> float:
@@ -108,16 +104,8 @@ class VotingConfig(Config):
 class OverlapConfig(Config):
     """Verification of the peaks: planar refinement by overlap, then the free-space check."""
 
-    obstacles: PositiveInt = 1000
-    """Number of obstacle voxels, and of ground columns, that are compared, evenly chosen."""
-    candidates: PositiveInt = 6
-    """Number of peaks, those with most overlap, that get the free-space check."""
     distinct_m: PositiveFloat = 1.0
-    """Motions nearer to each other than this, and than ``distinct_rad``, are the same."""
-    distinct_rad: PositiveFloat = 0.05
-    """Motions nearer to each other than this, and than ``distinct_m``, are the same."""
-    rays: PositiveInt = 40_000
-    """Number of points, evenly chosen, whose rays make the range image."""
+    """Motions nearer to each other than this, and than 0.05 rad, are the same."""
     margin_m: PositiveFloat = 0.2
     """Margin of the free-space check along a ray."""
 
@@ -127,12 +115,8 @@ class HoughAcceptanceConfig(Config):
 
     min_agreeing_ratio: Ratio = 0.1
     """Share of each scan's obstacles that the other measured, too. Right results had 0.12 or more."""
-    min_lead: NonNegativeFloat = 0.1
-    """Smallest lead of the score over that of any other motion."""
     pair_m: PositiveFloat = 0.5
     """A point of the refined clouds is an inlier if it is this near to one of the other cloud."""
-    refined: PositiveInt = 3
-    """Largest number of candidates with similar scores that are refined."""
 
 
 class GicpStagesConfig(Config):
@@ -141,8 +125,6 @@ class GicpStagesConfig(Config):
     kind: Literal["gicp"] = "gicp"
     pair_distances_m: Annotated[tuple[PositiveFloat, ...], Field(min_length=1)] = (1.0,)
     """Largest distance between the points of a pair, from coarse to fine."""
-    max_iterations: PositiveInt = 30
-    """Largest number of iterations at each of these distances."""
 
 
 class NdtStagesConfig(Config):
@@ -151,8 +133,6 @@ class NdtStagesConfig(Config):
     kind: Literal["ndt"] = "ndt"
     cells_m: Annotated[tuple[PositiveFloat, ...], Field(min_length=1)] = (2.0, 1.0)
     """Edges of the cells, from coarse to fine."""
-    max_iterations: PositiveInt = 30
-    """Largest number of iterations at each of these cell sizes."""
 
 
 class HoughConfig(Config):
@@ -166,8 +146,6 @@ class HoughConfig(Config):
     acceptance: HoughAcceptanceConfig = HoughAcceptanceConfig()
     voxel_m: PositiveFloat = 0.4
     """The clouds that are refined have one point per voxel."""
-    neighbours: Annotated[int, Field(ge=5)] = 10
-    """Number of nearest points for the normal of each of these."""
     refinement: Annotated[GicpStagesConfig | NdtStagesConfig, Field(discriminator="kind")]
     """Registration that refines the motion found by voting."""
 

@@ -77,6 +77,9 @@ def _cells(flat: Array, cell_m: float) -> NDArray[np.int64]:
 
 _MIN_VOXELS_RATIO = 0.5
 """An object, or an occupied cell, has at least this many times the voxels of the cloud's median cell."""
+_RAYS, _COMPARED = 40_000, 1000
+"""Points of a scan, evenly chosen, whose rays make the range image; obstacles and ground columns that are
+compared."""
 DIRECTION_RAD = 0.0175
 """Resolution of the range image: one degree."""
 
@@ -115,12 +118,12 @@ class HoughDescription:
 def describe(scan: Scan, config: HoughConfig) -> HoughDescription:
     """Return the description of a scan."""
     around = surroundings(scan.points_body, config.constellation)
-    ground, overlap = config.constellation.ground, config.overlap
-    ranges_m = range_image(_evenly_chosen(scan.points_body, overlap.rays), scan.origin_body, DIRECTION_RAD)
+    ground = config.constellation.ground
+    ranges_m = range_image(_evenly_chosen(scan.points_body, _RAYS), scan.origin_body, DIRECTION_RAD)
     obstacles, ground_points = (
         ScanDescription(
             around.levelling.T_level_body,
-            _evenly_chosen(points_level, overlap.obstacles),
+            _evenly_chosen(points_level, _COMPARED),
             ranges_m,
             DIRECTION_RAD,
             scan.origin_body,
@@ -139,7 +142,7 @@ def describe(scan: Scan, config: HoughConfig) -> HoughDescription:
         around.levelling.T_level_body,
         centres_of(around.obstacles, config.constellation.centres),
         around.ground,
-        _evenly_chosen(around.heights_m, overlap.obstacles),
+        _evenly_chosen(around.heights_m, _COMPARED),
         volume,
         obstacles,
         ground_points,

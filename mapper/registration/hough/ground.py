@@ -20,6 +20,7 @@ LEVEL_ABOVE_RAD = 0.09
 MIN_INLIER_RATIO = 0.03
 """With a smaller share of inliers there is no ground, and the scan is taken as level."""
 FITS = 3
+_SAMPLES = 400  # planes that are tried
 MIN_POINTS = 3
 """Columns with fewer points are noise."""
 
@@ -56,7 +57,7 @@ def level(points_body: Points32, config: LevellingConfig) -> Levelling:
     few = points_body[thin(points_body, config.cell_m, config.reach_m)].astype(np.float64)
     if len(few) < 3:
         return _WITHOUT_GROUND
-    triples = np.random.default_rng(config.seed).integers(0, len(few), (config.samples, 3))
+    triples = np.random.default_rng(config.seed).integers(0, len(few), (_SAMPLES, 3))
     plane, score = score_planes(
         few,
         triples,

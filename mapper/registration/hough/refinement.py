@@ -18,6 +18,7 @@ from mapper.registration.pair_refinement import refined_motion
 from mapper.registration.surfaces import Prepared, prepared
 
 _HALVINGS = 2
+_MOST_STEPS = 30  # of GICP at each pair distance
 """Number of times that the steps are halved: to a quarter of a voxel; the points are then refined."""
 _FIT_WIDTH_M = 0.5
 _MIN_FIT_CELLS = 30
@@ -103,7 +104,7 @@ class RefinementCloud:
 
 def refinement_cloud(scan: Scan, description: HoughDescription, config: HoughConfig) -> RefinementCloud:
     """Return a scan's points as the configured refinement takes them."""
-    thinned = prepared(scan.points_body, voxel_m=config.voxel_m, neighbours=config.neighbours)
+    thinned = prepared(scan.points_body, voxel_m=config.voxel_m)
     dense = sparse = np.empty((0, 3))
     if isinstance(config.refinement, NdtStagesConfig):
         min_height_m = config.constellation.ground.max_thickness_m
@@ -123,7 +124,6 @@ def refine_on_points(
             source.sparse,
             T_target_source,
             cells_m=refinement.cells_m,
-            max_iterations=refinement.max_iterations,
         )
     return refined_motion(
         target.thinned,
@@ -131,5 +131,5 @@ def refine_on_points(
         T_target_source,
         kind="gicp",
         pair_distances_m=refinement.pair_distances_m,
-        max_iterations=refinement.max_iterations,
+        max_iterations=_MOST_STEPS,
     )

@@ -9,6 +9,8 @@ from mapper.registration.hough.config import VotingConfig
 from mapper.registration.hough.voting_kernels import vote_slices
 
 _PER_ANGLE = 8
+DISTINCT_RAD = 0.09
+"""A peak nearer to a higher one than this, and than two bins, is the same peak."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +71,7 @@ def vote(target: Array, source: Array, config: VotingConfig) -> list[Peak]:
             votes=int(heights[i]),
             score=float(heights[i] / norm),
         )
-        for i in distinct(offsets_m, turns, config.peaks, far_m=config.width_m, far_rad=config.distinct_rad)
+        for i in distinct(offsets_m, turns, config.peaks, far_m=config.width_m, far_rad=DISTINCT_RAD)
     ]
 
 

@@ -17,7 +17,6 @@ from mapper.odometry.config import IsvdOdometryConfig
 from mapper.pipeline.solve import solve
 from mapper.pipeline.track import track_log
 from mapper.pipeline.tracking_result import TrackingResult
-from mapper.registration.config import IsvdConfig
 from mapper.runtime.progress import SILENT
 from mapper.runtime.resumable_jobs import JobResult
 from mapper.sources import open_source
@@ -56,7 +55,6 @@ def test_tables_compare_what_they_say():
     iterations = {name: setting.config().odometry.registration for name, setting in settings("5.1")}
     assert list(iterations) == ["1", "3", "4", "5", "7", "9", "11", "13", "15", "20", "25", "auto"]
     assert all(config.max_iterations == int(name) for name, config in iterations.items() if name != "auto")
-    assert {config.min_pairs for config in iterations.values()} == {IsvdConfig().min_pairs}
     assert [name for name, config in iterations.items() if config.min_error_mm > 0] == ["auto"]
     previous = {name: setting.config().odometry.previous_frames for name, setting in settings("5.2")}
     assert previous == {"MP1": 1, "MP2": 2, "MP3": 3, "MP4": 4, "MP6": 6}

@@ -216,9 +216,10 @@ def test_relocalises_at_a_keyframe():
     assert np.allclose(back.T_world_body, start, atol=0.02)
 
 
-def test_keyframes_far_from_the_loss_are_tried_in_turn():
+def test_keyframes_far_from_the_loss_are_tried_in_turn(monkeypatch):
     wall = Wall(5)
-    odometry = IsvdOdometry(config(keyframe_interval=5, relocalisation_keyframes=2))
+    monkeypatch.setattr("mapper.odometry.isvd.odometry.RELOCALISATION_KEYFRAMES", 2)
+    odometry = IsvdOdometry(config(keyframe_interval=5))
     follow(odometry, wall, path(60, step_m=0.08))
     start = np.eye(4)
 
@@ -249,7 +250,7 @@ def test_a_gyroscope_rules_out_a_view_of_another_direction(has_gyroscope):
     assert (odometry.track(wall.seen_from(turned, 3_910_000_000)).node is None) == has_gyroscope
 
 
-def test_bridges_a_view_without_a_common_plane_by_matching_without_homography():
+def test_bridges_a_view_without_a_common_plane_by_matching_without_homography(monkeypatch):
     deep = Wall(6, depth_m=4.0)
     poses = [np.eye(4), exp(np.array([0.0, 0.3, 0.0]), np.array([0.4, 0.1, 0.3]))]
 
@@ -257,8 +258,8 @@ def test_bridges_a_view_without_a_common_plane_by_matching_without_homography():
 
     assert tracks[1].diagnostics.method in ("isvd", "fallback")
     assert np.allclose(tracks[1].T_world_body, poses[1], atol=0.01)
-    strict = config(match=config().match.model_copy(update={"homography_tolerance_px": 0.01}))
-    assert follow(IsvdOdometry(strict), deep, poses)[1].diagnostics.method == "fallback"
+    monkeypatch.setattr("mapper.features.matching.TOLERANCE_PX", 0.01)
+    assert follow(IsvdOdometry(config()), deep, poses)[1].diagnostics.method == "fallback"
 
 
 def test_two_runs_give_the_same_bytes():

@@ -81,9 +81,10 @@ def test_a_known_place_is_recognised_in_its_first_frame_and_its_landmarks_are_sh
 
 
 @BOTH
-def test_an_unknown_place_begins_a_sub_map(frames, config):
+def test_an_unknown_place_begins_a_sub_map(frames, config, monkeypatch):
+    monkeypatch.setattr("mapper.odometry.keyframes.tracking.MOST_LOST_FRAMES", 4)
     before, elsewhere = frames[seconds(0.0, 1.0)], frames[seconds(2.3, 3.3)]
-    odometry = build_frame_odometry(config.model_copy(update={"max_lost_frames": 4}))
+    odometry = build_frame_odometry(config)
 
     tracks = tracked([*before, *elsewhere], odometry)
 
@@ -100,25 +101,20 @@ def test_an_unknown_place_begins_a_sub_map(frames, config):
     assert [part[0] for part in parts] == [0, first.node]
 
 
-def test_without_sub_maps_frames_stay_lost(frames):
-    odometry = build_frame_odometry(LocalMapConfig(max_lost_frames=0))
-    before, elsewhere = frames[seconds(0.0, 0.5)], frames[seconds(2.3, 3.3)]
-    assert all(t.node is None for t in tracked([*before, *elsewhere], odometry)[len(before) :])
-
-
-def test_darkness_is_no_place(frames):
+def test_darkness_is_no_place(frames, monkeypatch):
     """Frames without features never begin a map, however many they are."""
-    odometry = build_frame_odometry(LocalMapConfig(max_lost_frames=2))
+    monkeypatch.setattr("mapper.odometry.keyframes.tracking.MOST_LOST_FRAMES", 2)
+    odometry = build_frame_odometry(LocalMapConfig())
     tracks = tracked([*frames[:5], *map(blank, frames[5:9]), *frames[9:12]], odometry)
     assert all(t.node is None for t in tracks[5:9])
     assert tracks[9].diagnostics.method.startswith("relocalised")
 
 
 @pytest.mark.parametrize("order", [1, -1])
-def test_of_two_weak_poses_that_of_more_inliers_counts(frames, order):
+def test_of_two_weak_poses_that_of_more_inliers_counts(frames, order, monkeypatch):
     """No pose has enough inliers here, so each keyframe is tried, in any order."""
-    config = LocalMapConfig(weak_inliers=10_000)
-    odometry = build_frame_odometry(config)
+    monkeypatch.setattr("mapper.odometry.keyframes.relocalizer.WEAK_INLIERS", 10_000)
+    odometry = build_frame_odometry(LocalMapConfig())
     tracked(frames[:12], odometry)
     relocalizer, observation = odometry._tracking._relocalizer, odometry.observe(frames[12])
     keyframes = range(len(odometry._map.keyframes))[::order]
@@ -151,7 +147,7 @@ def test_a_place_that_only_looks_known_begins_a_sub_map(frames, config):
 
     back = next(track for track in tracks[dark.stop :] if track.node is not None)
     assert back.diagnostics.method == "start"
-    assert tracks.index(back) - dark.stop <= 1  # at once, instead of after ``max_lost_frames``
+    assert tracks.index(back) - dark.stop <= 1  # at once, instead of after MOST_LOST_FRAMES
     assert len(components(graph_of(tracks, odometry))) == 2
 
 

@@ -176,8 +176,9 @@ def test_a_jump_beyond_the_map_is_registered_without_a_guess():
     np.testing.assert_allclose(T_jumped_body, turned, atol=0.05)
 
 
-def test_another_street_is_lost_and_then_begins_a_sub_map():
-    config = GicpOdometryConfig(max_lost_scans=2, rescue=None)
+def test_another_street_is_lost_and_then_begins_a_sub_map(monkeypatch):
+    monkeypatch.setattr("mapper.odometry.scans.odometry.MOST_LOST_SCANS", 2)
+    config = GicpOdometryConfig(rescue=None)
     elsewhere = [
         Scan(scan.stamp_ns + 10_000_000_000, (scan.points_body * [1.0, -1.0, 1.0]).astype(np.float32))
         for scan in (street(5).entry_at(index).load() for index in range(6))
