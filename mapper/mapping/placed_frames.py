@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mapper.core.deskew import deskewed
+from mapper.core.deskew import deskewed, twist_at
 from mapper.core.frames import Frame, Scan, Sensor
 from mapper.core.geometry import Transform
 from mapper.core.timebase import NS_PER_S, nearest
@@ -29,7 +29,7 @@ class PlacedFrame:
         entry: The frame.
         sensor: What took it.
         index: Index of its pose in the trajectory.
-        T_world_body: (4, 4) its final pose.
+        T_world_body: (4, 4) its final pose, when its depth was measured.
         trajectory: Final poses of all frames of the same sensor.
         gyroscope: Readings of the log, for deskewing.
         wheels: T_odom_body of the log, for the same.
@@ -56,6 +56,8 @@ def placed_frames(source: Log, trajectory: Trajectory) -> Iterator[PlacedFrame]:
     for entry in source.entries_of(index_of):
         index = index_of[entry.stamp_ns]
         T_world_body = trajectory.T_world_body[index]
+        if delay_ns := entry.depth_stamp_ns - entry.stamp_ns:
+            T_world_body = T_world_body @ twist_at(trajectory, index).over(delay_ns / NS_PER_S)
         yield PlacedFrame(
             entry, source.sensor, index, T_world_body, trajectory, source.gyroscope, source.wheels
         )

@@ -36,7 +36,6 @@ from mapper.pipeline.georeference import Georeferenced, georeference
 from mapper.pipeline.inertial_bridging import bridge, check_accelerations
 from mapper.pipeline.lidar_adjustment import adjust_tracking
 from mapper.pipeline.solve import solve
-from mapper.pipeline.time_offsets import depth_time_offset
 from mapper.pipeline.track import first_session, noted_log_warnings, track_log
 from mapper.pipeline.tracking_checkpoints import TrackingCheckpoints
 from mapper.pipeline.tracking_result import TrackingResult, from_tracking, refuse_a_fragment, save_places
@@ -50,6 +49,7 @@ from mapper.run.writer import RunWriter, first_manifest, write_run
 from mapper.runtime.progress import SILENT, Progress
 from mapper.sensing.sweep_motion import motion_during
 from mapper.sources.base import Log
+from mapper.sources.depth_time import depth_time_offset
 from mapper.sources.trajectory_files import write_tum
 
 

@@ -33,16 +33,17 @@ from mapper.run.edits_file import edits_text, parse_edits, write_edits
 from mapper.run.folder import Run, moved_log, open_run
 from mapper.run.frame_outcomes import FrameRecord
 from mapper.run.input_logs import paths_of, refuse_another_log
-from mapper.run.manifest import DepthReach, Solve, Status, Timing
+from mapper.run.manifest import DepthReach, RunWarning, Solve, Status, Timing
 from mapper.run.observers import NULL_OBSERVER, Observer
 from mapper.run.results import RunResults
 from mapper.run.stored_tracking import StoredTracking, load_tracking, save_solved
-from mapper.run.verdict import FLOOR, find_warnings, floor_warnings, verdict_of
+from mapper.run.verdict import DEPTH_TIME, FLOOR, find_warnings, floor_warnings, verdict_of
 from mapper.run.writer import RunWriter, write_run
 from mapper.runtime.atomic import is_temporary
 from mapper.runtime.progress import SILENT, Progress
 from mapper.sensing.depth import DepthLimit
 from mapper.sources.base import Log
+from mapper.sources.depth_time import with_depth_on_time
 
 _FUSE_CONFIGS = frozenset(
     {"octree", "slice", "traversable", "cloud", "mcap", "mesh", "costmap", "octomap", "rerun", "workers"}
@@ -199,6 +200,9 @@ def fuse_into(
         results = replace(results, frame_ms={})
     make_writer = ScanUpdateWriter if checkpoints is None else partial(MarkedUpdates, checkpoints=checkpoints)
     with writer.clock.stage("fuse"):
+        source, late_depth = with_depth_on_time(source, config.source)
+        if late_depth:
+            progress.note(late_depth)
         settings = _with_depth_noise(writer, source, config, progress)
         if checkpoints is not None:
             cached = known_updates(checkpoints, settings.octree)
@@ -223,7 +227,9 @@ def fuse_into(
             log_maps(log, maps, stamp_ns=int(results.trajectory.stamps_ns[0]))
             _write_maps(writer.folder, maps)
             _write_pictures(writer, maps, results, has_colors=source.has_colours)
-    others = [warning for warning in writer.manifest.warnings if warning.kind != FLOOR]
+    others = [one for one in writer.manifest.warnings if one.kind not in (FLOOR, DEPTH_TIME)]
+    if late_depth:
+        others.append(RunWarning(kind=DEPTH_TIME, sentence=late_depth))
     found = floor_warnings(config.traversable, config.octree.resolution_m, has_path=maps.has_path)
     writer.update(warnings=(*others, *found), edits=maps.edits)
     warnings = find_warnings(results, writer.manifest)

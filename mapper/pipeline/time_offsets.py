@@ -16,8 +16,7 @@ from mapper.runtime.progress import SILENT, Progress
 from mapper.sensing.gyroscope import Gyroscope
 from mapper.sensing.wheel_kinematics import step_sizes
 from mapper.sources.base import Log
-from mapper.sources.config import SourceConfig
-from mapper.sources.depth_outlines import depth_offsets_s
+from mapper.sources.depth_time import depth_time_offset
 from mapper.sources.time_offsets import TimeOffset, peak_of, time_offset
 
 _STEP_NS = NS_PER_S // 10
@@ -80,12 +79,6 @@ def measure_time_offsets(log: Log, config: BuildConfig, *, progress: Progress = 
         ]
         found.append(min(tried, key=lambda one: inf if one.sigma_s is None else one.sigma_s))
     return found
-
-
-def depth_time_offset(log: Log, config: SourceConfig) -> TimeOffset:
-    """Return how late the stamps of an RGB-D log's depth are, from its images alone."""
-    late_s = -depth_offsets_s(log)
-    return time_offset("depth", late_s, setting="source.depth_offset_s", set_s=config.depth_offset_s)
 
 
 def _estimates(path: Trajectory, other: Trajectory | Gyroscope) -> list[Sequence[float]]:

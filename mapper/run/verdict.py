@@ -25,7 +25,8 @@ from mapper.run.manifest import Manifest, RunWarning, Verdict, Weight
 from mapper.run.results import RunResults, with_truth
 from mapper.run.timeline import TimeLine, counted
 
-FLOOR = "floor"
+FLOOR, DEPTH_TIME = "floor", "depth time"
+"""Kinds that are found while a run is fused, and anew when it is fused again."""
 INPUT_KINDS = frozenset(
     {
         "log",
@@ -43,6 +44,7 @@ INPUT_KINDS = frozenset(
         "mounting",
         "level",
         FLOOR,
+        DEPTH_TIME,
     }
 )
 """Kinds that are found while the log is read or fused; a finished run has them in its manifest alone."""

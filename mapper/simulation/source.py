@@ -29,7 +29,7 @@ from mapper.simulation.readings import measure_gnss, measure_imu, measure_wheels
 from mapper.simulation.scene import Scene, make_scene
 from mapper.simulation.shutter import Shutter
 from mapper.simulation.streams import Stream, noise_index, rng_of
-from mapper.sources.base import ImageFiles, Log
+from mapper.sources.base import EntryWithoutFiles, Log
 from mapper.sources.calibration_file import calibration_text
 from mapper.sources.image_files.reading import TUM_UNITS_PER_M
 from mapper.sources.imu_files import write_imu
@@ -56,18 +56,16 @@ def camera_of(config: SynthConfig) -> PinholeCamera:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SyntheticEntry:
+class SyntheticEntry(EntryWithoutFiles):
     """Frame that is simulated when it is loaded, and is the same every time.
 
     Attributes:
         stamp_ns: Time of the frame, nanoseconds.
         simulate: Returns the frame; an image is grey where its argument is false.
-        files: None, for there are none.
     """
 
     stamp_ns: int
     simulate: Callable[[bool], Frame]
-    files: ImageFiles | None = None
 
     def load(self, *, colour: bool = True) -> Frame:
         """Return the frame."""

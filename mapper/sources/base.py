@@ -72,6 +72,11 @@ class FrameRef(Protocol):
         ...
 
     @property
+    def depth_stamp_ns(self) -> int:
+        """Time of the depth image, nanoseconds; the frame's where it has no other."""
+        ...
+
+    @property
     def files(self) -> ImageFiles | None:
         """The frame's encoded images, where the log has them."""
         ...
@@ -99,6 +104,22 @@ class FrameRef(Protocol):
         ...
 
 
+class EntryWithoutFiles:
+    """Part of entries of scans, and of images that are in no file: all was measured at the stamp."""
+
+    __slots__ = ()
+
+    @property
+    def depth_stamp_ns(self: FrameRef) -> int:
+        """Time of the frame, nanoseconds."""
+        return self.stamp_ns
+
+    @property
+    def files(self) -> None:
+        """None, for there are none."""
+        return None
+
+
 @dataclass(frozen=True, slots=True)
 class WrappedEntry:
     """Frame of another log as it is; subclasses change what is read of it. See :class:`FrameRef`."""
@@ -109,6 +130,11 @@ class WrappedEntry:
     def stamp_ns(self) -> int:
         """Time of the frame, nanoseconds."""
         return self.entry.stamp_ns
+
+    @property
+    def depth_stamp_ns(self) -> int:
+        """Time of the depth image, nanoseconds."""
+        return self.entry.depth_stamp_ns
 
     @property
     def files(self) -> ImageFiles | None:

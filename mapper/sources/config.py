@@ -136,9 +136,10 @@ class SourceConfig(Config):
     max_pair_gap_s: NonNegativeFloat = 0.02
     """Largest time between a colour image and its depth image. Raise it if the two are not synchronised and
     the camera moves slowly; frames without a partner are left out."""
-    depth_offset_s: float = 0.0
+    depth_offset_s: float | None = None
     """Added to the stamps of depth images before they are paired with colour images: how much later they show
-    the scene than their stamps say. ``mapper inspect --time-offset`` measures it, and the next three."""
+    the scene than their stamps say. None pairs them as stamped, and fuses them at the time that the images
+    show. ``mapper inspect --time-offset`` measures it, and the next three."""
     imu_offset_s: float = 0.0
     """Added to the stamps of accelerations and angular velocities."""
     wheels_offset_s: float = 0.0

@@ -1,20 +1,14 @@
 """Plausibility of depth as that of the images: whether outlines in depth lie on edges of brightness."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from itertools import permutations
-from typing import NamedTuple, TypeAlias
+from typing import TypeAlias
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.core.errors import FrameError
 from mapper.core.frames import RgbdFrame
-from mapper.core.geometry import Array, spread_indices
-from mapper.core.timebase import NS_PER_S
-from mapper.runtime.ordered_map import ordered_map
-from mapper.sources.base import FrameRef, Log
-from mapper.sources.time_offsets import peak_of
 
 _WIDTH_PX, _MOST_PX, _NEAR_PX = 320, 48, 4
 """Width to which images are reduced, the largest shift that is tried there, and the largest that is none."""
@@ -32,12 +26,8 @@ _TIMES_OTHERS = 2.0
 """Score in that of other frames' depth: 3.4 and more if registered, 0 to 2.2 if of another time or camera."""
 _FLIPS = {"mirrored": 1, "put upside down": 0, "turned by 180°": -1}
 """OpenCV's codes."""
-_BURSTS, _BURST_FRAMES, _MOST_LATE_S = 8, 24, 0.3
-"""Parts of a log in which depth's time is compared, frames of each, and the largest offset that is tried."""
-_LEAST_RISE = 0.2
-"""Score at the best time above that 0.3 s away; of a camera at rest all times are alike."""
 
-_Pixels: TypeAlias = NDArray[np.float32]
+Pixels: TypeAlias = NDArray[np.float32]
 
 
 def outline_warnings(frames: Iterable[RgbdFrame]) -> list[str]:
@@ -46,7 +36,7 @@ def outline_warnings(frames: Iterable[RgbdFrame]) -> list[str]:
     Outlines of what stands before something else are edges of brightness too. The gradient of brightness at
     those of depth is averaged over frames for every shift of the images; it is largest at the true one.
     """
-    found = [(frame.camera.width_px, both) for frame in frames if (both := _outlines(frame)) is not None]
+    found = [(frame.camera.width_px, both) for frame in frames if (both := outlines(frame)) is not None]
     if len(found) < _FEWEST_FRAMES:
         return []
     pairs = [both for _, both in found]
@@ -79,64 +69,7 @@ def outline_warnings(frames: Iterable[RgbdFrame]) -> list[str]:
     return []
 
 
-class _Timed(NamedTuple):
-    """Frame's outlines as of ``_outlines``, with the times of its images, nanoseconds."""
-
-    image_ns: int
-    depth_ns: int
-    gradient: _Pixels
-    edges: _Pixels
-
-
-def depth_offsets_s(log: Log) -> Array:
-    """Return how much later depth shows the scene than its stamps say: (M,) seconds, of parts of a log.
-
-    The gradient of brightness at outlines in depth is averaged for every time between the two images, and is
-    largest at the true one, between frames by a parabola. Parts without outlines or motion have no estimate.
-    """
-    period_s = float(np.median(np.diff(log.stamps_ns))) / NS_PER_S if len(log) > 1 else np.inf
-    reach = int(_MOST_LATE_S / period_s)
-    length = _BURST_FRAMES + 2 * reach
-    if log.sensor != "rgbd" or reach == 0 or len(log) <= 2 * reach:
-        return np.empty(0)
-    found = []
-    for first in spread_indices(max(len(log) - length + 1, 1), _BURSTS).tolist():
-        entries = [log.entry_at(k) for k in range(first, min(first + length, len(log)))]
-        offset_s = _burst_offset_s(list(ordered_map(_timed_outlines, entries)), reach)
-        if offset_s is not None:
-            found.append(offset_s)
-    return np.array(found)
-
-
-def _timed_outlines(entry: FrameRef) -> _Timed | None:
-    try:
-        frame = entry.load(colour=False)
-    except FrameError:
-        return None
-    both = _outlines(frame) if isinstance(frame, RgbdFrame) else None
-    if both is None:
-        return None
-    depth_ns = entry.stamp_ns if entry.files is None else entry.files.depth_stamp_ns
-    return _Timed(entry.stamp_ns, depth_ns, *both)
-
-
-def _burst_offset_s(frames: Sequence[_Timed | None], reach: int) -> float | None:
-    """Return the best offset of depth to images up to ``reach`` frames before and after; None if unclear."""
-    scores, offsets_s = [], []
-    for centre in range(reach, len(frames) - reach):
-        around = [frame for frame in frames[centre - reach : centre + reach + 1] if frame is not None]
-        depth = frames[centre]
-        if depth is not None and len(around) == 2 * reach + 1:
-            on_outlines = depth.edges > 0.0
-            scores.append([frame.gradient[on_outlines].mean() for frame in around])
-            offsets_s.append([(frame.image_ns - depth.depth_ns) / NS_PER_S for frame in around])
-    if not scores:
-        return None
-    mean, at_s = np.mean(scores, axis=0), np.mean(offsets_s, axis=0)
-    return peak_of(at_s, mean) if mean.max() - max(mean[0], mean[-1]) >= _LEAST_RISE else None
-
-
-def _outlines(frame: RgbdFrame) -> tuple[_Pixels, _Pixels] | None:
+def outlines(frame: RgbdFrame) -> tuple[Pixels, Pixels] | None:
     """Return the gradient of brightness in standard deviations from its mean, and 1 at outlines in depth.
 
     None of a frame with few of either.
@@ -159,11 +92,11 @@ def _outlines(frame: RgbdFrame) -> tuple[_Pixels, _Pixels] | None:
     return (gradient - gradient.mean()) / gradient.std(), edges
 
 
-def _scores(gradient: _Pixels, edges: _Pixels, most_px: int) -> _Pixels:
+def _scores(gradient: Pixels, edges: Pixels, most_px: int) -> Pixels:
     """Return the mean gradient at edges, for each shift (rows, columns) of these."""
     sums, counts = (
         cv2.matchTemplate(np.pad(image, most_px), edges, cv2.TM_CCORR)
         for image in (gradient, np.ones_like(gradient))
     )
-    scores: _Pixels = sums / np.maximum(counts, _FEWEST_PX)
+    scores: Pixels = sums / np.maximum(counts, _FEWEST_PX)
     return scores

@@ -32,6 +32,10 @@ class _ShiftedEntry(WrappedEntry):
         return self.entry.stamp_ns + self.shift_ns
 
     @property
+    def depth_stamp_ns(self) -> int:
+        return self.entry.depth_stamp_ns + self.shift_ns
+
+    @property
     def files(self) -> ImageFiles | None:
         files = self.entry.files
         return files and replace(files, depth_stamp_ns=files.depth_stamp_ns + self.shift_ns)

@@ -24,6 +24,7 @@ from mapper.simulation import CameraSimulator, make_scene, write_tum_log
 from mapper.simulation.config import SynthConfig, SynthWheelsConfig
 from mapper.simulation.lidar import LidarSimulator
 from mapper.sources import open_source
+from mapper.sources.base import EntryWithoutFiles
 from mapper.sources.multi_session_log import chained
 from tests.support.logs import CountedReads
 from tests.support.paths import CONFIGS
@@ -40,7 +41,7 @@ def flat(scene):
     return CameraSimulator(FLAT, scene).log()
 
 
-class BlankEntry:
+class BlankEntry(EntryWithoutFiles):
     """An entry whose image may be of a wall without texture."""
 
     def __init__(self, entry, *, is_blank):

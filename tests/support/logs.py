@@ -7,16 +7,15 @@ from typing import Any
 import numpy as np
 
 from mapper.core.errors import FrameError
-from mapper.sources.base import Log
+from mapper.sources.base import EntryWithoutFiles, Log
 
 
 @dataclass(frozen=True)
-class MemoryEntry:
+class MemoryEntry(EntryWithoutFiles):
     """An entry without files; ``frame`` may be an error to raise."""
 
     stamp_ns: int
     frame: Any
-    files: None = None
 
     def load(self, *, colour: bool = True) -> Any:  # noqa: ARG002
         if isinstance(self.frame, Exception):
@@ -47,7 +46,7 @@ class CountedReads:
         self.log = replace(source, entry_at=lambda index: CountedEntry(self, index, source.entry_at(index)))
 
 
-class CountedEntry:
+class CountedEntry(EntryWithoutFiles):
     def __init__(self, counted, index, entry):
         self.counted, self.index, self.entry, self.stamp_ns = counted, index, entry, entry.stamp_ns
 

@@ -80,7 +80,7 @@ def ordered_pairs(
 
 def depth_offset_ns(config: SourceConfig) -> int:
     """Return what is added to the stamps of depth images, nanoseconds."""
-    return round(config.depth_offset_s * NS_PER_S)
+    return round((config.depth_offset_s or 0.0) * NS_PER_S)
 
 
 def pair_images(

@@ -57,6 +57,11 @@ class RgbdEntry:
     recorded: RecordedCamera
 
     @property
+    def depth_stamp_ns(self) -> int:
+        """Time of the depth image, nanoseconds."""
+        return self.encoded.depth_stamp_ns
+
+    @property
     def files(self) -> ImageFiles | None:
         """The encoded images; None where they show other views than the frame."""
         return self.encoded if self.recorded.shows_recorded_views else None
@@ -74,7 +79,7 @@ class RgbdEntry:
             image,
             self.recorded.depth_m(self._depth_m(), f"{self.encoded.depth}"),
             self.recorded.camera,
-            depth_delay_s=(self.encoded.depth_stamp_ns - self.stamp_ns) / NS_PER_S,
+            depth_delay_s=(self.depth_stamp_ns - self.stamp_ns) / NS_PER_S,
             is_depth_moved=self.recorded.registration is not None,
         )
 

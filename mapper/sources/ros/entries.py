@@ -7,7 +7,7 @@ import numpy as np
 
 from mapper.core.errors import DataError, FrameError
 from mapper.core.frames import DepthImage, Image, Scan
-from mapper.sources.base import ImageFiles
+from mapper.sources.base import EntryWithoutFiles, ImageFiles
 from mapper.sources.image_files.decoded import DecodedColour, DecodedDepth
 from mapper.sources.image_files.image_sizes import RecordedCamera
 from mapper.sources.image_folders.rgbd import RgbdEntry
@@ -136,7 +136,7 @@ def _file_of(message: ImageMessage) -> bytes | None:
 
 
 @dataclass(frozen=True, slots=True)
-class CloudEntry:
+class CloudEntry(EntryWithoutFiles):
     """Point cloud message, not read yet.
 
     Attributes:
@@ -152,7 +152,6 @@ class CloudEntry:
     tree: FrameTree
     scale: float | None = None
     is_planar: bool = False
-    files: ImageFiles | None = None
 
     @property
     def stamp_ns(self) -> int:

@@ -18,7 +18,7 @@ from mapper.core.geometry import Array, Transform, inverse, planar_motion
 from mapper.core.timebase import ns_from_seconds_text
 from mapper.core.trajectory import Trajectory
 from mapper.runtime.regular_files import read_text
-from mapper.sources.base import ImageFiles, Log
+from mapper.sources.base import EntryWithoutFiles, Log
 from mapper.sources.config import SourceConfig
 from mapper.sources.laser_scan import MOST_RAD, beam_points, planar_scan, rolling
 from mapper.sources.text import time_order
@@ -126,13 +126,12 @@ def read_log(path: Path, config: SourceConfig) -> Log:  # noqa: ARG001
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class CarmenEntry:
+class CarmenEntry(EntryWithoutFiles):
     """Scan of a laser's line; see :class:`mapper.sources.base.FrameRef`."""
 
     line: _Line
     T_robot_laser: Transform
     limit_m: float
-    files: ImageFiles | None = None
 
     @property
     def stamp_ns(self) -> int:

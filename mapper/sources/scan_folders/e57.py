@@ -16,7 +16,7 @@ from mapper.core.rotations import pose_of_row
 from mapper.core.timebase import GPS_EPOCH_S, NS_PER_S, Stamps
 from mapper.runtime.atomic import atomic_file
 from mapper.runtime.extras import extra, require
-from mapper.sources.base import ImageFiles, Log
+from mapper.sources.base import EntryWithoutFiles, Log
 from mapper.sources.cloud_files.parsing import MIN_POINTS
 from mapper.sources.config import SourceConfig
 from mapper.sources.image_folders.numbered import stamp_at
@@ -76,12 +76,11 @@ class _Station:
 
 
 @dataclass(frozen=True, slots=True)
-class _StationEntry:
+class _StationEntry(EntryWithoutFiles):
     """Scan that has not been read yet."""
 
     stamp_ns: int
     station: _Station
-    files: ImageFiles | None = None
 
     def load(self, *, colour: bool = True) -> Scan:
         """Read the scan, in the scanner's frame.

@@ -6,7 +6,7 @@ from pathlib import Path
 from mapper.core.errors import FrameError
 from mapper.core.frames import Scan
 from mapper.core.timebase import NS_PER_S
-from mapper.sources.base import ImageFiles
+from mapper.sources.base import EntryWithoutFiles
 from mapper.sources.cloud_files import read_cloud
 from mapper.sources.cloud_files.parsing import MIN_POINTS
 from mapper.sources.point_times import relative_times_s, without_untimed
@@ -14,7 +14,7 @@ from mapper.sources.valid_returns import FARTHEST_M, valid_returns
 
 
 @dataclass(frozen=True, slots=True)
-class ScanEntry:
+class ScanEntry(EntryWithoutFiles):
     """Cloud file, not read yet; the body is the LiDAR."""
 
     stamp_ns: int
@@ -25,7 +25,6 @@ class ScanEntry:
     """Numbers of a record in a .bin file; None is KITTI's four, and checked."""
     rows: tuple[int, int] | None = None
     """First point of a LAS file, and the one after the last; None is the whole file."""
-    files: ImageFiles | None = None
 
     def load(self, *, colour: bool = True) -> Scan:
         """Read the cloud, with the time of each point where the file has it; far returns are left out.

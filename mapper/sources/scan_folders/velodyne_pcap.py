@@ -12,7 +12,7 @@ import numpy as np
 
 from mapper.core.errors import DataError, FrameError, SourceError
 from mapper.core.frames import Scan
-from mapper.sources.base import ImageFiles, Log
+from mapper.sources.base import EntryWithoutFiles, Log
 from mapper.sources.captures import ENDINGS, Datagram, captured, first_datagrams
 from mapper.sources.config import SourceConfig
 from mapper.sources.ros.cloud_messages import scan_from
@@ -79,14 +79,13 @@ def read_log(path: Path, config: SourceConfig) -> Log:
 
 
 @dataclass(frozen=True, slots=True)
-class _TurnEntry:
+class _TurnEntry(EntryWithoutFiles):
     """Turn that has not been read yet; the body is the LiDAR."""
 
     path: Path
     sender: bytes
     turn: _Turn
     scale: float | None
-    files: ImageFiles | None = None
 
     @property
     def stamp_ns(self) -> int:

@@ -8,6 +8,7 @@ from mapper.odometry.config import IsvdOdometryConfig, LocalMapConfig, WheelsOdo
 from mapper.odometry.factory import build_frame_odometry, build_odometry
 from mapper.odometry.renumbered_nodes import NodeOffset
 from mapper.sources import open_source
+from mapper.sources.base import EntryWithoutFiles
 
 CONFIGS = {"local-map": LocalMapConfig(), "isvd": IsvdOdometryConfig(detector=OrbConfig())}
 
@@ -63,7 +64,7 @@ def test_the_first_frame_has_no_earlier_pixels_and_a_lost_one_no_matches(config,
     assert odometry.matches() is None
 
 
-class DarkEntry:
+class DarkEntry(EntryWithoutFiles):
     """A frame taken with the lens covered."""
 
     def __init__(self, entry):
