@@ -25,12 +25,10 @@ class UnitCamera:
     Attributes:
         calibration: The camera.
         T_unit_camera: (4, 4) pose in the unit: its IMU, or its first camera where no IMU is described.
-        topic: Topic of its images; empty if that is not stated.
     """
 
     calibration: Calibration
     T_unit_camera: Transform
-    topic: str = ""
 
 
 def read_sensor_yaml(path: Path) -> UnitCamera:
@@ -46,33 +44,41 @@ def read_sensor_yaml(path: Path) -> UnitCamera:
     return UnitCamera(read_yaml(text, f"{path}"), T_unit_camera)
 
 
-def chain_beside(*folders: Path) -> list[UnitCamera]:
-    """Return the cameras of the first ``*camchain*.yaml`` in some folders, cam0 and those after it.
+def pair_beside(*folders: Path, topics: tuple[str, str] = ("", "")) -> tuple[UnitCamera, UnitCamera] | None:
+    """Return two cameras of the first ``*camchain*.yaml`` in some folders; None if there is no such file.
 
-    None if there is no such file.
+    Args:
+        folders: Where it is looked for.
+        topics: Topics of their images; unless it has both, the cameras are cam0 and cam1.
 
     Raises:
-        SourceError: It cannot be read, or does not describe two cameras and their poses.
+        SourceError: It cannot be read, or does not describe the two and their poses.
     """
     files = [path for folder in folders for path in sorted(folder.glob("*camchain*.yaml")) if path.is_file()]
     if not files:
-        return []
-    sections = dict(_SECTION.findall(read_text(files[0], error=SourceError)))
+        return None
+    text = read_text(files[0], error=SourceError).replace("\r\n", "\n")
+    sections = dict(_SECTION.findall(text))
     if not {"0", "1"} <= sections.keys():
         raise SourceError(f"{files[0]}: want cameras cam0 and cam1")
-    cameras: list[UnitCamera] = []
-    for number in sorted(sections):
-        text, where = sections[number], f"{files[0]}: cam{number}"
-        T_unit_camera = np.eye(4)
-        if (T_camera_imu := _pose(text, "T_cam_imu", where)) is not None:
-            T_unit_camera = inverse(T_camera_imu)
-        elif cameras:
-            if (T_camera_before := _pose(text, "T_cn_cnm1", where)) is None:
+    found = {topic[1]: number for number, one in sections.items() if (topic := _TOPIC.search(one))}
+    left, right = ("0", "1") if not found.keys() >= {*topics} else (found[topic] for topic in topics)
+    poses: dict[str, Transform] = {}
+    T_unit_before = np.eye(4)
+    for number in sorted(one for one in sections if one <= max(left, right)):
+        where = f"{files[0]}: cam{number}"
+        if (T_camera_imu := _pose(sections[number], "T_cam_imu", where)) is not None:
+            T_unit_before = inverse(T_camera_imu)
+        elif poses:
+            if (T_camera_before := _pose(sections[number], "T_cn_cnm1", where)) is None:
                 raise SourceError(f"{where}: want the camera's pose, T_cam_imu or T_cn_cnm1")
-            T_unit_camera = cameras[-1].T_unit_camera @ inverse(T_camera_before)
-        topic = _TOPIC.search(text)
-        cameras.append(UnitCamera(read_yaml(text, where), T_unit_camera, topic[1] if topic else ""))
-    return cameras
+            T_unit_before = T_unit_before @ inverse(T_camera_before)
+        poses[number] = T_unit_before
+    one, other = (
+        UnitCamera(read_yaml(sections[number], f"{files[0]}: cam{number}"), poses[number])
+        for number in (left, right)
+    )
+    return one, other
 
 
 def _pose(text: str, key: str, where: str) -> Transform | None:

@@ -12,7 +12,7 @@ from mapper.sensing.stereo import stereo_depth_m
 from mapper.sources import open_source
 from mapper.sources.config import CameraConfig, SourceConfig
 from mapper.sources.writers import left_out, write_log
-from tests.support.recordings import transforms, write
+from tests.support.recordings import changed, transforms, write
 from tests.support.stereo_rig import (
     BARREL,
     FISHEYE,
@@ -189,6 +189,30 @@ def test_kalibrs_file_describes_the_cameras_of_a_recording(tmp_path, cameras, ha
     (tmp_path / "my-camchain-imucam.yaml").write_text(camera_chain(described, has_imu=has_imu, topics=topics))
     log = open_source(tmp_path / "a.bag")
     assert_shows_wall(log, [T @ turned_by_rectifying(cameras) for T in poses_world(2)])
+
+
+@pytest.mark.parametrize("case", ["zeros", "left alone", "third of another lens", "Windows"])
+def test_kalibrs_file_counts_unless_both_cameras_are_calibrated(tmp_path, case):
+    names = ("/cam0/image_raw", "/cam1/image_raw")
+    messages = recorded(BARREL, names, projections=projections(0.1))
+    if case == "zeros":  # as drivers publish that have no calibration
+        zeros = {"k": np.zeros(9), "p": np.zeros(12), "d": np.zeros(0)}
+        messages = [one if one.topic in names else changed(one, **zeros) for one in messages]
+    else:
+        kept = (*names, "/cam0/camera_info") if case == "left alone" else names
+        messages = [one for one in messages if one.topic in kept]
+    write(tmp_path / "a.bag", messages)
+    with pytest.raises(SourceError, match=r"no calibration .*camchain"):
+        open_source(tmp_path / "a.bag")
+    text = camera_chain(BARREL)
+    if case == "third of another lens":
+        text += "cam2:\n  camera_model: omni\n  rostopic: /cam2/image_raw\n"
+    if case == "Windows":
+        text = text.replace("\n", "\r\n")
+    (tmp_path / "camchain.yaml").write_bytes(text.encode())
+    assert_shows_wall(
+        open_source(tmp_path / "a.bag"), [T @ turned_by_rectifying(BARREL) for T in poses_world(2)]
+    )
 
 
 def test_what_is_missing_or_swapped_is_named(tmp_path):

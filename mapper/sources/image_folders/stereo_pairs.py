@@ -15,7 +15,7 @@ from mapper.core.errors import SourceError
 from mapper.core.geometry import Transform, inverse
 from mapper.core.trajectory import Trajectory
 from mapper.sources.base import Accelerations, Log
-from mapper.sources.camera_chain import UnitCamera, chain_beside, read_sensor_yaml
+from mapper.sources.camera_chain import UnitCamera, pair_beside, read_sensor_yaml
 from mapper.sources.config import SourceConfig
 from mapper.sources.image_files.reading import read_view
 from mapper.sources.image_folders.pairing import ImageList, pair_images
@@ -140,15 +140,15 @@ def _listed(folder: Path, notes: list[str]) -> ImageList:
     return ImageList(stamps[order], [paths[i] for i in order])
 
 
-def _euroc_cameras(path: Path, folder: Path) -> list[UnitCamera]:
+def _euroc_cameras(path: Path, folder: Path) -> tuple[UnitCamera, UnitCamera]:
     """Return both cameras and their poses in the body of the recording unit."""
-    files = [folder / f"cam{k}" / "sensor.yaml" for k in (0, 1)]
-    if all(file.is_file() for file in files):
-        return [read_sensor_yaml(file) for file in files]
-    cameras = chain_beside(path, folder, path / "dso")
-    if not cameras:
+    left, right = (folder / f"cam{k}" / "sensor.yaml" for k in (0, 1))
+    if left.is_file() and right.is_file():
+        return read_sensor_yaml(left), read_sensor_yaml(right)
+    pair = pair_beside(path, folder, path / "dso")
+    if pair is None:
         raise SourceError(f"{path}: no cam0/sensor.yaml and cam1/sensor.yaml, and no *camchain*.yaml")
-    return cameras[:2]
+    return pair
 
 
 def _euroc_truth(folder: Path, T_imu_body: Transform) -> tuple[Trajectory | None, list[str]]:

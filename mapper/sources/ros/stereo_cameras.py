@@ -4,7 +4,7 @@ import numpy as np
 
 from mapper.core.errors import SourceError
 from mapper.core.geometry import Array, inverse, nearest_rotation, transform
-from mapper.sources.camera_chain import UnitCamera, chain_beside
+from mapper.sources.camera_chain import pair_beside
 from mapper.sources.image_files.image_sizes import Size
 from mapper.sources.ros.cameras import calibration_of
 from mapper.sources.ros.message_index import Series
@@ -19,22 +19,23 @@ def stereo_camera(reader: RecordingReader, topics: StereoTopics, *, size_px: Siz
     """Return the camera of a pair's frames: the rectified left one.
 
     The right camera's place is that of its projection (CameraInfo's P), or else of tf. Images of a topic
-    without "rect" in its name are raw, and are rectified. Without CameraInfo, Kalibr's file counts.
+    without "rect" in its name are raw, and are rectified. Without a CameraInfo of
+    each that is calibrated, Kalibr's file counts.
 
     Raises:
         SourceError: A camera or its place is unknown, or the cameras do not lie side by side.
     """
     where, name = reader.recording.path, topics.left.topic.name
-    if topics.left_info is None and (chain := _chain_of(reader, topics)) is not None:
-        left_unit, right_unit = chain
-        T_left_right = inverse(left_unit.T_unit_camera) @ right_unit.T_unit_camera
-        return rectify(left_unit.calibration, right_unit.calibration, T_left_right, size_px)
     left, right = (_info(reader, one) for one in (topics.left_info, topics.right_info))
     if left is None or right is None or topics.left_info is None or topics.right_info is None:
+        folder = where if where.is_dir() else where.parent
+        if (pair := pair_beside(folder, topics=(name, topics.right.topic.name))) is not None:
+            T_left_right = inverse(pair[0].T_unit_camera) @ pair[1].T_unit_camera
+            return rectify(pair[0].calibration, pair[1].calibration, T_left_right, size_px)
         missing = topics.left if left is None else topics.right
         raise SourceError(
-            f"{where}: stereo images {name} and {topics.right.topic.name}: no camera info for "
-            f"{missing.topic.name}; record both, or put Kalibr's camchain.yaml beside the recording"
+            f"{where}: stereo images {name} and {topics.right.topic.name}: no calibration (camera info) "
+            f"of {missing.topic.name}; record both, or put Kalibr's camchain.yaml beside the recording"
         )
     is_rectified = is_called_rectified(name)
     left_camera, right_camera = (
@@ -62,20 +63,11 @@ def stereo_camera(reader: RecordingReader, topics: StereoTopics, *, size_px: Siz
     return rectify(left_camera, right_camera, T_left_right, size_px)
 
 
-def _chain_of(reader: RecordingReader, topics: StereoTopics) -> tuple[UnitCamera, UnitCamera] | None:
-    """Return both cameras by Kalibr's file beside the recording, by its topics or else its order."""
-    path = reader.recording.path
-    cameras = chain_beside(path if path.is_dir() else path.parent)
-    if not cameras:
-        return None
-    by_topic = {camera.topic: camera for camera in cameras}
-    left, right = (by_topic.get(one.topic.name) for one in (topics.left, topics.right))
-    return (cameras[0], cameras[1]) if left is None or right is None else (left, right)
-
-
 def _info(reader: RecordingReader, series: Series | None) -> CameraMessage | None:
+    """Return the calibration of a topic; None without one, and where it is all zeros."""
     info = series and reader.firsts.get(series.topic.name)
-    return info if isinstance(info, CameraMessage) else None
+    is_known = isinstance(info, CameraMessage) and (info.K.any() or info.P.any())
+    return info if is_known else None
 
 
 def _rotation(info: CameraMessage) -> Array:
