@@ -8,7 +8,7 @@ import numpy as np
 from mapper.core.errors import SourceError, listed
 from mapper.core.timebase import NS_PER_S
 from mapper.core.trajectory import Trajectory
-from mapper.sources.base import CameraImages, Log, MountedSensor
+from mapper.sources.base import BASES, CameraImages, Log, MountedSensor
 from mapper.sources.config import SourceConfig
 from mapper.sources.laser_scan import rolling
 from mapper.sources.ros.cameras import images_beside
@@ -143,8 +143,12 @@ def _truth(
 
 
 def _offered_truth(reader: RecordingReader, body: str) -> list[str]:
-    """Return that tf has poses of the body, in a sentence, unless these are of wheels alone."""
-    frames = [one for one in reader.tree.moving_above(body) if one.rpartition("/")[2] != "odom"]
+    """Return that tf has poses of the body, in a sentence, unless they are of wheels or its own joints."""
+    frames = reader.tree.moving_above(body)
+    base = reader.base_of(body)
+    if base in frames:  # a camera that pans on a robot
+        frames = frames[frames.index(base) + 1 :]
+    frames = [one for one in frames if one.rpartition("/")[2] not in ("odom", *BASES)]
     if not frames:
         return []
     return [

@@ -66,8 +66,9 @@ def stereo_camera(reader: RecordingReader, topics: StereoTopics, *, size_px: Siz
 def _info(reader: RecordingReader, series: Series | None) -> CameraMessage | None:
     """Return the calibration of a topic; None without one, and where it is all zeros."""
     info = series and reader.firsts.get(series.topic.name)
-    is_known = isinstance(info, CameraMessage) and (info.K.any() or info.P.any())
-    return info if is_known else None
+    if isinstance(info, CameraMessage) and (info.K.any() or info.P.any()):
+        return info
+    return None
 
 
 def _rotation(info: CameraMessage) -> Array:

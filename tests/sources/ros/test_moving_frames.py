@@ -202,3 +202,18 @@ def test_truth_is_taken_from_tf_on_request(tmp_path):
     for frame in ("marker", "map", ""):
         with pytest.raises(SourceError, match=r"does not move in .*: world$"):
             by(frame)
+
+
+def test_joints_of_the_robot_and_its_wheels_are_not_offered_for_the_truth(tmp_path):
+    joints = [transforms(("base_footprint", "base_link", np.eye(4))), *moving(pan, "base_link", "optical")]
+    wheels = moving(drive, "odom", "base_footprint")
+    for name, messages, offered in (
+        ("joints", joints, None),
+        ("wheels", [*joints, *wheels], None),
+        ("truth", [*joints, *wheels, *moving(drive, "world", "odom")], "world"),
+    ):
+        log = opened(tmp_path / f"{name}.mcap", [*messages, *shots(4)])
+        told = [choice for choice in log.choices if "topics.truth=" in choice]
+        assert [choice.partition("topics.truth=tf:")[2].split()[0] for choice in told] == (
+            [] if offered is None else [offered]
+        )
