@@ -1,11 +1,15 @@
 """Settings of a log: which part is used, and what its files do not state."""
 
 from pathlib import Path
-from typing import Literal, Self
+from typing import Annotated, Literal, Self
 
 from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, model_validator
 
 from mapper.core.config import Config
+
+OffsetS = Annotated[float, Field(ge=-4e9, le=4e9)]
+"""Seconds that are added to stamps: farther than any two clocks are apart, and the sum fits into 64 bits of
+nanoseconds."""
 
 
 class CameraConfig(Config):
@@ -136,15 +140,15 @@ class SourceConfig(Config):
     max_pair_gap_s: NonNegativeFloat = 0.02
     """Largest time between a colour image and its depth image. Raise it if the two are not synchronised and
     the camera moves slowly; frames without a partner are left out."""
-    depth_offset_s: float | None = None
+    depth_offset_s: OffsetS | None = None
     """Added to the stamps of depth images before they are paired with colour images: how much later they show
     the scene than their stamps say. None pairs them as stamped, and fuses them at the time that the images
     show. ``mapper inspect --time-offset`` measures it, and the next three."""
-    imu_offset_s: float = 0.0
+    imu_offset_s: OffsetS = 0.0
     """Added to the stamps of accelerations and angular velocities."""
-    wheels_offset_s: float = 0.0
+    wheels_offset_s: OffsetS = 0.0
     """Added to the stamps of wheel odometry."""
-    truth_offset_s: float = 0.0
+    truth_offset_s: OffsetS = 0.0
     """Added to the stamps of the true poses."""
     rate_hz: PositiveFloat | None = None
     """Frames per second of numbered files without stamps; None is the format's own (30, Poznań, scans 10)."""

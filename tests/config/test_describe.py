@@ -96,7 +96,7 @@ def test_limits_are_those_of_the_model():
     for setting in limited:
         low = float(setting.type.split()[-1 if "and" not in setting.type and "or" not in setting.type else 2])
         with pytest.raises(ConfigError, match=setting.key.rsplit(".", 1)[-1]):
-            load_config(overrides=[*needed(setting), f"{setting.key}={low - 1:g}"])
+            load_config(overrides=[*needed(setting), f"{setting.key}={low - 1:.12g}"])
 
 
 def test_units_follow_the_names():
