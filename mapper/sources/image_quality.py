@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.frames import Image, RgbdFrame
+from mapper.core.geometry import spread_indices
 from mapper.runtime.ordered_map import ordered_map
 
 _WIDTH_PX, _SMALL_PX = 640, 320
@@ -64,8 +65,8 @@ class ImageChecks:
 
     def __init__(self, frames: int) -> None:
         """Start with none of ``frames`` images."""
-        self._firsts = np.unique(np.linspace(0, frames - 2, _PAIRS).round().astype(int)).tolist()
-        self._wanted = {k for first in self._firsts if frames > 1 for k in (first, first + 1)}
+        self._firsts = spread_indices(max(frames - 1, 0), _PAIRS).tolist()
+        self._wanted = {k for first in self._firsts for k in (first, first + 1)}
         self._measured: dict[int, tuple[float, float, float, float]] = {}
         self._small: dict[int, Image] = {}
 
