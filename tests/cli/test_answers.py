@@ -51,7 +51,7 @@ ANSWERS = {
         "path graph config nodes edges loops rejected component_sizes error_before error_after "
         "chi2_per_freedom iterations seconds",
     ),
-    "inspect": (["LOG"], "path topics log problem build"),
+    "inspect": (["LOG"], "path topics log problem build time_offsets"),
     "convert": (["LOG", "--as", "mbag", "--out", "TMP/log"], "path format frames skipped"),
     "synth": (
         ["TMP/new", "--seconds", "0.1", "--set", "width_px=64", "--set", "texture_px_per_m=8"],
