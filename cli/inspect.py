@@ -60,6 +60,10 @@ def _lines(found: "Inspection", plan: str) -> Iterator[str]:
     if found.log is not None:
         rows += _log_rows(found.log)
     rows += [(f"time, {offset.sensor}", offset.text) for offset in found.time_offsets or ()]
+    if found.time_offsets is not None and not found.time_offsets:
+        rows.append(
+            ("time", "nothing beside the frames to compare: no depth, gyroscope, wheels, truth or poses")
+        )
     rows.append(("mapper build", plan))
     width = max(len(name) for name, _ in rows)
     yield from (f"{name:<{width}}  {text}" for name, text in rows)

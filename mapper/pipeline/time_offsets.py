@@ -11,7 +11,9 @@ from mapper.config.build import BuildConfig
 from mapper.core.geometry import Array
 from mapper.core.timebase import GAP_INTERVALS, NS_PER_S, Stamps
 from mapper.core.trajectory import Trajectory
+from mapper.odometry.given_poses import poses_for
 from mapper.pipeline.track import track_log
+from mapper.pipeline.tracking_result import BY_POSES
 from mapper.runtime.progress import SILENT, Progress
 from mapper.sensing.gyroscope import Gyroscope
 from mapper.sensing.wheel_kinematics import step_sizes
@@ -22,10 +24,13 @@ from mapper.sources.time_offsets import TimeOffset, peak_of, time_offset
 _STEP_NS = NS_PER_S // 10
 """Least time over which motion is compared: in less, noise of poses is as large."""
 _OFFSETS_S = 0.01 * np.arange(-100, 101)
+"""Offsets that are tried, a tenth of a step apart: the peak of correlations is as wide as a step."""
 _AROUND = 20
 """Offsets on either side of the log's best among which that of a part of it is searched."""
 _MOST_PARTS, _FEWEST_STEPS = 8, 10
+"""Parts of a log that have an estimate each, and steps that a part has."""
 _LEAST_CORRELATION = 0.5
+"""At the best offset: of steps of another motion it is less."""
 
 
 class _Motion(NamedTuple):
@@ -51,7 +56,7 @@ def measure_time_offsets(log: Log, config: BuildConfig, *, progress: Progress = 
 
     That of depth puts its outlines on edges of the images, and is searched within 0.3 s. All others are
     searched within 1 s: at the true offset, what a sensor turns or travels in steps of 0.1 s correlates best
-    with what the tracked frames do, whatever its mounting and unit.
+    with what the tracked frames do, whatever its mounting and unit. Poses that are the odometry are left out.
 
     Args:
         log: The log.
@@ -69,11 +74,13 @@ def measure_time_offsets(log: Log, config: BuildConfig, *, progress: Progress = 
         ("truth", log.truth, "source.truth_offset_s", source.truth_offset_s),
         ("device poses", log.device_poses, "", 0.0),
     ]
-    present = [(name, other, setting, set_s) for name, other, setting, set_s in others if other is not None]
+    own = poses_for(config.odometry, log) if config.odometry.kind in BY_POSES else None
+    present = [one for one in others if one[1] is not None and one[1] is not own]
     if not present:
         return found
     path = track_log(log, config, progress=progress).tracked_trajectory()
     for name, other, setting, set_s in present:
+        assert other is not None
         tried = [
             time_offset(name, late_s, setting=setting, set_s=set_s) for late_s in _estimates(path, other)
         ]

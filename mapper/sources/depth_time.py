@@ -14,12 +14,12 @@ from mapper.runtime.ordered_map import ordered_map
 from mapper.sources.base import FrameRef, Log, WrappedEntry
 from mapper.sources.config import SourceConfig
 from mapper.sources.depth_outlines import Pixels, outlines
-from mapper.sources.time_offsets import TimeOffset, peak_of, time_offset
+from mapper.sources.time_offsets import FEWEST_ESTIMATES, TimeOffset, peak_of, time_offset
 
 _MOST_S, _MOST_FUSED_S = 0.3, 0.1
 """Largest offsets that are looked for, on request and in each build: more makes a build doubtful."""
 _BURSTS, _BURST_FRAMES = 8, 8
-"""Parts of a log in which depth's time is compared, and frames of each."""
+"""Most parts of a log in which depth's time is compared, and most frames of each whose depth is."""
 _LEAST_RISE = 0.2
 """Score at the best time above that of the farthest; of a camera at rest all times are alike."""
 
@@ -84,12 +84,13 @@ def _offsets_s(log: Log, *, most_s: float) -> Array:
     """
     period_s = float(np.median(np.diff(log.stamps_ns))) / NS_PER_S if len(log) > 1 else np.inf
     reach = int(most_s / period_s)
-    length = _BURST_FRAMES + 2 * reach
-    if log.sensor != "rgbd" or reach == 0 or len(log) <= 2 * reach:
+    compared = len(log) - 2 * reach
+    length = min(_BURST_FRAMES, compared // FEWEST_ESTIMATES)  # no frame's depth in two parts
+    if log.sensor != "rgbd" or reach == 0 or length < 1:
         return np.empty(0)
     found = []
-    for first in spread_indices(max(len(log) - length + 1, 1), _BURSTS).tolist():
-        entries = [log.entry_at(k) for k in range(first, min(first + length, len(log)))]
+    for first in spread_indices(compared - length + 1, min(_BURSTS, compared // length)).tolist():
+        entries = [log.entry_at(first + k) for k in range(length + 2 * reach)]
         offset_s = _burst_offset_s(list(ordered_map(_timed_outlines, entries)), reach)
         if offset_s is not None:
             found.append(offset_s)

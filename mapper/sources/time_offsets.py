@@ -13,7 +13,7 @@ from mapper.core.trajectory import Trajectory
 from mapper.sources.base import Log
 from mapper.sources.config import SourceConfig
 
-_FEWEST, _MOST_SIGMA_S = 3, 0.02
+FEWEST_ESTIMATES, _MOST_SIGMA_S = 3, 0.02
 """Estimates of parts of a log: fewer, or a median less sure, do not tell an offset."""
 _RESOLUTION_S, _SURE_SIGMAS = 0.002, 3.0
 """Error that estimates share (shutters, delays of filters), and standard deviations that are no chance."""
@@ -57,7 +57,7 @@ def time_offset(
         setting: Setting that is added to its stamps; empty if there is none.
         set_s: What that is now.
     """
-    if len(estimates_s) < _FEWEST:
+    if len(estimates_s) < FEWEST_ESTIMATES:
         return TimeOffset(sensor, None, None)
     late_s = float(np.median(estimates_s))
     deviation_s = 1.4826 * float(np.median(np.abs(np.asarray(estimates_s) - late_s)))

@@ -1,19 +1,22 @@
 """Time offsets of a log's sensors: found by motion and by outlines in depth, and corrected by settings."""
 
+import json
 import re
 
 import numpy as np
 import pytest
 
-from mapper import inspect
 from mapper.config.loading import load_config
+from mapper.core.errors import ConfigError
 from mapper.core.frames import Scan
 from mapper.core.geometry import exp, log, rotation_exp
 from mapper.core.timebase import NS_PER_S
 from mapper.core.trajectory import Trajectory
 from mapper.pipeline.time_offsets import measure_time_offsets
 from mapper.sensing.gyroscope import Gyroscope
+from mapper.sources import open_source
 from mapper.sources.config import SourceConfig
+from mapper.sources.depth_time import depth_time_offset
 from mapper.sources.selection import selected
 from mapper.sources.trajectory_files import write_tum
 from tests.support.command_line import mapper
@@ -99,24 +102,43 @@ def test_settings_move_the_stamps_before_frames_are_selected(tmp_path):
     assert np.array_equal(moved.gyroscope.stamps_ns, source.gyroscope.stamps_ns - 500_000_000)
 
 
+def test_poses_that_are_the_odometry_have_no_offset(tmp_path):
+    truth, wheels, device_poses = (path_at(np.arange(-2.0, 32.0, 0.1)) for _ in range(3))
+    source, _ = walk(tmp_path, truth=truth, wheels=wheels, device_poses=device_poses)
+    for settings, compared in (
+        (["odometry.kind=wheels"], ["truth", "device poses"]),
+        (["odometry.kind=given"], ["wheels", "device poses"]),
+    ):
+        config = load_config(None, [*settings, "loops.kind=none"], sensor="lidar")
+        assert [one.sensor for one in measure_time_offsets(source, config)] == compared
+
+
+def test_a_log_of_scans_alone_says_that_nothing_is_compared(tmp_path):
+    for index in range(12):
+        points = np.random.default_rng(0).uniform(0.0, 9.0, (500, 4)).astype("<f4")
+        (tmp_path / f"{index:06d}.bin").write_bytes(points.tobytes())
+    shown = mapper("inspect", tmp_path, "--time-offset").output
+    assert sum(line.startswith("time ") for line in shown.splitlines()) == 1
+    answer = json.loads(mapper("inspect", tmp_path, "--time-offset", "--json").stdout)
+    assert answer["time_offsets"] == []
+    assert json.loads(mapper("inspect", tmp_path, "--json").stdout)["time_offsets"] is None
+
+
+@pytest.mark.parametrize("sensor", ["depth", "imu", "wheels", "truth"])
+def test_an_offset_that_no_stamp_can_hold_is_refused(sensor):
+    for offset_s in (5e9, -1e300, float("inf")):
+        with pytest.raises(ConfigError, match=f"{sensor}_offset_s"):
+            load_config(None, [f"source.{sensor}_offset_s={offset_s}"], sensor="rgbd")
+
+
 @real
-def test_late_depth_is_found_in_real_images():
-    def depth_late_s(offset_s):
-        settings = {"source.depth_offset_s": offset_s, "source.last_frame": 300}
-        found = inspect(FR1_XYZ, settings=settings, time_offset=True).time_offsets
-        (depth,) = [one for one in found if one.sensor == "depth"]
-        return depth.late_s
+def test_late_depth_is_found_in_real_images_and_the_proposed_setting_leaves_none():
+    def depth(offset_s):
+        config = SourceConfig(depth_offset_s=offset_s, last_frame=100)
+        return depth_time_offset(open_source(FR1_XYZ, config), config)
 
-    as_recorded_s = depth_late_s(0.0)
-    assert depth_late_s(0.1) - as_recorded_s == pytest.approx(0.1, abs=0.006)
-
-
-@real
-def test_the_proposed_setting_leaves_no_offset():
-    def shown(*settings):
-        result = mapper("inspect", FR1_XYZ, "--time-offset", "--set", "source.last_frame=300", *settings)
-        return next(line for line in result.output.splitlines() if line.startswith("time, depth"))
-
-    proposed = re.search(r"--set (source.depth_offset_s=\S+)", shown("--set", "source.depth_offset_s=0.1"))
-    assert proposed is not None
-    assert "--set" not in shown("--set", proposed[1])
+    as_recorded, later = depth(0.0), depth(0.1)
+    assert later.late_s - as_recorded.late_s == pytest.approx(0.1, abs=0.006)
+    proposed = re.search(r"--set source.depth_offset_s=(\S+)", later.remedy)
+    corrected = depth(float(proposed[1]))
+    assert (corrected.remedy, corrected.late_s) == ("", pytest.approx(0.0, abs=0.006))
