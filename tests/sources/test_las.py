@@ -1,5 +1,7 @@
+import warnings
 from dataclasses import replace
 
+import laspy
 import numpy as np
 import pytest
 
@@ -73,6 +75,30 @@ def test_what_does_not_turn_is_cut_by_the_usual_or_the_given_time(tmp_path, reco
     assert log.choices == ["cut into sweeps of 0.1 s (source.sweep_s)"]
     assert_same_scans(log, shuffled)
     assert len(open_source(path, SourceConfig(sweep_s=0.2))) == -(-len(scans) // 2)
+
+
+@pytest.mark.parametrize("wrong", [np.inf, 1e300])
+@pytest.mark.parametrize("row", [0, 5000])
+def test_single_wrong_times_leave_the_turns(tmp_path, recorded, wrong, row):
+    _, scans = recorded
+    path = write_las(tmp_path / "strip.las", scans)
+    cloud = laspy.read(path)
+    cloud.gps_time[row] = wrong
+    cloud.write(path)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        log = open_source(path)
+    assert log.choices == ["cut into sweeps of 0.1 s (as its points turn)"]
+    assert abs(len(log) - len(scans)) <= 1
+
+
+@pytest.mark.parametrize("ending", [".las", ".laz"])
+def test_a_strip_that_was_cut_is_named_as_damaged(tmp_path, recorded, ending):
+    _, scans = recorded
+    path = write_las(tmp_path / f"strip{ending}", scans)
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    with pytest.raises(SourceError, match=r"was the file cut|not a sound LAS file"):
+        open_source(path)
 
 
 def test_a_pause_begins_a_sweep(tmp_path, recorded):

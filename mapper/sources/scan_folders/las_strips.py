@@ -1,6 +1,7 @@
 """LAS and LAZ strips: files of many sweeps around a moving sensor, cut into sweeps by the points' times."""
 
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,12 +35,15 @@ _ONE_WAY, _MOST_UNEVEN_RAD = 0.7, 0.5
 
 
 def recognise(path: Path) -> bool:
-    """Return whether a path is, or holds first, a LAS file of points measured for longer than a sweep."""
+    """Return whether a path is, or holds first, a LAS file of points measured for longer than a sweep.
+
+    So is a damaged one.
+    """
     files = _files(path)
     try:
         extent = las_extent(files[0]) if files else None
     except (FrameError, OSError):
-        return False
+        return path.is_file()  # and is refused by what is wrong with it, not as a single cloud
     return extent is not None and abs(extent.last_s - extent.first_s) > MAX_SWEEP_S
 
 
@@ -58,11 +62,11 @@ def read_log(path: Path, config: SourceConfig) -> Log:
     sweep_s, turns = config.sweep_s, False
     try:
         for file in files:
-            times_s = _times(file)
+            times = _times(file)
             if sweep_s is None:
-                turn_s = _turn_s(file, times_s)
+                turn_s = _turn_s(file, times)
                 sweep_s, turns = turn_s or _SWEEP_S, turn_s is not None
-            entries += _sweeps(file, times_s, sweep_s, config.cloud_scale)
+            entries += _sweeps(file, times, sweep_s, config.cloud_scale)
     except (FrameError, OSError) as error:
         raise SourceError(f"{error}") from None
     if not entries:
@@ -101,11 +105,19 @@ def _in_map(path: Path, reason: str) -> str:
     )
 
 
-def _times(path: Path) -> Array:
+class _Times(NamedTuple):
+    """Times of a strip's points: (N,) seconds after ``zero_s``, 0 of those that are not sound."""
+
+    zero_s: float
+    since_s: Array
+    is_sound: NDArray[np.bool_]
+
+
+def _times(path: Path) -> _Times:
     """Return the times of all points of a strip around a sensor.
 
     Raises:
-        FrameError: It has none, or lies far from the origin.
+        FrameError: It has none, they count backwards, or it lies far from the origin.
     """
     extent = las_extent(path)
     if extent is None:
@@ -113,8 +125,16 @@ def _times(path: Path) -> Array:
     away_m = _away_m(extent)
     if away_m > MAX_RANGE_M:
         raise FrameError(_in_map(path, f"all are {away_m:.0f} m and more away from the origin"))
-    times_s: Array = counted_on(read_times_s(path)).astype(np.float64)
-    return times_s
+    times_s = counted_on(read_times_s(path)).astype(np.float64)
+    first, last = (np.nanmedian(end_s) for end_s in (times_s[:_AT_ENDS], times_s[-_AT_ENDS:]))
+    is_sound = (times_s > first - MAX_SWEEP_S) & (times_s < last + MAX_SWEEP_S)
+    if not is_sound[:_AT_ENDS].any():
+        raise FrameError(f"{path}: the points' times (gps_time) count backwards; sort them by gps_time")
+    zero_s = times_s[:_AT_ENDS][is_sound[:_AT_ENDS]].min()
+    since_s = (
+        np.where(is_sound, times_s, zero_s) - zero_s
+    )  # small numbers are not rounded as they are added up
+    return _Times(float(zero_s), since_s, is_sound)
 
 
 def _away_m(extent: LasExtent) -> float:
@@ -122,51 +142,43 @@ def _away_m(extent: LasExtent) -> float:
     return max(0.0, *extent.low, *(-high for high in extent.high))
 
 
-def _sweeps(path: Path, times_s: Array, sweep_s: float, scale: float | None) -> list[ScanEntry]:
+def _sweeps(path: Path, times: _Times, sweep_s: float, scale: float | None) -> list[ScanEntry]:
     """Return the sweeps that have enough points; after a pause the next one begins with its first point.
 
     Raises:
         FrameError: Its points are not in the order of their times.
     """
-    first, last = (np.nanmedian(end_s) for end_s in (times_s[:_AT_ENDS], times_s[-_AT_ENDS:]))
-    is_sound = (times_s > first - MAX_SWEEP_S) & (times_s < last + MAX_SWEEP_S)
-    if not is_sound[:_AT_ENDS].any():
-        raise FrameError(f"{path}: the points' times (gps_time) count backwards; sort them by gps_time")
-    zero_s = times_s[:_AT_ENDS][is_sound[:_AT_ENDS]].min()
-    times_s = np.where(is_sound, times_s - zero_s, 0.0)  # small numbers are not rounded as they are added up
-    latest_s = np.maximum.accumulate(times_s)
-    if (late := float((is_sound & (times_s < latest_s - sweep_s)).mean())) > _MOST_LATE:
+    latest_s = np.maximum.accumulate(times.since_s)
+    if (late := float((times.is_sound & (times.since_s < latest_s - sweep_s)).mean())) > _MOST_LATE:
         raise FrameError(
             f"{path}: {late:.0%} of the points come more than a sweep of {sweep_s:g} s after later ones; "
             "sort them by gps_time"
         )
-    zero_ns = round(zero_s * NS_PER_S)
+    zero_ns = round(times.zero_s * NS_PER_S)
     entries, row, begin_s = [], 0, 0.0
-    while row < len(times_s):
+    while row < len(latest_s):
         end = int(np.searchsorted(latest_s, begin_s + sweep_s - _ROUNDING_S))
         if end - row >= MIN_POINTS:
             entries.append(ScanEntry(zero_ns + round(begin_s * NS_PER_S), path, scale, rows=(row, end)))
         row, begin_s = end, begin_s + sweep_s
-        if row < len(times_s) and latest_s[row] >= begin_s + sweep_s:
+        if row < len(latest_s) and latest_s[row] >= begin_s + sweep_s:
             begin_s = float(latest_s[row])
     counts = [end - begin for begin, end in (entry.rows or (0, 0) for entry in entries)]
     return entries[:-1] if counts and counts[-1] < _LEAST_SHARE * np.median(counts) else entries
 
 
-def _turn_s(path: Path, times_s: Array) -> float | None:
+def _turn_s(path: Path, times: _Times) -> float | None:
     """Return the duration of the turns of a spinning LiDAR, whole milliseconds; None where none are seen."""
-    end = int((times_s < times_s[0] + _LOOKED_AT_S).sum())
-    columns = read_las(path, (0, end))
-    steps = np.floor((times_s[:end] - times_s[0]) / _STEP_S)
+    end = int(np.searchsorted(np.maximum.accumulate(times.since_s), _LOOKED_AT_S))
+    columns, known = read_las(path, (0, end)), times.is_sound[:end]
     directions = np.exp(1j * np.arctan2(columns["y"], columns["x"]))
-    return _period_s(steps, directions)
+    return _period_s(np.floor(times.since_s[:end] / _STEP_S)[known], directions[known])
 
 
 def _period_s(steps: Array, directions: NDArray[np.complex128]) -> float | None:
     """Return in what time directions (complex numbers, of counted steps) turn once; None if they do not."""
-    known = steps >= 0.0
-    numbers, of_step, counts = np.unique(steps[known], return_inverse=True, return_counts=True)
-    sums = np.bincount(of_step, directions[known].real) + 1j * np.bincount(of_step, directions[known].imag)
+    numbers, of_step, counts = np.unique(steps, return_inverse=True, return_counts=True)
+    sums = np.bincount(of_step, directions.real) + 1j * np.bincount(of_step, directions.imag)
     full = counts >= _FEWEST_POINTS
     if full.sum() < _FEWEST_POINTS or np.median(np.abs(sums[full]) / counts[full]) < _ONE_WAY:
         return None
