@@ -65,7 +65,9 @@ def time_offset(
     if sigma_s > _MOST_SIGMA_S:
         return TimeOffset(sensor, None, None)
     is_sure = abs(late_s) > _SURE_SIGMAS * sigma_s
-    remedy = f"--set {setting}={round(set_s - late_s, 3):g} corrects that" if is_sure and setting else ""
+    remedy = (
+        f"--set {setting}={round(set_s - late_s, 3) + 0.0:g} corrects that" if is_sure and setting else ""
+    )
     return TimeOffset(sensor, late_s, sigma_s, remedy)
 
 

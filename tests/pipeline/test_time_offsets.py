@@ -18,6 +18,7 @@ from mapper.sources import open_source
 from mapper.sources.config import SourceConfig
 from mapper.sources.depth_time import depth_time_offset
 from mapper.sources.selection import selected
+from mapper.sources.time_offsets import time_offset
 from mapper.sources.trajectory_files import write_tum
 from tests.support.command_line import mapper
 from tests.support.logs import MemoryEntry, log_in_memory
@@ -100,6 +101,11 @@ def test_settings_move_the_stamps_before_frames_are_selected(tmp_path):
     assert np.array_equal(moved.truth.stamps_ns, source.stamps_ns)
     assert np.array_equal(moved.wheels.stamps_ns, known.stamps_ns + 250_000_000)
     assert np.array_equal(moved.gyroscope.stamps_ns, source.gyroscope.stamps_ns - 500_000_000)
+
+
+def test_a_setting_that_is_the_whole_offset_is_proposed_to_be_zero():
+    found = time_offset("truth", [-0.3001, -0.3, -0.2999], setting="source.truth_offset_s", set_s=-0.3)
+    assert found.remedy.split()[1] == "source.truth_offset_s=0"
 
 
 def test_poses_that_are_the_odometry_have_no_offset(tmp_path):
