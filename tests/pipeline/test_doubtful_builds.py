@@ -19,6 +19,7 @@ from mapper.pipeline.fuse import fuse
 from mapper.run.folder import open_run
 from mapper.runtime.progress import SILENT
 from mapper.sources import open_source
+from mapper.sources.time_offsets import TimeOffset
 from tests.support.desk import REPEATABLE
 from tests.support.doubting_odometry import DOUBTS, doubt_frames
 from tests.support.files import files_of
@@ -34,9 +35,11 @@ def built(log, out, *overrides):
 
 @pytest.fixture(scope="module")
 def doubted(desk_log, tmp_path_factory):
-    """A build of the desk log three of whose frames are 0.5 m off, and doubted."""
+    """A build of the desk log three of whose frames are 0.5 m off, and doubted; its depth seems late."""
+    late = TimeOffset("depth", 0.05, 0.002, "--set source.depth_offset_s=-0.05 corrects that")
     with pytest.MonkeyPatch.context() as patch:
         doubt_frames(patch, DOUBTED)
+        patch.setattr("mapper.pipeline.build.depth_time_offset", lambda *_: late)
         return built(desk_log, tmp_path_factory.mktemp("doubted") / "run")
 
 
@@ -47,6 +50,18 @@ def test_doubtful_frames_are_counted_and_named(doubted):
     assert [k for k, record in enumerate(records) if record.outcome == "doubtful"] == list(DOUBTED)
     assert records[14].doubts == DOUBTS
     assert counts.frames_text == "28 tracked, 3 doubtful, 0 lost, 0 skipped"
+
+
+def test_late_depth_is_named_where_more_frames_are_doubtful_than_is_harmless(desk_log, doubted, tmp_path):
+    def told(run):
+        return [one.sentence for one in run.manifest.warnings if "depth_offset_s" in one.sentence]
+
+    (sentence,) = told(doubted)
+    assert "50 ± 2 ms late" in sentence
+    with pytest.MonkeyPatch.context() as patch:
+        doubt_frames(patch, {13: WRONG})
+        patch.setattr("mapper.pipeline.build.depth_time_offset", None)  # fails if it is called
+        assert told(built(desk_log, tmp_path / "run")) == []
 
 
 def test_they_have_poses_between_their_neighbours(doubted, desk_run):
