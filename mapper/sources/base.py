@@ -207,7 +207,7 @@ class SensorBeside:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MountedSensor:
-    """Where a sensor is on the robot, by the log.
+    """Mounting of a sensor on the robot, by the log.
 
     Attributes:
         frame: Name of its coordinate frame.
