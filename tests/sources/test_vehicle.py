@@ -1,10 +1,14 @@
 """The sensor's own vehicle: its returns are in no frame of a log, and inspect proposes where it is."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from mapper.core.errors import FrameError
 from mapper.core.frames import PinholeCamera, RgbdFrame, Scan
+from mapper.core.geometry import apply, exp, inverse
+from mapper.sources.base import SensorBeside
 from mapper.sources.config import BodyConfig, SourceConfig
 from mapper.sources.selection import selected
 from tests.support.logs import MemoryEntry, log_in_memory
@@ -58,6 +62,15 @@ def test_depth_of_the_vehicle_is_not_measured():
     np.testing.assert_array_equal(loaded.depth_m[2] > 0.0, [False, False, False, True])
     np.testing.assert_array_equal(entry.scan().points_body, loaded.scan().points_body)
     assert depth_m[2].all(), "the recorded image stays as it is"
+
+
+def test_sensors_beside_see_no_vehicle_either():
+    T_body_rear = exp(np.array([0.0, 0.0, np.pi]), np.array([-1.0, 0.0, 0.0]))
+    points = apply(inverse(T_body_rear), np.array(INSIDE[:1] + OUTSIDE))
+    log = replace(scan_log(OUTSIDE), beside=[SensorBeside(scan_log(points), T_body_rear)])
+    (rear,) = selected(log, SourceConfig(body=BodyConfig(box=BOX, max_range_m=20.0))).beside
+    for scan in (rear.log.entry_at(0).load(), rear.log.entry_at(0).scan()):
+        np.testing.assert_array_equal(scan.times_s, [1, 2, 3])
 
 
 def test_a_scan_of_nothing_but_the_vehicle_is_refused():
