@@ -97,7 +97,7 @@ class RecordingReader:
         return self._carried(truth, child, body), notes
 
     def truth_by_tf(self, frame: str, *, body: str) -> tuple[Trajectory, list[str]]:
-        """Return the body's poses in a frame of tf in which it moves, and a note.
+        """Return the body's poses in a frame of tf in which it moves, and that they were chosen.
 
         Raises:
             SourceError: It does not move in that frame.

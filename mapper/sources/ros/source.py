@@ -67,7 +67,7 @@ def recording_log(reader: RecordingReader, config: SourceConfig) -> Log:
         frames = stereo_frames(reader, choice.frames, config)
     else:
         frames = lidar_frames(reader, choice.frames, config)
-    truth, truth_notes = _truth(reader, choice, config, body=frames.body)
+    truth, truth_choices, truth_notes = _truth(reader, choice, config, body=frames.body)
     accelerations, imu_notes = reader.accelerations(choice.imu, body=frames.body)
     gyroscope, gyroscope_notes = reader.gyroscope(choice.gyroscope, body=frames.body)
     imu_notes = list(dict.fromkeys([*imu_notes, *gyroscope_notes]))  # of one topic, the same order
@@ -85,7 +85,7 @@ def recording_log(reader: RecordingReader, config: SourceConfig) -> Log:
     if reader.tree.contradicted:
         told = listed(reader.tree.contradicted)
         tf_notes.append(f"tf contradicts itself; of static frames the last is used, as in tf2: {told}")
-    mounting, mounting_notes = _mounting(reader, frames, config)
+    mounting, mounting_choices = _mounting(reader, frames, config)
     cameras = [images_beside(reader, camera, body=frames.body) for camera in choice.cameras]
     images = [one for one in cameras if isinstance(one, CameraImages)]
     beside, beside_choices = sensors_beside(reader, choice.beside, frames, config)
@@ -109,9 +109,10 @@ def recording_log(reader: RecordingReader, config: SourceConfig) -> Log:
         depth_noise=frames.depth_noise,
         choices=[
             *choice.choices,
-            *(_offered_truth(reader, frames.body) if truth is None else ()),
+            *truth_choices,
             *(one.choice if isinstance(one, CameraImages) else one for one in cameras),
             *beside_choices,
+            *mounting_choices,
         ],
         notes=[
             *choice.notes,
@@ -119,7 +120,6 @@ def recording_log(reader: RecordingReader, config: SourceConfig) -> Log:
             *clock_notes,
             *frames.notes,
             *tf_notes,
-            *mounting_notes,
             *truth_notes,
             *wheel_notes,
             *imu_notes,
@@ -130,16 +130,17 @@ def recording_log(reader: RecordingReader, config: SourceConfig) -> Log:
 
 def _truth(
     reader: RecordingReader, choice: Choice, config: SourceConfig, *, body: str
-) -> tuple[Trajectory | None, list[str]]:
-    """Return the true poses by their topic or by tf, and notes.
+) -> tuple[Trajectory | None, list[str], list[str]]:
+    """Return the true poses by their topic or by tf, what was or may be chosen, and notes.
 
     Raises:
         SourceError: The body does not move in the frame of tf that the settings name.
     """
     wanted = config.topics.truth or ""
     if wanted.startswith(BY_TF):
-        return reader.truth_by_tf(wanted.removeprefix(BY_TF), body=body)
-    return reader.truth(choice.truth, body=body)
+        return *reader.truth_by_tf(wanted.removeprefix(BY_TF), body=body), []
+    truth, notes = reader.truth(choice.truth, body=body)
+    return truth, _offered_truth(reader, body) if truth is None else [], notes
 
 
 def _offered_truth(reader: RecordingReader, body: str) -> list[str]:
@@ -160,7 +161,7 @@ def _offered_truth(reader: RecordingReader, body: str) -> list[str]:
 def _mounting(
     reader: RecordingReader, frames: RecordedFrames, config: SourceConfig
 ) -> tuple[dict[str, Any], list[str]]:
-    """Return the fields of a log that say where the body is on the robot, and notes.
+    """Return the fields of a log that say where the body is on the robot, and which frames have a base.
 
     Raises:
         SourceError: The frame that the settings name is none of the robot's.
@@ -176,13 +177,13 @@ def _mounting(
     if not reader.tree.moves(base, body):
         return {**fields, "T_base_body": reader.tree.find(base, body)}, []
     known, T_body_base = reader.tree_of(base, body).find_each(body, base, frames.stamps_ns)
-    notes = []
+    choices = []
     if not known.all():
-        notes.append(
+        choices.append(
             f"tf moves {body} on {base}, and says where at {known.sum()} of {len(known)} frames: only of "
             "these are the robot's poses written (base.tum)"
         )
-    return {**fields, "T_body_base": Trajectory(frames.stamps_ns[known], T_body_base)}, notes
+    return {**fields, "T_body_base": Trajectory(frames.stamps_ns[known], T_body_base)}, choices
 
 
 def _sensors(reader: RecordingReader, body: str, base: str) -> list[MountedSensor]:

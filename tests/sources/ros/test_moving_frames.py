@@ -98,7 +98,7 @@ def test_a_pan_unit_is_where_tf_has_it_at_each_scan_s_time(tmp_path):
     own = opened(tmp_path / "b.mcap", [*moving(pan, "base_link", "lidar"), *on_mast()], body_frame="lidar")
     assert own.T_base_body is None
     np.testing.assert_allclose(own.T_body_base.T_world_body, [inverse(pan(t)) for t in STAMPS_NS], atol=1e-3)
-    assert not any("base.tum" in note for note in own.notes)
+    assert not any("base.tum" in note for note in own.sentences)
     undated = [
         transforms(("base_link", "lidar", pan(tf.stamp_ns)), topic="/tf")._replace(stamp_ns=tf.stamp_ns)
         for tf in moving(pan, "base_link", "lidar")
@@ -199,6 +199,7 @@ def test_truth_is_taken_from_tf_on_request(tmp_path):
             truth.T_world_body, [T @ T_marker_optical for T in T_world_marker.values()], atol=1e-9
         )
         assert not any("truth=tf" in choice for choice in by(frame).choices)
+        assert list(by(frame).notes) == list(without.notes)  # which are possible causes of doubts
     for frame in ("marker", "map", ""):
         with pytest.raises(SourceError, match=r"does not move in .*: world$"):
             by(frame)
