@@ -249,6 +249,16 @@ def test_fractions_of_listed_stamps_without_leading_zeros_are_whole_numbers(tiny
     assert sum("leading zeros" in note for note in log.notes) == 2
 
 
+@pytest.mark.parametrize(("apart_s", "noted"), [(1.0, 1), (0.5, 0)])
+def test_stamps_that_count_frames_are_noted(tiny_tum_log, apart_s, noted):
+    folder = tiny_tum_log(12)
+    for name in ("rgb.txt", "depth.txt"):
+        files = [line.split()[1] for line in (folder / name).read_text().splitlines()[1:]]
+        lines = (f"{1 + apart_s * k} {file}" for k, file in enumerate(files))
+        (folder / name).write_text("\n".join(lines) + "\n")
+    assert sum("source.rate_hz" in note for note in open_source(folder).notes) == noted
+
+
 @pytest.mark.parametrize(
     ("header", "separator", "slash"),
     [("", ",", "/"), ("timestamp,filename\n", ", ", "/"), ("timestamp filename\n", "\t", "\\")],

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from mapper.core.errors import DataError, SourceError
+from mapper.core.timebase import NS_PER_S
 from mapper.core.trajectory import Trajectory
 from mapper.core.units import MM_PER_M
 from mapper.sources.base import Log
@@ -41,6 +42,8 @@ UNITS_NOTE = "depth taken as TUM's 5000 units a metre; source.camera.depth_facto
 METRES_NOTE = "depth of floats taken as metres; source.camera.depth_factor=1000 reads millimetres"
 _LISTS = (("rgb.txt", "depth.txt"), ("color.txt", "aligned_depth.txt"))
 """Lists of colour and of depth images, of TUM and of OpenLORIS."""
+_FEWEST_COUNTED = 10
+"""Images a second apart, to the nanosecond, that are counted rather than timed."""
 _BASE_NOTE = ("the truth of OpenLORIS is that of the robot's base, not of the camera",)
 _ASSOCIATIONS = ("associations.txt", "associated.txt", "association.txt", "associate.txt", "assoc.txt")
 
@@ -97,6 +100,12 @@ def log_of_images(
         SourceError: As :func:`read_log`.
     """
     pairs, pair_notes = pair_images(colour, depth, config, path=path)
+    if len(colour.stamps_ns) >= _FEWEST_COUNTED and (np.diff(colour.stamps_ns) == NS_PER_S).all():
+        first, second = (stamps_ns / NS_PER_S for stamps_ns in colour.stamps_ns[:2].tolist())
+        pair_notes.append(
+            f"stamps are {first:.9g}, {second:.9g} …, taken as seconds; if they count frames, leave "
+            "the lists out: images are then paired by the numbers in their names, source.rate_hz a second"
+        )
     known = freiburg_camera(path.resolve().name, name)
     calibration = find_calibration(path, config.camera, known=known)
     are_units_assumed = known is None and calibration.depth_units_per_m is None
