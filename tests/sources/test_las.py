@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from mapper.core.errors import SourceError
+from mapper.core.frames import Scan
 from mapper.core.geometry import apply
 from mapper.sources import open_source
 from mapper.sources.config import SourceConfig
@@ -134,6 +135,23 @@ def test_strips_in_a_map_or_out_of_order_are_refused(tmp_path, recorded):
         open_source(write_las(tmp_path / "any.las", scans, by_time=False))
     with pytest.raises(SourceError, match="one cloud is no log"):
         open_source(write_las(tmp_path / "scan.las", scans[:1]))
+
+
+def test_scans_of_a_tripod_that_take_a_minute_are_no_strips(tmp_path):
+    """A mirror turns 30 times a second about a level axis, and the head half a turn in the minute."""
+    since_s = np.linspace(0.0, 60.0, 60_000, endpoint=False)
+    heading, tilt = since_s / 60.0 * np.pi, 2.0 * np.pi * 30.1 * since_s
+    level = np.column_stack([np.cos(heading), np.sin(heading)]) * np.cos(tilt)[:, None]
+    directions = np.column_stack([level, np.sin(tilt)])
+    points = directions * (5.0 / np.abs(directions).max(axis=1))[:, None]
+    for k in range(3):
+        scan = Scan(
+            FIRST_NS + k * 200_000_000_000, points.astype(np.float32), times_s=since_s.astype(np.float32)
+        )
+        write_las(tmp_path / f"{k}.las", [scan])
+    log = open_source(tmp_path)
+    assert (log.kind, len(log)) == ("clouds", 3)
+    assert len(log[0].points_body) == 60_000
 
 
 @pytest.mark.parametrize("is_dated", [True, False])

@@ -49,12 +49,14 @@ class LasExtent:
         high: Largest x, y, z.
         first_s: Time of the first point in the file, as of :func:`read_las`.
         last_s: Time of the last one.
+        points: Their number.
     """
 
     low: tuple[float, float, float]
     high: tuple[float, float, float]
     first_s: float
     last_s: float
+    points: int
 
 
 def read_las(path: Path, rows: tuple[int, int] | None = None) -> Columns:
@@ -164,11 +166,13 @@ def _extent(reader: Any) -> LasExtent | None:
     header = reader.header
     if not header.point_count or _TIME not in header.point_format.dimension_names:
         return None
-    ends_s = []
-    for row in (0, header.point_count - 1):
+
+    def time_s(row: int) -> float:
         reader.seek(row)
-        ends_s.append(float(reader.read_points(1)[_TIME][0]) + _zero_s(reader))
-    return LasExtent(tuple(header.mins.tolist()), tuple(header.maxs.tolist()), *ends_s)
+        return float(reader.read_points(1)[_TIME][0]) + _zero_s(reader)
+
+    low, high = tuple(header.mins.tolist()), tuple(header.maxs.tolist())
+    return LasExtent(low, high, time_s(0), time_s(header.point_count - 1), header.point_count)
 
 
 def _times(reader: Any) -> Array:

@@ -11,7 +11,7 @@ from mapper.core.geometry import Array
 from mapper.core.timebase import NS_PER_S
 from mapper.sources.base import Log
 from mapper.sources.cloud_files.las import LAS_ENDINGS, LasExtent, las_extent, read_las, read_times_s
-from mapper.sources.cloud_files.parsing import MAX_RANGE_M, MIN_POINTS
+from mapper.sources.cloud_files.parsing import MAX_RANGE_M, MIN_POINTS, Columns
 from mapper.sources.config import SourceConfig
 from mapper.sources.image_folders.tum import read_truth
 from mapper.sources.listed_files import refuse_links_out
@@ -30,21 +30,27 @@ _LEAST_SHARE = 0.5
 _STEP_S, _LOOKED_AT_S, _FEWEST_POINTS = 0.005, 2.0, 10
 """Time in which a spinning LiDAR looks in one direction, part of the strip that is looked at, and how many
 points of a step, and steps, tell directions."""
+_MOST_POINTS, _CELL_RAD, _REPEATED = 1_000_000, 0.05, 0.2
+"""Points of which directions are compared, more than a turn of any LiDAR has; cells of directions, and share
+of these that points half the file later have, too: near 1 of sweeps; of a tripod's scan what lies above."""
 _ONE_WAY, _MOST_UNEVEN_RAD = 0.7, 0.5
 """Length of the mean of a step's directions, 1 of a single one; and RMS deviation from an even turn."""
 
 
 def recognise(path: Path) -> bool:
-    """Return whether a path is, or holds first, a LAS file of points measured for longer than a sweep.
+    """Return whether a path is, or holds first, a LAS file of several sweeps.
 
-    So is a damaged one.
+    A scanner on a tripod takes minutes for one, in which it looks in no direction twice. A damaged file is
+    called a strip, too.
     """
     files = _files(path)
     try:
         extent = las_extent(files[0]) if files else None
+        if extent is None or not abs(extent.last_s - extent.first_s) > MAX_SWEEP_S:
+            return False
+        return _repeats(files[0], extent)
     except (FrameError, OSError):
         return path.is_file()  # and is refused by what is wrong with it, not as a single cloud
-    return extent is not None and abs(extent.last_s - extent.first_s) > MAX_SWEEP_S
 
 
 def read_log(path: Path, config: SourceConfig) -> Log:
@@ -90,6 +96,24 @@ def read_log(path: Path, config: SourceConfig) -> Log:
     if scan_frame_warnings(log):
         raise SourceError(_in_map(path, "surfaces stay where they are while what is seen of them moves on"))
     return log
+
+
+def _repeats(path: Path, extent: LasExtent) -> bool:
+    """Return whether points half the file later lie in directions of the first ones."""
+    count = min(extent.points // 8, _MOST_POINTS)
+    first, later = (
+        _direction_cells(read_las(path, (begin, begin + count))) for begin in (0, extent.points // 2)
+    )
+    return len(np.intersect1d(first, later)) > _REPEATED * min(len(first), len(later))
+
+
+def _direction_cells(columns: Columns) -> NDArray[np.int64]:
+    """Return the numbers of the cells of azimuth and elevation in which points lie."""
+    x, y, z = (columns[axis].astype(np.float64) for axis in "xyz")
+    angles = np.array([np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))])
+    columns_of, rows_of = np.floor(angles / _CELL_RAD).astype(np.int64)
+    cells: NDArray[np.int64] = np.unique(columns_of * 1000 + rows_of)
+    return cells
 
 
 def _files(path: Path) -> list[Path]:
