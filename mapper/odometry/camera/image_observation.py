@@ -23,7 +23,7 @@ from mapper.sensing.config import KINECT_NOISE
 from mapper.sensing.depth import depth_sigma_m, feature_depth_m, feature_depth_sigma_m
 
 _MIN_DEPTH_M = 0.05
-FEW_MOVING = 0.05
+_FEW_MOVING = 0.05
 """Share of the features below which nothing moves by itself: depths at edges look like it."""
 _SCALE_ERROR = 0.02
 """Error of depths beside the sensor's noise, as a share: its scale, and the slope where a feature lies."""
@@ -104,7 +104,7 @@ class ImageObservation(Archivable):
         Args:
             moved: (N,) features that move by themselves. Among many of them the depth tells still ones apart.
         """
-        return self.sensor_weights if moved.sum() > FEW_MOVING * len(self) else self.weights
+        return self.sensor_weights if moved.sum() > _FEW_MOVING * len(self) else self.weights
 
     def swept(self, sweep_camera: Array) -> "ImageObservation":
         """Return the observation with the shift of each row by another motion of the camera taken out."""

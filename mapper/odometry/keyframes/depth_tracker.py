@@ -108,7 +108,6 @@ class DepthTracker:
             alignment.T_camera_world,
             unmatched(observation),
             reference=reference,
-            agreement=alignment.agreeing_ratio,
             method="depth+map",
         )
         if found is None:
@@ -204,7 +203,6 @@ class DepthTracker:
             unmatched(observation),
             reference,
             alignment.points,
-            alignment.agreeing_ratio,
             0,
             0.0,
             DEPTH_ONLY,

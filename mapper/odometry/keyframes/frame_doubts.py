@@ -8,7 +8,6 @@ import numpy as np
 from mapper.core.doubts import Doubt
 from mapper.core.geometry import Array, Transform, inverse, log
 from mapper.core.running_median import RunningMedian
-from mapper.odometry.camera.image_observation import FEW_MOVING
 from mapper.odometry.keyframes.depth_comparison import Displacement
 from mapper.odometry.keyframes.pose_tracker import TrackedPose
 
@@ -19,14 +18,9 @@ _FEWEST = 10
 _JUMP_RATIO = 8.0
 """Deviation from constant velocity, relative to the usual per second, that is a jump. The 99th percentile of
 right poses is 3 to 6."""
-_SUPPORT_AGREEMENT, _SUPPORT_RATIO = 0.85, 2.0
-"""A jump is believed if the agreement is at least this share of the usual, and the uncertainty at most this
-multiple, and nothing in view moves by itself: fast motions are real."""
-
-_MOST_DISPLACED, _MOST_DISPLACED_STILL = 0.4, 0.5
-"""When a larger share of the surfaces that two images have in common lies elsewhere, the pose is doubtful;
-where few features move, the majority has to. A real desk's edges give up to 0.48 under right poses, a
-passer-by's pose more than 0.4 in every second frame."""
+_MOST_DISPLACED = 0.5
+"""When a larger share of the surfaces that two images have in common lies elsewhere, the pose is doubtful. A
+real desk's edges give up to 0.48 under right poses."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +45,7 @@ class FrameDoubts:
     """Running medians of a log's figures of tracking, and the tests of new frames against them."""
 
     def __init__(self) -> None:
-        names = ("sigma_m", "agreement", "jump_rad_s", "jump_m_s", "speed_rad_s", "speed_m_s")
+        names = ("jump_rad_s", "jump_m_s", "speed_rad_s", "speed_m_s")
         self._figures = {name: RunningMedian(memory=_MEMORY, fewest=_FEWEST) for name in names}
         self._shown_since_ns = 0
 
@@ -86,19 +80,10 @@ class FrameDoubts:
         doubts = list(tracked_pose.doubts)
         if tracked_pose.depth is not None:  # landmarks were few, so the medians of their figures say nothing
             return Assessment(tuple(doubts), sigma_rad, sigma_m) if doubts else UNDOUBTED
-        usual_m, usual_agreement = self._median("sigma_m"), self._median("agreement")
-        agreement = tracked_pose.agreement
-        few_move = len(tracked_pose.moving) <= FEW_MOVING * len(tracked_pose.observation)
-        is_supported = (
-            agreement >= _SUPPORT_AGREEMENT * usual_agreement
-            and sigma_m <= _SUPPORT_RATIO * usual_m
-            and few_move
-        )
-        if not is_supported:
-            doubts += self._jumps(jump, elapsed_s)
+        doubts += self._jumps(jump, elapsed_s)
         if shown_s > 0.0:
             doubts.append(Doubt("repeated image", f"the image has been the same for {shown_s:.2f} s"))
-        if displaced.ratio > (_MOST_DISPLACED_STILL if few_move else _MOST_DISPLACED):
+        if displaced.ratio > _MOST_DISPLACED:
             doubts.append(
                 Doubt(
                     "elsewhere",
@@ -114,7 +99,6 @@ class FrameDoubts:
                 for miss, name in zip(jump, ("speed_rad_s", "speed_m_s"), strict=True)
             ]
             return Assessment(tuple(doubts), max(off[0], sigma_rad), max(off[1], sigma_m))
-        self._learn(sigma_m=sigma_m, agreement=agreement)
         if elapsed_s > 0.0:
             self._learn(speed_rad_s=speed[0] / elapsed_s, speed_m_s=speed[1] / elapsed_s)
             if T_camera_world_predicted is not None:

@@ -45,7 +45,6 @@ class LocalSearch:
         landmark_of_feature: Ids,
         *,
         reference: int,
-        agreement: float,
         method: str,
     ) -> TrackedPose | None:
         """Search the landmarks of the most covisible keyframes and refine the pose with all that match.
@@ -55,7 +54,6 @@ class LocalSearch:
             T_camera_world: (4, 4) first pose, good to a few pixels.
             landmark_of_feature: (N,) landmark of each feature matched so far, −1 for none.
             reference: Keyframe to search if no feature is matched.
-            agreement: Share of the first matches that agree with it.
             method: Step that found the first pose, for ``TrackedPose.method``.
 
         Returns:
@@ -116,7 +114,6 @@ class LocalSearch:
             landmark_of_feature,
             order[0],
             len(features),
-            agreement,
             len(visible) + len(matched),
             rms_px(T_camera_world, landmarks["position"][ids[agree]], observation, features[agree]),
             method,

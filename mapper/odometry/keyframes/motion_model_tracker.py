@@ -123,7 +123,6 @@ class MotionPoseTracker:
             motion.T_camera_world,
             landmark_of_feature,
             reference=last.reference,
-            agreement=float(agree.mean()),
             method="map",
         )
         if found is None:

@@ -34,7 +34,6 @@ class TrackedPose:
         landmark_of_feature: (N,) int32 landmark of each feature, −1 for none; inliers only.
         reference: Keyframe that observes most of these landmarks.
         matches: Number of proposed pairs.
-        agreement: Share of the first matches, before the local map is searched, that agree with the pose.
         visible: Number of the map's landmarks that should be in view.
         residual_px: Root mean square image residual of the inliers.
         method: Step that found the pose, e.g. "map", "fallback" or "relocalised".
@@ -49,7 +48,6 @@ class TrackedPose:
     landmark_of_feature: Ids
     reference: int
     matches: int
-    agreement: float
     visible: int
     residual_px: float
     method: str

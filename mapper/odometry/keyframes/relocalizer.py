@@ -163,7 +163,6 @@ class Relocalizer:
         fewest = max(_MIN_AGREEMENT_RATIO * len(features), self._config.min_matches // 2)
         if len(agreeing) < fewest:
             return None
-        matches = len(features)
         features, landmarks = features[agreeing], landmarks[agreeing]
         T_camera_world, agree = refined(T_camera_world, points_world[agreeing], observation, features)
         landmark_of_feature = unmatched(observation)
@@ -173,7 +172,6 @@ class Relocalizer:
             T_camera_world,
             landmark_of_feature,
             reference=reference,
-            agreement=int(agree.sum()) / matches,
             method=method,
         )
 

@@ -82,7 +82,7 @@ class Tracking:
         self.is_lost, self._unknown_frames = False, 0
         self._depth.began(observation)
         T_camera_world = inverse(observation.T_body_camera) if last is None else last.T_camera_world
-        return TrackedPose(observation, T_camera_world, unmatched(observation), 0, 0, 1.0, 0, 0.0, "start")
+        return TrackedPose(observation, T_camera_world, unmatched(observation), 0, 0, 0, 0.0, "start")
 
     def information(self, tracked_pose: TrackedPose) -> Array:
         """Return the (6, 6) information of a pose from its landmarks and depth, in the body's tangent."""
