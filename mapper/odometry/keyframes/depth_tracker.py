@@ -110,10 +110,7 @@ class DepthTracker:
             reference=reference,
             method="depth+map",
         )
-        if found is None:
-            return self._by_depth(observation, alignment, reference, gap_s)
-        joint = self._aligned(observation, found.T_camera_world, T_predicted, last, found)
-        return found if joint is None or not _agrees(joint) else self._by_both(observation, joint, found)
+        return found or self._by_depth(observation, alignment, reference, gap_s)
 
     def _aligned(
         self,
