@@ -20,6 +20,7 @@ from mapper.octree.scan_updates import ScanUpdateWriter, decompress, displacemen
 from mapper.runtime.progress import SILENT
 from mapper.simulation import CameraSimulator
 from mapper.simulation.config import SynthConfig
+from mapper.sources.base import EntryWithoutFiles
 
 FRAMES = 16
 CONFIG = overridden(BuildConfig(), ["cloud.frame_stride=1000", "mcap.image_stride=0", "workers=0"])
@@ -34,7 +35,7 @@ class Counted:
         self.log = replace(source, entry_at=lambda index: CountedEntry(source.entry_at(index), self.read))
 
 
-class CountedEntry:
+class CountedEntry(EntryWithoutFiles):
     def __init__(self, entry, read):
         self.stamp_ns, self._entry, self._read = entry.stamp_ns, entry, read
 
