@@ -147,7 +147,7 @@ def inspect_log(
     Raises:
         SourceError: It is no log of a known format, or is damaged beyond reading.
     """
-    if not (path.exists() and format_of(path) == RECORDING):
+    if not ((path.is_dir() or path.is_file()) and format_of(path) == RECORDING):
         return _inspected(path, [], open_source(path, config), check)
     reader = RecordingReader(recordings.open_recording(path))
     topics = [_topic(series) for series in reader.series.values()]

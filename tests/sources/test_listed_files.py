@@ -12,6 +12,7 @@ from mapper.runtime import regular_files
 from mapper.sources import open_source
 from mapper.sources.config import SourceConfig
 from mapper.sources.inspection import inspect_log
+from mapper.sources.scan_folders.clouds import read_scan
 from mapper.sources.writers import write_log
 from tests.support.tum_logs import copy_numbered
 
@@ -105,10 +106,13 @@ def test_a_pipe_is_no_list_and_no_log(tiny_tum_log, tmp_path):
     os.mkfifo(log / "depth.txt")
     with pytest.raises(SourceError, match=r"depth\.txt: no regular file"):
         open_source(log)
-    os.mkfifo(tmp_path / "log.mcap")
-    for opened in (open_source, lambda path: inspect_log(path, SourceConfig())):
-        with pytest.raises(SourceError, match=r"log\.mcap: a device or a pipe; want a file or a folder"):
-            opened(tmp_path / "log.mcap")
+    for name in ("log.mcap", "log.las", "log.laz", "log.e57", "log.pcap", "log.sens", "log.mkv", "log.r3d"):
+        os.mkfifo(tmp_path / name)
+        for opened in (open_source, lambda path: inspect_log(path, SourceConfig())):
+            with pytest.raises(SourceError, match=rf"{name}: a device or a pipe; want a file or a folder"):
+                opened(tmp_path / name)
+    with pytest.raises(FrameError, match=r"log\.las: no regular file"):
+        read_scan(tmp_path / "log.las")
 
 
 def test_a_list_without_end_is_refused_before_it_is_read(tiny_tum_log):

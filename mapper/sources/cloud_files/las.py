@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from functools import partial
 from io import BytesIO
 from pathlib import Path
+from stat import S_ISREG
 from typing import Any, BinaryIO, TypeVar
 
 import numpy as np
@@ -112,7 +113,10 @@ def _read(path: Path, job: Callable[[Any], R], *, count: int | None) -> R:
         job: A function that can be pickled.
         count: Number of points that it makes columns of; None is all, 0 every point's time alone.
     """
-    size = path.stat().st_size
+    status = path.stat()
+    if not S_ISREG(status.st_mode):  # opening a pipe waits for its writer
+        raise FrameError(f"{path}: no regular file")
+    size = status.st_size
     with path.open("rb") as stream, refusing_damage(path, what="LAS"):
         (records,) = _RECORDS.unpack(stream.read(_RECORDS.size))
         if records * _RECORD_BYTES > size:  # laspy would make as many empty ones

@@ -119,7 +119,7 @@ def _direction_cells(columns: Columns) -> NDArray[np.int64]:
 def _files(path: Path) -> list[Path]:
     if path.is_dir():
         return sorted(file for file in path.glob("*.[lL][aA][sSzZ]") if file.is_file())
-    return [path] if path.suffix.lower() in LAS_ENDINGS else []
+    return [path] if path.suffix.lower() in LAS_ENDINGS and path.is_file() else []
 
 
 def _in_map(path: Path, reason: str) -> str:
