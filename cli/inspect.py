@@ -118,7 +118,7 @@ def _image_rows(images: "ImageQuality") -> Iterator[tuple[str, str]]:
     yield (
         "images",
         f"{edges}, {images.blurred or 'none'} of {images.looked_at} blurred; {images.saturated:.0%} of the "
-        f"pixels saturated, the brightest twentieth from level {images.brightest:.0f} of 255",
+        f"pixels saturated, 5% brighter than level {images.brightest:.0f} of 255",
     )
     if images.overlap is not None:
         yield (

@@ -119,8 +119,8 @@ def level_in_plane(
     """Return the level frame of planar scans: up is the normal of their plane.
 
     The floor is the robot's footprint, or where the log states none, the robot's z = 0. A laser in or below
-    that is taken to be on the floor. Its plane is a third of a voxel above the border of
-    a layer, so that no rounding puts a scan into the layer below, at this resolution or at half of it.
+    that is taken to be on the floor. Its plane is a third of a voxel above the border of a layer, so that no
+    rounding puts a scan into the layer below, at this resolution or at half of it.
 
     Args:
         scans: As for ``find_level``, planar.

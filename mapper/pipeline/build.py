@@ -44,7 +44,7 @@ from mapper.run.folder import Run, open_run
 from mapper.run.manifest import Levelling, RunWarning, Solve, Weight
 from mapper.run.observers import NULL_OBSERVER, Observer
 from mapper.run.stored_tracking import save_solved, save_tracking
-from mapper.run.verdict import MAX_SHARE
+from mapper.run.verdict import DEPTH_TIME, MAX_SHARE
 from mapper.run.writer import RunWriter, first_manifest, write_run
 from mapper.runtime.progress import SILENT, Progress
 from mapper.sensing.sweep_motion import motion_during
@@ -171,7 +171,7 @@ class _Steps:
         if self.source.sensor != "rgbd" or unsure <= MAX_SHARE * len(tracking.tracks):
             return []
         late = depth_time_offset(self.source, self.config.source)
-        return [RunWarning(kind="log", sentence=f"depth: {late.text}")] if late.remedy else []
+        return [RunWarning(kind=DEPTH_TIME, sentence=f"depth: {late.text}")] if late.remedy else []
 
     def solve(self, tracking: TrackingResult) -> _Solved:
         """Solve the graph, keep its largest component, and level the world."""

@@ -227,7 +227,8 @@ def fuse_into(
             log_maps(log, maps, stamp_ns=int(results.trajectory.stamps_ns[0]))
             _write_maps(writer.folder, maps)
             _write_pictures(writer, maps, results, has_colors=source.has_colours)
-    others = [one for one in writer.manifest.warnings if one.kind not in (FLOOR, DEPTH_TIME)]
+    found_anew = {FLOOR, DEPTH_TIME} if late_depth else {FLOOR}
+    others = [warning for warning in writer.manifest.warnings if warning.kind not in found_anew]
     if late_depth:
         others.append(RunWarning(kind=DEPTH_TIME, sentence=late_depth))
     found = floor_warnings(config.traversable, config.octree.resolution_m, has_path=maps.has_path)

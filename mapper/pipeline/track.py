@@ -111,8 +111,8 @@ def track_log(
         ConfigError: The odometry needs wheels or poses and there are none, or the loops need feature counts.
     """
     start = start or first_session(source, config)
-    read = with_merged_scans(source) if config.source.topics.others == "tracked" else source
-    odometry, checks = start.odometry, ReadingChecks(read)
+    odometry, checks = start.odometry, ReadingChecks(source)
+    read = with_merged_scans(checks.log) if config.source.topics.others == "tracked" else checks.log
     known: Sequence[FrameCheckpoint] = ()
     if checkpoints is not None:
         state = checkpoints.restore(odometry, checks)
@@ -122,7 +122,7 @@ def track_log(
         start, _wheel_measurements(source, config), are_predicted=source.sensor == "lidar-2d"
     )
     first_pass.repeat(known, searches)
-    entries = map(checks.log.entry_at, range(len(known), len(source)))
+    entries = map(read.entry_at, range(len(known), len(source)))
     observations = ordered_map(partial(_observe, odometry), entries, workers=config.workers)
     with progress.stage("track") as report:
         for done, observed in enumerate(observations, start=len(known) + 1):

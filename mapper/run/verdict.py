@@ -26,7 +26,7 @@ from mapper.run.results import RunResults, with_truth
 from mapper.run.timeline import TimeLine, counted
 
 FLOOR, DEPTH_TIME = "floor", "depth time"
-"""Kinds that are found while a run is fused, and anew when it is fused again."""
+"""Kinds that are found each time a run is fused; the second after tracking, too."""
 INPUT_KINDS = frozenset(
     {
         "log",
@@ -101,12 +101,12 @@ def find_warnings(results: RunResults, manifest: Manifest) -> list[RunWarning]:
 def verdict_of(warnings: Sequence[RunWarning]) -> Verdict:
     """Return the verdict: the heaviest weight of any warning, and the sentences above a note.
 
-    To these come the notes on the log: what was assumed when it was opened may be the cause.
+    To these come the notes on the log and on its depth's time: what was assumed may be the cause.
     """
     heavy = [warning for warning in warnings if warning.weight != "note"]
     weights = {warning.weight for warning in heavy}
     state = "broken in parts" if "break" in weights else "doubtful" if "doubt" in weights else "trusted"
-    known = [warning for warning in warnings if warning.kind == "log" and warning.weight == "note"]
+    known = [one for one in warnings if one.kind in ("log", DEPTH_TIME) and one.weight == "note"]
     causes = [f"a possible cause: {warning.text}" for warning in known] if heavy else []
     return Verdict(state=state, sentences=(*(warning.text for warning in heavy), *causes))
 

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Container, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol, Self, overload
+from typing import Protocol, Self, TypeVar, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -165,6 +165,10 @@ class Accelerations:
     acceleration_mps2: Array
     are_axes_stated: bool = False
     place_body: Array | None = None
+
+
+Readings = TypeVar("Readings", Trajectory, Gyroscope, Accelerations, GnssFixes)
+"""What a log has at stamps of its own, in ``stamps_ns``."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -49,7 +49,10 @@ def with_depth_on_time(log: Log, config: SourceConfig) -> tuple[Log, str]:
         return log, ""
     late_ns = round(offset.late_s * NS_PER_S)
     moved = replace(log, entry_at=lambda index: _RetimedEntry(log.entry_at(index), late_ns))
-    return moved, f"depth: {offset.text}, for pairing too; it is fused at its true time"
+    return (
+        moved,
+        f"depth: {offset.found}: it is fused at its true time, but paired by its stamps; {offset.remedy}",
+    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,17 +23,17 @@ class _MergedEntry(WrappedEntry):
 
     others: Sequence[tuple[FrameRef, Transform]]
 
-    def load(self, *, colour: bool = True) -> Frame:  # noqa: ARG002
-        return self.scan()
-
-    def scan(self) -> Scan:
-        scans = [self.entry.scan()]
+    def load(self, *, colour: bool = True) -> Frame:
+        scans = [self.entry.load(colour=colour).scan()]
         for entry, T_body_other in self.others:
             with suppress(FrameError):  # fusing reports it
                 scan = entry.scan()
                 points_body = apply(T_body_other, scan.points_body.astype(np.float64)).astype(np.float32)
                 scans.append(replace(scan, points_body=points_body))
         return _merged(scans)
+
+    def scan(self) -> Scan:
+        return self.load(colour=False).scan()
 
 
 def with_merged_scans(log: Log) -> Log:

@@ -2,15 +2,11 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 
 from mapper.core.timebase import Stamps, seconds_text_from_ns
-from mapper.core.trajectory import Trajectory
-from mapper.sensing.gnss import GnssFixes
-from mapper.sensing.gyroscope import Gyroscope
-from mapper.sources.base import Accelerations, Log
+from mapper.sources.base import Log, Readings
 from mapper.sources.config import SourceConfig
 from mapper.sources.gnss_files import read_gnss
 from mapper.sources.imu_files import read_imu
@@ -18,8 +14,6 @@ from mapper.sources.wheel_files import read_wheels
 
 _UNITS_NS = {"µs": 1_000, "ms": 1_000_000, "s": 1_000_000_000}
 """Units in which files have stamps that should be nanoseconds."""
-
-Readings = TypeVar("Readings", Trajectory, Gyroscope, Accelerations, GnssFixes)
 
 
 def with_readings(log: Log, folder: Path, config: SourceConfig) -> Log:

@@ -8,9 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.geometry import Array
-from mapper.core.timebase import NS_PER_S, Stamps
-from mapper.core.trajectory import Trajectory
-from mapper.sources.base import Log
+from mapper.core.timebase import NS_PER_S
+from mapper.sources.base import Log, Readings
 from mapper.sources.config import SourceConfig
 
 FEWEST_ESTIMATES, _MOST_SIGMA_S = 3, 0.02
@@ -37,13 +36,17 @@ class TimeOffset:
     remedy: str = ""
 
     @property
-    def text(self) -> str:
-        """The offset in words."""
+    def found(self) -> str:
+        """The offset in words, without the remedy."""
         if self.late_s is None or self.sigma_s is None:
             return "cannot be told: too little motion, too few frames, or no agreement"
         side = "late" if self.late_s >= 0.0 else "early"
-        found = f"stamps are {1e3 * abs(self.late_s):.0f} ± {1e3 * self.sigma_s:.0f} ms {side}"
-        return f"{found}; {self.remedy}" if self.remedy else found
+        return f"stamps are {1e3 * abs(self.late_s):.0f} ± {1e3 * self.sigma_s:.0f} ms {side}"
+
+    @property
+    def text(self) -> str:
+        """The offset in words, and the remedy."""
+        return f"{self.found}; {self.remedy}" if self.remedy else self.found
 
 
 def time_offset(
@@ -87,17 +90,15 @@ def with_time_offsets(log: Log, config: SourceConfig) -> Log:
     if not (config.truth_offset_s or config.wheels_offset_s or config.imu_offset_s):
         return log
 
-    def moved(stamps_ns: Stamps, offset_s: float) -> Stamps:
-        return stamps_ns + round(offset_s * NS_PER_S)
+    def moved(readings: Readings | None, offset_s: float) -> Readings | None:
+        if readings is None:
+            return None
+        return replace(readings, stamps_ns=readings.stamps_ns + round(offset_s * NS_PER_S))
 
-    truth, wheels = log.truth, log.wheels
-    gyroscope, accelerations = log.gyroscope, log.accelerations
-    if truth is not None:
-        truth = Trajectory(moved(truth.stamps_ns, config.truth_offset_s), truth.T_world_body)
-    if wheels is not None:
-        wheels = Trajectory(moved(wheels.stamps_ns, config.wheels_offset_s), wheels.T_world_body)
-    if gyroscope is not None:
-        gyroscope = replace(gyroscope, stamps_ns=moved(gyroscope.stamps_ns, config.imu_offset_s))
-    if accelerations is not None:
-        accelerations = replace(accelerations, stamps_ns=moved(accelerations.stamps_ns, config.imu_offset_s))
-    return replace(log, truth=truth, wheels=wheels, gyroscope=gyroscope, accelerations=accelerations)
+    return replace(
+        log,
+        truth=moved(log.truth, config.truth_offset_s),
+        wheels=moved(log.wheels, config.wheels_offset_s),
+        gyroscope=moved(log.gyroscope, config.imu_offset_s),
+        accelerations=moved(log.accelerations, config.imu_offset_s),
+    )

@@ -16,6 +16,7 @@ from mapper.simulation.config import LidarSensorConfig, LidarSynthConfig
 from mapper.simulation.lidar import LidarSimulator
 from mapper.sources.base import SensorBeside, WrappedEntry
 from mapper.sources.merged_scans import with_merged_scans
+from mapper.sources.reading_checks import ReadingChecks
 from tests.support.logs import MemoryEntry, log_in_memory
 
 MS = 1_000_000
@@ -107,3 +108,14 @@ def test_two_narrow_views_track_better_than_one():
     (both_m, both), (front_m, alone) = error_m("tracked"), error_m("fused")
     assert both == len(log) > alone
     assert both_m < 0.7 * front_m
+
+
+def test_a_frozen_sensor_is_noticed_beside_one_that_is_not():
+    frozen = scans(*range(0, 800, 100))
+    entries = [
+        MemoryEntry(entry.stamp_ns, replace(frozen[0], stamp_ns=entry.stamp_ns)) for entry in frozen.entries()
+    ]
+    checks = ReadingChecks(log_in_memory(entries, sensor="lidar"))
+    log = merged(checks.log, scans(*range(0, 800, 100)))
+    assert {len(frame.points_body) for frame in log} == {4}
+    assert checks.repeated("scan", fewest=3) == [range(8)]

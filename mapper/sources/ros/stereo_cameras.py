@@ -19,8 +19,8 @@ def stereo_camera(reader: RecordingReader, topics: StereoTopics, *, size_px: Siz
     """Return the camera of a pair's frames: the rectified left one.
 
     The right camera's place is that of its projection (CameraInfo's P), or else of tf. Images of a topic
-    without "rect" in its name are raw, and are rectified. Without a CameraInfo of
-    each that is calibrated, Kalibr's file counts.
+    without "rect" in its name are raw, and are rectified. Without a calibrated CameraInfo of each, Kalibr's
+    file counts.
 
     Raises:
         SourceError: A camera or its place is unknown, or the cameras do not lie side by side.

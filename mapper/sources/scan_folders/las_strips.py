@@ -155,9 +155,7 @@ def _times(path: Path) -> _Times:
     if not is_sound[:_AT_ENDS].any():
         raise FrameError(f"{path}: the points' times (gps_time) count backwards; sort them by gps_time")
     zero_s = times_s[:_AT_ENDS][is_sound[:_AT_ENDS]].min()
-    since_s = (
-        np.where(is_sound, times_s, zero_s) - zero_s
-    )  # small numbers are not rounded as they are added up
+    since_s = np.where(is_sound, times_s, zero_s) - zero_s  # small numbers keep their digits in sums
     return _Times(float(zero_s), since_s, is_sound)
 
 
