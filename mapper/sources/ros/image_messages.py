@@ -1,8 +1,10 @@
 """Image messages as arrays: RGB, grey, and depth in metres."""
 
+import math
 import struct
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from fractions import Fraction
 from typing import Any
 
 import cv2
@@ -26,14 +28,19 @@ from mapper.sources.ros.messages import FileMessage, ImageMessage, PixelsMessage
 
 @dataclass(frozen=True, slots=True)
 class _Encoding:
-    """Storage of colour pixels, and OpenCV's conversions to RGB and to grey; None for no conversion."""
+    """Storage of colour pixels, and OpenCV's conversions to RGB and to grey; None for no conversion.
+
+    Of values of 16 bits the upper 8 are used. Behind half-size planes of colour there are ``rows`` of an image.
+    """
 
     channels: int
     to_rgb: int | None
     to_grey: int | None
+    kind: str = "u1"
+    rows: Fraction = Fraction(1)
 
 
-_COLOUR = {
+_COLOUR_8 = {
     "rgb8": _Encoding(3, None, cv2.COLOR_RGB2GRAY),
     "bgr8": _Encoding(3, cv2.COLOR_BGR2RGB, cv2.COLOR_BGR2GRAY),
     "8UC3": _Encoding(3, cv2.COLOR_BGR2RGB, cv2.COLOR_BGR2GRAY),
@@ -49,6 +56,13 @@ _COLOUR = {
     "bayer_bggr8": _Encoding(1, cv2.COLOR_BayerRG2RGB, cv2.COLOR_BayerRG2GRAY),
     "bayer_gbrg8": _Encoding(1, cv2.COLOR_BayerGR2RGB, cv2.COLOR_BayerGR2GRAY),
     "bayer_grbg8": _Encoding(1, cv2.COLOR_BayerGB2RGB, cv2.COLOR_BayerGB2GRAY),
+    "nv12": _Encoding(1, cv2.COLOR_YUV2RGB_NV12, cv2.COLOR_YUV2GRAY_420, rows=Fraction(3, 2)),
+    "nv21": _Encoding(1, cv2.COLOR_YUV2RGB_NV21, cv2.COLOR_YUV2GRAY_420, rows=Fraction(3, 2)),
+}
+_COLOUR = _COLOUR_8 | {
+    name.replace("8", "16"): replace(encoding, kind="u2")
+    for name, encoding in _COLOUR_8.items()
+    if "8" in name and name not in ("mono8", "8UC1")  # those of 16 bits are depth
 }
 _DEPTH = {"16UC1": "u2", "mono16": "u2", "16SC1": "i2", "32FC1": "f4", "64FC1": "f8"}
 _TIFF_STARTS = (b"II*\x00", b"MM\x00*")
@@ -105,14 +119,18 @@ def image_of(message: ImageMessage, *, colour: bool, where: str) -> Image:
     encoding = _COLOUR.get(message.encoding)
     if encoding is None:
         raise FrameError(f"{where}: colour encoded as {message.encoding}; known are {', '.join(_COLOUR)}")
-    pixels = _pixels(message, "u1", encoding.channels, where=where)
+    order = ">" if message.is_big_endian else "<"
+    pixels = _pixels(message, order + encoding.kind, encoding.channels, rows=encoding.rows, where=where)
     if not pixels.size:
         raise FrameError(f"{where}: an image of {message.width_px}×{message.height_px} px")
+    pixels = np.ascontiguousarray(pixels if encoding.kind == "u1" else pixels >> 8, dtype=np.uint8)
     code = encoding.to_rgb if colour else encoding.to_grey
-    if code is None:
-        return np.ascontiguousarray(pixels)
-    image: Image = cv2.cvtColor(np.ascontiguousarray(pixels), code)
-    return image
+    try:
+        return pixels if code is None else cv2.cvtColor(pixels, code)
+    except cv2.error:  # colours of two pixels, in each direction, are stored together
+        raise FrameError(
+            f"{where}: {message.encoding} of {message.width_px}×{message.height_px} px, want even numbers"
+        ) from None
 
 
 def depth_m_of(
@@ -206,13 +224,16 @@ def _refuse_video(data: bytes, format_: str, *, where: str) -> None:
         )
 
 
-def _pixels(message: PixelsMessage, kind: str, channels: int, *, where: str) -> NDArray[Any]:
+def _pixels(
+    message: PixelsMessage, kind: str, channels: int, *, rows: Fraction = Fraction(1), where: str
+) -> NDArray[Any]:
     """Return a view of an image's rows as (H, W) or (H, W, channels), whatever their padding."""
     pixel = np.dtype(kind)
-    shape = (message.height_px, message.width_px, channels)
+    height = math.ceil(message.height_px * rows)
+    shape = (height, message.width_px, channels)
     used_bytes = message.width_px * channels * pixel.itemsize
     row_bytes = message.row_bytes or used_bytes
-    if len(message.data) == message.height_px * used_bytes:
+    if len(message.data) == height * used_bytes:
         row_bytes = used_bytes  # whatever the message says: without padding there is one way to read it
     strides = (row_bytes, channels * pixel.itemsize, pixel.itemsize)
     try:

@@ -77,6 +77,9 @@ BGR = RGB[:, :, ::-1]
         ("rgba8", np.concatenate([RGB, ALPHA], axis=2)),
         ("bgra8", np.concatenate([BGR, ALPHA], axis=2)),
         ("8UC4", np.concatenate([BGR, ALPHA], axis=2)),
+        ("rgb16", RGB.astype(np.uint16) * 257),
+        ("bgr16", BGR.astype(np.uint16) * 257),
+        ("16UC4", np.concatenate([BGR, ALPHA], axis=2).astype(np.uint16) * 257),
     ],
 )
 def test_colour_comes_as_rgb_and_as_the_grey_of_files(encoding, array, padding):
@@ -113,6 +116,24 @@ def test_yuv_is_read_in_both_orders_of_bytes():
         image = image_of(message, colour=True, where="m")
         assert np.abs(image.astype(int) - 128).max() <= 1
         assert image_of(message, colour=False, where="m").shape == (48, 64)
+
+
+@pytest.mark.parametrize("padding", [0, 16])
+@pytest.mark.parametrize(("encoding", "u_first"), [("nv12", True), ("nv21", False)])
+def test_half_size_planes_of_colour_follow_the_grey_one(encoding, u_first, padding):
+    """By BT.601, U 90 and V 240 on Y 81 are red."""
+    rows = np.full((48 * 3 // 2, 64), 81, np.uint8)
+    rows[48:, 0::2], rows[48:, 1::2] = (90, 240) if u_first else (240, 90)
+    message = replace(pixels(rows, encoding, padding=padding), height_px=48)
+    assert size_of(message, where="m") == (64, 48)
+    assert np.abs(image_of(message, colour=True, where="m").astype(int) - [255, 0, 0]).max() <= 2
+    np.testing.assert_array_equal(image_of(message, colour=False, where="m"), rows[:48])
+
+
+def test_bytes_of_16_bits_are_in_the_order_that_the_message_says():
+    values = (RGB.astype(np.uint16) * 256 + 7).astype(">u2")
+    message = pixels(values, "rgb16", is_big_endian=True)
+    np.testing.assert_array_equal(image_of(message, colour=True, where="m"), RGB)
 
 
 @pytest.mark.parametrize(("ending", "format_"), [(".png", "png"), (".jpg", "rgb8; jpeg compressed bgr8")])
@@ -216,7 +237,9 @@ def test_rows_that_follow_each_other_are_read_whatever_step_says():
     [
         (replace(pixels(RGB, "rgb8"), height_px=0), "px"),
         (replace(pixels(RGB, "rgb8"), data=memoryview(b"")), "but 0 bytes are there"),
-        (pixels(RGB, "rgb16"), "colour encoded as rgb16; known are rgb8"),
+        (pixels(RGB, "nv24"), "colour encoded as nv24; known are rgb8"),
+        (replace(pixels(GREY[:, :63], "nv12"), height_px=32), "nv12 of 63×32 px, want even numbers"),
+        (pixels(GREY, "nv12"), "but 3072 bytes are there"),
         (file(encoded(BGR, ".jpg")[:-50], "jpeg"), "truncated JPEG"),
         (file(b"", "jpeg"), "empty file"),
         (PixelsMessage(0, "", "rgb8", 64, 48, 192, False, memoryview(bytes(100))), "but 100 bytes are there"),
