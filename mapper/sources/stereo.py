@@ -1,6 +1,7 @@
 """Stereo pairs as frames with depth: rectified as they are read, and matched where depth is asked for."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 
 from mapper.core.errors import FrameError, SourceError
 from mapper.core.frames import DepthImage, Image
-from mapper.core.geometry import Transform, inverse, nearest_rotation, transform
+from mapper.core.geometry import Transform, inverse, nearest_rotation, spread_indices, transform
 from mapper.sensing.config import DepthNoiseConfig
 from mapper.sensing.stereo import LEAST_DISPARITY_PX, stereo_depth_m, stereo_noise
 from mapper.sources.calibration import Calibration
@@ -24,6 +25,8 @@ Maps = tuple[NDArray[np.float32], NDArray[np.float32]]
 """(H, W) columns and rows in a recorded image of the rectified one's pixels, for ``cv2.remap``."""
 ReadImage = Callable[[bool], Image]
 """Reads an image, in colour or grey."""
+_PAIRS_LOOKED_AT, _MATCHED_SHARE, _EXCHANGED_RATIO = 3, 1 / 3, 1.5
+"""Of three real logs' pixels 52 to 82 % match, and if left and right are exchanged 13 to 30 %."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,6 +75,35 @@ class StereoCamera:
     def depth_of(self, read_left: ReadImage, read_right: ReadImage, where: object) -> DecodedDepth:
         """Return the depth of a frame, not read yet."""
         return DecodedDepth(where, partial(self._depth_m, read_left, read_right, where), self.units_per_m)
+
+    def refuse_exchanged(
+        self, pair_at: Callable[[int], Sequence[ReadImage]], count: int, where: object
+    ) -> None:
+        """Refuse a log whose images match only if the right one is taken for the left one.
+
+        Args:
+            pair_at: Returns the left and the right image of frame 0 … count − 1.
+            count: Number of frames.
+            where: What an error names.
+
+        Raises:
+            SourceError: Left and right have changed places.
+        """
+        shares = []
+        for index in spread_indices(count, _PAIRS_LOOKED_AT).tolist():
+            with suppress(FrameError):
+                left, right = (self._rectify(read(False), k, where) for k, read in enumerate(pair_at(index)))
+                depths_m = (
+                    stereo_depth_m(*one, focal_baseline_px_m=1.0) for one in ((left, right), (right, left))
+                )
+                shares.append([(depth_m > 0.0).mean() for depth_m in depths_m])
+        matched, exchanged = np.median(shares, axis=0) if shares else (0.0, 0.0)
+        if exchanged > max(_MATCHED_SHARE, _EXCHANGED_RATIO * matched):
+            raise SourceError(
+                f"{where}: left and right have changed places: {exchanged:.0%} of the pixels match if the "
+                f"images are exchanged, {matched:.0%} as they are; exchange the folders' names, or in a "
+                "recording set source.topics.color to the topic that is called right"
+            )
 
     @property
     def _focal_baseline_px_m(self) -> float:

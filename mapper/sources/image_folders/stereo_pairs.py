@@ -61,6 +61,9 @@ def stereo_log(
 ) -> Log:
     """Return the log of left images that have a right one; arguments as of ``rgbd_log``."""
     pairs, pair_notes = pair_images(left, right, config, path=path, names=("left", "right"))
+    camera.refuse_exchanged(
+        lambda k: [partial(read_view, image) for image in (pairs[k].colour, pairs[k].depth)], len(pairs), path
+    )
     return replace(
         rgbd_log(
             [_frame(pair, camera) for pair in pairs],

@@ -114,7 +114,7 @@ def stereo_entry(left: Located, right: Located, camera: StereoCamera, recorded: 
         camera: Rectifies and matches them.
         recorded: Camera of the frame, and the size of both images.
     """
-    read_left, read_right = (partial(_read, one) for one in (left, right))
+    read_left, read_right = (partial(read_image, one) for one in (left, right))
     depth = camera.depth_of(read_left, read_right, left)
     images = ImageFiles(
         camera.image_of(read_left, left),
@@ -127,7 +127,8 @@ def stereo_entry(left: Located, right: Located, camera: StereoCamera, recorded: 
     return RgbdEntry(left.stamp_ns, images, recorded)
 
 
-def _read(image: Located, in_colour: bool) -> Image:
+def read_image(image: Located, in_colour: bool) -> Image:
+    """Read an image in colour or grey."""
     return image_of(image.image(), colour=in_colour, where=f"{image}")
 
 

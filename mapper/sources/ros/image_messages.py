@@ -30,7 +30,7 @@ from mapper.sources.ros.messages import FileMessage, ImageMessage, PixelsMessage
 class _Encoding:
     """Storage of colour pixels, and OpenCV's conversions to RGB and to grey; None for no conversion.
 
-    Of values of 16 bits the upper 8 are used. Behind half-size planes of colour there are ``rows`` of an image.
+    Of values of 16 bits the upper 8 are used. ``rows``, with planes of colour, are of each row of the image.
     """
 
     channels: int

@@ -21,7 +21,7 @@ from mapper.sources.image_folders.rgbd import RgbdEntry
 from mapper.sources.laser_scan import MAX_TILT_RAD, tilt_rad
 from mapper.sources.point_times import counted_on, relative_times_s, time_field
 from mapper.sources.ros.cameras import calibrate
-from mapper.sources.ros.entries import CloudEntry, rgbd_entry, stereo_entry
+from mapper.sources.ros.entries import CloudEntry, Located, read_image, rgbd_entry, stereo_entry
 from mapper.sources.ros.frame_tree import is_fixed
 from mapper.sources.ros.image_messages import has_float_depth, size_of
 from mapper.sources.ros.message_index import Series, why_unread
@@ -79,11 +79,15 @@ def stereo_frames(reader: RecordingReader, topics: StereoTopics, config: SourceC
     camera = stereo_camera(reader, topics, size_px=size_px)
     recorded = recorded_camera(camera.calibration, colour_px=size_px, depth_px=size_px, where=where)
 
-    def entry_at(index: int) -> FrameRef:
-        return stereo_entry(
-            reader.located(left, int(i[index])), reader.located(right, int(j[index])), camera, recorded
-        )
+    def located(index: int) -> tuple[Located, Located]:
+        return reader.located(left, int(i[index])), reader.located(right, int(j[index]))
 
+    def entry_at(index: int) -> FrameRef:
+        return stereo_entry(*located(index), camera, recorded)
+
+    camera.refuse_exchanged(
+        lambda k: [partial(read_image, one) for one in located(k)], len(i), f"{where}: {left.topic.name}"
+    )
     notes.append(camera.note)
     return RecordedFrames("rgbd", frame_of(first), left.stamps_ns[i], entry_at, notes, camera.noise)
 

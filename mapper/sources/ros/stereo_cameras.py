@@ -18,9 +18,9 @@ from mapper.sources.stereo import StereoCamera, rectified_pair, rectify
 def stereo_camera(reader: RecordingReader, topics: StereoTopics, *, size_px: Size) -> StereoCamera:
     """Return the camera of a pair's frames: the rectified left one.
 
-    The right camera's place is that of its projection (CameraInfo's P), or else of tf. Images of a topic
-    without "rect" in its name are raw, and are rectified. Without a calibrated CameraInfo of each, Kalibr's
-    file counts.
+    The cameras' distance is that of their projections (CameraInfo's P), or else of tf; the images tell which
+    is on the left. Those of a topic without "rect" in its name are raw, and are rectified. Without a
+    calibrated CameraInfo of each, Kalibr's file counts.
 
     Raises:
         SourceError: A camera or its place is unknown, or the cameras do not lie side by side.
@@ -42,7 +42,10 @@ def stereo_camera(reader: RecordingReader, topics: StereoTopics, *, size_px: Siz
         calibration_of(info, size_px, is_rectified=is_rectified, name=series.topic.name)
         for info, series in ((left, topics.left_info), (right, topics.right_info))
     )
-    baseline_m = -right.P[3] / right.P[0] if right.P.size == 12 and right.P[0] > 0.0 else 0.0
+    along_m = [
+        info.P[3] / info.P[0] if info.P.size == 12 and info.P[0] > 0.0 else 0.0 for info in (left, right)
+    ]
+    baseline_m = abs(along_m[0] - along_m[1])
     of_tf = reader.tree.find(
         *(frame_of(reader.firsts.get(one.topic.name)) for one in (topics.left, topics.right))
     )

@@ -233,7 +233,7 @@ def choose(
         left_info, right_info = (next(iter(infos_beside(one, infos)), None) for one in (left, right))
         frames = StereoTopics(left, right, left_info, right_info)
         chosen = f"stereo pairs {left.topic.name} and {right.topic.name}"
-        choices = [_choice_note(chosen, "color", others=len(pairs) > 1 and config.color is None)]
+        choices = [_choice_note(chosen, "color", others=len(pairs) > 2)]
         used, image_reason = [left, right], "one pair is mapped"
     else:
         strange = [one for one in series.values() if one.topic.type not in READ]
@@ -378,13 +378,14 @@ def _namespace(one: Series) -> str:
 
 
 def _stereo_pairs(lefts: Sequence[Series], images: Sequence[Series]) -> list[tuple[Series, Series]]:
-    """Return the topics of left images with those of the right ones, by their names; rectified ones first."""
+    """Return the topics of pairs by their names, in both orders: rectified ones first, then left ones."""
     by_name = {one.topic.name: one for one in images}
     found = [
         (left, by_name[other])
-        for left in lefts
+        for left in images
         if (other := _SIDES.sub(_other_side, name := left.topic.name)) != name and other in by_name
     ]
+    found = [pair for left, right in found for pair in ((left, right), (right, left)) if pair[0] in lefts]
     return sorted(found, key=lambda pair: (not is_called_rectified(pair[0].topic.name), pair[0].topic.name))
 
 
