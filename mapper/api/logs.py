@@ -1,6 +1,5 @@
 """Recorded logs, and single frames, by name."""
 
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,6 +15,7 @@ from mapper.sources.scan_folders.clouds import read_scan
 
 if TYPE_CHECKING:
     from mapper.sources.inspection import Inspection
+    from mapper.sources.time_offsets import TimeOffset
 
 
 def open_log(path: AnyPath, *, config: AnyPath | None = None, settings: Settings | None = None) -> Log:
@@ -87,16 +87,16 @@ def inspect(
             return None
         return scan_observation.why_untrackable(log, odometry)
 
-    config = load_source_config(settings=settings)
-    found = inspect_log(Path(path), config, check=why_untrackable)
-    if not time_offset or found.log is None or found.problem is not None:
-        return found
-    from mapper.pipeline.time_offsets import measure_time_offsets
+    def offsets(log: Log) -> "list[TimeOffset]":
+        from mapper.pipeline.time_offsets import measure_time_offsets
 
-    log = open_source(Path(path), config)
-    tracked_by = load_config(settings={**(settings or {}), "loops.kind": "none"}, sensor=log.sensor)
-    offsets = measure_time_offsets(log, tracked_by, progress=receiver_of(progress))
-    return replace(found, time_offsets=offsets)
+        tracked_by = load_config(settings={**(settings or {}), "loops.kind": "none"}, sensor=log.sensor)
+        return measure_time_offsets(log, tracked_by, progress=receiver_of(progress))
+
+    config = load_source_config(settings=settings)
+    return inspect_log(
+        Path(path), config, check=why_untrackable, time_offsets=offsets if time_offset else None
+    )
 
 
 def read_frame(name: AnyPath, config: SourceConfig) -> tuple[Frame, Sensor]:

@@ -33,6 +33,10 @@ _MOST_LOADED = 200
 """Frames of an RGB-D log that are loaded, evenly spread: a second or two of reading, whatever its length."""
 
 
+_AT_STAMP = 0.05
+"""Part of a sweep within which its first or last point counts as measured at the stamp."""
+
+
 @dataclass(frozen=True, slots=True)
 class Timing:
     """Rate and gaps of messages or frames.
@@ -134,7 +138,11 @@ class Inspection:
 
 
 def inspect_log(
-    path: Path, config: SourceConfig, *, check: Callable[[Log], str | None] = lambda _: None
+    path: Path,
+    config: SourceConfig,
+    *,
+    check: Callable[[Log], str | None] = lambda _: None,
+    time_offsets: Callable[[Log], Sequence[TimeOffset]] | None = None,
 ) -> Inspection:
     """Return what is in a log of any kind.
 
@@ -143,19 +151,20 @@ def inspect_log(
         config: Settings by which it is opened.
         check: Returns why nothing of it can be mapped, as only the settings of the odometry tell; None if
             something can.
+        time_offsets: Measures those of a log that can be mapped; None for none.
 
     Raises:
         SourceError: It is no log of a known format, or is damaged beyond reading.
     """
     if not ((path.is_dir() or path.is_file()) and format_of(path) == RECORDING):
-        return _inspected(path, [], open_source(path, config), check)
+        return _inspected(path, [], open_source(path, config), check, time_offsets)
     reader = RecordingReader(recordings.open_recording(path))
     topics = [_topic(series) for series in reader.series.values()]
     try:
         log = selected(recording_log(reader, config), config)
     except (DependencyError, SourceError) as error:
         return Inspection(path, topics, None, str(error))
-    return _inspected(path, topics, log, check)
+    return _inspected(path, topics, log, check, time_offsets)
 
 
 def timing_of(stamps_ns: Stamps) -> Timing:
@@ -179,7 +188,11 @@ def _topic(series: Series) -> TopicFacts:
 
 
 def _inspected(
-    path: Path, topics: Sequence[TopicFacts], source: Log, check: Callable[[Log], str | None]
+    path: Path,
+    topics: Sequence[TopicFacts],
+    source: Log,
+    check: Callable[[Log], str | None],
+    time_offsets: Callable[[Log], Sequence[TimeOffset]] | None,
 ) -> Inspection:
     checks = ReadingChecks(source)
     images = ImageChecks(len(source))
@@ -217,7 +230,8 @@ def _inspected(
         vehicle=vehicle_box(source),
     )
     why = problem or why_no_depth(source, frames) or _unwritable(source) or check(source)
-    return Inspection(path, topics, log, why)
+    offsets = None if why is not None or time_offsets is None else time_offsets(source)
+    return Inspection(path, topics, log, why, offsets)
 
 
 def _unwritable(source: Log) -> str | None:
@@ -254,7 +268,10 @@ def _times_text(scan: Scan, timing: Timing) -> str | None:
     if scan.times_s is None or not len(scan.times_s):
         return None
     first_ms, last_ms = (1e3 * float(extreme) for extreme in (scan.times_s.min(), scan.times_s.max()))
-    text = f"{first_ms:.1f} … {last_ms:.1f} ms after the stamp"
+    near_ms = _AT_STAMP * (last_ms - first_ms)
+    at = next((name for name, ms in (("first", first_ms), ("last", last_ms)) if abs(ms) <= near_ms), None)
+    which = "" if at is None else f", which is that of the {at} point"
+    text = f"{first_ms:.1f} … {last_ms:.1f} ms after the stamp{which}"
     if timing.rate_hz == 0.0:
         return text
     return f"{text}, {(last_ms - first_ms) / 1e3 * timing.rate_hz:.0%} of the time between scans"

@@ -96,6 +96,18 @@ def relative_times_s(values: NDArray[np.number], stamp_ns: int) -> NDArray[np.fl
     return times_s
 
 
+def are_on_own_clock(values: NDArray[np.number], stamp_ns: int) -> bool:
+    """Return whether times of :func:`relative_times_s` say nothing of the stamp, where the first is taken."""
+    values = counted_on(values)
+    _, units_per_s = _middle_and_unit(values)
+    first, last = values.min(), values.max()
+    if units_per_s is None or not (np.isfinite(first) and np.isfinite(last)):
+        return False
+    first_ns = _ns(first, units_per_s)
+    sweep_ns = round(float(_less(last, first)) * (NS_PER_S // units_per_s))
+    return first_ns != 0 and _first_after_stamp_ns(first_ns, sweep_ns, stamp_ns) == 0 != first_ns - stamp_ns
+
+
 def without_untimed(scan: Scan) -> Scan:
     """Return a scan without the returns whose time is NaN, which are counted."""
     if scan.times_s is None or not np.isnan(scan.times_s.sum()):

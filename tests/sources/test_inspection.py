@@ -4,10 +4,12 @@ import re
 import numpy as np
 import pytest
 
+from mapper.core.frames import Scan
 from mapper.export.mcap_log import McapLog
 from mapper.sources.config import SourceConfig
 from mapper.sources.image_files.decoded import encode_depth
 from mapper.sources.inspection import inspect_log, timing_of
+from mapper.sources.ros.encode_ros import cloud_message
 from tests.support.command_line import invoke
 from tests.support.recordings import CAMERA, COLOR, DEPTH, shots, write
 from tests.support.tum_logs import FIRST_NS, PERIOD_NS
@@ -42,6 +44,17 @@ def test_a_recording_tells_its_topics_and_its_frames(tmp_path, name):
     assert found.log.content.startswith("colour and depth of 64×48 px, the first 94% measured")
     assert f"{CAMERA.fx_px:g}" in found.log.calibration
     assert found.problem is None
+
+
+@pytest.mark.parametrize(("first_ms", "at"), [(0.0, "first"), (-99.0, "last"), (-50.0, None)])
+def test_the_point_that_was_measured_at_the_stamp_is_named(tmp_path, first_ms, at):
+    points = np.random.default_rng(0).uniform(1.0, 9.0, (100, 3)).astype(np.float32)
+    times_s = np.linspace(first_ms, first_ms + 99.0, 100).astype(np.float32) / 1e3
+    scans = [Scan(FIRST_NS + k * 100 * MS, points, times_s=times_s) for k in range(2)]
+    path = write(tmp_path / "log.mcap", [cloud_message("/points", scan, frame="lidar") for scan in scans])
+    told = inspect_log(path, SourceConfig()).log.point_times
+    assert told.startswith(f"{first_ms:.1f} … {first_ms + 99.0:.1f} ms")
+    assert [name for name in ("first", "last") if name in told] == ([] if at is None else [at])
 
 
 def test_a_folder_tells_its_frames_truth_both_sizes_and_what_is_resized(tiny_tum_log):

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from mapper.sources.point_times import relative_times_s, time_field
+from mapper.sources.point_times import are_on_own_clock, relative_times_s, time_field
 
 STAMP_NS = 1_567_410_201_745_204_700
 SWEEP_S = np.linspace(0.0, 0.0999, 1000)
@@ -24,6 +24,7 @@ def test_every_unit_and_clock_becomes_seconds_after_the_stamp(values):
     times_s = relative_times_s(values, STAMP_NS)
     assert times_s.dtype == np.float32
     np.testing.assert_allclose(times_s, SWEEP_S, atol=1e-6)
+    assert are_on_own_clock(values, STAMP_NS) == (values[0] == 345_678.9)
 
 
 def test_a_stamp_at_the_end_of_the_sweep_gives_negative_times():

@@ -19,7 +19,7 @@ from mapper.sources.image_files.reading import TUM_UNITS_PER_M
 from mapper.sources.image_folders.pairing import depth_offset_ns
 from mapper.sources.image_folders.rgbd import RgbdEntry
 from mapper.sources.laser_scan import MAX_TILT_RAD, tilt_rad
-from mapper.sources.point_times import counted_on, relative_times_s, time_field
+from mapper.sources.point_times import are_on_own_clock, counted_on, relative_times_s, time_field
 from mapper.sources.ros.cameras import calibrate
 from mapper.sources.ros.entries import CloudEntry, Located, read_image, rgbd_entry, stereo_entry
 from mapper.sources.ros.frame_tree import is_fixed
@@ -160,6 +160,11 @@ def lidar_frames(reader: RecordingReader, clouds: Series, config: SourceConfig) 
     values = None if times is None or not len(first.points) else first.points[times]
     if values is not None and relative_times_s(values, first.stamp_ns) is None:
         notes.append(f"{clouds.topic.name}: field {times} of the first cloud holds no times; not deskewed")
+    elif values is not None and are_on_own_clock(values, first.stamp_ns):
+        notes.append(
+            f"{clouds.topic.name}: field {times} is on a clock of its own; the first point of each sweep is "
+            "taken to be measured at its stamp"
+        )
     elif values is not None and counted_on(values) is not values:
         notes.append(f"{clouds.topic.name}: field {times} begins anew during a sweep; counted on")
     frame, is_planar = _usual_frame(reader, clouds, frame_of(first)), clouds.topic.type in LASERS
