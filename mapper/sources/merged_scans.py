@@ -1,16 +1,24 @@
-"""Scans of several LiDARs on one body, merged by time into one."""
+"""Scans merged by time into one: of several LiDARs on one body, or parts of a turn of one."""
 
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mapper.core.errors import FrameError
 from mapper.core.frames import Frame, Scan
 from mapper.core.geometry import Transform, apply
 from mapper.core.timebase import NS_PER_S, nearest
 from mapper.sources.base import FrameRef, Log, WrappedEntry
+from mapper.sources.point_times import MAX_SWEEP_S
+
+_LOOKED_AT, _FEWEST_PARTS, _WIDEST_PART_RAD = 16, 8, 1.5 * np.pi
+_LEAST_TURNED_RAD, _SAME_RATE, _MIN_USUAL = 1e-3, 0.25, 0.75
+"""Rates of turning that count as the same, and the share of them: scenes are empty on one side and not on
+another, and packets are lost."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -18,18 +26,20 @@ class _MergedEntry(WrappedEntry):
     """An entry whose scan has the points of other LiDARs' scans, too, each at its own time.
 
     Attributes:
-        others: Their entries, and the poses T_body_other of their bodies.
+        others: Their entries, and the poses T_body_other of their bodies; None of the same body.
     """
 
-    others: Sequence[tuple[FrameRef, Transform]]
+    others: Sequence[tuple[FrameRef, Transform | None]]
 
     def load(self, *, colour: bool = True) -> Frame:
         scans = [self.entry.load(colour=colour).scan()]
         for entry, T_body_other in self.others:
             with suppress(FrameError):  # fusing reports it
-                scan = entry.scan()
-                points_body = apply(T_body_other, scan.points_body.astype(np.float64)).astype(np.float32)
-                scans.append(replace(scan, points_body=points_body))
+                scan = entry.load(colour=colour).scan()
+                if T_body_other is not None:
+                    points_body = apply(T_body_other, scan.points_body.astype(np.float64)).astype(np.float32)
+                    scan = replace(scan, points_body=points_body)
+                scans.append(scan)
         return _merged(scans)
 
     def scan(self) -> Scan:
@@ -57,6 +67,56 @@ def with_merged_scans(log: Log) -> Log:
     return replace(log, entry_at=lambda index: _MergedEntry(log.entry_at(index), others[index]))
 
 
+def with_whole_turns(log: Log) -> Log:
+    """Return a spinning LiDAR's log whose scans are whole turns where parts of turns were published.
+
+    Parts are clouds of less than three quarters of a turn, each as far round from the one before as the time
+    between them says. A turn has the stamp of its first part.
+    """
+    turn_ns = _turn_of_parts_ns(log) if log.sensor == "lidar" and len(log) > _FEWEST_PARTS else None
+    if turn_ns is None:
+        return log
+    turns = (log.stamps_ns - log.stamps_ns[0] + int(np.median(np.diff(log.stamps_ns))) // 2) // turn_ns
+    begins = np.flatnonzero(np.diff(turns, prepend=-1))
+    ends = np.append(begins[1:], len(log))
+
+    def entry_at(index: int) -> FrameRef:
+        first, *others = (log.entry_at(k) for k in range(begins[index], ends[index]))
+        return _MergedEntry(first, [(one, None) for one in others])
+
+    note = (
+        f"the {len(log)} clouds are parts of turns: {np.median(ends - begins):.0f} of them are joined to "
+        f"each of {len(begins)} scans of {turn_ns / NS_PER_S:.3g} s"
+    )
+    return replace(log, stamps_ns=log.stamps_ns[begins], entry_at=entry_at, notes=[*log.notes, note])
+
+
+def _turn_of_parts_ns(log: Log) -> int | None:
+    """Return the duration of a turn of whose parts the first clouds are; None if they are none."""
+    parts = []
+    for index in range(min(len(log), _LOOKED_AT)):
+        entry = log.entry_at(index)
+        with suppress(FrameError):
+            scan = entry.scan()
+            x, y = (scan.points_body[:, :2] - scan.origin_body[:2]).T.astype(np.float64)
+            direction = (x + 1j * y) / np.maximum(np.hypot(x, y), 1e-9)
+            middle = direction.sum()
+            if len(direction) == 0 or np.ptp(np.angle(direction * middle.conj())) > _WIDEST_PART_RAD:
+                return None
+            parts.append((entry.stamp_ns, middle))
+    if len(parts) < _FEWEST_PARTS:
+        return None
+    stamps_ns, middles = (np.array(one) for one in zip(*parts, strict=True))
+    turned_rad = np.abs(np.angle(middles[1:] * middles[:-1].conj()))
+    turns_ns = 2.0 * np.pi * np.diff(stamps_ns) / np.maximum(turned_rad, _LEAST_TURNED_RAD)
+    turn_ns = float(np.median(turns_ns))
+    is_usual = np.abs(turns_ns / turn_ns - 1.0) < _SAME_RATE
+    if turn_ns > MAX_SWEEP_S * NS_PER_S or is_usual.mean() < _MIN_USUAL:
+        return None
+    part_ns = float(np.median(np.diff(log.stamps_ns)))
+    return round(max(round(turn_ns / part_ns), 1) * part_ns)
+
+
 def _merged(scans: Sequence[Scan]) -> Scan:
     first_ns = scans[0].stamp_ns
     apart_s = [(scan.stamp_ns - first_ns) / NS_PER_S for scan in scans]
@@ -68,8 +128,13 @@ def _merged(scans: Sequence[Scan]) -> Scan:
         scans[0],
         points_body=np.concatenate([scan.points_body for scan in scans]),
         times_s=np.concatenate([own_s + np.float32(s) for own_s, s in zip(times_s, apart_s, strict=True)]),
-        colors=None,
-        intensities=None,
+        colors=_joined([scan.colors for scan in scans]),
+        intensities=_joined([scan.intensities for scan in scans]),
         far_returns=sum(scan.far_returns for scan in scans),
         untimed_returns=sum(scan.untimed_returns for scan in scans),
     )
+
+
+def _joined(parts: Sequence[NDArray[Any] | None]) -> NDArray[Any] | None:
+    known = [part for part in parts if part is not None]
+    return np.concatenate(known) if len(known) == len(parts) else None

@@ -10,6 +10,7 @@ from mapper.core.errors import SourceError
 from mapper.core.timebase import NS_PER_S, nearest
 from mapper.sources.base import Log
 from mapper.sources.config import SourceConfig
+from mapper.sources.merged_scans import with_whole_turns
 from mapper.sources.time_offsets import with_time_offsets
 from mapper.sources.timed_scans import with_point_times
 from mapper.sources.vehicle import without_vehicle
@@ -23,6 +24,7 @@ def selected(log: Log, config: SourceConfig) -> Log:
     Raises:
         SourceError: Nothing is left, or truth is required of a log that has none.
     """
+    log = with_whole_turns(log)
     if log.sensor != "rgbd" and (config.point_time_scale != 1.0 or config.sweep_s is not None):
         log = with_point_times(log, time_scale=config.point_time_scale, sweep_s=config.sweep_s)
     log = with_time_offsets(log, config)

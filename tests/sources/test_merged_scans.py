@@ -15,8 +15,10 @@ from mapper.runtime.progress import SILENT
 from mapper.simulation.config import LidarSensorConfig, LidarSynthConfig
 from mapper.simulation.lidar import LidarSimulator
 from mapper.sources.base import SensorBeside, WrappedEntry
-from mapper.sources.merged_scans import with_merged_scans
+from mapper.sources.config import SourceConfig
+from mapper.sources.merged_scans import with_merged_scans, with_whole_turns
 from mapper.sources.reading_checks import ReadingChecks
+from mapper.sources.selection import selected
 from tests.support.logs import MemoryEntry, log_in_memory
 
 MS = 1_000_000
@@ -119,3 +121,38 @@ def test_a_frozen_sensor_is_noticed_beside_one_that_is_not():
     log = merged(checks.log, scans(*range(0, 800, 100)))
     assert {len(frame.points_body) for frame in log} == {4}
     assert checks.repeated("scan", fewest=3) == [range(8)]
+
+
+def parts_of(log, count, *, timed):
+    """The same scans in parts of a turn that are published one by one."""
+    entries = []
+    for scan in log:
+        part = np.minimum(scan.times_s * count / 0.1, count - 1).astype(int)
+        for k in range(count):
+            late_ns = k * 100 * MS // count
+            times_s = scan.times_s - np.float32(late_ns / 1e9) if timed else None
+            cut = replace(scan, stamp_ns=scan.stamp_ns + late_ns, times_s=times_s).select(part == k)
+            entries.append(MemoryEntry(cut.stamp_ns, cut))
+    return log_in_memory(entries, sensor="lidar")
+
+
+@pytest.mark.parametrize(("count", "timed"), [(2, True), (4, True), (4, False), (75, True)])
+def test_parts_of_turns_are_joined_to_whole_ones(count, timed):
+    sensor = LidarSensorConfig(rings=8, azimuth_steps=600)
+    whole = LidarSimulator(LidarSynthConfig(seed=6, loop_m=60.0, duration_s=1.0, sensor=sensor)).log()
+    joined = selected(parts_of(whole, count, timed=timed), SourceConfig())
+    assert len(joined.notes) == 1
+    np.testing.assert_array_equal(joined.stamps_ns, whole.stamps_ns)
+    for found, wanted in zip(joined, whole, strict=True):
+        assert len(found.points_body) == len(wanted.points_body)
+        within_s = 1e-6 if timed else 0.1 / count
+        assert np.abs(np.sort(found.times_s) - np.sort(wanted.times_s)).max() < within_s
+    half = whole.subset(np.arange(0, len(whole), 2))
+    assert with_whole_turns(half) is half
+
+
+def test_views_of_one_direction_are_no_parts_of_turns():
+    sensor = LidarSensorConfig(rings=8, azimuth_steps=600)
+    whole = LidarSimulator(LidarSynthConfig(seed=6, loop_m=60.0, duration_s=2.0, sensor=sensor)).log()
+    front = replace(whole, entry_at=lambda index: View(whole.entry_at(index), np.eye(4)))
+    assert with_whole_turns(front) is front
