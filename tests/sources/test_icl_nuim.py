@@ -95,6 +95,10 @@ def test_a_list_of_numbers_alone_is_enough_but_the_camera_is_noted(tmp_path):
     assert (source.kind, len(source), len(source.truth)) == ("icl-nuim", 3, 3)
     assert "associations.txt: 1 of 4 listed pairs do not exist; dropped" in source.notes
     assert any("camera assumed to be the camera of ICL-NUIM" in note for note in source.notes)
+    assert any("source.rate_hz" in note for note in source.notes)
+    assert source.are_units_assumed
+    (folder / "groundtruth.txt").unlink()
+    assert not any("mirrored" in note for note in open_source(folder).notes)
 
 
 def test_associations_by_stamp_are_not_taken_for_frame_numbers(tiny_tum_log):

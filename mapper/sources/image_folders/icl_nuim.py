@@ -7,6 +7,7 @@ but the y axes of camera and world point up, so that both frames are left-handed
 
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from mapper.core.errors import SourceError
@@ -15,10 +16,11 @@ from mapper.core.trajectory import Trajectory
 from mapper.sources.base import Log
 from mapper.sources.calibration import ICL_NUIM
 from mapper.sources.config import SourceConfig
-from mapper.sources.image_files.reading import TUM_UNITS_PER_M
+from mapper.sources.image_files.reading import TUM_UNITS_PER_M, has_floats
 from mapper.sources.image_folders.numbered import RATE_HZ, find_images, stamp_at
 from mapper.sources.image_folders.pairing import ordered_pairs, usable_pairs
 from mapper.sources.image_folders.rgbd import FramePair, assumed_camera_note, find_calibration, rgbd_log
+from mapper.sources.image_folders.tum import METRES_NOTE, UNITS_NOTE
 from mapper.sources.listed_files import within
 from mapper.sources.text import (
     parse_count,
@@ -52,9 +54,15 @@ def read_log(path: Path, config: SourceConfig) -> Log:
     rate_hz = config.rate_hz or RATE_HZ
     pairs, notes = _read_pairs(path, config, rate_hz)
     calibration = find_calibration(path, config.camera, known=ICL_NUIM)
-    if calibration.origin == ICL_NUIM.origin and not _has_truth(path):
+    is_own = not _has_truth(path)
+    if is_own and calibration.origin == ICL_NUIM.origin:
         notes.append(assumed_camera_note(ICL_NUIM))
-    return rgbd_log(
+    if is_own and config.rate_hz is None:
+        notes.append(f"frames carry a number, no time; {rate_hz:g} a second assumed (source.rate_hz)")
+    are_units_assumed = is_own and calibration.depth_units_per_m is None
+    if are_units_assumed:
+        notes.append(METRES_NOTE if has_floats(pairs[0].depth) else UNITS_NOTE)
+    log = rgbd_log(
         pairs,
         calibration,
         depth_units_per_m=TUM_UNITS_PER_M,
@@ -64,6 +72,7 @@ def read_log(path: Path, config: SourceConfig) -> Log:
         truth=_read_truth(path, rate_hz),
         notes=notes,
     )
+    return replace(log, are_units_assumed=are_units_assumed)
 
 
 def _has_truth(folder: Path) -> bool:

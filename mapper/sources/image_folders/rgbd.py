@@ -147,8 +147,9 @@ def rgbd_log(
     notes = [*notes, *truth_notes]
     if calibration.fy_px < 0.0:
         calibration = calibration.with_y_down()
-        poses = poses and replace(poses, T_world_body=_MIRROR_Y @ poses.T_world_body @ _MIRROR_Y)
-        notes = [*notes, "fy < 0: the camera's y axis points up; y of camera and truth is mirrored"]
+        if poses is not None:
+            poses = replace(poses, T_world_body=_MIRROR_Y @ poses.T_world_body @ _MIRROR_Y)
+            notes.append("fy < 0: the camera's y axis points up; y of camera and truth is mirrored")
     folder = path if path.is_dir() else path.parent
     images = (image for pair in pairs for image in (pair.colour, pair.depth))
     files = (image.where if isinstance(image, DecodedColour | DecodedDepth) else image for image in images)
