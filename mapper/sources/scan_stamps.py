@@ -1,9 +1,10 @@
-"""Stamps of the clouds in a folder: by their names, by a list beside them, or by their numbers and a rate."""
+"""Stamps of the files in a folder: by their names, by a list beside them, or by their numbers and a rate."""
 
 import re
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from math import inf
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,6 @@ from numpy.typing import NDArray
 
 from mapper.core.errors import DataError, SourceError
 from mapper.core.timebase import NS_PER_S, UNITS_PER_S, Stamps, ns_from_date_text, ns_from_seconds_text
-from mapper.sources.image_folders.numbered import stamp_at
 from mapper.sources.text import parse_date, parse_stamp, rows
 
 RATE_HZ = 10.0
@@ -24,9 +24,17 @@ _DATE = re.compile(
 _TWO_PARTS = re.compile(r"(?<!\d)(\d{10})[_-](\d{1,9})$")
 _WHOLE = re.compile(r"(?<!\d)\d+$")
 _NUMBER = re.compile(r"\d+(?=\D*$)")
+_MOST_DIGITS, _MOST_NS = 20, 2**63
 _EPOCH_DIGITS = 10  # of seconds, in the years 2001 to 2286
 _UNIT_DIGITS = (3, 6, 9)  # of ms, µs and ns in a second
-
+_LIST = re.compile(
+    r"(?:(?:rgb|colou?r|images?|frames?|camera|lidar|velodyne|scans?)_?)?(?:times?|(?:time_?)?stamps?)\.(?:txt|csv)",
+    re.IGNORECASE,
+)
+_ENDING = re.compile(r"\.[A-Za-z]\w*$")
+_LEAST_STEP_US, _LEAST_STEP_MS = 2000, 10
+"""Whole numbers that advance by less are no microseconds, as 500 images a second are the most that cameras
+take, and no milliseconds."""
 
 UNPADDED_NOTE = "fractions of the stamps are taken as whole numbers without leading zeros"
 
@@ -76,7 +84,7 @@ def scan_stamps(
         is_unpadded = unpadded_stamps([path.stem for path in files]) is not None
         return named, [UNPADDED_NOTE] if is_unpadded else []
     if listed := chosen or beside:
-        return _listed(listed, files, wording), []
+        return listed_stamps(listed, files, wording)
     if rate_hz is None and (stamps_ns := recorded()) is not None:
         return stamps_ns, []
     rate_hz = rate_hz or RATE_HZ
@@ -107,23 +115,115 @@ def line_of_each(files: Sequence[Path], total: int) -> NDArray[np.int64] | None:
     return np.arange(total) if total == len(files) else numbers_of(files)
 
 
-def _listed(path: Path, files: Sequence[Path], wording: Wording) -> Stamps:
-    stamps_ns = []
-    for number, words in rows(path):
-        where = f"{path}:{number}"
-        if len(words) == 2 and "-" in words[0][1:]:  # KITTI's raw recordings: date and time of day
-            stamps_ns.append(parse_date(" ".join(words), where=where))
-        elif len(words) == 1:
-            stamps_ns.append(_epoch_ns(words[0]) or parse_stamp(words[0], where=where))
-        else:
-            raise SourceError(f"{where}: {len(words)} columns, want 1: a stamp")
-    lines = line_of_each(files, len(stamps_ns))
-    if lines is None or lines.max() >= len(stamps_ns):
+def stamps_list(folders: Iterable[Path]) -> Path | None:
+    """Return the first list of stamps in some folders, by its name."""
+    for folder in folders:
+        found = [path for path in folder.glob("*.*") if _LIST.fullmatch(path.name) and path.is_file()]
+        if found:
+            return min(found, key=lambda path: (len(path.name), path.name))
+    return None
+
+
+def listed_stamps(
+    path: Path, files: Sequence[Path], wording: Wording = Wording()
+) -> tuple[Stamps, list[str]]:
+    """Return the stamp of each file by a list's lines, and a note where their unit is a guess.
+
+    A line has a stamp; or the name or the number of a file, and its stamp, in either order.
+
+    Raises:
+        SourceError: A line has neither, or the lines are not those of the files.
+    """
+    lines = _stamp_lines(path)
+    numbers = numbers_of(files)
+    keys = [{_key_of(file.name)} for file in files]
+    if numbers is not None:
+        keys = [{*own, f"{number}"} for own, number in zip(keys, numbers.tolist(), strict=True)]
+    known = set[str]().union(*keys)
+    named = [sum(_key_of(words[k]) in known for _, words in lines if len(words) == 2) for k in (0, 1)]
+    at = 0 if named[1] > named[0] else -1
+    stamps_ns, notes = _in_one_unit([(where, words[at]) for where, words in lines], path.name)
+    if any(named):
+        of_key = {_key_of(words[-1 - at]): ns for (_, words), ns in zip(lines, stamps_ns, strict=True)}
+        found = [next((of_key[key] for key in sorted(own) if key in of_key), None) for own in keys]
+        if None in found:
+            raise SourceError(f"{path}: no line has the stamp of {files[found.index(None)].name}")
+        return np.array(found, dtype=np.int64), notes
+    of_files = line_of_each(files, len(stamps_ns))
+    if of_files is None or of_files.max() >= len(stamps_ns):
         raise SourceError(
             f"{path}: {len(stamps_ns)} stamps for {len(files)} {wording.files}; want a line for each, "
             f"or for each number in their names from 0 on ({wording.stamps_file} names another list)"
         )
-    return np.array(stamps_ns, dtype=np.int64)[lines]
+    return np.array(stamps_ns, dtype=np.int64)[of_files], notes
+
+
+def _stamp_lines(path: Path) -> list[tuple[str, list[str]]]:
+    """Return place and words of a list's lines, all one or all two; a date and its time of day are one."""
+    lines: list[tuple[str, list[str]]] = []
+    for number, separated in rows(path):
+        words = " ".join(separated).replace(",", " ").split()
+        if not lines and not any(word[0].isdigit() for word in words):
+            continue  # a header
+        if len(words) == 2 and "-" in words[0][1:] and ":" in words[1]:  # KITTI's raw recordings
+            words = [" ".join(words)]
+        lines.append((f"{path}:{number}", words))
+        if len(words) != len(lines[0][1]) or len(words) > 2:
+            raise SourceError(
+                f"{path}:{number}: {len(words)} columns, want 1: a stamp, or 2: a file's name or number, "
+                "and its stamp"
+            )
+    return lines
+
+
+def _key_of(word: str) -> str:
+    """Return a file's number, or its name without folder and ending; of a stamp the stamp."""
+    name = _ENDING.sub("", Path(word).name)
+    return f"{int(name)}" if name.isdecimal() else name
+
+
+def _in_one_unit(stamps: Sequence[tuple[str, str]], name: str) -> tuple[list[int], list[str]]:
+    """Return nanoseconds of places and texts of stamps, and a note on a unit that their steps tell."""
+    texts = [text for _, text in stamps if text.isdecimal() and len(text) < _MOST_DIGITS]
+    counts = [int(text) for text in texts if _epoch_ns(text) is None]
+    unit = unit_of_counts(counts, least_ms=_LEAST_STEP_MS) if len(counts) == len(stamps) else None
+    if unit is not None and max(counts) * unit.ns < _MOST_NS:
+        note = f"{name}: whole numbers are taken for {unit.name}: they advance by {unit.step}"
+        return [count * unit.ns for count in counts], [note]
+    return [
+        parse_date(text, where=where) if " " in text else _epoch_ns(text) or parse_stamp(text, where=where)
+        for where, text in stamps
+    ], []
+
+
+@dataclass(frozen=True, slots=True)
+class CountUnit:
+    """Unit of whole numbers that are times, and the usual step in it."""
+
+    name: str
+    ns: int
+    step: int
+
+
+def unit_of_counts(numbers: Sequence[int], *, least_ms: float = inf) -> CountUnit | None:
+    """Return the unit of increasing numbers that advance as times do; None where they count.
+
+    Args:
+        numbers: In order.
+        least_ms: Step from which they are milliseconds.
+    """
+    step = int(np.median(np.diff(numbers))) if len(numbers) > 1 else 0
+    units = (
+        (_LEAST_STEP_US * 1000, "nanoseconds", 1),
+        (_LEAST_STEP_US, "microseconds", 1_000),
+        (least_ms, "milliseconds", 1_000_000),
+    )
+    return next((CountUnit(name, ns, step) for least, name, ns in units if step >= least), None)
+
+
+def stamp_at(number: int, *, rate_hz: float) -> int:
+    """Return when the image of this number was taken, nanoseconds; number 0 at time 0."""
+    return round(number * NS_PER_S / rate_hz)
 
 
 def _stamps_of(files: Sequence[Path]) -> Stamps | None:
@@ -182,10 +282,14 @@ def _stamp_in(stem: str) -> int | None:
 
 
 def _epoch_ns(text: str) -> int | None:
-    """Return a whole number of s, ms, µs or ns since the epoch, by its size, as nanoseconds."""
-    value = int(text) if text.isdecimal() and len(text) < 20 else 0
-    units = (unit for unit in UNITS_PER_S if len(str(value // unit)) == _EPOCH_DIGITS)
-    return next((value * (NS_PER_S // unit) for unit in units), None)
+    """Return s, ms, µs or ns since the epoch, by the digits before the point, as nanoseconds."""
+    whole, _, fraction = text.partition(".")
+    is_number = whole.isdecimal() and len(whole) < 20 and f"{fraction}0".isdecimal()
+    units = (unit for unit in UNITS_PER_S if is_number and len(f"{int(whole) // unit}") == _EPOCH_DIGITS)
+    ns = next((NS_PER_S // unit for unit in units), None)
+    if ns is None or int(whole) * ns >= _MOST_NS - NS_PER_S:
+        return None
+    return int(whole) * ns + round(float(f"0.{fraction or 0}") * ns)
 
 
 def _natural(name: str) -> list[str | int]:

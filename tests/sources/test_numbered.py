@@ -34,6 +34,19 @@ def redwood(folder, names, *, colour="rgb", ending=".jpg"):
     return folder
 
 
+def test_a_list_of_stamps_goes_before_an_assumed_rate(tmp_path):
+    folder = redwood(tmp_path, ["000003", "000004", "000005"])
+    (folder / "rgb/timestamps.txt").write_text("".join(f"{k} {0.25 * k}\n" for k in range(9)))
+    source = open_source(folder)
+    assert stamps_of(source) == [750_000_000, 1_000_000_000, 1_250_000_000]
+    assert not any("source.rate_hz" in note for note in source.notes)
+    assert stamps_of(open_source(folder, SourceConfig(rate_hz=1.0)))[0] == 3_000_000_000
+    (folder / "rgb/timestamps.txt").write_text("1\n2\n")
+    source = open_source(folder)
+    assert stamps_of(source)[0] == 100_000_000
+    assert any("timestamps.txt is not used" in note for note in source.notes)
+
+
 def stamps_of(source):
     return [entry.stamp_ns for entry in source.entries()]
 

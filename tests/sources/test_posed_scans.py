@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import math
 import os
 import sys
 
@@ -212,6 +213,33 @@ def test_a_matrix_that_lost_a_number_is_no_pose(shots, tmp_path):
     (folder / "transforms.json").write_text(json.dumps(listed))
     log = open_source(folder)
     assert (len(log), len(log.device_poses)) == (len(shots.frames), len(shots.frames) - 1)
+
+
+def test_nerfs_angle_of_view_and_names_without_ending_are_read(shots, tmp_path):
+    folder = WRITERS["nerfstudio"][0](tmp_path / "scan", shots)
+    path = folder / "transforms.json"
+    listed, camera = json.loads(path.read_text()), open_source(folder)[0].camera
+    angle_rad = 2.0 * math.atan(0.5 * camera.width_px / camera.fx_px)
+    frames = [
+        {
+            "file_path": "./" + frame["file_path"].removesuffix(".png"),
+            "depth_path": frame["depth_file_path"],
+            "transform_matrix": frame["transform_matrix"],
+        }
+        for frame in listed["frames"]
+    ]
+    path.write_text(json.dumps({"camera_angle_x": angle_rad, "frames": frames}))
+    found = open_source(folder)[0].camera
+    assert found.fx_px == found.fy_px == pytest.approx(camera.fx_px, rel=1e-9)
+    assert (found.cx_px, found.cy_px) == (0.5 * (found.width_px - 1), 0.5 * (found.height_px - 1))
+
+
+def test_depth_of_openexr_is_refused_by_name(tmp_path):
+    for name in ("rgb/0.png", "depth/0.exr"):
+        (tmp_path / name).parent.mkdir()
+        (tmp_path / name).write_bytes(b"v/1\1")
+    with pytest.raises(SourceError, match="OpenEXR"):
+        open_source(tmp_path)
 
 
 def test_an_image_of_endless_width_is_refused(shots, tmp_path):

@@ -177,6 +177,29 @@ def test_a_list_of_stamps(tmp_path, listed):
     assert source.notes == []
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        "frame,timestamp\n2,1544676777.3\n0,1544676777.1\n1,1544676777.2\n",
+        "#timestamp [ns],filename\n" + "".join(f"1544676777{k + 1}00000000,{k}.npy\n" for k in range(3)),
+        "000000.npy 1544676777100.0\n000001.npy 1544676777200.0\n000002.npy 1544676777300.0\n",
+    ],
+)
+def test_a_list_of_files_and_stamps(tmp_path, text):
+    folder = cloud_folder(tmp_path, ["000000.npy", "000001.npy", "000002.npy"])
+    (folder / "timestamps.csv").write_text(text)
+    assert stamps_of(open_source(folder)) == [1544676777100000000 + i * PERIOD_NS for i in range(3)]
+
+
+@pytest.mark.parametrize(("unit", "per_s"), [("milli", 1000), ("micro", 10**6), ("nano", 10**9)])
+def test_whole_numbers_that_advance_as_times_do_are_in_their_unit(tmp_path, unit, per_s):
+    folder = cloud_folder(tmp_path, ["0.npy", "1.npy", "2.npy"])
+    (folder / "times.txt").write_text("".join(f"{12 * per_s + i * per_s // 10}\n" for i in range(3)))
+    source = open_source(folder)
+    assert stamps_of(source) == [12_000_000_000 + i * PERIOD_NS for i in range(3)]
+    assert unit in source.notes[0]
+
+
 def test_a_list_for_all_numbers_serves_some_of_the_scans(tmp_path):
     folder = cloud_folder(tmp_path, ["000002.npy", "000005.npy"])
     (folder / "times.txt").write_text("".join(f"{0.5 * i}\n" for i in range(9)))
@@ -189,7 +212,9 @@ def test_a_list_for_all_numbers_serves_some_of_the_scans(tmp_path):
         ("1\n2\n", "times.txt: 2 stamps for 3 scans; want a line for each"),
         ("1\n2\n3\n4\n", "times.txt: 4 stamps for 3 scans"),
         ("1\n2\nthree\n", "times.txt:3: stamp 'three' is not a decimal number of seconds"),
-        ("0 1\n1 2\n2 3\n", "times.txt:1: 2 columns, want 1: a stamp"),
+        ("0 1 7\n1 2 7\n2 3 7\n", "times.txt:1: 3 columns, want 1: a stamp"),
+        ("a.npy 1\nb.npy 2\nd.npy 3\n", "times.txt: no line has the stamp of c.npy"),
+        ("1\n2 3\n", "times.txt:2: 2 columns"),
     ],
 )
 def test_a_list_that_does_not_fit_is_refused(tmp_path, text, says):
@@ -343,3 +368,11 @@ def test_clouds_beside_images_do_not_hide_them(tiny_tum_log):
     cloud_folder(log, ["0.npy", "1.npy"])
     cloud_folder(log / "velodyne", ["0.bin", "1.bin"])
     assert open_source(log).kind == "tum"
+
+
+@pytest.mark.parametrize("text", ["1\n9223372036854775808\n9\n", "9" * 5000 + "\n1\n2\n", "1 2\n"])
+def test_stamps_beyond_64_bits_are_refused(tmp_path, text):
+    folder = cloud_folder(tmp_path, ["a.npy", "b.npy", "c.npy"])
+    (folder / "times.txt").write_text(text)
+    with pytest.raises(SourceError, match=r"times\.txt"):
+        open_source(folder)

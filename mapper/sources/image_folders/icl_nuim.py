@@ -17,11 +17,12 @@ from mapper.sources.base import Log
 from mapper.sources.calibration import ICL_NUIM
 from mapper.sources.config import SourceConfig
 from mapper.sources.image_files.reading import TUM_UNITS_PER_M, has_floats
-from mapper.sources.image_folders.numbered import RATE_HZ, find_images, stamp_at
+from mapper.sources.image_folders.numbered import RATE_HZ, find_images
 from mapper.sources.image_folders.pairing import ordered_pairs, usable_pairs
 from mapper.sources.image_folders.rgbd import FramePair, assumed_camera_note, find_calibration, rgbd_log
 from mapper.sources.image_folders.tum import METRES_NOTE, UNITS_NOTE
 from mapper.sources.listed_files import within
+from mapper.sources.scan_stamps import stamp_at
 from mapper.sources.text import (
     parse_count,
     parse_numbers,

@@ -13,11 +13,8 @@ from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 
-import numpy as np
-
 from mapper.core.errors import SourceError
 from mapper.core.geometry import Transform
-from mapper.core.timebase import NS_PER_S
 from mapper.core.trajectory import Trajectory
 from mapper.core.units import MM_PER_M
 from mapper.sources.base import Log
@@ -26,6 +23,7 @@ from mapper.sources.calibration_file import calibration_files
 from mapper.sources.config import SourceConfig
 from mapper.sources.image_folders.pairing import ordered_pairs
 from mapper.sources.image_folders.rgbd import FramePair, assumed_camera_note, find_calibration, rgbd_log
+from mapper.sources.scan_stamps import Wording, listed_stamps, stamp_at, stamps_list, unit_of_counts
 from mapper.sources.text import parse_count, parse_numbers, pose_from_matrix, rows, truth_from
 
 RATE_HZ = 30.0
@@ -37,8 +35,6 @@ _DEPTH_ENDINGS = frozenset({".npy"})
 _IMAGE_ENDINGS = frozenset({".png", ".jpg", ".jpeg", ".pgm", ".ppm", ".tif", ".tiff", ".bmp"})
 _NUMBERED = re.compile(r"\D*(?P<number>\d{1,18})(?:-(?P<microseconds>\d+))?\D*")
 _SEVEN_SCENES = re.compile(r"frame-\d+\.color\.\w+")
-_LEAST_STEP_US = 2000
-"""Numbers that advance by less count images: 500 images a second are the most that cameras take."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,7 +102,8 @@ def read_log(path: Path, config: SourceConfig) -> Log:
     notes = list(images.notes)
     if calibration.origin == known.origin:
         notes.append(assumed_camera_note(known))
-    pairs, stamp_notes = stamped(images.pairs, rate_hz=config.rate_hz or RATE_HZ)
+    folders = [path, images.pairs[0].colour.parent]
+    pairs, stamp_notes = stamped(images.pairs, rate_hz=config.rate_hz, beside=folders)
     ordered, order_notes = ordered_pairs(pairs, config, what="image names", path=path)
     return rgbd_log(
         ordered,
@@ -178,17 +175,30 @@ def image_places(folder: Path) -> tuple[Sequence[Place], Sequence[Place], tuple[
     return colour_places, depth_places, (_in_folder(folder, r"colou?r|rgb"), _in_folder(folder, r"depth"))
 
 
-def stamped(images: Sequence[NumberedPair], *, rate_hz: float) -> tuple[list[FramePair], list[str]]:
-    """Return the pairs with stamps from their names, or else from their numbers at a rate."""
-    notes = []
+def stamped(
+    images: Sequence[NumberedPair],
+    *,
+    rate_hz: float | None,
+    usual_hz: float = RATE_HZ,
+    beside: Sequence[Path] = (),
+) -> tuple[list[FramePair], list[str]]:
+    """Return the pairs with stamps, and notes on what was assumed.
+
+    Stamps are from their names, else from a list in the folders ``beside``, else from numbers that are times,
+    else from their numbers at a rate, of which None is the usual. One that is given goes before the list.
+    """
+    notes: list[str] = []
     if all(pair.microseconds is not None for pair in images):
         stamps_ns = [1000 * (pair.microseconds or 0) for pair in images]
-    elif unit := _unit_of([pair.number for pair in images]):
+    elif rate_hz is None and (listed := _listed(images, beside, notes)):
+        stamps_ns = listed
+    elif unit := unit_of_counts([pair.number for pair in images]):
         stamps_ns = [pair.number * unit.ns for pair in images]
         notes.append(f"numbers in file names are taken for {unit.name}: they advance by {unit.step}")
     else:
-        stamps_ns = [stamp_at(pair.number, rate_hz=rate_hz) for pair in images]
-        notes.append(f"file names carry no time; {rate_hz:g} frames a second assumed (source.rate_hz)")
+        stamps_ns = [stamp_at(pair.number, rate_hz=rate_hz or usual_hz) for pair in images]
+        if rate_hz is None:
+            notes.append(f"file names carry no time; {usual_hz:g} frames a second assumed (source.rate_hz)")
     pairs = [
         FramePair(stamp_ns, pair.colour, stamp_ns, pair.depth)
         for stamp_ns, pair in zip(stamps_ns, images, strict=True)
@@ -196,27 +206,18 @@ def stamped(images: Sequence[NumberedPair], *, rate_hz: float) -> tuple[list[Fra
     return pairs, notes
 
 
-@dataclass(frozen=True, slots=True)
-class _Unit:
-    """Unit of numbers that are times, and the usual step in it."""
-
-    name: str
-    ns: int
-    step: int
-
-
-def _unit_of(numbers: Sequence[int]) -> _Unit | None:
-    """Return the unit of increasing numbers that advance as times do; None where they count images."""
-    step = int(np.median(np.diff(numbers))) if len(numbers) > 1 else 0
-    if step < _LEAST_STEP_US:
-        return None
-    is_us = step < _LEAST_STEP_US * 1000
-    return _Unit("microseconds", 1000, step) if is_us else _Unit("nanoseconds", 1, step)
-
-
-def stamp_at(number: int, *, rate_hz: float) -> int:
-    """Return when the image of this number was taken, nanoseconds; number 0 at time 0."""
-    return round(number * NS_PER_S / rate_hz)
+def _listed(images: Sequence[NumberedPair], folders: Sequence[Path], notes: list[str]) -> list[int]:
+    """Return stamps of a list, none without one that fits; add notes on it."""
+    path = stamps_list(folders)
+    if path is None:
+        return []
+    try:
+        stamps_ns, more = listed_stamps(path, [pair.colour for pair in images], Wording("pairs of images"))
+    except SourceError as error:
+        notes.append(f"{path.name} is not used: {error}")
+        return []
+    notes += [f"stamps are those of {path.name}", *more]
+    return list(map(int, stamps_ns))
 
 
 def _sequences(path: Path) -> list[Path]:

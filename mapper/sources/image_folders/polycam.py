@@ -13,7 +13,7 @@ from mapper.core.errors import SourceError
 from mapper.core.units import MM_PER_M
 from mapper.sources.config import SourceConfig
 from mapper.sources.image_files.confidence import confident_depths
-from mapper.sources.image_folders.numbered import RATE_HZ, NumberedPair, stamped
+from mapper.sources.image_folders.numbered import NumberedPair, stamped
 from mapper.sources.image_folders.posed import (
     PosedFrame,
     PosedFrames,
@@ -87,7 +87,7 @@ def read_frames(folder: Path, config: SourceConfig) -> PosedFrames:
     numbers = [int(path.stem) if path.stem.isdecimal() else index for index, path in enumerate(paths)]
     pairs, stamp_notes = stamped(
         [NumberedPair(number, image, image, None) for number, image in zip(numbers, images, strict=True)],
-        rate_hz=config.rate_hz or RATE_HZ,
+        rate_hz=config.rate_hz,
     )
     frames = [
         PosedFrame(pair.stamp_ns, pair.colour, depth, pose_of_opengl(one.matrix()))

@@ -19,9 +19,10 @@ from mapper.core.trajectory import Trajectory
 from mapper.core.units import MM_PER_M
 from mapper.sources.base import Log
 from mapper.sources.config import SourceConfig
-from mapper.sources.image_folders.numbered import find_images, stamp_at, stamped
+from mapper.sources.image_folders.numbered import find_images, stamped
 from mapper.sources.image_folders.pairing import ordered_pairs
 from mapper.sources.image_folders.rgbd import find_calibration, rgbd_log
+from mapper.sources.scan_stamps import stamp_at
 from mapper.sources.text import parse_count, parse_numbers, read_lines, rows, truth_from
 
 RATE_HZ = 10.0  # "every 100 ms", Somlyai (PhD thesis), §5.6
@@ -45,7 +46,7 @@ def read_log(path: Path, config: SourceConfig) -> Log:
     if images is None or truth_path is None:
         raise SourceError(f"{path}: not a Poznań log; want {LOOKED_FOR}")
     rate_hz = config.rate_hz or RATE_HZ
-    pairs, stamp_notes = stamped(images.pairs, rate_hz=rate_hz)
+    pairs, stamp_notes = stamped(images.pairs, rate_hz=config.rate_hz, usual_hz=RATE_HZ)
     ordered, order_notes = ordered_pairs(pairs, config, what="image names", path=path)
     stamps_ns = {image.number: pair.stamp_ns for image, pair in zip(images.pairs, pairs, strict=True)}
     return rgbd_log(

@@ -23,7 +23,6 @@ from mapper.sources.image_files.confidence import NOTE, without_low_confidence
 from mapper.sources.image_files.decoded import DecodedColour, DecodedDepth
 from mapper.sources.image_files.reading import TUM_UNITS_PER_M, bytes_of, decode_colour, decode_grey
 from mapper.sources.image_files.size import MOST_MEGAPIXELS
-from mapper.sources.image_folders.numbered import stamp_at
 from mapper.sources.image_folders.posed import (
     PosedFrame,
     PosedFrames,
@@ -33,6 +32,7 @@ from mapper.sources.image_folders.posed import (
 )
 from mapper.sources.json_files import parse_json
 from mapper.sources.listed_files import refuse_links_out
+from mapper.sources.scan_stamps import stamp_at
 from mapper.sources.text import poses_from_numbers
 
 FILES = (".r3d", "metadata", "rgbd/*.jpg")

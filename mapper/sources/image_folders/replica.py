@@ -7,7 +7,7 @@ from pathlib import Path
 
 from mapper.core.errors import SourceError
 from mapper.sources.config import SourceConfig
-from mapper.sources.image_folders.numbered import RATE_HZ, NumberedPair, stamped
+from mapper.sources.image_folders.numbered import NumberedPair, stamped
 from mapper.sources.image_folders.posed import PosedFrame, PosedFrames
 from mapper.sources.image_folders.rgbd import find_calibration
 from mapper.sources.text import parse_count, parse_numbers, pose_from_matrix, rows
@@ -39,7 +39,7 @@ def read_frames(folder: Path, config: SourceConfig) -> PosedFrames:
         if len(words) != 16:
             raise SourceError(f"{path}:{number}: {len(words)} numbers, want 16: the rows of a 4×4 pose")
         poses.append(pose_from_matrix(parse_numbers(words, where=f"{path}:{number}").reshape(4, 4)))
-    pairs, notes = stamped(images, rate_hz=config.rate_hz or RATE_HZ)
+    pairs, notes = stamped(images, rate_hz=config.rate_hz)
     if images and images[-1].number >= len(poses):
         notes.append(f"{path.name}: {len(poses)} poses; frames from number {len(poses)} on have none")
     frames = [

@@ -20,9 +20,10 @@ from mapper.sources.calibration import Calibration
 from mapper.sources.config import SourceConfig
 from mapper.sources.image_files.decoded import DecodedDepth, FilePart
 from mapper.sources.image_files.reading import depth_m_from
-from mapper.sources.image_folders.numbered import RATE_HZ, stamp_at
+from mapper.sources.image_folders.numbered import RATE_HZ
 from mapper.sources.image_folders.posed import PosedFrame, PosedFrames, camera_of
 from mapper.sources.listed_files import refuse_links_out
+from mapper.sources.scan_stamps import stamp_at
 from mapper.sources.text import pose_from_matrix
 
 FILES = (".sens", "*.sens")

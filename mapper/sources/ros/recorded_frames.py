@@ -160,13 +160,13 @@ def lidar_frames(reader: RecordingReader, clouds: Series, config: SourceConfig) 
     values = None if times is None or not len(first.points) else first.points[times]
     if values is not None and relative_times_s(values, first.stamp_ns) is None:
         notes.append(f"{clouds.topic.name}: field {times} of the first cloud holds no times; not deskewed")
+    elif values is not None and counted_on(values) is not values:
+        notes.append(f"{clouds.topic.name}: field {times} begins anew during a sweep; counted on")
     elif values is not None and are_on_own_clock(values, first.stamp_ns):
         notes.append(
             f"{clouds.topic.name}: field {times} is on a clock of its own; the first point of each sweep is "
             "taken to be measured at its stamp"
         )
-    elif values is not None and counted_on(values) is not values:
-        notes.append(f"{clouds.topic.name}: field {times} begins anew during a sweep; counted on")
     frame, is_planar = _usual_frame(reader, clouds, frame_of(first)), clouds.topic.type in LASERS
     if is_planar and config.body_frame is None:
         config = config.model_copy(update={"body_frame": reader.base_of(frame)})

@@ -8,7 +8,6 @@ from mapper.sources.base import Log
 from mapper.sources.cloud_files.pcd import viewpoint_note
 from mapper.sources.config import SourceConfig
 from mapper.sources.scan_folders.scan_folder import (
-    STAMP_FILES,
     clouds_in,
     first_of,
     is_cloud_name,
@@ -16,6 +15,7 @@ from mapper.sources.scan_folders.scan_folder import (
     scan_log,
 )
 from mapper.sources.scan_folders.scans import ScanEntry
+from mapper.sources.scan_stamps import stamps_list
 
 TRUTH_FILES = ("groundtruth.txt", "poses.txt")
 
@@ -59,7 +59,7 @@ def read_log(path: Path, config: SourceConfig) -> Log:
         path,
         files,
         kind="clouds",
-        stamps_file=first_of((folder, path), STAMP_FILES),
+        stamps_file=stamps_list((folder, path)),
         truth_file=first_of((folder, path), TRUTH_FILES),
         config=config,
         notes=[*notes, *refused],

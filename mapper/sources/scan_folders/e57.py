@@ -19,8 +19,8 @@ from mapper.runtime.extras import extra, require
 from mapper.sources.base import EntryWithoutFiles, Log
 from mapper.sources.cloud_files.parsing import MIN_POINTS
 from mapper.sources.config import SourceConfig
-from mapper.sources.image_folders.numbered import stamp_at
 from mapper.sources.listed_files import refuse_links_out
+from mapper.sources.scan_stamps import stamp_at
 from mapper.sources.text import time_order, truth_from
 from mapper.sources.valid_returns import FARTHEST_M, valid_returns
 

@@ -18,7 +18,8 @@ from mapper.sources.base import Log
 from mapper.sources.config import SourceConfig
 from mapper.sources.kitti_calibration import read_matrix, rigid_motion
 from mapper.sources.scan_folders.kitti_images import with_images
-from mapper.sources.scan_folders.scan_folder import STAMP_FILES, clouds_in, first_of, most_clouds, scan_log
+from mapper.sources.scan_folders.scan_folder import clouds_in, first_of, most_clouds, scan_log
+from mapper.sources.scan_stamps import stamps_list
 
 _ALONG_Z_RATIO = 0.9
 _CAMERAS_NOTE = (
@@ -54,7 +55,7 @@ def read_log(path: Path, config: SourceConfig) -> Log:
         sequence,
         files,
         kind="kitti",
-        stamps_file=first_of([sequence, scans.parent], STAMP_FILES),
+        stamps_file=stamps_list([sequence, scans.parent]),
         truth_file=first_of(
             [sequence, at.parent.parent / "poses"], ["poses.txt", f"{at.name}.txt", "groundtruth.txt"]
         ),

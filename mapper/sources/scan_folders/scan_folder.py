@@ -23,8 +23,6 @@ from mapper.sources.scan_stamps import in_order, line_of_each, scan_stamps
 from mapper.sources.text import time_order, truth_from
 from mapper.sources.trajectory_files import read_kitti, tum_rows
 
-STAMP_FILES = ("times.txt", "stamps.txt", "timestamps.txt")
-
 _TEXT_ENDINGS = (".txt", ".csv")
 _SAMPLED = 5
 """Text files of a folder that are tried before it is taken for one of clouds."""
