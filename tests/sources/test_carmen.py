@@ -42,7 +42,9 @@ def test_returns_lie_where_the_beams_met_walls_and_wheels_are_the_odometry(tmp_p
     [(180, -90.0, 1.0), (181, -90.0, 1.0), (360, -90.0, 0.5), (361, -90.0, 0.5)],
 )
 def test_number_of_readings_gives_the_directions(tmp_path, beams, first_deg, step_deg):
-    x, y, _ = opened(tmp_path / "beams.clf", ["2.00"] * beams)[0].points_body.T
+    x, y, _ = opened(tmp_path / f"beams.{'txt' if beams == 180 else 'clf'}", ["2.00"] * beams)[
+        0
+    ].points_body.T
     angles_deg = np.degrees(np.arctan2(y, x))
     assert angles_deg == pytest.approx(first_deg + step_deg * np.arange(beams), abs=1e-3)
 

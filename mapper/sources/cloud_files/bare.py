@@ -23,7 +23,12 @@ _MAX_CLASS = 1000
 _WITH_INTENSITY = (KITTIS, 5)
 """Widths of records whose fourth number is an intensity: KITTI's, and nuScenes' with a ring after it."""
 _WIDE_M = 10.0
+_NCLT = np.dtype([("xyz", "<u2", 3), ("intensity", "u1"), ("laser", "u1")])
+_NCLT_UNIT_M, _NCLT_ORIGIN_M, _NCLT_LASERS = 0.005, 100.0, 32
+_LEAST_FLOAT, _MOST_FLOAT, _MOST_STRANGE = 1e-12, 1e6, 0.1
+"""Sizes of float32 in a cloud's file, other than 0, and the share of others from which they are none."""
 EMPTY = "the file is empty"
+_VELOVIEW = re.compile(r"points\w*:(?P<axis>[012])")
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*([eE][-+]?\d+)?|\.\d+([eE][-+]?\d+)?|nan|inf)", re.IGNORECASE)
 
 
@@ -38,6 +43,8 @@ def read_bin(path: Path, columns: int | None = None) -> Columns:
         FrameError: The file is not a whole number of records, or of other ones.
     """
     size = path.stat().st_size
+    if columns is None and (of_nclt := _nclt_columns(path, size)):
+        return of_nclt
     numbers = np.fromfile(path, _FLOAT32) if size % _FLOAT32.itemsize == 0 else np.empty(0, _FLOAT32)
     if columns is None and (other := other_width(numbers)):
         width, is_certain = other
@@ -64,6 +71,23 @@ def read_bin(path: Path, columns: int | None = None) -> Columns:
     return {name: records[:, column] for column, name in enumerate(names)}
 
 
+def _nclt_columns(path: Path, size: int) -> Columns | None:
+    """Return the columns of NCLT's file (Carlevaris-Bianco et al. 2016), turned upright; None of another.
+
+    A record is x forward, y right, z down in 5 mm from -100 m on, intensity, and number of the laser.
+    """
+    if size % _NCLT.itemsize or not size:
+        return None
+    records = np.fromfile(path, _NCLT)
+    floats = np.abs(records[: len(records) // 2 * 2].view(_FLOAT32))
+    with np.errstate(invalid="ignore"):
+        is_strange = ~((floats == 0.0) | ((floats > _LEAST_FLOAT) & (floats < _MOST_FLOAT)))
+    if records["laser"].max() >= _NCLT_LASERS or is_strange.mean() < _MOST_STRANGE:
+        return None
+    x, y, z = (records["xyz"].astype(np.float32) * np.float32(_NCLT_UNIT_M) - np.float32(_NCLT_ORIGIN_M)).T
+    return {"x": x, "y": -y, "z": -z, "intensity": records["intensity"]}
+
+
 def _refuse_others_first(table: Column, path: Path) -> None:
     """Refuse (N, ≥ 3) numbers of which the first are in a narrow range above 0, and the next two are not."""
     first, others = table[:, 0], table[:, 1:3]
@@ -87,6 +111,8 @@ def read_npy(path: Path) -> Columns:
         return {name: array[name].ravel() for name in array.dtype.names if array[name].shape == array.shape}
     if array.ndim < 2 or array.shape[-1] < 3 or array.dtype.kind not in "fiu":
         raise FrameError(f"{path}: {array.dtype} of shape {array.shape}, want numbers, (N, 3) or wider")
+    if array.ndim == 2 and len(array) < MIN_POINTS <= array.shape[1]:
+        array = array.T  # a row of each coordinate
     return _xyz(array.reshape(-1, array.shape[-1]), path)
 
 
@@ -157,10 +183,17 @@ def _header(text: str) -> tuple[list[str], int | None]:
         words = line.split()
         if len(words) >= 3 and all(_NUMBER.fullmatch(word) for word in words):
             return names, number
-        bare = [word.strip('"#/').lower() for word in words if word.strip('"#/')]
+        bare = [_column_name(word) for word in words if word.strip('"#/')]
         if {"x", "y", "z"} <= set(bare) or not line.startswith(("#", "//")):
             names = bare
     return names, None
+
+
+def _column_name(word: str) -> str:
+    """Return a word of a header in lower case, x y z for VeloView's Points_m_XYZ:0 and so on."""
+    name = word.strip('"#/').lower()
+    found = _VELOVIEW.fullmatch(name)
+    return "xyz"[int(found["axis"])] if found else name
 
 
 def _xyz(table: Column, path: Path) -> Columns:

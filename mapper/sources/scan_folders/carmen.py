@@ -23,7 +23,7 @@ from mapper.sources.config import SourceConfig
 from mapper.sources.laser_scan import MOST_RAD, beam_points, planar_scan, rolling
 from mapper.sources.text import time_order
 
-_ENDINGS = (".log", ".clf")
+_ENDINGS = (".log", ".clf", ".txt")
 _HEAD_BYTES = 1 << 16
 _MESSAGE = re.compile(rb"^(?:[FR]LASER|(?:ROBOT|RAW)LASER\d|ODOM|PARAM) ", re.MULTILINE)
 _NAMES = re.compile(r"(?:[FR]LASER|(?:ROBOT|RAW)LASER\d)$")

@@ -1,4 +1,4 @@
-"""Single clouds, and folders of them in any format: .bin .pcd .ply .xyz .txt .csv .npy .las .laz."""
+"""Single clouds, and folders of them in any of the formats of ``cloud_files.ENDINGS``."""
 
 from pathlib import Path
 

@@ -31,7 +31,7 @@ _SAMPLED = 5
 def is_cloud_name(path: Path) -> bool:
     """Return whether a path is called as a cloud is: by its ending, and a text file also by a number."""
     ending = path.suffix.lower()
-    return ending in ENDINGS and (ending not in _TEXT_ENDINGS or path.stem[-1:].isdecimal())
+    return ending in ENDINGS and (ending not in _TEXT_ENDINGS or path.stem.rstrip(")")[-1:].isdecimal())
 
 
 def most_clouds(folder: Path) -> int:

@@ -59,13 +59,12 @@ def write_las(path, *, offset=(0.0, 0.0, 0.0)):
     cloud.write(path)
 
 
+TEXTS = (".xyz", ".xyzi", ".xyzrgb", ".asc", ".pts", ".txt", ".csv")
 WRITERS = {
     ".bin": write_bin,
     ".pcd": write_pcd,
     ".ply": write_ply,
-    ".xyz": write_text,
-    ".txt": write_text,
-    ".csv": write_text,
+    **dict.fromkeys(TEXTS, write_text),
     ".npy": write_npy,
     ".las": write_las,
     ".laz": write_las,
@@ -123,6 +122,31 @@ def test_every_format_gives_its_points(tmp_path, ending):
     np.testing.assert_allclose(cloud.points, POINTS, atol=1e-4)
 
 
+def test_records_of_nclt_are_turned_upright(tmp_path):
+    records = np.zeros(N, np.dtype([("xyz", "<u2", 3), ("intensity", "u1"), ("laser", "u1")]))
+    records["xyz"] = np.rint((POINTS * [1.0, -1.0, -1.0] + 100.0) / 0.005)
+    records["intensity"], records["laser"] = 50, np.arange(N) % 32
+    records.tofile(tmp_path / "1326030975726043.bin")
+    cloud = read_cloud(tmp_path / "1326030975726043.bin")
+    np.testing.assert_allclose(cloud.points, POINTS, atol=0.0026)
+    assert set(cloud.intensities) == {50.0}
+
+
+def test_columns_of_veloview_are_found(tmp_path):
+    path = tmp_path / "frame (0001).csv"
+    names = '"intensity","laser_id","timestamp","Points_m_XYZ:0","Points_m_XYZ:1","Points_m_XYZ:2"'
+    table = np.column_stack([np.full(N, 7), np.zeros(N), TIMES, POINTS])
+    np.savetxt(path, table, delimiter=",", header=names, comments="")
+    cloud = read_cloud(path)
+    np.testing.assert_allclose(cloud.points, POINTS, atol=1e-4)
+    np.testing.assert_allclose(cloud.times, TIMES)
+
+
+def test_an_array_of_a_row_for_each_coordinate_is_read(tmp_path):
+    np.save(tmp_path / "cloud.npy", POINTS.T)
+    np.testing.assert_allclose(read_cloud(tmp_path / "cloud.npy").points, POINTS, atol=1e-5)
+
+
 @pytest.mark.parametrize("ending", ENDINGS)
 def test_a_file_cut_anywhere_is_refused_in_one_line_or_gives_whole_points(tmp_path, ending):
     path = tmp_path / f"cloud{ending}"
@@ -136,7 +160,7 @@ def test_a_file_cut_anywhere_is_refused_in_one_line_or_gives_whole_points(tmp_pa
             assert "\n" not in result
         else:
             # A cut ply may lack faces only; formats without a count cannot tell, but for half a number.
-            assert ending in (".ply", ".bin", ".xyz", ".txt", ".csv")
+            assert ending in (".ply", ".bin", *TEXTS)
             np.testing.assert_allclose(result.points[:-1], POINTS[: len(result.points) - 1], atol=1e-4)
 
 
