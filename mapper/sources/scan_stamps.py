@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.errors import DataError, SourceError
-from mapper.core.timebase import NS_PER_S, UNITS_PER_S, Stamps, ns_from_date_text, ns_from_seconds_text
-from mapper.sources.text import parse_date, parse_stamp, rows
+from mapper.core.timebase import NS_PER_S, Stamps, ns_from_date_text, ns_from_seconds_text
+from mapper.sources.text import epoch_ns, parse_date, parse_stamp, rows
 
 RATE_HZ = 10.0
 
@@ -25,7 +25,6 @@ _TWO_PARTS = re.compile(r"(?<!\d)(\d{10})[_-](\d{1,9})$")
 _WHOLE = re.compile(r"(?<!\d)\d+$")
 _NUMBER = re.compile(r"\d+(?=\D*$)")
 _MOST_DIGITS, _MOST_NS = 20, 2**63
-_EPOCH_DIGITS = 10  # of seconds, in the years 2001 to 2286
 _UNIT_DIGITS = (3, 6, 9)  # of ms, µs and ns in a second
 _LIST = re.compile(
     r"(?:(?:rgb|colou?r|images?|frames?|camera|lidar|velodyne|scans?)_?)?(?:times?|(?:time_?)?stamps?)\.(?:txt|csv)",
@@ -185,13 +184,13 @@ def _key_of(word: str) -> str:
 def _in_one_unit(stamps: Sequence[tuple[str, str]], name: str) -> tuple[list[int], list[str]]:
     """Return nanoseconds of places and texts of stamps, and a note on a unit that their steps tell."""
     texts = [text for _, text in stamps if text.isdecimal() and len(text) < _MOST_DIGITS]
-    counts = [int(text) for text in texts if _epoch_ns(text) is None]
+    counts = [int(text) for text in texts if epoch_ns(text) is None]
     unit = unit_of_counts(counts, least_ms=_LEAST_STEP_MS) if len(counts) == len(stamps) else None
     if unit is not None and max(counts) * unit.ns < _MOST_NS:
         note = f"{name}: whole numbers are taken for {unit.name}: they advance by {unit.step}"
         return [count * unit.ns for count in counts], [note]
     return [
-        parse_date(text, where=where) if " " in text else _epoch_ns(text) or parse_stamp(text, where=where)
+        parse_date(text, where=where) if " " in text else parse_stamp(text, where=where)
         for where, text in stamps
     ], []
 
@@ -278,18 +277,7 @@ def _stamp_in(stem: str) -> int | None:
     if found := _TWO_PARTS.search(stem):
         return int(found[1]) * NS_PER_S + int(found[2])
     found = _WHOLE.search(stem)
-    return _epoch_ns(found[0]) if found else None
-
-
-def _epoch_ns(text: str) -> int | None:
-    """Return s, ms, µs or ns since the epoch, by the digits before the point, as nanoseconds."""
-    whole, _, fraction = text.partition(".")
-    is_number = whole.isdecimal() and len(whole) < 20 and f"{fraction}0".isdecimal()
-    units = (unit for unit in UNITS_PER_S if is_number and len(f"{int(whole) // unit}") == _EPOCH_DIGITS)
-    ns = next((NS_PER_S // unit for unit in units), None)
-    if ns is None or int(whole) * ns >= _MOST_NS - NS_PER_S:
-        return None
-    return int(whole) * ns + round(float(f"0.{fraction or 0}") * ns)
+    return epoch_ns(found[0]) if found else None
 
 
 def _natural(name: str) -> list[str | int]:

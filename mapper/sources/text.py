@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Iterator, Sequence
+from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
@@ -10,13 +11,15 @@ from numpy.typing import NDArray
 from mapper.core.errors import DataError, SourceError
 from mapper.core.geometry import FARTHEST_M, Array, Transform, is_rigid, nearest_rotation, transform
 from mapper.core.rotations import pose_of_row
-from mapper.core.timebase import Stamps, ns_from_date_text, ns_from_seconds_text
+from mapper.core.timebase import NS_PER_S, UNITS_PER_S, Stamps, ns_from_date_text, ns_from_seconds_text
 from mapper.core.trajectory import Trajectory
 from mapper.runtime.regular_files import read_text
 
 ROUNDING = 0.01
 """Error of a rotation in text of few digits; what is farther off is none."""
 _MOST_DIGITS = 9  # a year of frames at 30 Hz
+_EPOCH_DIGITS = 10  # of seconds, in the years 2001 to 2286
+_LONGEST, _MOST_NS = 20, 2**63
 
 
 def read_lines(path: Path) -> list[str]:
@@ -58,14 +61,24 @@ def table(path: Path, *columns: str) -> Iterator[tuple[str, list[str]]]:
         yield where, words
 
 
+def epoch_ns(text: str) -> int | None:
+    """Return s, ms, µs or ns since 1970, told apart by the digits before the point, as nanoseconds."""
+    whole, _, fraction = text.partition(".")
+    is_number = whole.isdecimal() and len(whole) < _LONGEST and f"{fraction}0".isdecimal()
+    units = (unit for unit in UNITS_PER_S if is_number and len(f"{int(whole) // unit}") == _EPOCH_DIGITS)
+    ns = next((int(Decimal(text) * (NS_PER_S // unit)) for unit in units), _MOST_NS)
+    return ns if ns < _MOST_NS else None
+
+
 def parse_stamp(text: str, *, where: str) -> int:
-    """Return decimal seconds as nanoseconds.
+    """Return decimal seconds, or ms, µs or ns since 1970, as nanoseconds.
 
     Raises:
         SourceError: The text is no finite number; the message starts with ``where``.
     """
     try:
-        return ns_from_seconds_text(text)
+        since_epoch_ns = epoch_ns(text)
+        return ns_from_seconds_text(text) if since_epoch_ns is None else since_epoch_ns
     except DataError as error:
         raise SourceError(f"{where}: {error}") from None
 

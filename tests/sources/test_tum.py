@@ -115,6 +115,10 @@ BAD = "1305031102.5 nan nan nan nan nan nan nan\n1305031102.6 0 0 0 0 0 0 0\nnan
         (None, [], []),
         ("# header\n", [], ["no usable pose"]),
         (BAD, [], ["3 of 3 poses are not finite rigid motions; dropped", "no usable pose"]),
+        *(
+            (f"{stamp} 0 0 0 0 0 0 1\n", [1305031102_500000123], [])
+            for stamp in ("1305031102500000123", "1305031102500000.123", "1305031102500.000123")
+        ),
         (f"{BAD}1.0 0 0 0 0 0 0 1\n", [10**9], ["3 of 4 poses are not finite rigid motions; dropped"]),
     ],
 )

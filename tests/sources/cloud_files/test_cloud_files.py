@@ -122,16 +122,6 @@ def test_every_format_gives_its_points(tmp_path, ending):
     np.testing.assert_allclose(cloud.points, POINTS, atol=1e-4)
 
 
-def test_records_of_nclt_are_turned_upright(tmp_path):
-    records = np.zeros(N, np.dtype([("xyz", "<u2", 3), ("intensity", "u1"), ("laser", "u1")]))
-    records["xyz"] = np.rint((POINTS * [1.0, -1.0, -1.0] + 100.0) / 0.005)
-    records["intensity"], records["laser"] = 50, np.arange(N) % 32
-    records.tofile(tmp_path / "1326030975726043.bin")
-    cloud = read_cloud(tmp_path / "1326030975726043.bin")
-    np.testing.assert_allclose(cloud.points, POINTS, atol=0.0026)
-    assert set(cloud.intensities) == {50.0}
-
-
 def test_columns_of_veloview_are_found(tmp_path):
     path = tmp_path / "frame (0001).csv"
     names = '"intensity","laser_id","timestamp","Points_m_XYZ:0","Points_m_XYZ:1","Points_m_XYZ:2"'

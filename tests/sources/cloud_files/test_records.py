@@ -128,3 +128,14 @@ def test_points_that_begin_with_their_time_are_refused(tmp_path, ending):
     if ending == ".txt":
         path.write_text(f"t x y z\n{path.read_text()}")
         assert len(read_cloud(path).points) == N
+
+
+def test_records_of_nclt_are_turned_upright(tmp_path):
+    records = np.zeros(N, np.dtype([("xyz", "<u2", 3), ("intensity", "u1"), ("laser", "u1")]))
+    points = np.random.default_rng(0).uniform(-60.0, 60.0, (N, 3))
+    records["xyz"] = np.rint((points * [1.0, -1.0, -1.0] + 100.0) / 0.005)
+    records["intensity"], records["laser"] = 50, np.arange(N) % 32
+    records.tofile(tmp_path / "1326030975726043.bin")
+    cloud = read_cloud(tmp_path / "1326030975726043.bin")
+    np.testing.assert_allclose(cloud.points, points, atol=0.0026)
+    assert set(cloud.intensities) == {50.0}
