@@ -19,8 +19,8 @@ import numpy as np
 from mapper.config.loading import load_config
 from mapper.core.frames import Scan
 from mapper.core.trajectory import Trajectory, trajectory_from
+from mapper.evaluators.compare.catalogue import RkoLioTracker
 from mapper.evaluators.compare.methods import OdometryTracker, Tracker
-from mapper.evaluators.compare.rko_lio import RkoLioTracker
 from mapper.evaluators.metrics.trajectory_errors import ate_rmse_m
 from mapper.odometry.factory import build_frame_odometry
 from mapper.sources import open_source

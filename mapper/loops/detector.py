@@ -1,25 +1,29 @@
-"""Loop detectors: they search loops while a log is tracked, and accept or reject every candidate."""
+"""Loop detectors: they search loops while a log is tracked, and accept or reject every candidate.
+
+The drift gate rejects loops that odometry and wheels rule out, and reports where many of these agree.
+"""
 
 from bisect import bisect_right
 from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import dataclass
 from functools import partial
+from statistics import median
 from typing import Generic, Protocol
 
 import numpy as np
 
 from mapper.core.errors import ConfigError, FrameError
-from mapper.core.geometry import Transform
+from mapper.core.geometry import Transform, inverse
 from mapper.core.timebase import NS_PER_S
 from mapper.features.frame_view import FrameView
+from mapper.graph.measurement_covariance import Comparison, compare
 from mapper.graph.model import PoseGraph
 from mapper.loops.base import Place, Proposer, Verifier, verify_proposal
 from mapper.loops.closure import MIN_CONFLICTS, Discrepancy, LoopClosure, discrepancy, exceeds
-from mapper.loops.config import KeyframeLoopsConfig
+from mapper.loops.config import GateConfig, KeyframeLoopsConfig
 from mapper.loops.consistency_check import ConsistencyCheck
-from mapper.loops.drift_gate import DriftGate
 from mapper.loops.nearby_proposer import PoseProposer
-from mapper.loops.odometry_drift import OdometryChain
+from mapper.loops.odometry_drift import OdometryChain, allowed
 from mapper.loops.online_pose_estimator import OnlinePoseEstimator
 from mapper.loops.place_file import AnyPlace
 from mapper.odometry.base import FrameResult
@@ -234,3 +238,78 @@ class KeyframeLoopDetector(Generic[Place]):
             self._chain.add([confirmed.factor])
             if confirmed.i in self._disconnected:
                 self._disconnected = frozenset()
+
+
+class DriftGate:
+    """Drift gate: compares measured loops with the current estimate of the poses.
+
+    A loop is possible if it lies within what the steps between its nodes leave uncertain, by the covariances
+    of odometry and wheels, and what the path's length allows for errors that no covariance describes.
+    """
+
+    def __init__(
+        self,
+        config: GateConfig,
+        chain: OdometryChain,
+        estimator: OnlinePoseEstimator,
+        rejected: ConsistencyCheck,
+    ) -> None:
+        """Start without loops.
+
+        Args:
+            config: Errors by the path's length.
+            chain: Factors between the nodes.
+            estimator: Poses of the nodes.
+            rejected: Empty; finds those rejected loops that agree with each other.
+        """
+        self._config = config
+        self._chain = chain
+        self._estimator = estimator
+        self._rejected = rejected
+        self._conflicts: dict[bool, list[LoopClosure]] = {True: [], False: []}
+        self._compared: dict[tuple[int, int], tuple[Comparison, bool]] = {}
+
+    def checked(self, closure: LoopClosure) -> LoopClosure:
+        """Return a measured loop as it is, or rejected if odometry and wheels cannot have drifted by it."""
+        if closure.T_i_j is None or closure.information is None:
+            return closure
+        drift = self._chain.between(closure.i, closure.j)
+        if drift is None:
+            return closure
+        limit = allowed(self._config, drift.path)
+        comparison = compare(
+            closure.T_i_j,
+            inverse(self._estimator.pose_of(closure.i)) @ self._estimator.pose_of(closure.j),
+            drift.covariance + np.linalg.inv(closure.information),
+            slack_m=limit.translation_m,
+            slack_rad=limit.rotation_rad,
+        )
+        if comparison.is_possible:
+            return closure
+        self._compared[closure.i, closure.j] = comparison, drift.by_wheels
+        for agreeing in self._rejected.add(closure):
+            self._conflicts[self._compared[agreeing.i, agreeing.j][1]].append(agreeing)
+        source = "wheels and odometry" if drift.by_wheels else "odometry"
+        return closure.rejected("gate", f"{comparison}, after {drift.path.path_m:.1f} m of path by {source}")
+
+    def notes(self) -> list[str]:
+        """Return a sentence about the rejected loops that agree with each other, if there are many."""
+        return [
+            _note([self._compared[loop.i, loop.j][0] for loop in loops], by_wheels)
+            for by_wheels, loops in self._conflicts.items()
+            if loops
+        ]
+
+
+def _note(comparisons: list[Comparison], by_wheels: bool) -> str:
+    miss_m = median(comparison.translation_m for comparison in comparisons)
+    miss_rad = median(comparison.rotation_rad for comparison in comparisons)
+    but, why = (
+        ("the wheels", "or did the wheels slip (graph.wheels.use=false maps without them)?")
+        if by_wheels
+        else ("the odometry", "or did the odometry jump (loops.gate allows more drift)?")
+    )
+    return (
+        f"{len(comparisons)} loops agree with each other but not with {but}: median {miss_m:.2f} m and "
+        f"{miss_rad:.2f} rad off; they are rejected. Do two places look alike, {why}"
+    )

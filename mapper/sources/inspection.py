@@ -27,7 +27,7 @@ from mapper.sources.scan_frame import scan_frame_warnings
 from mapper.sources.selection import selected
 from mapper.sources.time_offsets import TimeOffset
 from mapper.sources.valid_returns import FARTHEST_M
-from mapper.sources.vehicle_box import Box, vehicle_box
+from mapper.sources.vehicle import Box, vehicle_box
 
 _MOST_LOADED = 200
 """Frames of an RGB-D log that are loaded, evenly spread: a second or two of reading, whatever its length."""

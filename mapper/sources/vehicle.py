@@ -1,14 +1,19 @@
-"""Removal of the sensor's own vehicle from the frames of a log, before they are used."""
+"""The sensor's own vehicle: its removal from the frames of a log, and a proposal of its box.
 
+The box is that of returns that stand still while the sensor moves.
+"""
+
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mapper.core.clusters import cluster_numbers
 from mapper.core.errors import FrameError
-from mapper.core.frames import Frame, RgbdFrame, Scan
-from mapper.core.geometry import Transform, apply
-from mapper.sources.base import Log, WrappedEntry
+from mapper.core.frames import Frame, RgbdFrame, Scan, Sensor
+from mapper.core.geometry import Array, Points, Transform, apply
+from mapper.sources.base import SPREAD_FRAMES, Log, WrappedEntry
 from mapper.sources.config import BodyConfig
 
 
@@ -86,3 +91,121 @@ class _ClearedEntry(WrappedEntry):
             range_m = np.linalg.norm(points - scan.origin_body.astype(np.float32), axis=1)
             kept &= (range_m >= config.min_range_m) & (range_m <= (config.max_range_m or np.inf))
         return kept
+
+
+Box = tuple[float, float, float, float, float, float]
+"""Least x y z, then largest x y z, metres, body frame."""
+
+_MIN_FRAMES = 8
+_MIN_STANDING_RATIO, _SURE_RATIO, _MIN_SURE_CELLS = 0.6, 0.95, 2
+"""Shares of the frames in which a cell of the vehicle has returns: at the edge of a driver who walks along,
+and in the middle. With fewer of the latter a group is a wall that the sensor happens to keep beside."""
+_MAX_STILL_WORLD_RATIO = 0.5
+"""If more of the far cells stand still, so does the sensor, or it moves along a tunnel."""
+_MAX_STEP_CELLS = 2
+"""At most one empty cell lies between two members of a group."""
+_MAX_RETURNS_RATIO = 0.3
+"""What takes up more of the view is no vehicle: it is the object that is scanned."""
+_MARGIN_M = 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class _Scale:
+    """Size of a vehicle around a kind of sensor.
+
+    Attributes:
+        cell_m: Edge of the cells that returns are counted in.
+        vehicle_m: The vehicle is within this distance.
+        around_m: Returns up to here are used to distinguish walls that stand beside it.
+        ground_m: Height up to which returns are the ground's; None where up is not known.
+    """
+
+    cell_m: float
+    vehicle_m: float
+    around_m: float
+    ground_m: float | None
+
+
+_SCALES: Mapping[Sensor, _Scale] = {
+    "lidar": _Scale(cell_m=0.25, vehicle_m=4.0, around_m=12.0, ground_m=0.3),
+    "rgbd": _Scale(cell_m=0.05, vehicle_m=1.0, around_m=3.0, ground_m=None),
+    "lidar-2d": _Scale(cell_m=0.05, vehicle_m=1.0, around_m=3.0, ground_m=None),
+}
+
+
+def vehicle_box(log: Log) -> Box | None:
+    """Return a box around the vehicle that carries a log's sensor, and a driver beside it; None without.
+
+    Returns near the sensor are counted in cells of the body frame, over frames spread over the log. Cells
+    that have returns in most of them are the vehicle, unless they join others that lie farther off, as
+    those of walls along the way do. Ground below a LiDAR stands still too, and is left out by its height.
+    """
+    scale = _SCALES[log.sensor]
+    clouds, returns = _clouds(log, scale)
+    if len(clouds) < _MIN_FRAMES:
+        return None
+    cells, standing = _counted(clouds, scale)
+    range_m = np.linalg.norm((cells + 0.5) * scale.cell_m, axis=1)
+    still = standing >= _MIN_STANDING_RATIO
+    far = range_m > scale.vehicle_m
+    world = still[far & (standing >= 2.0 / len(clouds))]
+    if not far.any() or (len(world) and world.mean() > _MAX_STILL_WORLD_RATIO):
+        return None
+    joined = cluster_numbers(cells[still], _MAX_STEP_CELLS, norm=np.inf)
+    still_range_m = range_m[still]
+    own = np.array(
+        [
+            (standing[still][members := joined == label] >= _SURE_RATIO).sum() >= _MIN_SURE_CELLS
+            and still_range_m[members].max() <= scale.vehicle_m
+            for label in range(joined.max(initial=-1) + 1)
+        ],
+        np.bool_,
+    )
+    own_cells = cells[still][own[joined]] if len(own) else cells[:0]
+    if not len(own_cells):
+        return None
+    lower = own_cells.min(axis=0) * scale.cell_m - _MARGIN_M
+    upper = (own_cells.max(axis=0) + 1) * scale.cell_m + _MARGIN_M
+    inside = sum(int(((points >= lower) & (points <= upper)).all(axis=1).sum()) for points in clouds)
+    if inside > _MAX_RETURNS_RATIO * returns:
+        return None
+    x_low, y_low, z_low, x_high, y_high, z_high = (round(float(v), 3) for v in (*lower, *upper))
+    return x_low, y_low, z_low, x_high, y_high, z_high
+
+
+def _clouds(log: Log, scale: _Scale) -> tuple[list[Points], int]:
+    """Return the points around the sensor of some frames, without the ground, and the number of all."""
+    clouds: list[Points] = []
+    returns = 0
+    for entry in log.spread_entries(SPREAD_FRAMES):
+        try:
+            points = entry.scan().points_body
+        except FrameError:
+            continue
+        points = points.astype(np.float64)
+        returns += len(points)
+        clouds.append(points[np.linalg.norm(points, axis=1) <= scale.around_m])
+    if scale.ground_m is not None and clouds:
+        limit_m = _ground_m(np.concatenate([points[:, 2] for points in clouds])) + scale.ground_m
+        clouds = [points[points[:, 2] > limit_m] for points in clouds]
+    return clouds, returns
+
+
+def _ground_m(heights_m: Array) -> float:
+    """Return the height below the sensor at which most returns lie."""
+    below_m = heights_m[heights_m < 0.0]
+    if not len(below_m):
+        return -np.inf
+    counts, edges_m = np.histogram(below_m, bins=np.arange(np.floor(below_m.min()), 0.15, 0.1))
+    return float(edges_m[int(counts.argmax())]) + 0.05
+
+
+def _counted(clouds: list[Points], scale: _Scale) -> tuple[NDArray[np.int64], Array]:
+    """Return the (C, 3) cells with returns, and the share of the clouds that have some in each."""
+    reach = int(scale.around_m / scale.cell_m) + 1
+    counts = np.zeros((2 * reach + 1,) * 3, np.int64)
+    for points in clouds:
+        seen = np.zeros(counts.shape, np.bool_)
+        seen[tuple((np.floor(points / scale.cell_m).astype(np.int64) + reach).T)] = True
+        counts += seen
+    return np.argwhere(counts) - reach, counts[counts > 0] / len(clouds)

@@ -11,11 +11,10 @@ from mapper.simulation.config import (
     SensorConfig,
     SynthConfig,
 )
-from mapper.simulation.disturbances import gain_at
 from mapper.simulation.kinect import BASELINE_M, DISPARITY_FOCAL_PX
 from mapper.simulation.path import seconds_of
 from mapper.simulation.shutter import make_lens
-from mapper.simulation.source import camera_of
+from mapper.simulation.source import camera_of, gain_at
 from tests.support.ideal_sensors import IDEAL_SENSOR
 
 PLAIN = SynthConfig(

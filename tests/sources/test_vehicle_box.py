@@ -6,7 +6,7 @@ import pytest
 from mapper.core.frames import PinholeCamera, RgbdFrame, Scan
 from mapper.sources.config import BodyConfig, SourceConfig
 from mapper.sources.selection import selected
-from mapper.sources.vehicle_box import vehicle_box
+from mapper.sources.vehicle import vehicle_box
 from tests.support.logs import MemoryEntry, log_in_memory
 from tests.support.street_scans import on_street, street, view
 

@@ -5,6 +5,7 @@ from array import array
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from math import nan
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +17,6 @@ from mapper.core.units import MIB
 from mapper.sources.ros import decode_foxglove
 from mapper.sources.ros.decode import decode, decompressed
 from mapper.sources.ros.image_messages import size_of
-from mapper.sources.ros.imu_messages import readings_of
 from mapper.sources.ros.messages import (
     CLOUDS,
     IMUS,
@@ -227,3 +227,25 @@ def _header_frame(topic: Topic, data: memoryview) -> str:
         name = bytes(data[_FRAME_OFFSET + 4 :][: min(length, _LONGEST_FRAME)])
         return name.rstrip(b"\0").decode(errors="replace").lstrip("/")
     return ""
+
+
+_UNPACK = {order: struct.Struct(f"{order}104x3d72x3d72x") for order in "<>"}
+"""Orientation and its covariance, angular velocity, covariance, acceleration, covariance: 37 doubles."""
+_HEADER_BYTES = 12
+_NONE = (nan,) * 6
+
+
+def readings_of(topic: Topic, data: memoryview) -> tuple[float, ...]:
+    """Return the angular velocity and the acceleration, six numbers; NaN of a message that is damaged.
+
+    The numbers end a message in both CDR and ROS 1, so the length of the frame's name does not matter.
+    """
+    try:
+        data = decompressed(topic, data)
+    except DataError:
+        return _NONE
+    order = "<" if topic.encoding == "ros1" or bytes(data[1:2]) == b"\1" else ">"
+    offset = len(data) - _UNPACK[order].size
+    if topic.encoding not in ("cdr", "ros1") or offset < _HEADER_BYTES:
+        return _NONE
+    return _UNPACK[order].unpack_from(data, offset)

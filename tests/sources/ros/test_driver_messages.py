@@ -12,7 +12,7 @@ from mapper.evaluators.metrics.evaluate import evaluate
 from mapper.pipeline.build import build
 from mapper.sources import open_source
 from mapper.sources.inspection import inspect_log
-from mapper.sources.ros.driver_messages import decode_driver_message
+from mapper.sources.ros.decode_ros import decode_driver_message
 from mapper.sources.ros.recording import Topic
 from tests.support.driver_recordings import FIRST_NS, street, write_livox, write_vlp16
 
