@@ -27,7 +27,6 @@ from mapper.evaluators.study.engine import CELLS
 from mapper.evaluators.study.table import Column, Table, column, csv_text, decimals, degrees, percent
 from mapper.run.manifest import library_versions
 from mapper.runtime.atomic import MANIFEST_NAME, FolderKind, atomic_folder, write_json, write_text
-from mapper.runtime.progress import SILENT, Progress
 from mapper.runtime.regular_files import AnyPath
 from mapper.sources import open_source
 from mapper.sources.base import Log
@@ -63,50 +62,25 @@ def compare(
     Args:
         log: Recorded log, or its path.
         methods: Methods to compare; none are all that fit the log.
-        out: Folder to create; a comparison that was stopped is resumed.
+        out: Folder to create, called ``OUT.partial`` until it is whole; a comparison that was stopped is
+            resumed.
         settings: Values by dotted name, such as ``{"pairs": 10}``.
         progress: As for ``mapper.build``.
-        overwrite: Replace OUT.
+        overwrite: Replace OUT, once the new one is whole.
 
     Raises:
-        ConfigError: There is no such method or setting.
-        RunError: OUT exists already.
-        MapperError: The log cannot be opened.
+        ConfigError: There is no such method or setting, or none of the methods can use the log.
+        RunError: OUT exists already, or another process is filling it.
+        MapperError: The log cannot be opened, or no frame of it can be read.
     """
-    given = CompareConfig(methods=tuple(methods))
-    config = overridden(given, settings=settings)
+    config = overridden(CompareConfig(methods=tuple(methods)), settings=settings)
     source = log if isinstance(log, Log) else open_source(Path(log), config.source)
-    return compare_into(Path(out), source, config, overwrite=overwrite, progress=receiver_of(progress))
-
-
-def compare_into(
-    out: Path,
-    source: Log,
-    config: CompareConfig,
-    *,
-    overwrite: bool = False,
-    progress: Progress = SILENT,
-) -> Comparison:
-    """Compare methods on a log and leave a folder; a comparison that was stopped is resumed.
-
-    Args:
-        out: Folder to create; until it is whole it is called ``OUT.partial``.
-        source: The log.
-        config: Methods, and how they are compared.
-        overwrite: Replace a folder that is there, once the new one is whole.
-        progress: As for ``compare``.
-
-    Raises:
-        RunError: OUT is there already, or another process is filling it.
-        ConfigError: As for ``compare``.
-        DataError: As for ``compare``.
-    """
     plan = json.dumps(_manifest(source.path, config), indent=2, ensure_ascii=False) + "\n"
     with atomic_folder(
-        out, _FOLDER, overwrite=overwrite, keeps=lambda partial: _kept_of(partial, plan)
+        Path(out), _FOLDER, overwrite=overwrite, keeps=lambda partial: _kept_of(partial, plan)
     ) as folder:
         write_text(folder / MANIFEST_NAME, plan)
-        comparison = compare_methods(source, config, folder / CELLS, progress=progress)
+        comparison = compare_methods(source, config, folder / CELLS, progress=receiver_of(progress))
         write_comparison(folder, comparison)
         shutil.rmtree(folder / CELLS)
     return comparison

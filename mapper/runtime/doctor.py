@@ -1,13 +1,11 @@
-"""Checks of a machine and an installation: processors, memory, disk, kernels, and every library."""
+"""Checks of a machine and an installation: a line for the machine, the kernels, and each library."""
 
-import ctypes
 import os
 import platform
 import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterable
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -53,43 +51,24 @@ class Finding:
             raise DataError(f"{self.name}: verdict {self.verdict!r} with remedy {self.remedy!r}")
 
 
-def machine_findings() -> list[Finding]:
-    """Return the findings about this machine."""
-    return [check_machine(), check_room(), check_system_libraries(), check_kernels()]
-
-
 def check_machine() -> Finding:
-    """Return our version, the interpreter's, and the number of processors."""
-    text = (
-        f"mapper {mapper.__version__} on Python {platform.python_version()}, {sys.platform} "
-        f"{platform.machine()}, {processors()} processors"
-    )
-    if os.environ.get("OMP_NUM_THREADS", "1") != "1":
-        return Finding("machine", "warning", text, "unset OMP_NUM_THREADS: small matrices are slower with it")
-    return Finding("machine", "well", text)
-
-
-def check_room() -> Finding:
-    """Return the memory that is available, and the room for runs here."""
-    room = {"disk": shutil.disk_usage(Path.cwd()).free / 1e9}
+    """Return our version, the interpreter's, the number of processors, and what memory and disk are free."""
+    free_gb = {"disk": shutil.disk_usage(Path.cwd()).free / 1e9}
     meminfo = Path("/proc/meminfo")
     if meminfo.exists():
         lines = re.findall(r"^(\w+): +(\d+) kB", meminfo.read_text(encoding="ascii"), re.MULTILINE)
-        room["memory"] = {name: int(value) for name, value in lines}["MemAvailable"] * 1024 / 1e9
-    text = ", ".join(f"{free_gb:.1f} GB of {name} free" for name, free_gb in room.items())
-    if min(room.values()) < _LEAST_GB:
+        free_gb["memory"] = {name: int(value) for name, value in lines}["MemAvailable"] * 1024 / 1e9
+    text = (
+        f"mapper {mapper.__version__} on Python {platform.python_version()}, {sys.platform} "
+        f"{platform.machine()}, {processors()} processors, "
+        f"{', '.join(f'{free:.1f} GB of {name} free' for name, free in free_gb.items())}"
+    )
+    if min(free_gb.values()) < _LEAST_GB:
         remedy = "end other programs, choose an --out elsewhere, or build with --set workers=0"
-        return Finding("room", "warning", text, remedy)
-    return Finding("room", "well", text)
-
-
-def check_system_libraries(wanted: Iterable[str] = tuple(PACKAGES)) -> Finding:
-    """Return which shared objects the loader does not find."""
-    wanted = list(wanted)
-    missing = [name for name in wanted if not _loads(name)]
-    if missing:
-        return Finding("system libraries", "failed", f"missing {', '.join(missing)}", apt_line(missing))
-    return Finding("system libraries", "well", f"all {len(wanted)} are there")
+        return Finding("machine", "warning", text, remedy)
+    if os.environ.get("OMP_NUM_THREADS", "1") != "1":
+        return Finding("machine", "warning", text, "unset OMP_NUM_THREADS: small matrices are slower with it")
+    return Finding("machine", "well", text)
 
 
 def check_kernels() -> Finding:
@@ -110,23 +89,6 @@ def processors() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))  # a container may have fewer than the machine
     return os.cpu_count() or 1
-
-
-def apt_line(missing: Iterable[str]) -> str:
-    """Return the command that brings shared objects to Debian or Ubuntu."""
-    missing = list(missing)
-    known = [PACKAGES[name] for name in missing if name in PACKAGES]
-    if len(known) < len(missing):
-        return f"find the package with: apt-file search {missing[0]}"
-    return f"sudo apt-get install {' '.join(known)}"
-
-
-def _loads(name: str) -> bool:
-    try:
-        ctypes.CDLL(name)
-    except OSError:
-        return False
-    return True
 
 
 _REQUIREMENT = re.compile(r"(?P<name>[\w.-]+)(\[[\w,]*\])?(>=(?P<least>[\d.]+))?")
@@ -159,7 +121,7 @@ class Requirement:
 
 def examine(*, progress: Progress = SILENT) -> list[Finding]:
     """Check the machine, then import every library in a process of its own, one per processor at a time."""
-    findings, wanted = machine_findings(), requirements()
+    findings, wanted = [check_machine(), check_kernels()], requirements()
     with progress.stage("try") as report:
         for done, finding in enumerate(ordered_map(check_library, wanted, workers=processors()), start=1):
             findings.append(finding)
@@ -204,10 +166,15 @@ def check_library(wanted: Requirement) -> Finding:
     if ended.returncode == 0:
         return Finding(name, "well", version)
     said = (ended.stderr.strip().splitlines() or [f"exit status {ended.returncode}"])[-1]
-    missing = _MISSING_OBJECT.search(said)
-    return Finding(
-        name, "failed", f"{version}, {said}", again if missing is None else apt_line([missing["object"]])
-    )
+    if missing := _MISSING_OBJECT.search(said):
+        wanted_object = missing["object"]
+        package = PACKAGES.get(wanted_object)
+        again = (
+            f"sudo apt-get install {package}"
+            if package
+            else f"find the package with: apt-file search {wanted_object}"
+        )
+    return Finding(name, "failed", f"{version}, {said}", again)
 
 
 def _numbers(version: str) -> list[int]:

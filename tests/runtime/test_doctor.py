@@ -48,6 +48,7 @@ def test_libraries_are_there_and_new_enough(wanted, verdict, said):
     ("code", "remedy"),
     [
         ("raise ImportError('libGL.so.1: cannot open shared object file')", "sudo apt-get install libgl1"),
+        ("raise ImportError('libno.so.7: cannot open shared object file')", "find the package with"),
         ("import os; os.abort()", "pip install --force-reinstall"),
     ],
 )
@@ -60,18 +61,13 @@ def test_a_library_that_cannot_be_imported_fails_alone(tmp_path, monkeypatch, co
     assert finding.remedy.startswith(remedy)
 
 
-def test_missing_system_libraries_have_a_package_or_a_way_to_find_it():
-    finding = doctor.check_system_libraries(["libnothing.so.7"])
-    assert (finding.verdict, "libnothing.so.7" in finding.detail) == ("failed", True)
-    assert doctor.apt_line(["libGL.so.1", "libEGL.so.1"]) == "sudo apt-get install libgl1 libegl1"
-
-
 def test_what_is_scarce_is_a_warning_and_a_cache_that_cannot_be_written_fails(monkeypatch, tmp_path):
     monkeypatch.setattr(doctor, "_LEAST_GB", 1e9)
     monkeypatch.setenv("OMP_NUM_THREADS", "8")
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
-    checks = (doctor.check_room, doctor.check_machine, doctor.check_kernels)
-    assert [check().verdict for check in checks] == ["warning"] * 3
+    assert [check().verdict for check in (doctor.check_machine, doctor.check_kernels)] == ["warning"] * 2
+    monkeypatch.setattr(doctor, "_LEAST_GB", 0.0)
+    assert "OMP_NUM_THREADS" in doctor.check_machine().remedy
     monkeypatch.setattr(doctor.os, "access", lambda _path, _mode: False)
     assert doctor.check_kernels().verdict == "failed"
     with pytest.raises(DataError, match="verdict 'failed' with remedy ''"):

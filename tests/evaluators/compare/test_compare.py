@@ -15,7 +15,8 @@ from mapper.evaluators.compare import comparison as compare_module
 from mapper.evaluators.compare.catalogue import methods_for
 from mapper.evaluators.compare.comparison import compare
 from mapper.evaluators.compare.config import CompareConfig, LidarCompareConfig
-from mapper.evaluators.compare.files import compare_into, tables_of, tables_text, write_comparison
+from mapper.evaluators.compare.files import compare as compare_into
+from mapper.evaluators.compare.files import tables_of, tables_text, write_comparison
 from mapper.evaluators.compare.methods import registration_method
 from mapper.evaluators.compare.pairwise import registration_records
 from mapper.evaluators.metrics.odometry import PathErrors
@@ -270,16 +271,16 @@ def test_the_verb_prints_both_tables_and_leaves_a_folder(desk_log, tmp_path):
 
 
 def test_a_comparison_that_was_stopped_goes_on_where_it_was(desk, tmp_path, monkeypatch):
-    config = CompareConfig(methods=("gicp", "kiss-icp"), pairs=0)
-    once = compare_into(tmp_path / "once", desk, config)
+    chosen = {"methods": ("gicp", "kiss-icp"), "settings": {"pairs": 0}}
+    once = compare_into(desk, out=tmp_path / "once", **chosen)
     with monkeypatch.context() as patch:
         patch.setattr("mapper.evaluators.compare.methods.OdometryTracker.add", interrupt)
         with pytest.raises(KeyboardInterrupt):
-            compare_into(tmp_path / "out", desk, config)
+            compare_into(desk, out=tmp_path / "out", **chosen)
     followed = []
     monkeypatch.setattr(compare_module.MethodRun, "add", recording(followed, compare_module.MethodRun.add))
 
-    comparison = compare_into(tmp_path / "out", desk, config)
+    comparison = compare_into(desk, out=tmp_path / "out", **chosen)
 
     assert followed == ["kiss-icp"] * 8
     assert without_times(odometry_records(comparison)) == without_times(odometry_records(once))
