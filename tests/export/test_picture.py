@@ -190,6 +190,11 @@ def test_a_band_is_as_wide_as_told_and_has_gaps():
     assert set(np.unique(image[:, :, 3])) == {0, 60}
 
 
+def test_a_band_that_is_wider_than_any_image_covers_all():
+    image = band_image(np.eye(2), np.array([1.0, 1e9]), low=np.zeros(2), high=np.ones(2))
+    assert (image[:, :, 3] > 0).all()
+
+
 @pytest.mark.filterwarnings("error")
 def test_a_name_that_the_font_has_no_letters_for_is_no_warning(tmp_path):
     figure = new_figure(2.0, 1.0)

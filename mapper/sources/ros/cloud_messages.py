@@ -39,7 +39,8 @@ def usable_fields(
     """
     fields: dict[str, Field] = {}
     notes: list[str] = []
-    for name, offset, number, count in stated:
+    for stated_name, offset, number, count in stated:
+        name = stated_name.lower() if stated_name in ("X", "Y", "Z") else stated_name
         kind = types.get(number)
         if kind is None:
             why = f"its type {number} is not known"

@@ -17,6 +17,8 @@ _Indices = NDArray[np.intp]
 _NEIGHBOURS = 5
 _MAX_STRAY_NS = NS_PER_S
 """A stamp further from the median of itself and its neighbours is damaged: even where frames are lost."""
+_SET_FORWARD_S = 10.0
+"""Stamps that advance by so much more than the times of recording are of a clock that was set."""
 _SAME_DELAY_S = 0.25
 """Times of recording are later than stamps by what drivers take, of one camera's images about the same."""
 _STOPPED_S = 1.0
@@ -100,7 +102,14 @@ def _sound(series: Series) -> tuple[_Indices, list[str]]:
             f"{series.topic.name}: {wrong} of {len(stamps_ns) + series.undated} messages have stamps that "
             "cannot be right; left out"
         )
-    return np.flatnonzero(is_sound), notes
+    sound = np.flatnonzero(is_sound)
+    ahead_s = (np.diff(stamps_ns[sound]) - np.diff(series.log_ns[sound])) / NS_PER_S
+    notes += [
+        f"{series.topic.name}: the clock was set forward by {ahead_s[k]:.1f} s while recording, before "
+        f"message {sound[k + 1]}: map the parts apart (source.first_frame, source.last_frame)"
+        for k in np.flatnonzero((ahead_s > _SET_FORWARD_S) & (np.ptp(series.log_ns) > 0))[:1].tolist()
+    ]
+    return sound, notes
 
 
 def _epochs(stamps_ns: Stamps) -> NDArray[np.int64]:

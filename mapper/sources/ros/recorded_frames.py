@@ -1,5 +1,6 @@
 """Frames of a recording's sensors: RGB-D cameras, stereo pairs, LiDARs and 2D lasers, not decoded yet."""
 
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -42,6 +43,9 @@ from mapper.sources.stereo import refuse_settings
 from mapper.sources.velodyne_packets import require_decoder
 
 _JPEG_START = b"\xff\xd8"
+_MOST_IN_FLOAT32 = 1e6
+"""Seconds of which float32 tells a sixteenth."""
+_LIKE_TIME = re.compile(r"time|stamp|(?:^|_)n?secs?(?:_|$)", re.IGNORECASE)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -156,10 +160,19 @@ def lidar_frames(reader: RecordingReader, clouds: Series, config: SourceConfig) 
     first = _first_of(reader, clouds)
     assert isinstance(first, CloudMessage)
     notes += [f"{clouds.topic.name}: {note}" for note in first.notes]
-    times = time_field(first.points.dtype.names or ())
+    fields = first.points.dtype.names or ()
+    times = time_field(fields)
     values = None if times is None or not len(first.points) else first.points[times]
     if values is not None and relative_times_s(values, first.stamp_ns) is None:
-        notes.append(f"{clouds.topic.name}: field {times} of the first cloud holds no times; not deskewed")
+        is_coarse = values.dtype == np.float32 and np.abs(values).max() > _MOST_IN_FLOAT32
+        why = ": its 32 bits are too few for seconds since 1970" if is_coarse else ""
+        notes.append(
+            f"{clouds.topic.name}: field {times} of the first cloud holds no times{why}; not deskewed"
+        )
+    elif others := [name for name in fields if times is None and _LIKE_TIME.search(name)]:
+        notes.append(
+            f"{clouds.topic.name}: fields {listed(others)} are not known as times of points; not deskewed"
+        )
     elif values is not None and counted_on(values) is not values:
         notes.append(f"{clouds.topic.name}: field {times} begins anew during a sweep; counted on")
     elif values is not None and are_on_own_clock(values, first.stamp_ns):

@@ -77,6 +77,13 @@ def test_a_clock_that_was_set_back_never_mixes_two_times(stamps, kept):
     )  # fmt: skip
 
 
+@pytest.mark.parametrize(("jump_ms", "noted"), [(3_600_000, True), (5_000, False)])
+def test_a_clock_that_was_set_forward_is_noted(jump_ms, noted):
+    order, notes = ordered(series([*range(0, 1_000, 100), *range(1_000 + jump_ms, 2_000 + jump_ms, 100)]))
+    assert len(order) == 20
+    assert [f"{jump_ms / 1e3:.1f} s" in note and "message 10" in note for note in notes] == [True] * noted
+
+
 def test_each_colour_image_gets_its_nearest_depth():
     found, notes = pairs([0, 33, 67, 100], [5, 40, 60, 190])
     assert found == [(0, 0), (1, 1), (2, 2)]

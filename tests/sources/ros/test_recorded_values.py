@@ -12,7 +12,8 @@ from mapper.sources.calibration_file import calibration_text
 from mapper.sources.config import SourceConfig, TopicsConfig
 from mapper.sources.inspection import inspect_log
 from mapper.sources.ros.encode_ros import cloud_message
-from tests.support.recordings import CAMERA, COLOR, DEPTH, camera_info, image, shots, write
+from mapper.sources.ros.typestore import typestore
+from tests.support.recordings import CAMERA, COLOR, DEPTH, camera_info, changed, image, shots, write
 from tests.support.tum_logs import FIRST_NS, PERIOD_NS, picture
 
 STAMPS_NS = [FIRST_NS + i * PERIOD_NS for i in range(3)]
@@ -52,6 +53,28 @@ def test_a_field_of_times_that_holds_none_is_noted(tmp_path, value):
     log = open_source(write(tmp_path / "a.mcap", messages), SourceConfig())
     assert sum("no times" in note for note in log.notes) == 1
     assert log[0].times_s is None
+
+
+def renamed(message, names):
+    """The cloud with other names of its fields."""
+    fields = typestore("cdr").deserialize_cdr(message.cdr, message.type).fields
+    return changed(
+        message, fields=[replace(field, name=names.get(field.name, field.name)) for field in fields]
+    )
+
+
+def test_fields_of_other_names(tmp_path):
+    points = np.random.default_rng(3).uniform(-9.0, 9.0, (20, 3)).astype(np.float32)
+    messages = clouds(points, times_s=np.linspace(0.0, 0.09, 20, dtype=np.float32))
+    known = {
+        field.name for field in typestore("cdr").deserialize_cdr(messages[0].cdr, messages[0].type).fields
+    }
+    (times,) = known & {"t", "time"}
+    for k, name in enumerate(("time_sec", "tag")):
+        names = {"x": "X", "y": "Y", "z": "Z", times: name}
+        log = open_source(write(tmp_path / f"{k}.mcap", [renamed(one, names) for one in messages]))
+        np.testing.assert_array_equal(log[0].points_body, points)
+        assert [name in note for note in log.notes] == [True] * (k == 0)
 
 
 def test_clouds_in_millimetres_are_refused_and_the_setting_reads_them(tmp_path):
