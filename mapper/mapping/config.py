@@ -18,9 +18,10 @@ class LevelConfig(Config):
     """Number of frames, spread over the log, in which planes are searched."""
     plane_tolerance_m: PositiveFloat = 0.03
     """Largest standard deviation of a plane's points from it: the noise of the sensor."""
-    up: Literal["auto", "accelerometer", "sensor"] = "auto"
-    """What says which way is up where the accelerometer's axes, as the log states them, contradict the
-    sensor's mounting by more than 60°: auto asks the floor."""
+    up: Literal["auto", "accelerometer", "sensor", "x", "-x", "y", "-y", "z", "-z"] = "auto"
+    """What says which way is up where the accelerometer contradicts the sensor's mounting by more than 60°:
+    auto asks the floor of a LiDAR, and of a camera the accelerometer if the path confirms it. Or the axis of
+    the sensor that points up: of a camera y points down in its images and x to their right."""
     heading: Literal["walls", "start"] = "walls"
     """Direction of x and y: along most walls if these agree, so that they are straight in a slice; or the
     first pose's heading."""

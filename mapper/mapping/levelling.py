@@ -2,23 +2,21 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import permutations, product
 
 import numpy as np
 
 from mapper.core.errors import DataError
 from mapper.core.frames import Scan
-from mapper.core.geometry import Array, Points, Transform, exp, stride_for, transform
-from mapper.core.timebase import nearest
+from mapper.core.geometry import Array, Points, Transform, exp, transform
 from mapper.core.trajectory import Trajectory
 from mapper.mapping.body_axes import AXES, BodyAxes, mean_up
 from mapper.mapping.config import LevelConfig
 from mapper.mapping.floor_height import floor_below, floor_of, heights_of, weighed
+from mapper.mapping.gravity import up_by_accelerometer, up_in_stated_axes
 from mapper.mapping.wall_direction import WallHeading, wall_heading
 from mapper.registration.planes import (
     MAX_TILT_RAD,
     MIN_PATCHES,
-    PARALLEL_RAD,
     Patches,
     Vertical,
     patches_of,
@@ -27,12 +25,8 @@ from mapper.registration.planes import (
 from mapper.registration.surfaces import prepared
 from mapper.sources.base import Accelerations
 
+_FELT = "the accelerometer"
 _IN_LAYER = 1.0 / 3.0  # of a voxel
-_MAX_READING_GAP_NS = 50_000_000
-_MIN_READINGS = 50
-_MAX_READINGS = 5000
-_MAX_SPREAD_RAD = np.radians(20.0)
-_CLEAR_SPREAD_RATIO = 1.25
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,8 +64,8 @@ def find_level(
 
     Up comes from the accelerometer if the log has one that is unambiguous, else from the planes in the scans,
     else from the mean of the body's own up direction. The first two lie within 60° of the last: a camera is
-    held roughly upright. Of a LiDAR, the mounting and the axes of the accelerometer that the log states are
-    weighed against it.
+    held roughly upright. The mounting and the axes of the accelerometer that the log states, or that the path
+    shows, are weighed against it.
 
     Args:
         scans: Scans, spread over the log, with their T_world_body.
@@ -173,38 +167,30 @@ def _rough_up(
     config: LevelConfig,
     axes: BodyAxes,
 ) -> _RoughUp:
-    """Return up as tf mounts the sensor, as its accelerometer feels it, or along its z axis.
+    """Return up as tf mounts the sensor, as its accelerometer feels it, or along its own axis.
 
-    The first of them that the log states is taken, or, where they contradict each other, the first below
-    which a floor is seen: drivers turn the clouds of an inverted LiDAR, but may leave tf and accelerometer as
-    they are.
+    The first of them that the log states is taken. Where they contradict each other, it is the first below
+    which a LiDAR sees a floor: drivers turn the clouds of an inverted one, but may leave tf and accelerometer
+    as they are. Of a camera, whose images show floors and ceilings alike, it is the accelerometer if the
+    path's turns and changes of velocity confirm it.
     """
-    up_sensor = axes.up_in(trajectory)
-    if not axes.stands_on_floor:
-        return _RoughUp(up_sensor)
-    mounted = _Candidate("the mounting in tf" if axes.are_stated else "the sensor's z axis", up_sensor)
-    candidates = [_Candidate("the accelerometer", up) for up in _felt(accelerations, trajectory)]
-    candidates.insert(0 if axes.are_stated else len(candidates), mounted)
-    if axes.are_stated:
-        candidates.append(_Candidate("the sensor's z axis", mean_up(trajectory, AXES["lidar"].up)))
+    if config.up[-1] in "xyz":
+        axis = np.eye(3)["xyz".index(config.up[-1])]
+        return _RoughUp(mean_up(trajectory, -axis if config.up[0] == "-" else axis))
+    candidates = _candidates(trajectory, accelerations, axes)
     chosen, is_decided = candidates[0], True
     if any(chosen.contradicts(other) for other in candidates):
-        with_floor = [
-            candidate
-            for candidate in candidates
-            if floor_below(scans, candidate.up_world, tolerance_m=config.plane_tolerance_m).is_seen
-        ]
-        chosen = next(iter(with_floor), chosen)
-        is_decided = bool(with_floor) and not any(chosen.contradicts(other) for other in with_floor)
+        is_decided = accelerations is not None and accelerations.are_checked
+        if axes.stands_on_floor:
+            chosen, is_decided = _above_floor(candidates, scans, config.plane_tolerance_m)
     if config.up != "auto" and len(candidates) > 1:
-        wanted = mounted.name if config.up == "sensor" else "the accelerometer"
-        chosen, is_decided = next((c for c in candidates if c.name == wanted), chosen), True
-    stated = [mounted, *(candidate for candidate in candidates if candidate.name == "the accelerometer")]
-    against = next((other for other in stated if chosen.contradicts(other)), None)
+        is_wanted = [(one.name == _FELT) == (config.up == "accelerometer") for one in candidates]
+        chosen, is_decided = candidates[is_wanted.index(True)] if any(is_wanted) else chosen, True
+    against = next((one for one in candidates if one.is_stated and chosen.contradicts(one)), None)
     if against is None:
         return _RoughUp(chosen.up_world)
     angle_deg = np.degrees(chosen.angle_to(against))
-    doubt = "" if is_decided else " though no floor decides"
+    doubt = "" if is_decided else " though nothing decides"
     conflict = (
         f"up by {against.name} is {angle_deg:.0f}° from up by {chosen.name}, which is taken{doubt}; "
         "level.up=sensor or level.up=accelerometer says which is right"
@@ -212,12 +198,50 @@ def _rough_up(
     return _RoughUp(chosen.up_world, conflict, is_decided)
 
 
+def _candidates(
+    trajectory: Trajectory, accelerations: Accelerations | None, axes: BodyAxes
+) -> list["_Candidate"]:
+    """Return what says which way is up, the first of which is taken where nothing contradicts it."""
+    is_camera = not axes.stands_on_floor
+    own = "the top of the images" if is_camera else "the sensor's z axis"
+    mounted = _Candidate("the mounting in tf" if axes.are_stated else own, axes.up_in(trajectory))
+    up_felt = up_in_stated_axes(accelerations, trajectory)
+    if accelerations is None or up_felt is None:
+        felt = []
+    else:
+        is_reversed = is_camera and not accelerations.are_checked and mounted.is_opposite(up_felt)
+        felt = [_Candidate(_FELT, -up_felt if is_reversed else up_felt)]  # some point down at rest
+        if is_camera and accelerations.are_checked:
+            return [*felt, mounted]
+    if not axes.are_stated:
+        return [*felt, mounted]
+    if is_camera:
+        return [mounted, *felt]
+    z_axis = _Candidate(own, mean_up(trajectory, AXES["lidar"].up), is_stated=False)
+    return [mounted, *felt, z_axis]
+
+
+def _above_floor(
+    candidates: Sequence["_Candidate"], scans: Sequence[tuple[Scan, Transform]], tolerance_m: float
+) -> tuple["_Candidate", bool]:
+    """Return the first candidate with a floor below it, and whether none with a floor contradicts it."""
+    with_floor = [
+        candidate
+        for candidate in candidates
+        if floor_below(scans, candidate.up_world, tolerance_m=tolerance_m).is_seen
+    ]
+    if not with_floor:
+        return candidates[0], False
+    return with_floor[0], not any(with_floor[0].contradicts(other) for other in with_floor)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class _Candidate:
-    """A direction in the world that something says is up."""
+    """A direction in the world that may be up, and whether the log or the way a sensor is held says so."""
 
     name: str
     up_world: Array
+    is_stated: bool = True
 
     def angle_to(self, other: "_Candidate") -> float:
         return float(np.arccos(np.clip(self.up_world @ other.up_world, -1.0, 1.0)))
@@ -225,25 +249,8 @@ class _Candidate:
     def contradicts(self, other: "_Candidate") -> bool:
         return self.angle_to(other) > float(MAX_TILT_RAD)
 
-
-def _felt(accelerations: Accelerations | None, trajectory: Trajectory) -> list[Array]:
-    """Return up by an accelerometer in the axes that the log states; nothing where it is not clear."""
-    if accelerations is None or not accelerations.are_axes_stated:
-        return []
-    readings, R_world_body = _matched_readings(accelerations, trajectory)
-    if len(readings) < _MIN_READINGS:
-        return []
-    up_felt, spread_rad = _mean_direction(readings, R_world_body)
-    return [up_felt] if spread_rad <= _MAX_SPREAD_RAD else []
-
-
-def _mean_direction(readings: Array, R_world_body: Array) -> tuple[Array, float]:
-    """Return the mean direction of (N, 3) readings in the world, and their RMS angle from it, rad."""
-    directions_world = np.einsum("nij,nj->ni", R_world_body, readings)
-    mean = directions_world.mean(axis=0)
-    mean /= max(float(np.linalg.norm(mean)), 1e-12)
-    angles = np.arccos(np.clip(directions_world @ mean, -1.0, 1.0))
-    return mean, float(np.sqrt(np.mean(angles**2)))
+    def is_opposite(self, up_world: Array) -> bool:
+        return bool(self.up_world @ up_world < -np.cos(MAX_TILT_RAD))
 
 
 def _up(
@@ -257,7 +264,7 @@ def _up(
     """Return up in the world, its method, and the detail for the manifest, refused methods included."""
     details = []
     if accelerations is not None:
-        up_world, detail = _up_by_accelerometer(accelerations, trajectory, up_guess)
+        up_world, detail = up_by_accelerometer(accelerations, trajectory, up_guess)
         if up_world is not None:
             return up_world, "accelerometer", detail
         details.append(detail)
@@ -270,72 +277,6 @@ def _up(
     else:
         details.append(f"only {len(patches)} flat patches seen, want {MIN_PATCHES}")
     return up_guess, "camera", "; ".join([*details, "up is the sensor's mean up direction"])
-
-
-def _up_by_accelerometer(
-    accelerations: Accelerations, trajectory: Trajectory, up_guess: Array
-) -> tuple[Array | None, str]:
-    """Return the mean direction of the readings in the world, or None, and the detail or the reason.
-
-    The accelerometer's axes are one of the 24 right-angled frames; with the right one gravity keeps its
-    direction in the world while the body turns.
-    """
-    readings, R_world_body = _matched_readings(accelerations, trajectory)
-    if len(readings) < _MIN_READINGS:
-        return None, f"accelerometer: only {len(readings)} readings near a pose, want {_MIN_READINGS}"
-    found = []
-    for R_body_sensor in _right_angled_frames():
-        mean, spread_rad = _mean_direction(readings @ R_body_sensor.T, R_world_body)
-        if mean @ up_guess > np.cos(MAX_TILT_RAD):
-            found.append((spread_rad, mean))
-    if not found:
-        return None, "accelerometer: no axes put up within 60° of the camera's"
-    found.sort(key=lambda one: one[0])
-    spread_rad, up_world = found[0]
-    if spread_rad > _MAX_SPREAD_RAD:
-        return (
-            None,
-            f"accelerometer: readings spread over {np.degrees(spread_rad):.0f}°, at most 20° is usable",
-        )
-    others = [spread for spread, up in found if up @ up_world < np.cos(PARALLEL_RAD)]
-    if others and others[0] < _CLEAR_SPREAD_RATIO * spread_rad:
-        stated_up, stated_spread_rad = _mean_direction(readings, R_world_body)
-        is_possible = stated_up @ up_guess > np.cos(MAX_TILT_RAD)
-        if accelerations.are_axes_stated and is_possible and stated_spread_rad <= _MAX_SPREAD_RAD:
-            detail = f"{len(readings)} accelerometer readings in the axes that the log states"
-            return stated_up, f"{detail}, spread over {np.degrees(stated_spread_rad):.1f}°"
-        return None, "accelerometer: its axes are ambiguous because the body hardly turned"
-    return up_world, f"{len(readings)} accelerometer readings spread over {np.degrees(spread_rad):.1f}°"
-
-
-def _matched_readings(accelerations: Accelerations, trajectory: Trajectory) -> tuple[Array, Array]:
-    """Return (N, 3) unit readings and the (N, 3, 3) rotation R_world_body at their time.
-
-    Readings far from the median length are left out: the body accelerates.
-    """
-    stride = stride_for(len(accelerations.stamps_ns), _MAX_READINGS)
-    stamps_ns = accelerations.stamps_ns[::stride]
-    readings = accelerations.acceleration_mps2[::stride]
-    lengths = np.linalg.norm(readings, axis=1)
-    usable = np.isfinite(lengths) & (lengths > 0.0)
-    if not usable.any():
-        return np.empty((0, 3)), np.empty((0, 3, 3))
-    median = np.median(lengths[usable])
-    pose, gap_ns = nearest(trajectory.stamps_ns, stamps_ns)
-    usable &= (np.abs(lengths - median) <= 0.2 * median) & (gap_ns <= _MAX_READING_GAP_NS)
-    return readings[usable] / lengths[usable, None], trajectory.T_world_body[pose[usable], :3, :3]
-
-
-def _right_angled_frames() -> list[Array]:
-    """Return the 24 rotations that permute and flip axes."""
-    frames = []
-    for order in permutations(range(3)):
-        for signs in product((1.0, -1.0), repeat=3):
-            R = np.zeros((3, 3))
-            R[range(3), order] = signs
-            if np.linalg.det(R) > 0.0:
-                frames.append(R)
-    return frames
 
 
 def _frame(T_world_first: Transform, up_world: Array, floor_m: float | None, axes: BodyAxes) -> Transform:

@@ -33,7 +33,7 @@ from mapper.pipeline.checkpoints import (
 from mapper.pipeline.component_loops import joined
 from mapper.pipeline.disconnected_components import largest_component
 from mapper.pipeline.georeference import Georeferenced, georeference
-from mapper.pipeline.inertial_bridging import bridge, check_accelerations
+from mapper.pipeline.inertial_bridging import bridge, with_body_readings
 from mapper.pipeline.lidar_adjustment import adjust_tracking
 from mapper.pipeline.solve import solve
 from mapper.pipeline.track import first_session, noted_log_warnings, track_log
@@ -182,8 +182,7 @@ class _Steps:
         with self.writer.clock.stage("solve"):
             tracking, planes = adjust_tracking(self.source, tracking, self.config, progress=self.progress)
         with self.writer.clock.stage("level"):
-            source, *_ = check_accelerations(self.source, tracking)
-            level = level_of(with_body_rates(source, tracking.gyroscope), tracking, self.config)
+            level = level_of(self.source, tracking, self.config)
             tracking = replace(tracking, graph=tracking.graph.moved(level.T_level_world))
             placed = georeference(tracking, self.source.gnss, self.config.graph)
         level = replace(level, T_level_world=placed.T_map_world @ level.T_level_world)
@@ -247,7 +246,10 @@ def _height_warning(source: Log, trajectory: Trajectory) -> str:
     height_m = float(np.median(trajectory.positions_world[:, 2]))
     if source.sensor != "rgbd" or height_m <= MAX_SENSOR_HEIGHT_M:
         return ""
-    return f"the camera is {height_m:.1f} m above the floor; is source.camera.depth_factor right?"
+    return (
+        f"the camera is {height_m:.1f} m above the floor; is source.camera.depth_factor right? Of a camera "
+        "that is not held upright level.up says which of its axes points up"
+    )
 
 
 def _mounting_warnings(source: Log, tracking: TrackingResult, config: BuildConfig) -> list[str]:
@@ -264,6 +266,7 @@ def _mounting_warnings(source: Log, tracking: TrackingResult, config: BuildConfi
 
 def level_of(source: Log, tracking: TrackingResult, config: BuildConfig) -> Level:
     """Return the level frame of a solved log, found in scans of some of its tracked frames."""
+    source = with_body_readings(source, tracking)
     trajectory = tracking.tracked_trajectory()
     scans = _spread_scans(source, trajectory, config.level.frames)
     placed = [

@@ -17,13 +17,13 @@ from mapper.graph.inertial_smoothing import SmoothedPath, smooth_path
 from mapper.graph.measurement_covariance import information_of
 from mapper.graph.model import BetweenFactor, PoseGraph
 from mapper.odometry.base import FrameResult
-from mapper.odometry.gyroscope_calibration import body_readings
+from mapper.odometry.gyroscope_calibration import body_readings, with_body_rates
 from mapper.pipeline.disconnected_components import largest_component
 from mapper.pipeline.tracking_result import TrackingResult
 from mapper.run.manifest import RunWarning
 from mapper.runtime.progress import SILENT, Progress
 from mapper.sensing.inertial import InertialReadings
-from mapper.sources.base import Log
+from mapper.sources.base import Accelerations, Log
 
 _TRUSTED_MPS = 0.1
 """Standard deviation of the velocity up to which a frame is placed, as of motions that scans do not show."""
@@ -110,6 +110,23 @@ def check_accelerations(source: Log, tracking: TrackingResult) -> tuple[Log, tup
             )
         )
     return source, tuple(warnings), True
+
+
+def with_body_readings(source: Log, tracking: TrackingResult) -> Log:
+    """Return the log with what its inertial unit measures of the body, as far as the path shows that."""
+    if tracking.gyroscope is None:
+        return source
+    source, _, is_sign_known = check_accelerations(source, tracking)
+    readings = body_readings(source, tracking.gyroscope)
+    if readings is not None:
+        felt = Accelerations(
+            readings.stamps_ns,
+            readings.accelerations_mps2,
+            are_axes_stated=True,
+            are_checked=is_sign_known,
+        )
+        source = replace(source, accelerations=felt)
+    return with_body_rates(source, tracking.gyroscope)
 
 
 def _is_weak(track: FrameResult) -> bool:

@@ -159,12 +159,14 @@ class Accelerations:
         acceleration_mps2: (N, 3) float64; at rest it points up.
         are_axes_stated: The axes are the body's, as the log says; else they may be a permutation of them.
         place_body: (3,) position of the unit in the body, metres; None if the log does not state it.
+        are_checked: The axes are the body's and the sign is right, as turns and changes of velocity show.
     """
 
     stamps_ns: Stamps
     acceleration_mps2: Array
     are_axes_stated: bool = False
     place_body: Array | None = None
+    are_checked: bool = False
 
 
 Readings = TypeVar("Readings", Trajectory, Gyroscope, Accelerations, GnssFixes)

@@ -1,106 +1,34 @@
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
 
 from mapper.core.errors import DataError
-from mapper.core.frames import PinholeCamera, RgbdFrame, Scan, ray_table
-from mapper.core.geometry import apply, exp, inverse, rotation_exp, transform
+from mapper.core.frames import PinholeCamera, RgbdFrame, Scan
+from mapper.core.geometry import apply, exp, inverse, transform
 from mapper.core.timebase import nearest, ns_from_seconds_text
 from mapper.core.trajectory import Trajectory
-from mapper.mapping.body_axes import AXES, BodyAxes, axes_of
+from mapper.mapping.body_axes import AXES, axes_of
 from mapper.mapping.config import LevelConfig
-from mapper.mapping.levelling import find_level, level_in_plane
-from mapper.sources.base import Accelerations
+from mapper.mapping.levelling import level_in_plane
 from mapper.sources.trajectory_files import read_tum
 from tests.support.logs import log_in_memory
 from tests.support.paths import FR1_XYZ
-
-CAMERA = PinholeCamera(width_px=160, height_px=120, fx_px=130.0, fy_px=130.0, cx_px=79.5, cy_px=59.5)
-MS = 1_000_000
-_DEFAULTS = LevelConfig()
-
-
-@dataclass
-class Rectangle:
-    """A patch of the plane where coordinate ``axis`` equals ``at``; bounds of the other two, metres."""
-
-    axis: int
-    at: float
-    low: tuple[float, float] = (-3.0, -3.0)
-    high: tuple[float, float] = (3.0, 3.0)
-
-
-FLOOR = Rectangle(2, 0.0)
-CEILING = Rectangle(2, 2.6)
-WALLS = [Rectangle(0, 3.0, (-3.0, 0.0), (3.0, 2.6)), Rectangle(1, 3.0, (-3.0, 0.0), (3.0, 2.6))]
-OTHER_WALLS = [Rectangle(0, -3.0, (-3.0, 0.0), (3.0, 2.6)), Rectangle(1, -3.0, (-3.0, 0.0), (3.0, 2.6))]
-ROOM = [FLOOR, CEILING, *WALLS, *OTHER_WALLS]
-DESK = Rectangle(2, 0.75, (0.3, -1.5), (2.9, 1.5))
-
-
-def pose(x, y, z, *, yaw_deg, down_deg, roll_deg=0.0):
-    """T_room_camera of a camera facing along yaw (0 is +x) and down."""
-    yaw, down, roll = np.radians([yaw_deg, down_deg, roll_deg])
-    R_room_level_camera = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-    R = rotation_exp(np.array([0.0, 0.0, yaw])) @ R_room_level_camera
-    return transform(
-        R @ rotation_exp(np.array([-down, 0.0, 0.0])) @ rotation_exp(np.array([0.0, 0.0, roll])), [x, y, z]
-    )
-
-
-def seen(scene, T_room_camera, *, rng, stamp_ns=0):
-    """What a depth camera with Kinect-like noise sees of the rectangles."""
-    rays_camera = np.dstack([ray_table(CAMERA), np.ones((120, 160))])[::2, ::2].reshape(-1, 3)
-    rays = rays_camera @ T_room_camera[:3, :3].T
-    eye = T_room_camera[:3, 3]
-    depth_m = np.full(len(rays), np.inf)
-    for rectangle in scene:
-        others = [k for k in range(3) if k != rectangle.axis]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            t = (rectangle.at - eye[rectangle.axis]) / rays[:, rectangle.axis]
-            hits = eye + t[:, None] * rays
-        within = (hits[:, others] >= rectangle.low) & (hits[:, others] <= rectangle.high)
-        depth_m = np.where((t > 0.3) & within.all(axis=1) & (t < depth_m), t, depth_m)
-    got = depth_m < 5.0
-    noisy = depth_m[got] + rng.normal(0.0, 1.0, got.sum()) * 0.0012 * depth_m[got] ** 2
-    return Scan(stamp_ns, (rays_camera[got] * noisy[:, None]).astype(np.float32))
-
-
-def log_of(scene, T_room_cameras, *, seed=0):
-    """Scans and trajectory in a world that is tilted against the room, as the first camera's frame is."""
-    rng = np.random.default_rng(seed)
-    T_world_room = exp(rng.normal(0, 1, 3), rng.normal(0, 2, 3))
-    T_world_cameras = np.array([T_world_room @ T for T in T_room_cameras])
-    stamps_ns = np.arange(len(T_world_cameras), dtype=np.int64) * 33 * MS
-    scans = [
-        (seen(scene, T_room, rng=rng, stamp_ns=int(stamp)), T_world)
-        for stamp, T_room, T_world in zip(stamps_ns, T_room_cameras, T_world_cameras, strict=True)
-    ]
-    return scans, Trajectory(stamps_ns, T_world_cameras), T_world_room
-
-
-def around(*, x=0.0, down_deg=25.0, n=12, height_m=1.4, span_deg=90.0):
-    rolls = np.linspace(-4, 4, n)
-    return [
-        pose(x, 0.0, height_m, yaw_deg=yaw, down_deg=down_deg, roll_deg=roll)
-        for yaw, roll in zip(np.linspace(0, span_deg, n), rolls, strict=True)
-    ]
-
-
-def level_of(scans, trajectory, accelerations=None, config=_DEFAULTS, axes=AXES["rgbd"]):
-    return find_level(scans, trajectory=trajectory, accelerations=accelerations, config=config, axes=axes)
-
-
-def tilt_deg(level, T_world_room):
-    up_level = level.T_level_world[:3, :3] @ T_world_room[:3, 2]
-    return np.degrees(np.arccos(np.clip(up_level[2], -1.0, 1.0)))
-
-
-def floor_height_m(level, T_world_room):
-    """Where the room's own floor, below the first pose, lies in the level frame."""
-    return float(apply(level.T_level_world @ T_world_room, np.zeros((1, 3)))[0, 2])
+from tests.support.rooms import (
+    DESK,
+    FLOOR,
+    MS,
+    ROOM,
+    WALLS,
+    Rectangle,
+    around,
+    floor_height_m,
+    level_of,
+    log_of,
+    pose,
+    tilt_deg,
+)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -217,55 +145,6 @@ def test_without_any_plane_up_is_the_camera_s():
     assert "no points seen" in level.detail
 
 
-def readings_of(trajectory, T_world_room, R_body_sensor, *, noise_mps2, seed=0, per_pose=32):
-    """Readings around each pose, pointing up in the accelerometer's own axes."""
-    rng = np.random.default_rng(seed)
-    R_world_body = np.repeat(trajectory.T_world_body[:, :3, :3], per_pose, axis=0)
-    up_sensor = np.einsum("ji,nkj,k->ni", R_body_sensor, R_world_body, T_world_room[:3, 2])
-    stamps_ns = np.repeat(trajectory.stamps_ns, per_pose) + np.tile(np.arange(per_pose), len(trajectory)) * MS
-    return Accelerations(stamps_ns, 9.81 * up_sensor + rng.normal(0, noise_mps2, up_sensor.shape))
-
-
-SENSOR_AXES = [
-    np.eye(3),
-    np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]),
-    np.array([[0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [1.0, 0.0, 0.0]]),
-]
-
-
-@pytest.mark.parametrize("R_body_sensor", SENSOR_AXES)
-def test_an_accelerometer_of_any_axes_gives_up(R_body_sensor):
-    poses = [
-        pose(0, 0, 1.4, yaw_deg=y, down_deg=20 + 15 * np.sin(y / 15), roll_deg=10 * np.cos(y / 15))
-        for y in range(0, 90, 3)
-    ]
-    scans, trajectory, T_world_room = log_of([], poses)
-    accelerations = readings_of(trajectory, T_world_room, R_body_sensor, noise_mps2=0.6)
-    level = level_of(scans, trajectory, accelerations)
-    assert level.method == "accelerometer"
-    assert tilt_deg(level, T_world_room) < 0.5
-
-
-def test_an_accelerometer_with_ambiguous_axes_is_replaced_by_planes():
-    still = [pose(0.02 * k, 0, 1.4, yaw_deg=0, down_deg=30) for k in range(8)]
-    scans, trajectory, T_world_room = log_of(ROOM, still)
-    accelerations = readings_of(trajectory, T_world_room, SENSOR_AXES[1], noise_mps2=0.5)
-    level = level_of(scans, trajectory, accelerations)
-    assert level.method == "planes"
-    assert "ambiguous" in level.detail
-    assert tilt_deg(level, T_world_room) < 0.5
-
-
-@pytest.mark.parametrize(("shift_ns", "noise_mps2"), [(10**12, 0.1), (0, 30.0)])
-def test_useless_readings_are_replaced_by_planes_with_the_reason(shift_ns, noise_mps2):
-    scans, trajectory, T_world_room = log_of(ROOM, around())
-    readings = readings_of(trajectory, T_world_room, np.eye(3), noise_mps2=noise_mps2)
-    late = Accelerations(readings.stamps_ns + shift_ns, readings.acceleration_mps2)
-    level = level_of(scans, trajectory, late)
-    assert level.method == "planes"
-    assert "accelerometer" in level.detail
-
-
 def test_a_body_may_have_other_axes():
     R_camera_lidar = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])  # x forward, z up
     T_camera_lidar = transform(R_camera_lidar, np.zeros(3))
@@ -281,59 +160,6 @@ def test_a_body_may_have_other_axes():
     level = level_of(as_lidar, moved, axes=AXES["lidar"])
     assert tilt_deg(level, T_world_room) < 0.3
     assert (level.T_level_world @ moved.T_world_body[0])[0, 0] > 0.8
-
-
-def street(*, is_inverted, has_ground=True, imu_is_inverted):
-    """Scans of a LiDAR that drives 1.7 m above the ground beside a wall, and stated accelerations."""
-    rng = np.random.default_rng(0)
-    ground = np.column_stack([rng.uniform(-20, 20, (2000, 2)), rng.normal(-1.7, 0.01, 2000)])
-    wall = np.column_stack([rng.uniform(-20, 20, 500), rng.normal(8.0, 0.01, 500), rng.uniform(-1.7, 4, 500)])
-    points = np.concatenate([ground, wall]) if has_ground else wall
-    R_body_robot = np.diag([1.0, -1.0, -1.0]) if is_inverted else np.eye(3)
-    poses = [transform(np.eye(3), [0.1 * k, 0.0, 0.0]) for k in range(100)]
-    trajectory = Trajectory(np.arange(100, dtype=np.int64) * 100 * MS, np.array(poses))
-    scans = [(Scan(0, (points @ R_body_robot.T).astype(np.float32)), poses[0])]
-    felt = [0.0, 0.0, -9.81 if imu_is_inverted else 9.81]
-    return (
-        scans,
-        trajectory,
-        Accelerations(trajectory.stamps_ns, np.tile(felt, (100, 1)), are_axes_stated=True),
-    )
-
-
-STATED = BodyAxes(
-    np.array([0.0, 0.0, -1.0]), np.array([1.0, 0.0, 0.0]), stands_on_floor=True, are_stated=True
-)
-"""Axes of a LiDAR that tf says is mounted upside down."""
-
-
-@pytest.mark.parametrize("axes", [AXES["lidar"], STATED])
-@pytest.mark.parametrize("is_inverted", [True, False])
-def test_the_floor_decides_between_the_accelerometer_and_the_mounting(is_inverted, axes):
-    scans, trajectory, readings = street(is_inverted=is_inverted, imu_is_inverted=True)
-    level = level_of(scans, trajectory, readings, axes=axes)
-    assert level.T_level_world[2, 2] == pytest.approx(-1.0 if is_inverted else 1.0, abs=0.01)
-    assert level.T_level_world[2, 3] == pytest.approx(1.7, abs=0.05)
-    assert bool(level.conflict) == (axes is AXES["lidar"] or not is_inverted)
-    assert level.is_decided
-
-
-@pytest.mark.parametrize(("axes", "z_up"), [(AXES["lidar"], -1.0), (STATED, -1.0)])
-def test_without_a_floor_a_stated_mounting_goes_before_the_accelerometer(axes, z_up):
-    scans, trajectory, readings = street(
-        is_inverted=True, has_ground=False, imu_is_inverted=axes is AXES["lidar"]
-    )
-    level = level_of(scans, trajectory, readings, axes=axes)
-    assert level.T_level_world[2, 2] == pytest.approx(z_up, abs=0.05)
-    assert level.conflict
-    assert not level.is_decided
-
-
-@pytest.mark.parametrize(("up", "z_up"), [("sensor", 1.0), ("accelerometer", -1.0)])
-def test_the_user_can_say_which_way_is_up(up, z_up):
-    scans, trajectory, readings = street(is_inverted=True, imu_is_inverted=True)
-    level = level_of(scans, trajectory, readings, LevelConfig(up=up), axes=AXES["lidar"])
-    assert level.T_level_world[2, 2] == pytest.approx(z_up, abs=0.05)
 
 
 def on_robot(scene, T_room_cameras, *, footprint_m=0.0, known=slice(None), base_frame="a/base_link"):

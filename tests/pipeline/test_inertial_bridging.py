@@ -10,12 +10,12 @@ from scipy.spatial.transform import Rotation
 
 from mapper.core.doubts import Doubt
 from mapper.core.geometry import exp, inverse, length_and_angle, log
-from mapper.core.timebase import NS_PER_S
+from mapper.core.timebase import NS_PER_S, nearest
 from mapper.graph.components import components
 from mapper.graph.model import BetweenFactor, PoseGraph
 from mapper.odometry.base import Diagnostics, FrameResult, lost_frame
 from mapper.odometry.gyroscope_calibration import GyroscopeCalibration, body_readings
-from mapper.pipeline.inertial_bridging import bridge, check_accelerations
+from mapper.pipeline.inertial_bridging import bridge, check_accelerations, with_body_readings
 from mapper.pipeline.tracking_result import TrackingResult
 from mapper.runtime.progress import SILENT
 from mapper.sensing.inertial import InertialReadings
@@ -259,6 +259,29 @@ def test_accelerations_of_either_sign_point_up_at_rest(seed, sign):
     checked, warnings, _ = check_accelerations(given, tracking)
     assert np.array_equal(checked.accelerations.acceleration_mps2, felt.acceleration_mps2)
     assert [(warning.kind, warning.weight) for warning in warnings] == [("imu", "note")] * (sign < 0.0)
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_accelerations_are_the_body_s_where_the_gyroscope_shows_the_mounting(seed, sign):
+    log_, tracking, truth = made(seed)
+    felt = log_.accelerations
+    given = replace(log_, accelerations=replace(felt, acceleration_mps2=sign * felt.acceleration_mps2))
+    found = with_body_readings(given, tracking).accelerations
+    assert (found.are_axes_stated, found.are_checked) == (True, True)
+    at_ns = np.array([track.stamp_ns for track in tracking.tracks])
+    felt_world = np.einsum(
+        "nij,nj->ni", truth[:, :3, :3], found.acceleration_mps2[nearest(found.stamps_ns, at_ns)[0]]
+    )
+    mean = felt_world.mean(axis=0)
+    assert np.degrees(np.arccos(mean[2] / np.linalg.norm(mean))) < 2.0  # IMU.mounting_rad is 13°
+
+
+def test_accelerations_stay_in_their_own_axes_where_the_mounting_is_not_known():
+    log_, tracking, _ = made(0)
+    unsure = replace(CALIBRATION, covariance=np.eye(7))
+    found = with_body_readings(log_, replace(tracking, gyroscope=unsure)).accelerations
+    assert found is log_.accelerations
 
 
 @pytest.mark.parametrize("is_exact", [True, False])
