@@ -6,13 +6,14 @@ them.
 """
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from rosbags.serde import SerdeError
 
-from mapper.core.errors import DataError
+from mapper.core.errors import DataError, listed
 from mapper.core.geometry import is_rigid, transform
 from mapper.core.rotations import row_of_pose
 from mapper.core.timebase import NS_PER_S
@@ -126,6 +127,28 @@ def _laser(m: Any) -> CloudMessage:
     return CloudMessage(_ns(m.header.stamp), m.header.frame_id, points)
 
 
+def _first_echoes(m: Any) -> CloudMessage:
+    """Return the nearest return of each beam of a laser that sees several."""
+    first = {
+        name: np.array([beam.echoes[0] if len(beam.echoes) else np.inf for beam in getattr(m, name)])
+        for name in ("ranges", "intensities")
+    }
+    return _laser(replace(m, **first))
+
+
+def _old_cloud(m: Any) -> CloudMessage:
+    """Return a cloud of PointCloud2's predecessor: points, and channels of a number for each."""
+    numbers = {axis: [getattr(point, axis) for point in m.points] for axis in "xyz"}
+    whole = {one.name: one.values for one in m.channels if len(one.values) == len(m.points)}
+    numbers = whole | numbers
+    points = np.zeros(len(m.points), [(name, "f4") for name in numbers])
+    for name, values in numbers.items():
+        points[name] = values
+    left_out = [one.name for one in m.channels if one.name not in numbers]
+    notes = [f"channels whose length is not the cloud's are left out: {listed(left_out)}"] if left_out else []
+    return CloudMessage(_ns(m.header.stamp), m.header.frame_id, points, notes=notes)
+
+
 def _imu(m: Any) -> ImuMessage:
     a = m.linear_acceleration
     return ImuMessage(_ns(m.header.stamp), m.header.frame_id, np.array([a.x, a.y, a.z]))
@@ -183,7 +206,9 @@ _READERS: Mapping[str, Callable[[Any], Message]] = {
     "sensor_msgs/msg/CompressedImage": _file,
     "sensor_msgs/msg/CameraInfo": _camera,
     "sensor_msgs/msg/PointCloud2": _cloud,
+    "sensor_msgs/msg/PointCloud": _old_cloud,
     "sensor_msgs/msg/LaserScan": _laser,
+    "sensor_msgs/msg/MultiEchoLaserScan": _first_echoes,
     "sensor_msgs/msg/Imu": _imu,
     "sensor_msgs/msg/NavSatFix": _fix,
     **dict.fromkeys(GPS_FIXES, _fix),

@@ -116,9 +116,12 @@ def image_of(message: ImageMessage, *, colour: bool, where: str) -> Image:
         data = bytes(message.data)
         _refuse_video(data, message.format, where=where)
         return decode_colour(data, where) if colour else decode_grey(data, where)
-    encoding = _COLOUR.get(message.encoding)
+    encoding = _COLOUR.get(message.encoding) or _COLOUR.get(message.encoding.lower())
     if encoding is None:
-        raise FrameError(f"{where}: colour encoded as {message.encoding}; known are {', '.join(_COLOUR)}")
+        data = bytes(message.data)
+        if data.startswith(_IMAGE_STARTS[:2]):  # of a webcam's driver
+            return decode_colour(data, where) if colour else decode_grey(data, where)
+        raise FrameError(f"{where}: colour encoded as {message.encoding!r}; known are {', '.join(_COLOUR)}")
     order = ">" if message.is_big_endian else "<"
     pixels = _pixels(message, order + encoding.kind, encoding.channels, rows=encoding.rows, where=where)
     if not pixels.size:
@@ -158,7 +161,14 @@ def depth_m_of(
     pixels = _pixels(message, order + kind, 1, where=where)
     if kind.startswith("f"):
         return valid_depth(pixels, float_units_per_m, where=where)
+    if message.is_big_endian and _roughness(pixels) > _roughness(pixels.byteswap()):
+        pixels = pixels.byteswap()  # drivers label what they do not swap
     return depth_m_from(np.ascontiguousarray(np.maximum(pixels, 0), dtype=np.uint16), units_per_m)
+
+
+def _roughness(units: NDArray[Any]) -> float:
+    """Return the mean difference of neighbours in a row: of bytes in the wrong order it is large."""
+    return float(np.abs(np.diff(units.astype(np.int32), axis=1)).mean()) if units.shape[1] > 1 else 0.0
 
 
 def depth_file_of(message: ImageMessage) -> bytes | None:

@@ -208,8 +208,12 @@ DRIVER_CLOUDS = LIVOX | VELODYNE
 OUSTER_PACKETS = frozenset(
     f"{package}/msg/PacketMsg" for package in ("ouster_ros", "ouster_sensor_msgs", "ouster_msgs")
 )
-LASERS = frozenset({"sensor_msgs/msg/LaserScan", "foxglove.LaserScan"})
-CLOUDS = frozenset({"sensor_msgs/msg/PointCloud2", "foxglove.PointCloud"}) | DRIVER_CLOUDS | LASERS
+LASERS = frozenset({"sensor_msgs/msg/LaserScan", "sensor_msgs/msg/MultiEchoLaserScan", "foxglove.LaserScan"})
+CLOUDS = (
+    frozenset({"sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/PointCloud", "foxglove.PointCloud"})
+    | DRIVER_CLOUDS
+    | LASERS
+)
 IMUS = frozenset({"sensor_msgs/msg/Imu"})
 SENTENCES = frozenset({"nmea_msgs/msg/Sentence"})
 GPS_FIXES = frozenset({"gps_common/msg/GPSFix", "gps_msgs/msg/GPSFix"})

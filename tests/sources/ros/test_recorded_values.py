@@ -11,8 +11,8 @@ from mapper.sources import open_source
 from mapper.sources.calibration_file import calibration_text
 from mapper.sources.config import SourceConfig, TopicsConfig
 from mapper.sources.inspection import inspect_log
-from mapper.sources.ros.encode_ros import cloud_message
-from mapper.sources.ros.typestore import typestore
+from mapper.sources.ros.encode_ros import SerializedMessage, cloud_message
+from mapper.sources.ros.typestore import serialize, typestore
 from tests.support.recordings import CAMERA, COLOR, DEPTH, camera_info, changed, image, shots, write
 from tests.support.tum_logs import FIRST_NS, PERIOD_NS, picture
 
@@ -97,3 +97,56 @@ def test_images_without_pixels_and_depth_without_values_are_refused(tmp_path):
     for name, topic, made in (("a", COLOR, (none, "rgb8")), ("b", DEPTH, (zero, "16UC1"))):
         messages = [image(m.stamp_ns, topic, *made) if m.topic == topic else m for m in shots(3)]
         assert inspect_log(write(tmp_path / f"{name}.mcap", messages), SourceConfig()).problem is not None
+
+
+def sensor_message(type_, stamp_ns, topic, **fields):
+    store = typestore("cdr")
+    types, second = store.types, 10**9
+    stamp = types["builtin_interfaces/msg/Time"](sec=stamp_ns // second, nanosec=stamp_ns % second)
+    header = types["std_msgs/msg/Header"](stamp=stamp, frame_id="lidar")
+    made = types[type_](header=header, **fields)
+    return SerializedMessage(stamp_ns, topic, type_, serialize(made))
+
+
+def test_clouds_of_the_older_message_are_read_with_their_channels(tmp_path):
+    types = typestore("cdr").types
+    points = np.random.default_rng(3).uniform(-9.0, 9.0, (20, 3)).astype(np.float32)
+    times_s = np.linspace(0.0, 0.09, 20, dtype=np.float32)
+    channels = [
+        types["sensor_msgs/msg/ChannelFloat32"](name=name, values=values)
+        for name, values in (("time", times_s), ("intensity", times_s + 1), ("short", times_s[:3]))
+    ]
+    messages = [
+        sensor_message(
+            "sensor_msgs/msg/PointCloud",
+            stamp_ns,
+            "/cloud",
+            points=[types["geometry_msgs/msg/Point32"](*point) for point in points.tolist()],
+            channels=channels,
+        )
+        for stamp_ns in STAMPS_NS
+    ]
+    for name in ("a.mcap", "a.bag"):
+        log = open_source(write(tmp_path / name, messages))
+        np.testing.assert_array_equal(log[0].points_body, points)
+        np.testing.assert_allclose(log[0].times_s, times_s, atol=1e-7)
+        np.testing.assert_array_equal(log[0].intensities, times_s + 1)
+        assert sum("short" in note for note in log.notes) == 1
+
+
+def test_of_several_echoes_the_nearest_is_read(tmp_path):
+    types = typestore("cdr").types
+    echoes = [[2.0, 5.0], [], [3.0]] * 20
+    beams = [types["sensor_msgs/msg/LaserEcho"](echoes=np.array(one, np.float32)) for one in echoes]
+    limits = {"angle_min": -1.0, "angle_max": 1.0, "angle_increment": 2.0 / 59, "range_min": 0.1}
+    limits |= {"range_max": 30.0, "time_increment": 0.0, "scan_time": 0.1}
+    messages = [
+        sensor_message(
+            "sensor_msgs/msg/MultiEchoLaserScan", stamp_ns, "/echoes", ranges=beams, intensities=[], **limits
+        )
+        for stamp_ns in STAMPS_NS
+    ]
+    log = open_source(write(tmp_path / "a.mcap", messages))
+    assert log.sensor == "lidar-2d"
+    distances_m = np.linalg.norm(log[0].points_body, axis=1)
+    np.testing.assert_allclose(distances_m, [2.0, 3.0] * 20, rtol=1e-6)

@@ -227,6 +227,19 @@ def test_compressed_depth_of_32_bits_is_inverse_depth():
     np.testing.assert_allclose(got.ravel()[1:], depth.ravel()[1:], rtol=5e-4 * 9.0)
 
 
+def test_depth_is_in_the_order_of_bytes_that_makes_it_smooth():
+    units = np.add.outer(np.arange(48), np.arange(64)).astype(np.uint16) + 900
+    for is_big_endian, stored in ((True, units), (True, units.byteswap()), (False, units)):
+        message = pixels(stored, "16UC1", is_big_endian=is_big_endian)
+        np.testing.assert_array_equal(depth_m_of(message, units_per_m=1.0, where="m"), units)
+
+
+def test_what_an_encoding_is_called_is_read_by_its_content():
+    np.testing.assert_array_equal(image_of(pixels(BGR, "BGR8"), colour=True, where="m"), RGB)
+    message = replace(pixels(RGB, "mjpeg"), data=memoryview(encoded(BGR, ".png")))
+    np.testing.assert_array_equal(image_of(message, colour=True, where="m"), RGB)
+
+
 def test_rows_that_follow_each_other_are_read_whatever_step_says():
     message = replace(pixels(RGB, "rgb8"), row_bytes=64)
     np.testing.assert_array_equal(image_of(message, colour=True, where="m"), RGB)
@@ -237,7 +250,7 @@ def test_rows_that_follow_each_other_are_read_whatever_step_says():
     [
         (replace(pixels(RGB, "rgb8"), height_px=0), "px"),
         (replace(pixels(RGB, "rgb8"), data=memoryview(b"")), "but 0 bytes are there"),
-        (pixels(RGB, "nv24"), "colour encoded as nv24; known are rgb8"),
+        (pixels(RGB, "nv24"), "colour encoded as 'nv24'; known are rgb8"),
         (replace(pixels(GREY[:, :63], "nv12"), height_px=32), "nv12 of 63×32 px, want even numbers"),
         (pixels(GREY, "nv12"), "but 3072 bytes are there"),
         (file(encoded(BGR, ".jpg")[:-50], "jpeg"), "truncated JPEG"),
