@@ -4,6 +4,7 @@ import re
 from contextlib import suppress
 from dataclasses import replace
 from importlib import import_module
+from itertools import chain, islice
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -42,8 +43,8 @@ FORMATS = (
     "scan_folders.clouds",
 )
 """Modules, imported one after the other when a log is opened, until one recognises it."""
-_MOST_TRIED = 20
-"""Folders within a folder that are looked at, to say which is the log."""
+_MOST_TRIED, _MOST_LOOKED_AT = 20, 10_000
+"""Folders within a folder, and files, that are looked at to say which is the log or what lacks."""
 _DEFAULTS = SourceConfig()
 _ADDRESS = re.compile(r"\w+:/")
 _IMAGES = {".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff", ".ppm"}
@@ -145,10 +146,22 @@ def format_of(path: Path) -> str | None:
 
 def _inner_hint(path: Path) -> str:
     """Return advice to open what is in a folder: a log in a folder of its own, or one of several bags."""
-    folders = sorted(inner for inner in path.glob("*") if inner.is_dir())[:_MOST_TRIED]
-    for inner in folders:
+    within = (sorted(inner for inner in path.glob(names) if inner.is_dir()) for names in ("*", "*/*"))
+    for inner in chain.from_iterable(folders[:_MOST_TRIED] for folders in within):
         with suppress(SourceError):  # of a file in it that cannot be read
             if format_of(inner):
-                return f"; {inner.name} in it is one"
+                return f"; {inner.relative_to(path)} in it is one"
     recordings = sorted(one.name for one in path.glob("*") if one.suffix in (".mcap", ".bag", ".db3"))
-    return f"; open one of {listed(recordings)}" if recordings else ""
+    if recordings:
+        return f"; open one of {listed(recordings)}"
+    for names in ("*/*", "*/*/*", "*/*/*/*"):
+        files = islice(path.glob(names), _MOST_LOOKED_AT)
+        images = sorted(
+            {f"{one.parent.relative_to(path)}/" for one in files if one.suffix.lower() in _IMAGES}
+        )
+        if images:
+            return (
+                f"; it has images in {listed(images)} and no depth, as in depth/; stereo pairs are read as "
+                "EuRoC and KITTI keep them, with their calibration"
+            )
+    return ""

@@ -312,6 +312,8 @@ def _yaml_numbers(text: str) -> tuple[dict[str, Sequence[float]], str]:
 def _json_numbers(table: Any) -> tuple[_Numbers, str]:
     """Take the matrix of Open3D and Record3D, column by column, or the numbers of Replica and nerfstudio."""
     camera = table.get("camera", table) if isinstance(table, dict) else None
+    for name in ("color", "colour", "rgb") if camera is table else ():  # of a recorder by librealsense
+        camera = {**table, **table[name]} if isinstance(table.get(name), dict) else camera
     if not isinstance(camera, dict):
         raise DataError("no table of numbers")
     model = "equidistant" if camera.get("is_fisheye") else _lens_model(f"{camera.get('camera_model', '')}")
@@ -334,7 +336,11 @@ def _is_numeric(value: Any) -> bool:
 
 
 def _text_numbers(text: str) -> _Numbers:
-    """Take a matrix of 3×3, 3×4 or 4×4 numbers, or a line of fx fy cx cy and distortion coefficients."""
+    """Take a matrix of 3×3, 3×4 or 4×4 numbers, or a line of fx fy cx cy and distortion coefficients.
+
+    Matrices may be in brackets, as NumPy and MATLAB print them.
+    """
+    text = text.replace(";", "\n").replace("[", " ").replace("]", " ")
     lines = [line.split("#")[0].replace(",", " ").split() for line in text.splitlines()]
     rows = [[float(word) for word in words] for words in lines if words]
     if len(rows) == 1 and 4 <= len(rows[0]) <= 4 + len(NO_DISTORTION):

@@ -9,7 +9,7 @@ from mapper.core.errors import SourceError, listed
 
 _SENSOR_FILES = [
     re.compile(
-        rf"(?:^|[^a-z])(?:{words}).*\.(?:txt|csv|tsv|json|ya?ml|toml|log|np[yz]|tum|bag|mcap|db3)$", re.I
+        rf"(?:^|[^a-z])(?:{words}).*\.(?:txt|csv|tsv|json|ya?ml|xml|toml|log|np[yz]|tum|bag|mcap|db3)$", re.I
     )
     for words in (
         "ground.?truth|gt(?![a-z])|pose|traj",

@@ -72,6 +72,13 @@ FILES = [
     ("tuesday-camchain.yaml", KALIBR),
     ("camera-intrinsics.txt", MATRIX),
     ("K.txt", MATRIX.replace(" ", ", ")),
+    ("K.txt", "[60, 0, 31.5; 0, 61, 23.5; 0, 0, 1]"),
+    ("intrinsics.txt", "[[60. 0. 31.5]\n [0. 61. 23.5]\n [0. 0. 1.]]\n"),
+    (
+        "intrinsics.json",
+        '{"depth_scale": 0.001, "depth": {"fx": 40, "fy": 40, "ppx": 32, "ppy": 24}, '
+        '"color": {"width": 64, "height": 48, "fx": 60, "fy": 61, "ppx": 31.5, "ppy": 23.5, "coeffs": [0]}}',
+    ),
     ("calibration.txt", "# fx fy cx cy\n60 61 31.5 23.5\n"),
     ("intrinsics.txt", "60 61 31.5 23.5 0 0 0 0 0"),
     ("intrinsic/intrinsic_color.txt", "60 0 31.5 0\n0 61 23.5 0\n0 0 1 0\n0 0 0 1\n"),

@@ -376,3 +376,22 @@ def test_stamps_beyond_64_bits_are_refused(tmp_path, text):
     (folder / "times.txt").write_text(text)
     with pytest.raises(SourceError, match=r"times\.txt"):
         open_source(folder)
+
+
+def test_files_that_macos_leaves_beside_others_are_none(tmp_path):
+    folder = cloud_folder(tmp_path, ["0.npy", "1.npy", "2.npy"])
+    for path in list(folder.iterdir()):
+        (folder / f"._{path.name}").write_bytes(b"\0\5\x16\7")
+    assert len(open_source(folder)) == 3
+
+
+@pytest.mark.parametrize(
+    ("folders", "told"),
+    [(("left", "right"), "left/"), (("walk/cam/rgb", "walk/cam/depth"), "walk/cam in it")],
+)
+def test_what_a_folder_of_images_lacks_is_told(tmp_path, folders, told):
+    for k, name in enumerate(folders):
+        (tmp_path / name).mkdir(parents=True)
+        (tmp_path / name / "1.png").write_bytes(f"{k}".encode())
+    with pytest.raises(SourceError, match=f"not a log .*{told}"):
+        open_source(tmp_path)

@@ -134,7 +134,7 @@ def _pairs_in(folder: Path) -> _Pairs | None:
 
 
 def _images(folder: Path) -> list[Path]:
-    return in_order(path for path in folder.glob("*") if path.suffix.lower() in _ENDINGS)
+    return in_order(path for path in folder.glob("[!.]*") if path.suffix.lower() in _ENDINGS)
 
 
 def _stamps(pairs: _Pairs, files: Sequence[Path], config: SourceConfig) -> tuple[Stamps, list[str]]:

@@ -229,7 +229,9 @@ def _in_folder(folder: Path, word: str = "", *, endings: Set[str] = _IMAGE_ENDIN
     images = [
         path
         for path in sorted(folder.iterdir())
-        if path.suffix.lower() in endings and re.search(word, path.stem, re.IGNORECASE)
+        if path.suffix.lower() in endings
+        and path.name[0] != "."
+        and re.search(word, path.stem, re.IGNORECASE)
     ]
     numbered: dict[int, tuple[Path, int | None]] = {}
     for path in images:

@@ -169,7 +169,7 @@ def _why_no_points(paths: Sequence[Path]) -> str | None:
 def _files(folder: Path) -> list[Path]:
     try:
         with os.scandir(folder) as found:  # tells files from folders without a stat of each
-            return [folder / entry.name for entry in found if entry.is_file()]
+            return [folder / one.name for one in found if one.name[0] != "." and one.is_file()]  # macOS' ._
     except OSError:  # there is none, it may not be read, or is a link to itself
         return []
 
