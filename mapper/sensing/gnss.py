@@ -86,7 +86,7 @@ class GnssFixes:
         has_fix = self.status > NO_FIX
         for count, what in (
             (int((~has_fix).sum()), "have the status of no fix"),
-            (int((has_fix & ~is_place).sum()), "have no latitude, longitude and height (NaN, or zeros)"),
+            (int((has_fix & ~is_place).sum()), "have no place (NaN, zeros, or no degrees)"),
         ):
             if count:
                 notes.append(f"{self.name}: {count} of {len(self)} messages {what}; left out")

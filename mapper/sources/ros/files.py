@@ -28,7 +28,7 @@ def recognise(path: Path) -> bool:
     """Return whether a path is named as a recording, or is a folder of the parts of one."""
     if path.is_dir():
         return bool(_parts(path))
-    return path.suffix in (*_ENDINGS, _PACKED, _UNFINISHED) and path.is_file()
+    return path.suffix.lower() in (*_ENDINGS, _PACKED, _UNFINISHED) and path.is_file()
 
 
 def read_log(path: Path, config: SourceConfig) -> Log:
@@ -98,19 +98,20 @@ def _named_by_rosbag2(folder: Path) -> list[str]:
 
 def _opened(path: Path) -> Recording:
     # Each reader loads a library that the others do not need.
-    if path.suffix == ".mcap":
+    ending = path.suffix.lower()
+    if ending == ".mcap":
         from mapper.sources.ros.mcap_file import open_mcap
 
         return open_mcap(path)
-    if path.suffix in (".bag", _UNFINISHED):
+    if ending in (".bag", _UNFINISHED):
         from mapper.sources.ros.ros1_bag import open_bag
 
         return open_bag(path)
-    if path.suffix == ".db3":
+    if ending == ".db3":
         from mapper.sources.ros.ros2_bag import DatabaseRecording
 
         return DatabaseRecording(path)
-    if path.suffix == _PACKED:
+    if ending == _PACKED:
         raise SourceError(
             f"{path}: compressed as a whole, so no part can be read alone; unpack it first: zstd -d {path}"
         )
@@ -126,9 +127,9 @@ def _parts(folder: Path) -> list[Path]:
     from mapper.sources.ros.ros2_bag import in_sequence
 
     for ending in _IN_FOLDERS:
-        found = [*folder.glob(f"*{ending}"), *folder.glob(f"*{ending}{_UNFINISHED}")]
-        parts = [path for path in found if path.is_file()]
-        if len({re.sub(r"[\d_.-]+", "", path.name.partition(ending)[0]) for path in parts}) > 1:
+        endings = (ending, f"{ending}{_UNFINISHED}")
+        parts = [path for path in folder.glob("*") if path.name.lower().endswith(endings) and path.is_file()]
+        if len({re.sub(r"[\d_.-]+", "", path.name.lower().partition(ending)[0]) for path in parts}) > 1:
             named = _named_by_rosbag2(folder)
             parts = [path for path in parts if path.name in named]
         if parts:

@@ -150,3 +150,11 @@ def test_of_several_echoes_the_nearest_is_read(tmp_path):
     assert log.sensor == "lidar-2d"
     distances_m = np.linalg.norm(log[0].points_body, axis=1)
     np.testing.assert_allclose(distances_m, [2.0, 3.0] * 20, rtol=1e-6)
+
+
+@pytest.mark.parametrize("ending", ["mcap", "bag"])
+def test_endings_in_capitals_are_read(tmp_path, ending):
+    path = write(tmp_path / f"a.{ending}", shots(2))
+    path.rename(tmp_path / f"A.{ending.upper()}")
+    for opened in (tmp_path / f"A.{ending.upper()}", tmp_path):
+        assert len(open_source(opened)) == 2

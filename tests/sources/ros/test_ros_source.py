@@ -116,7 +116,7 @@ def test_topics_that_are_not_used_are_named_with_the_reason(tmp_path):
         "/map_cloud",
         "/nmea/fix",
         "/odom, /vio",
-        "1 of 1 messages have no latitude, longitude and height (NaN, or zeros); left out",
+        "1 of 1 messages have no place (NaN, zeros, or no degrees); left out",
         "its angular velocities are all 0 or no numbers; not used",
         "no fixes",
     ]
