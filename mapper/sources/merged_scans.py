@@ -13,9 +13,10 @@ from mapper.core.frames import Frame, Scan
 from mapper.core.geometry import Transform, apply
 from mapper.core.timebase import NS_PER_S, nearest
 from mapper.sources.base import FrameRef, Log, WrappedEntry
-from mapper.sources.point_times import MAX_SWEEP_S
 
 _LOOKED_AT, _FEWEST_PARTS, _WIDEST_PART_RAD = 16, 8, 1.5 * np.pi
+_LONGEST_TURN_NS = NS_PER_S // 4
+"""LiDARs turn 5 to 20 times a second; what turns them (a pan unit) is slower, and its tf is known."""
 _LEAST_TURNED_RAD, _SAME_RATE, _MIN_USUAL = 1e-3, 0.25, 0.75
 """Rates of turning that count as the same, and the share of them: scenes are empty on one side and not on
 another, and packets are lost."""
@@ -111,7 +112,7 @@ def _turn_of_parts_ns(log: Log) -> int | None:
     turns_ns = 2.0 * np.pi * np.diff(stamps_ns) / np.maximum(turned_rad, _LEAST_TURNED_RAD)
     turn_ns = float(np.median(turns_ns))
     is_usual = np.abs(turns_ns / turn_ns - 1.0) < _SAME_RATE
-    if turn_ns > MAX_SWEEP_S * NS_PER_S or is_usual.mean() < _MIN_USUAL:
+    if turn_ns > _LONGEST_TURN_NS or is_usual.mean() < _MIN_USUAL:
         return None
     part_ns = float(np.median(np.diff(log.stamps_ns)))
     return round(max(round(turn_ns / part_ns), 1) * part_ns)

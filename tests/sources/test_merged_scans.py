@@ -156,3 +156,18 @@ def test_views_of_one_direction_are_no_parts_of_turns():
     whole = LidarSimulator(LidarSynthConfig(seed=6, loop_m=60.0, duration_s=2.0, sensor=sensor)).log()
     front = replace(whole, entry_at=lambda index: View(whole.entry_at(index), np.eye(4)))
     assert with_whole_turns(front) is front
+
+
+def test_a_view_that_a_pan_unit_turns_stays_a_scan_of_its_own():
+    angles_rad = np.linspace(-0.5, 0.5, 50)
+    entries = []
+    for k in range(20):  # at 10 Hz, a turn in a second
+        direction_rad = angles_rad + 0.2 * np.pi * k
+        points = np.column_stack([np.cos(direction_rad), np.sin(direction_rad), 0.0 * direction_rad])
+        entries.append(MemoryEntry(100 * k * MS, Scan(100 * k * MS, points.astype(np.float32))))
+    log = log_in_memory(entries, sensor="lidar")
+    assert with_whole_turns(log) is log
+    faster = log_in_memory(
+        [MemoryEntry(k * 10 * MS, e.load()) for k, e in enumerate(entries)], sensor="lidar"
+    )
+    assert len(with_whole_turns(faster)) == 2
