@@ -22,7 +22,7 @@ from mapper.sources import open_source
 from mapper.sources.base import FrameRef
 from mapper.sources.cloud_files import ENDINGS
 from mapper.sources.scan_folders import clouds, kitti
-from mapper.sources.scan_folders.clouds import read_scan
+from mapper.sources.scan_folders.scans import read_scan
 
 GIVEN = "pairs.toml"
 ALL_RINGS, FEW_RINGS = "all rings", "16 rings"

@@ -11,7 +11,7 @@ from mapper.runtime.regular_files import AnyPath
 from mapper.sources import open_source
 from mapper.sources.base import Log
 from mapper.sources.config import SourceConfig
-from mapper.sources.scan_folders.clouds import read_scan
+from mapper.sources.scan_folders.scans import read_scan
 
 if TYPE_CHECKING:
     from mapper.sources.inspection import Inspection

@@ -5,7 +5,7 @@ Disturbances of the recording are gaps, a frozen camera, a hand before the lens,
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.core.frames import DepthImage, Frame, Image, PinholeCamera, RgbdFrame, Scan, Sensor
+from mapper.core.frames import DepthImage, Frame, Image, PinholeCamera, RgbdFrame, Sensor
 from mapper.core.geometry import Array
 from mapper.core.timebase import seconds_text_from_ns
 from mapper.core.trajectory import Trajectory
@@ -32,7 +32,7 @@ from mapper.simulation.readings import measure_gnss, measure_imu, measure_wheels
 from mapper.simulation.scene import Scene, make_scene
 from mapper.simulation.shutter import Shutter
 from mapper.simulation.streams import Stream, noise_index, rng_of
-from mapper.sources.base import EntryWithoutFiles, Log
+from mapper.sources.base import LazyFrame, Log
 from mapper.sources.calibration_file import calibration_text
 from mapper.sources.image_files.reading import TUM_UNITS_PER_M
 from mapper.sources.imu_files import write_imu
@@ -56,27 +56,6 @@ def camera_of(config: SynthConfig) -> PinholeCamera:
     focal_px = config.width_px / (2.0 * math.tan(config.horizontal_view_rad / 2.0))
     middle = ((config.width_px - 1) / 2.0, (config.height_px - 1) / 2.0)
     return PinholeCamera(config.width_px, config.height_px, focal_px, focal_px, *middle)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class SyntheticEntry(EntryWithoutFiles):
-    """Frame that is simulated when it is loaded, and is the same every time.
-
-    Attributes:
-        stamp_ns: Time of the frame, nanoseconds.
-        simulate: Returns the frame; an image is grey where its argument is false.
-    """
-
-    stamp_ns: int
-    simulate: Callable[[bool], Frame]
-
-    def load(self, *, colour: bool = True) -> Frame:
-        """Return the frame."""
-        return self.simulate(colour)
-
-    def scan(self) -> Scan:
-        """Return the frame's returns."""
-        return self.simulate(False).scan()
 
 
 def synthetic_log(
@@ -116,7 +95,7 @@ def synthetic_log(
         kind="synthetic",
         sensor=sensor,
         stamps_ns=truth.stamps_ns,
-        entry_at=lambda index: SyntheticEntry(int(truth.stamps_ns[index]), partial(simulate, index)),
+        entry_at=lambda index: LazyFrame(int(truth.stamps_ns[index]), partial(simulate, index)),
         truth=truth,
         wheels=wheels,
         gyroscope=gyroscope,

@@ -104,13 +104,21 @@ class FrameRef(Protocol):
         ...
 
 
-class EntryWithoutFiles:
-    """Part of entries of scans, and of images that are in no file: all was measured at the stamp."""
+@dataclass(frozen=True, slots=True)
+class LazyFrame:
+    """Frame that a function reads, without image files; see :class:`FrameRef`. All was measured at the stamp.
 
-    __slots__ = ()
+    Attributes:
+        stamp_ns: Time of the frame, nanoseconds.
+        read: Returns the frame. Where its argument is false an image may be grey, and a scan has neither
+            colours nor intensities. It raises ``FrameError`` if the frame cannot be used.
+    """
+
+    stamp_ns: int
+    read: Callable[[bool], Frame]
 
     @property
-    def depth_stamp_ns(self: FrameRef) -> int:
+    def depth_stamp_ns(self) -> int:
         """Time of the frame, nanoseconds."""
         return self.stamp_ns
 
@@ -118,6 +126,22 @@ class EntryWithoutFiles:
     def files(self) -> None:
         """None, for there are none."""
         return None
+
+    def load(self, *, colour: bool = True) -> Frame:
+        """Read the frame.
+
+        Raises:
+            FrameError: It cannot be used.
+        """
+        return self.read(colour)
+
+    def scan(self) -> Scan:
+        """Read the returns alone.
+
+        Raises:
+            FrameError: As ``load``.
+        """
+        return self.read(False).scan()
 
 
 @dataclass(frozen=True, slots=True)

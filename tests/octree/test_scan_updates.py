@@ -20,7 +20,7 @@ from mapper.octree.scan_updates import ScanUpdateWriter, decompress, displacemen
 from mapper.runtime.progress import SILENT
 from mapper.simulation import CameraSimulator
 from mapper.simulation.config import SynthConfig
-from mapper.sources.base import EntryWithoutFiles
+from tests.support.logs import EntryWithoutFiles
 
 FRAMES = 16
 CONFIG = overridden(BuildConfig(), ["cloud.frame_stride=1000", "mcap.image_stride=0", "workers=0"])

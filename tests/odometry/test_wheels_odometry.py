@@ -24,9 +24,8 @@ from mapper.simulation import CameraSimulator, make_scene, write_tum_log
 from mapper.simulation.config import SynthConfig, SynthWheelsConfig
 from mapper.simulation.lidar import LidarSimulator
 from mapper.sources import open_source
-from mapper.sources.base import EntryWithoutFiles
 from mapper.sources.multi_session_log import chained
-from tests.support.logs import CountedReads
+from tests.support.logs import CountedReads, EntryWithoutFiles
 from tests.support.paths import CONFIGS
 from tests.support.wheeled_worlds import EXACT, FLAT, STREET_ON_WHEELS
 

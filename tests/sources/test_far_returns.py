@@ -18,7 +18,7 @@ from mapper.sources.ros.cloud_messages import scan_from
 from mapper.sources.ros.decode_ros import decode_ros
 from mapper.sources.ros.encode_ros import cloud_message
 from mapper.sources.ros.recording import Topic
-from mapper.sources.scan_folders.scans import ScanEntry
+from mapper.sources.scan_folders.scans import read_scan
 from mapper.sources.valid_returns import FARTHEST_M
 from tests.support.clouds import save_cloud
 
@@ -35,7 +35,7 @@ def test_far_returns_of_a_file_are_left_out_and_counted(tmp_path, ending):
         points[40] = 1e30, -1e30, 1.0
     path = tmp_path / f"1{ending}"
     save_cloud(path, points)
-    scan = ScanEntry(0, path).load()
+    scan = read_scan(path)
     far = np.linalg.norm(points.astype(np.float64), axis=1) >= FARTHEST_M
     assert scan.far_returns == far.sum() >= 1
     np.testing.assert_allclose(scan.points_body, points[~far], atol=1e-4)
@@ -51,13 +51,13 @@ def test_times_and_colours_stay_with_their_points(tmp_path):
     points["red"] = np.arange(100)
     points["x"][30] = 7000.0
     np.save(tmp_path / "1.npy", points)
-    scan = ScanEntry(0, tmp_path / "1.npy").load()
+    scan = read_scan(tmp_path / "1.npy")
     assert scan.far_returns == 1
     np.testing.assert_array_equal(scan.colors[:, 0], np.delete(np.arange(100), 30))
     np.testing.assert_allclose(scan.times_s, np.delete(points["t"], 30), atol=1e-6)
     np.save(tmp_path / "2.npy", sweep(100) * 1000.0 + 1e4)
     with pytest.raises(FrameError, match=r"2\.npy: 100 of 100 points are farther than 5000 m"):
-        ScanEntry(0, tmp_path / "2.npy", scale=1.0).load()
+        read_scan(tmp_path / "2.npy", scale=1.0)
 
 
 def test_far_returns_of_a_message_are_left_out_and_counted():
@@ -74,7 +74,7 @@ def test_a_cloud_of_the_other_order_of_bytes_is_refused(tmp_path):
     points = sweep().byteswap()
     np.save(tmp_path / "1.npy", points)
     with pytest.raises(FrameError, match="points are farther than 5000 m"):
-        ScanEntry(0, tmp_path / "1.npy", scale=1.0).load()
+        read_scan(tmp_path / "1.npy", scale=1.0)
     data = memoryview(
         cloud_message("/points", Scan(0, points[np.isfinite(points).all(axis=1)]), frame="a").cdr
     )

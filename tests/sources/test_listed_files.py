@@ -12,7 +12,7 @@ from mapper.runtime import regular_files
 from mapper.sources import open_source
 from mapper.sources.config import SourceConfig
 from mapper.sources.inspection import inspect_log
-from mapper.sources.scan_folders.clouds import read_scan
+from mapper.sources.scan_folders.scans import read_scan
 from mapper.sources.writers import write_log
 from tests.support.tum_logs import copy_numbered
 

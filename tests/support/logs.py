@@ -7,7 +7,19 @@ from typing import Any
 import numpy as np
 
 from mapper.core.errors import FrameError
-from mapper.sources.base import EntryWithoutFiles, Log
+from mapper.sources.base import FrameRef, Log
+
+
+class EntryWithoutFiles:
+    """Part of entries whose whole frame was measured at the stamp."""
+
+    @property
+    def depth_stamp_ns(self: FrameRef) -> int:
+        return self.stamp_ns
+
+    @property
+    def files(self) -> None:
+        return None
 
 
 @dataclass(frozen=True)

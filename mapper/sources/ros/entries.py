@@ -1,4 +1,4 @@
-"""Frames of a recording that have not been read yet; see :class:`mapper.sources.base.Entry`."""
+"""Frames of a recording that have not been read yet; see :class:`mapper.sources.base.FrameRef`."""
 
 from dataclasses import dataclass, replace
 from functools import partial
@@ -7,7 +7,7 @@ import numpy as np
 
 from mapper.core.errors import DataError, FrameError
 from mapper.core.frames import DepthImage, Image, Scan
-from mapper.sources.base import EntryWithoutFiles, ImageFiles
+from mapper.sources.base import ImageFiles, LazyFrame
 from mapper.sources.image_files.decoded import DecodedColour, DecodedDepth
 from mapper.sources.image_files.image_sizes import RecordedCamera
 from mapper.sources.image_folders.rgbd import RgbdEntry
@@ -136,11 +136,15 @@ def _file_of(message: ImageMessage) -> bytes | None:
     return bytes(message.data) if isinstance(message, FileMessage) else None
 
 
-@dataclass(frozen=True, slots=True)
-class CloudEntry(EntryWithoutFiles):
-    """Point cloud message, not read yet.
+def cloud_entry(
+    cloud: Located, body: str, tree: FrameTree, *, scale: float | None = None, is_planar: bool = False
+) -> LazyFrame:
+    """Return the entry of a point cloud message, with the time of each point where the message has it.
 
-    Attributes:
+    It cannot be read if the message is damaged, its points have no x, y and z, or tf does not tie their frame
+    to the body's.
+
+    Args:
         cloud: The message.
         body: Coordinate frame of the scan.
         tree: Coordinate frames that tie each message's own frame to the body's.
@@ -148,52 +152,24 @@ class CloudEntry(EntryWithoutFiles):
         is_planar: They are of a 2D laser.
     """
 
-    cloud: Located
-    body: str
-    tree: FrameTree
-    scale: float | None = None
-    is_planar: bool = False
-
-    @property
-    def stamp_ns(self) -> int:
-        """Return the cloud's time."""
-        return self.cloud.stamp_ns
-
-    def load(self, *, colour: bool = True) -> Scan:
-        """Read the cloud, with the time of each point where the message has it.
-
-        Raises:
-            FrameError: The message is damaged, its points have no x, y and z, or tf does not tie their frame
-                to the body's.
-        """
-        message = self.cloud.read()
+    def read(colour: bool) -> Scan:
+        message = cloud.read()
         if not isinstance(message, CloudMessage):
-            raise FrameError(f"{self.cloud}: {self.cloud.topic.type} is no point cloud")
-        message = replace(message, stamp_ns=self.cloud.stamp_ns)
+            raise FrameError(f"{cloud}: {cloud.topic.type} is no point cloud")
+        message = replace(message, stamp_ns=cloud.stamp_ns)
         frame = frame_of(message)
-        T_body_frame = self.tree.find(self.body, frame, stamp_ns=self.stamp_ns)
+        T_body_frame = tree.find(body, frame, stamp_ns=cloud.stamp_ns)
         if T_body_frame is None:
-            when = "" if self.tree.find(self.body, frame) is None else " at that time"
+            when = "" if tree.find(body, frame) is None else " at that time"
             raise FrameError(
-                f"{self.cloud}: its points are in frame {frame}, which tf does not connect to "
-                f"{self.body}{when}"
+                f"{cloud}: its points are in frame {frame}, which tf does not connect to {body}{when}"
             )
         scan = scan_from(
-            message,
-            T_body_frame=T_body_frame,
-            with_colours=colour,
-            where=f"{self.cloud}",
-            scale=self.scale,
+            message, T_body_frame=T_body_frame, with_colours=colour, where=f"{cloud}", scale=scale
         )
-        if frame != self.body and is_fixed(frame):
+        if frame != body and is_fixed(frame):
             # Where the sensor was is not stated; what turned its points into that frame has deskewed them.
             scan = replace(scan, origin_body=np.zeros(3), times_s=None)
-        return planar(scan) if self.is_planar else scan
+        return planar(scan) if is_planar else scan
 
-    def scan(self) -> Scan:
-        """Read the cloud without its colours.
-
-        Raises:
-            FrameError: As ``load``.
-        """
-        return self.load(colour=False)
+    return LazyFrame(cloud.stamp_ns, read)

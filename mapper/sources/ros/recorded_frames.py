@@ -22,7 +22,7 @@ from mapper.sources.image_folders.rgbd import RgbdEntry
 from mapper.sources.laser_scan import MAX_TILT_RAD, tilt_rad
 from mapper.sources.point_times import are_on_own_clock, counted_on, relative_times_s, time_field
 from mapper.sources.ros.cameras import calibrate
-from mapper.sources.ros.entries import CloudEntry, Located, read_image, rgbd_entry, stereo_entry
+from mapper.sources.ros.entries import Located, cloud_entry, read_image, rgbd_entry, stereo_entry
 from mapper.sources.ros.frame_tree import is_fixed
 from mapper.sources.ros.image_messages import has_float_depth, size_of
 from mapper.sources.ros.message_index import Series, why_unread
@@ -191,7 +191,8 @@ def lidar_frames(reader: RecordingReader, clouds: Series, config: SourceConfig) 
         notes.append(f"points are in {body}, whose z looks forward; source.body_frame can take another")
 
     def entry_at(index: int) -> FrameRef:
-        return CloudEntry(reader.located(clouds, int(i[index])), body, tree, config.cloud_scale, is_planar)
+        cloud = reader.located(clouds, int(i[index]))
+        return cloud_entry(cloud, body, tree, scale=config.cloud_scale, is_planar=is_planar)
 
     is_apart = np.array([reader.tree.find(body, one) is None for one in clouds.frames], np.bool_)
     if is_apart.any():

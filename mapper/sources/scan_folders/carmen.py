@@ -18,7 +18,7 @@ from mapper.core.geometry import Array, Transform, inverse, planar_motion
 from mapper.core.timebase import ns_from_seconds_text
 from mapper.core.trajectory import Trajectory
 from mapper.runtime.regular_files import read_text
-from mapper.sources.base import EntryWithoutFiles, Log
+from mapper.sources.base import LazyFrame, Log
 from mapper.sources.config import SourceConfig
 from mapper.sources.laser_scan import MOST_RAD, beam_points, planar_scan, rolling
 from mapper.sources.text import time_order
@@ -118,39 +118,22 @@ def read_log(path: Path, config: SourceConfig) -> Log:  # noqa: ARG001
         kind="carmen",
         sensor="lidar-2d",
         stamps_ns=np.array([line.stamp_ns for line in scans]),
-        entry_at=lambda index: CarmenEntry(scans[index], T_robot_laser, limit_m),
+        entry_at=lambda index: LazyFrame(
+            scans[index].stamp_ns, lambda _: _scan_of(scans[index], T_robot_laser, limit_m)
+        ),
         truth=true_poses,
         wheels=wheels,
         notes=[*notes, *order_notes, *mounting_notes, *wheel_notes, *still_notes, *truth_notes],
     )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class CarmenEntry(EntryWithoutFiles):
-    """Scan of a laser's line; see :class:`mapper.sources.base.FrameRef`."""
-
-    line: _Line
-    T_robot_laser: Transform
-    limit_m: float
-
-    @property
-    def stamp_ns(self) -> int:
-        """Time of the scan."""
-        return self.line.stamp_ns
-
-    def load(self, *, colour: bool = True) -> Scan:  # noqa: ARG002
-        """Return the scan."""
-        line = self.line
-        # A reading of the largest range is none, whatever the digits that are written.
-        limits_m = 0.0, min(line.max_m - _LAST_DIGIT_M, self.limit_m)
-        points, _ = beam_points(
-            line.ranges_m, first_rad=line.first_rad, step_rad=line.step_rad, limits_m=limits_m
-        )
-        return planar_scan(line.stamp_ns, points, self.T_robot_laser)
-
-    def scan(self) -> Scan:
-        """Return the same."""
-        return self.load()
+def _scan_of(line: _Line, T_robot_laser: Transform, limit_m: float) -> Scan:
+    # A reading of the largest range is none, whatever the digits that are written.
+    limits_m = 0.0, min(line.max_m - _LAST_DIGIT_M, limit_m)
+    points, _ = beam_points(
+        line.ranges_m, first_rad=line.first_rad, step_rad=line.step_rad, limits_m=limits_m
+    )
+    return planar_scan(line.stamp_ns, points, T_robot_laser)
 
 
 def _laser_line(number: int, words: Sequence[str]) -> _Line:

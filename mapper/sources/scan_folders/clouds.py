@@ -3,7 +3,6 @@
 from pathlib import Path
 
 from mapper.core.errors import SourceError
-from mapper.core.frames import Scan
 from mapper.sources.base import Log
 from mapper.sources.cloud_files.pcd import viewpoint_note
 from mapper.sources.config import SourceConfig
@@ -14,7 +13,6 @@ from mapper.sources.scan_folders.scan_folder import (
     most_clouds,
     scan_log,
 )
-from mapper.sources.scan_folders.scans import ScanEntry
 from mapper.sources.scan_stamps import stamps_list
 
 TRUTH_FILES = ("groundtruth.txt", "poses.txt")
@@ -55,7 +53,7 @@ def read_log(path: Path, config: SourceConfig) -> Log:
         raise SourceError(f"{folder}: no cloud matches source.pattern={config.pattern}")
     if files[-1].suffix == ".pcd":
         notes = [*notes, *viewpoint_note(files[-1])]
-    return scan_log(
+    log, _ = scan_log(
         path,
         files,
         kind="clouds",
@@ -64,20 +62,7 @@ def read_log(path: Path, config: SourceConfig) -> Log:
         config=config,
         notes=[*notes, *refused],
     )
-
-
-def read_scan(path: Path, *, scale: float | None = None, bin_columns: int | None = None) -> Scan:
-    """Return the cloud of one file as a scan at time zero.
-
-    Args:
-        path: A file of one of ``cloud_files.ENDINGS``.
-        scale: Metres per unit of the file; None is 1, and refuses what looks like millimetres.
-        bin_columns: Numbers of a record in a .bin file; None is KITTI's four, and refuses others.
-
-    Raises:
-        FrameError: The file is missing, damaged, empty or not in metres around the sensor.
-    """
-    return ScanEntry(0, path, scale, bin_columns).load()
+    return log
 
 
 def _folders(path: Path) -> list[Path]:

@@ -16,7 +16,7 @@ from mapper.core.rotations import pose_of_row
 from mapper.core.timebase import GPS_EPOCH_S, NS_PER_S, Stamps
 from mapper.runtime.atomic import atomic_file
 from mapper.runtime.extras import extra, require
-from mapper.sources.base import EntryWithoutFiles, Log
+from mapper.sources.base import LazyFrame, Log
 from mapper.sources.cloud_files.parsing import MIN_POINTS
 from mapper.sources.config import SourceConfig
 from mapper.sources.listed_files import refuse_links_out
@@ -53,13 +53,18 @@ def read_log(path: Path, config: SourceConfig) -> Log:
     order, order_notes = time_order(stamps_ns, what="scans")
     posed = [(int(stamps_ns[i]), stations[i].T_world_scanner) for i in order]
     poses, pose_notes = truth_from(posed, what="poses")
+
+    def entry_at(index: int) -> LazyFrame:
+        stamp_ns, station = int(stamps_ns[order[index]]), stations[int(order[index])]
+        return LazyFrame(stamp_ns, lambda colour: _read(station, stamp_ns, colour=colour))
+
     return Log(
         path=path,
         name=path.resolve().stem,
         kind="e57",
         sensor="lidar",
         stamps_ns=stamps_ns[order],
-        entry_at=lambda index: _StationEntry(int(stamps_ns[order[index]]), stations[int(order[index])]),
+        entry_at=entry_at,
         device_poses=poses,
         notes=[*notes, *order_notes, *(pose_notes if poses is not None else [])],
     )
@@ -75,51 +80,36 @@ class _Station:
     T_world_scanner: Transform | None
 
 
-@dataclass(frozen=True, slots=True)
-class _StationEntry(EntryWithoutFiles):
-    """Scan that has not been read yet."""
+def _read(station: _Station, stamp_ns: int, *, colour: bool) -> Scan:
+    """Read a scan, in the scanner's frame.
 
-    stamp_ns: int
-    station: _Station
-
-    def load(self, *, colour: bool = True) -> Scan:
-        """Read the scan, in the scanner's frame.
-
-        Raises:
-            FrameError: It is damaged, or has too few points within reach.
-        """
-        where = f"{self.station.path}: scan {self.station.index}"
-        with _opened(self.station.path, FrameError) as file:
-            fields = file.read_scan(
-                self.station.index,
-                intensity=colour,
-                colors=colour,
-                transform=False,
-                ignore_missing_fields=True,
-            )
-        points, rows, far = valid_returns(_points(fields))
-        if len(points) < MIN_POINTS:
-            raise FrameError(
-                f"{where}: {len(points)} points, {far} others are farther than {FARTHEST_M:g} m; want "
-                f"{MIN_POINTS}"
-            )
-        kept = slice(None) if rows is None else rows
-        has_colours = all(name in fields for name in _RGB)
-        return Scan(
-            self.stamp_ns,
-            points,
-            colors=np.column_stack([fields[name][kept] for name in _RGB]) if has_colours else None,
-            far_returns=far,
-            intensities=fields["intensity"][kept] if "intensity" in fields else None,
+    Raises:
+        FrameError: It is damaged, or has too few points within reach.
+    """
+    where = f"{station.path}: scan {station.index}"
+    with _opened(station.path, FrameError) as file:
+        fields = file.read_scan(
+            station.index,
+            intensity=colour,
+            colors=colour,
+            transform=False,
+            ignore_missing_fields=True,
         )
-
-    def scan(self) -> Scan:
-        """Read the scan without colours and intensities.
-
-        Raises:
-            FrameError: As ``load``.
-        """
-        return self.load(colour=False)
+    points, rows, far = valid_returns(_points(fields))
+    if len(points) < MIN_POINTS:
+        raise FrameError(
+            f"{where}: {len(points)} points, {far} others are farther than {FARTHEST_M:g} m; want "
+            f"{MIN_POINTS}"
+        )
+    kept = slice(None) if rows is None else rows
+    has_colours = all(name in fields for name in _RGB)
+    return Scan(
+        stamp_ns,
+        points,
+        colors=np.column_stack([fields[name][kept] for name in _RGB]) if has_colours else None,
+        far_returns=far,
+        intensities=fields["intensity"][kept] if "intensity" in fields else None,
+    )
 
 
 def _files(path: Path) -> list[Path]:

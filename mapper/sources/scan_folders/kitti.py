@@ -7,6 +7,7 @@ are the camera's; else they are the LiDAR's own. Raw recordings (Geiger et al. 2
 camera's images colour the cloud.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -32,7 +33,6 @@ from mapper.sources.kitti_calibration import (
 )
 from mapper.sources.listed_files import refuse_links_out
 from mapper.sources.scan_folders.scan_folder import clouds_in, first_of, most_clouds, scan_log
-from mapper.sources.scan_folders.scans import ScanEntry
 from mapper.sources.scan_stamps import stamps_list
 
 _ALONG_Z_RATIO = 0.9
@@ -58,18 +58,18 @@ def read_log(path: Path, config: SourceConfig) -> Log:
         names = ", ".join(str(folder.relative_to(path)) for folder in sequences)
         raise SourceError(f"{path}: holds {len(sequences)} sequences; open one of {names}")
     sequence = sequences[0]
-    scans = _scans(sequence)
-    files, notes = clouds_in(scans, config.pattern)
+    folder = _scans(sequence)
+    files, notes = clouds_in(folder, config.pattern)
     if not files:
         raise SourceError(f"{sequence}: no scan matches source.pattern={config.pattern}")
     at = sequence.resolve()
     mounting = read_matrix(calibration := sequence / "calib.txt", "Tr", 3, 4)
     T_camera_lidar = None if mounting is None else rigid_motion(mounting, f"{calibration}: Tr")
-    log = scan_log(
+    log, scans = scan_log(
         sequence,
         files,
         kind="kitti",
-        stamps_file=stamps_list([sequence, scans.parent]),
+        stamps_file=stamps_list([sequence, folder.parent]),
         truth_file=first_of(
             [sequence, at.parent.parent / "poses"], ["poses.txt", f"{at.name}.txt", "groundtruth.txt"]
         ),
@@ -79,7 +79,7 @@ def read_log(path: Path, config: SourceConfig) -> Log:
     )
     if T_camera_lidar is None and log.truth is not None and _moves_as_a_camera(log.truth):
         log = replace(log, notes=[*log.notes, _CAMERAS_NOTE])
-    return with_images(log, sequence)
+    return with_images(log, sequence, scans)
 
 
 def _moves_as_a_camera(truth: Trajectory) -> bool:
@@ -107,7 +107,7 @@ _FOLDERS = ("image_2", "image_02/data")
 _ENDINGS = {".png", ".jpg"}
 
 
-def with_images(log: Log, sequence: Path) -> Log:
+def with_images(log: Log, sequence: Path, scans: Sequence[Path]) -> Log:
     """Return the log with the images of the left colour camera that are named as scans.
 
     They are taken at the times of their scans: the LiDAR triggers the camera when it looks forward.
@@ -119,8 +119,8 @@ def with_images(log: Log, sequence: Path) -> Log:
     if folder is None:
         return log
     by_stem = {path.stem: path for path in sorted(folder.iterdir()) if path.suffix.lower() in _ENDINGS}
-    scans = (entry for entry in log.entries() if isinstance(entry, ScanEntry))
-    paired = [(scan.stamp_ns, by_stem[scan.path.stem]) for scan in scans if scan.path.stem in by_stem]
+    stamped = zip(log.stamps_ns.tolist(), scans, strict=True)
+    paired = [(stamp_ns, by_stem[scan.stem]) for stamp_ns, scan in stamped if scan.stem in by_stem]
     if not paired:
         why = f"images that are not used, as none has the name of a scan: {folder}"
         return replace(log, notes=[*log.notes, why])

@@ -9,14 +9,14 @@ from numpy.typing import NDArray
 from mapper.core.errors import FrameError, SourceError
 from mapper.core.geometry import Array
 from mapper.core.timebase import NS_PER_S
-from mapper.sources.base import Log
+from mapper.sources.base import LazyFrame, Log
 from mapper.sources.cloud_files.las import LAS_ENDINGS, LasExtent, las_extent, read_las, read_times_s
 from mapper.sources.cloud_files.parsing import MAX_RANGE_M, MIN_POINTS, Columns
 from mapper.sources.config import SourceConfig
 from mapper.sources.image_folders.tum import read_truth
 from mapper.sources.listed_files import refuse_links_out
 from mapper.sources.point_times import MAX_SWEEP_S, counted_on
-from mapper.sources.scan_folders.scans import ScanEntry
+from mapper.sources.scan_folders.scans import read_scan
 from mapper.sources.scan_frame import scan_frame_warnings
 from mapper.sources.text import time_order
 
@@ -64,7 +64,7 @@ def read_log(path: Path, config: SourceConfig) -> Log:
     files = _files(path)
     if path.is_dir():
         refuse_links_out(files, log=path)
-    entries: list[ScanEntry] = []
+    sweeps: list[_Sweep] = []
     sweep_s, turns = config.sweep_s, False
     try:
         for file in files:
@@ -72,23 +72,31 @@ def read_log(path: Path, config: SourceConfig) -> Log:
             if sweep_s is None:
                 turn_s = _turn_s(file, times)
                 sweep_s, turns = turn_s or _SWEEP_S, turn_s is not None
-            entries += _sweeps(file, times, sweep_s, config.cloud_scale)
+            sweeps += _sweeps(file, times, sweep_s)
     except (FrameError, OSError) as error:
         raise SourceError(f"{error}") from None
-    if not entries:
+    if not sweeps:
         raise SourceError(f"{path}: no sweep of {sweep_s:g} s has {MIN_POINTS} points")
-    stamps_ns = np.array([entry.stamp_ns for entry in entries], np.int64)
+    stamps_ns = np.array([sweep.stamp_ns for sweep in sweeps], np.int64)
     order, notes = time_order(stamps_ns, what="sweeps")
     truth_file = path / (config.truth_file or "groundtruth.txt")
     truth, truth_notes = read_truth(truth_file) if truth_file.is_file() else (None, [])
     how = "as its points turn" if turns else "source.sweep_s"
+
+    def entry_at(index: int) -> LazyFrame:
+        file, stamp_ns, rows = sweeps[int(order[index])]
+        return LazyFrame(
+            stamp_ns,
+            lambda colour: read_scan(file, stamp_ns, colour=colour, scale=config.cloud_scale, rows=rows),
+        )
+
     log = Log(
         path=path,
         name=path.resolve().stem,
         kind="las-strip",
         sensor="lidar",
         stamps_ns=stamps_ns[order],
-        entry_at=lambda index: entries[int(order[index])],
+        entry_at=entry_at,
         truth=truth,
         choices=[f"cut into sweeps of {sweep_s:g} s ({how})"],
         notes=[*notes, *truth_notes],
@@ -164,7 +172,15 @@ def _away_m(extent: LasExtent) -> float:
     return max(0.0, *extent.low, *(-high for high in extent.high))
 
 
-def _sweeps(path: Path, times: _Times, sweep_s: float, scale: float | None) -> list[ScanEntry]:
+class _Sweep(NamedTuple):
+    """Sweep of a strip: its file, its time, its first point and the one after its last."""
+
+    path: Path
+    stamp_ns: int
+    rows: tuple[int, int]
+
+
+def _sweeps(path: Path, times: _Times, sweep_s: float) -> list[_Sweep]:
     """Return the sweeps that have enough points; after a pause the next one begins with its first point.
 
     Raises:
@@ -177,16 +193,16 @@ def _sweeps(path: Path, times: _Times, sweep_s: float, scale: float | None) -> l
             "sort them by gps_time"
         )
     zero_ns = round(times.zero_s * NS_PER_S)
-    entries, row, begin_s = [], 0, 0.0
+    sweeps, row, begin_s = [], 0, 0.0
     while row < len(latest_s):
         end = int(np.searchsorted(latest_s, begin_s + sweep_s - _ROUNDING_S))
         if end - row >= MIN_POINTS:
-            entries.append(ScanEntry(zero_ns + round(begin_s * NS_PER_S), path, scale, rows=(row, end)))
+            sweeps.append(_Sweep(path, zero_ns + round(begin_s * NS_PER_S), (row, end)))
         row, begin_s = end, begin_s + sweep_s
         if row < len(latest_s) and latest_s[row] >= begin_s + sweep_s:
             begin_s = float(latest_s[row])
-    counts = [end - begin for begin, end in (entry.rows or (0, 0) for entry in entries)]
-    return entries[:-1] if counts and counts[-1] < _LEAST_SHARE * np.median(counts) else entries
+    counts = [end - begin for _, _, (begin, end) in sweeps]
+    return sweeps[:-1] if counts and counts[-1] < _LEAST_SHARE * np.median(counts) else sweeps
 
 
 def _turn_s(path: Path, times: _Times) -> float | None:

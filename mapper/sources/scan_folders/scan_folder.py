@@ -12,13 +12,13 @@ from mapper.core.errors import FrameError, SourceError
 from mapper.core.geometry import Transform, inverse, spread_indices
 from mapper.core.timebase import NS_PER_S, Stamps
 from mapper.core.trajectory import Trajectory
-from mapper.sources.base import Log
+from mapper.sources.base import LazyFrame, Log
 from mapper.sources.cloud_files import EMPTY, ENDINGS, why_no_points
 from mapper.sources.cloud_files.las import LAS_ENDINGS, first_time_s
 from mapper.sources.config import SourceConfig
 from mapper.sources.image_folders.tum import read_truth
 from mapper.sources.listed_files import refuse_links_out
-from mapper.sources.scan_folders.scans import ScanEntry
+from mapper.sources.scan_folders.scans import read_scan
 from mapper.sources.scan_stamps import in_order, line_of_each, scan_stamps
 from mapper.sources.text import time_order, truth_from
 from mapper.sources.trajectory_files import read_kitti, tum_rows
@@ -83,8 +83,8 @@ def scan_log(
     config: SourceConfig,
     T_posed_lidar: Transform | None = None,
     notes: Iterable[str] = (),
-) -> Log:
-    """Return the log of some clouds, in time order.
+) -> tuple[Log, list[Path]]:
+    """Return the log of some clouds, and these in time order.
 
     Args:
         path: Folder that was opened.
@@ -113,18 +113,32 @@ def scan_log(
         _chosen(path, config.truth_file) or truth_file, files, stamps_ns, T_posed_lidar
     )
     order, order_notes = time_order(stamps_ns, what="scans")
-    return Log(
+    ordered = [files[k] for k in order]
+
+    def entry_at(index: int) -> LazyFrame:
+        stamp_ns = int(stamps_ns[order[index]])
+        return LazyFrame(
+            stamp_ns,
+            lambda colour: read_scan(
+                ordered[index],
+                stamp_ns,
+                colour=colour,
+                scale=config.cloud_scale,
+                bin_columns=config.bin_columns,
+            ),
+        )
+
+    log = Log(
         path=path,
         name=path.resolve().name,
         kind=kind,
         sensor="lidar",
         stamps_ns=stamps_ns[order],
-        entry_at=lambda index: ScanEntry(
-            int(stamps_ns[order[index]]), files[order[index]], config.cloud_scale, config.bin_columns
-        ),
+        entry_at=entry_at,
         truth=truth,
         notes=[*notes, *stamp_notes, *order_notes, *truth_notes],
     )
+    return log, ordered
 
 
 def _las_stamps(files: Sequence[Path]) -> Stamps | None:

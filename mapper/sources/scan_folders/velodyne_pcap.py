@@ -2,7 +2,6 @@
 
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
 from ipaddress import ip_address
 from itertools import islice
 from pathlib import Path
@@ -12,7 +11,7 @@ import numpy as np
 
 from mapper.core.errors import DataError, FrameError, SourceError
 from mapper.core.frames import Scan
-from mapper.sources.base import EntryWithoutFiles, Log
+from mapper.sources.base import LazyFrame, Log
 from mapper.sources.captures import ENDINGS, Datagram, captured, first_datagrams
 from mapper.sources.config import SourceConfig
 from mapper.sources.ros.cloud_messages import scan_from
@@ -27,7 +26,10 @@ _MAKERS = {b"\xee\xff": "a Hesai's", b"\x55\xaa": "a RoboSense's"}
 
 
 class _Turn(NamedTuple):
-    """Packets of a turn: where they begin, how many were captured until its last, how many are its own."""
+    """Packets of a turn: where they begin, how many were captured until its last, how many are its own.
+
+    Its time is its last packet's.
+    """
 
     offset: int
     captured: int
@@ -67,55 +69,40 @@ def read_log(path: Path, config: SourceConfig) -> Log:
         notes.append(f"{len(turns) - len(whole)} of {len(turns)} turns are cut; left out")
     stamps_ns = np.array([turn.stamp_ns for turn in whole], np.int64)
     order, order_notes = time_order(stamps_ns, what=path.name)
+
+    def entry_at(index: int) -> LazyFrame:
+        turn = whole[int(order[index])]
+        return LazyFrame(
+            turn.stamp_ns, lambda colour: _read(path, sender, turn, config.cloud_scale, colour=colour)
+        )
+
     return Log(
         path=path,
         name=path.resolve().stem,
         kind="velodyne-pcap",
         sensor="lidar",
         stamps_ns=stamps_ns[order],
-        entry_at=lambda index: _TurnEntry(path, sender, whole[int(order[index])], config.cloud_scale),
+        entry_at=entry_at,
         notes=[*notes, *order_notes],
     )
 
 
-@dataclass(frozen=True, slots=True)
-class _TurnEntry(EntryWithoutFiles):
-    """Turn that has not been read yet; the body is the LiDAR."""
+def _read(path: Path, sender: bytes, turn: _Turn, scale: float | None, *, colour: bool) -> Scan:
+    """Read and decode the packets of a turn; the body is the LiDAR.
 
-    path: Path
-    sender: bytes
-    turn: _Turn
-    scale: float | None
-
-    @property
-    def stamp_ns(self) -> int:
-        """Return the time of the last packet."""
-        return self.turn.stamp_ns
-
-    def load(self, *, colour: bool = True) -> Scan:
-        """Read and decode the packets.
-
-        Raises:
-            FrameError: They are damaged, or the file has changed.
-        """
-        where = f"{self.path}: turn at {self.stamp_ns}"
-        turn = islice(_captured(self.path, self.turn.offset), self.turn.captured)
-        packets = [packet for _, packet in turn if packet is not None and packet.sender == self.sender]
-        received_ns = np.array([packet.received_ns for packet in packets], np.int64)
-        try:
-            points = decode_packets([packet.payload for packet in packets], received_ns, self.stamp_ns)
-        except DataError as error:
-            raise FrameError(f"{where}: {error}") from None
-        message = CloudMessage(self.stamp_ns, "", points)
-        return scan_from(message, T_body_frame=np.eye(4), with_colours=colour, where=where, scale=self.scale)
-
-    def scan(self) -> Scan:
-        """Read and decode the packets.
-
-        Raises:
-            FrameError: As ``load``.
-        """
-        return self.load()
+    Raises:
+        FrameError: They are damaged, or the file has changed.
+    """
+    where = f"{path}: turn at {turn.stamp_ns}"
+    found = islice(_captured(path, turn.offset), turn.captured)
+    packets = [packet for _, packet in found if packet is not None and packet.sender == sender]
+    received_ns = np.array([packet.received_ns for packet in packets], np.int64)
+    try:
+        points = decode_packets([packet.payload for packet in packets], received_ns, turn.stamp_ns)
+    except DataError as error:
+        raise FrameError(f"{where}: {error}") from None
+    message = CloudMessage(turn.stamp_ns, "", points)
+    return scan_from(message, T_body_frame=np.eye(4), with_colours=colour, where=where, scale=scale)
 
 
 def _most_sent(path: Path) -> str:

@@ -17,7 +17,7 @@ from mapper.registration.hough.config import HoughGicpConfig
 from mapper.simulation.config import STREET, LidarSensorConfig
 from mapper.simulation.lidar import LidarSimulator
 from mapper.sources import open_source
-from mapper.sources.scan_folders.clouds import read_scan
+from mapper.sources.scan_folders.scans import read_scan
 from tests.support.command_line import mapper
 
 T_TURNED = exp(np.array([0.0, 0.0, 1.2]), np.array([3.0, -2.0, 0.0]))

@@ -8,7 +8,7 @@ from mapper.odometry.config import IsvdOdometryConfig, LocalMapConfig, WheelsOdo
 from mapper.odometry.factory import build_frame_odometry, build_odometry
 from mapper.odometry.renumbered_nodes import NodeOffset
 from mapper.sources import open_source
-from mapper.sources.base import EntryWithoutFiles
+from tests.support.logs import EntryWithoutFiles
 
 CONFIGS = {"local-map": LocalMapConfig(), "isvd": IsvdOdometryConfig(detector=OrbConfig())}
 

@@ -9,7 +9,7 @@ from pypcd4 import Encoding, PointCloud
 from mapper.core.errors import FrameError
 from mapper.sources.cloud_files import ENDINGS, read_cloud
 from mapper.sources.cloud_files.ply import read_ply
-from mapper.sources.scan_folders.clouds import read_scan
+from mapper.sources.scan_folders.scans import read_scan
 
 N = 60
 RNG = np.random.default_rng(3)
