@@ -20,7 +20,7 @@ from mapper.sources.calibration_file import read_calibration
 from mapper.sources.config import SourceConfig
 from mapper.sources.image_files.reading import read_grey
 from mapper.sources.image_folders.numbered import NumberedPair, stamped
-from mapper.sources.image_folders.posed import PosedFrame, PosedFrames, camera_of, pose_of_opengl
+from mapper.sources.image_folders.posed import PosedFrames, camera_of, pose_of_opengl
 from mapper.sources.image_folders.rgbd import first_size
 from mapper.sources.json_files import read_json
 from mapper.sources.listed_files import within
@@ -78,17 +78,14 @@ def read_frames(folder: Path, config: SourceConfig) -> PosedFrames:
     )
     if len(with_depth) < len(listed.frames):
         notes.append(f"{len(listed.frames) - len(with_depth)} frames of {_LIST} have no depth; left out")
-    frames = [
-        PosedFrame(pair.stamp_ns, pair.colour, pair.depth, pose_of_opengl(with_depth[i].transform_matrix))
-        for i, pair in zip(order, pairs, strict=True)
-    ]
+    poses = [pose_of_opengl(with_depth[i].transform_matrix) for i in order]
     scale = listed.integer_depth_scale
     if listed.camera_angle_x and not (listed.fl_x or with_depth[0].fl_x):
         stated = _camera_by_angles(listed, colours, f"{path}: camera_angle_x")
     else:
         stated = read_calibration(path)
     camera = camera_of(folder, config, stated)
-    return PosedFrames(frames, camera, 1.0 / scale if scale else MM_PER_M, notes)
+    return PosedFrames(pairs, poses, camera, 1.0 / scale if scale else MM_PER_M, notes)
 
 
 def _camera_by_angles(listed: _Transforms, images: Sequence[Path], origin: str) -> Calibration | None:

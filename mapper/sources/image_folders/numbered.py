@@ -17,7 +17,7 @@ from mapper.core.errors import SourceError
 from mapper.core.geometry import Transform
 from mapper.core.trajectory import Trajectory
 from mapper.core.units import MM_PER_M
-from mapper.sources.base import Log
+from mapper.sources.base import ImageFile, Log
 from mapper.sources.calibration import PRIMESENSE, SEVEN_SCENES
 from mapper.sources.calibration_file import calibration_files
 from mapper.sources.config import SourceConfig
@@ -43,7 +43,7 @@ class NumberedPair:
 
     number: int
     colour: Path
-    depth: Path
+    depth: ImageFile
     microseconds: int | None
 
 

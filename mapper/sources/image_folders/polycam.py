@@ -15,7 +15,6 @@ from mapper.sources.config import SourceConfig
 from mapper.sources.image_files.confidence import confident_depths
 from mapper.sources.image_folders.numbered import NumberedPair, stamped
 from mapper.sources.image_folders.posed import (
-    PosedFrame,
     PosedFrames,
     camera_of,
     median_camera,
@@ -85,12 +84,7 @@ def read_frames(folder: Path, config: SourceConfig) -> PosedFrames:
     refuse_links_out((keyframes / "confidence" / f"{path.stem}.png" for path in paths), log=folder)
     images = [keyframes / f"{prefix}images" / f"{path.stem}.jpg" for path in paths]
     numbers = [int(path.stem) if path.stem.isdecimal() else index for index, path in enumerate(paths)]
-    pairs, stamp_notes = stamped(
-        [NumberedPair(number, image, image, None) for number, image in zip(numbers, images, strict=True)],
-        rate_hz=config.rate_hz,
-    )
-    frames = [
-        PosedFrame(pair.stamp_ns, pair.colour, depth, pose_of_opengl(one.matrix()))
-        for pair, depth, one in zip(pairs, depths, cameras, strict=True)
-    ]
-    return PosedFrames(frames, camera, MM_PER_M, [*notes, *depth_notes, *stamp_notes])
+    numbered = [NumberedPair(*of_frame, None) for of_frame in zip(numbers, images, depths, strict=True)]
+    pairs, stamp_notes = stamped(numbered, rate_hz=config.rate_hz)
+    poses = [pose_of_opengl(one.matrix()) for one in cameras]
+    return PosedFrames(pairs, poses, camera, MM_PER_M, [*notes, *depth_notes, *stamp_notes])

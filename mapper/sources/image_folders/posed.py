@@ -13,7 +13,7 @@ import numpy as np
 
 from mapper.core.errors import SourceError
 from mapper.core.geometry import Array, Transform
-from mapper.sources.base import ImageFile, Log
+from mapper.sources.base import Log
 from mapper.sources.calibration import Calibration, configured
 from mapper.sources.config import SourceConfig
 from mapper.sources.image_folders.pairing import ordered_pairs
@@ -26,34 +26,19 @@ _STEADY_RATIO = 0.01
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PosedFrame:
-    """Frame of such a layout.
-
-    Attributes:
-        stamp_ns: Time of both images, nanoseconds.
-        colour: Colour image.
-        depth: Depth image.
-        T_world_camera: (4, 4) pose; None where there is none.
-    """
-
-    stamp_ns: int
-    colour: ImageFile
-    depth: ImageFile
-    T_world_camera: Transform | None
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class PosedFrames:
     """Frames of a log.
 
     Attributes:
-        frames: The frames, in any order.
+        pairs: Both images of each, in any order.
+        poses: Their T_world_camera; None where there is none.
         calibration: Camera of the colour images.
         depth_units_per_m: Units per metre of 16-bit depth images, where the calibration states none.
         notes: Sentences on what finding them left out or assumed.
     """
 
-    frames: Sequence[PosedFrame]
+    pairs: Sequence[FramePair]
+    poses: Sequence[Transform | None]
     calibration: Calibration
     depth_units_per_m: float
     notes: Sequence[str] = ()
@@ -94,10 +79,9 @@ def log_of(layout: Layout, path: Path, config: SourceConfig) -> Log:
         DependencyError: A library that decodes them is not installed.
     """
     found = layout.read(path, config)
-    frames, notes = _whole(found.frames, path)
-    pairs = [FramePair(frame.stamp_ns, frame.colour, frame.stamp_ns, frame.depth) for frame in frames]
-    ordered, order_notes = ordered_pairs(pairs, config, what=layout.kind, path=path)
-    poses = [(frame.stamp_ns, frame.T_world_camera) for frame in frames]
+    frames, notes = _whole(found, path)
+    ordered, order_notes = ordered_pairs([pair for pair, _ in frames], config, what=layout.kind, path=path)
+    poses = [(pair.stamp_ns, T_world_camera) for pair, T_world_camera in frames]
     stated, pose_notes = truth_from(poses, what=f"poses of {path.name}")
     log = rgbd_log(
         ordered,
@@ -154,19 +138,20 @@ def median_camera(
     return Calibration(origin, fx, fy, cx, cy, size_px=size_px), notes
 
 
-def _whole(frames: Sequence[PosedFrame], path: Path) -> tuple[Sequence[PosedFrame], list[str]]:
+def _whole(found: PosedFrames, path: Path) -> tuple[Sequence[tuple[FramePair, Transform | None]], list[str]]:
     """Return the frames whose image files exist, and a note on the others."""
+    frames = list(zip(found.pairs, found.poses, strict=True))
     if not frames:
         raise SourceError(f"{path}: no frame in it")
     missing = np.zeros(len(frames), bool)
-    for files in ([frame.colour for frame in frames], [frame.depth for frame in frames]):
+    for files in ([pair.colour for pair in found.pairs], [pair.depth for pair in found.pairs]):
         paths = {i: file for i, file in enumerate(files) if isinstance(file, Path)}
         missing[list(paths)] |= ~np.array(present(paths.values()), bool)
     whole = [frame for frame, is_missing in zip(frames, missing.tolist(), strict=True) if not is_missing]
     if not whole:
         raise SourceError(
             f"{path}: none of its {len(frames)} frames has both images; the first: "
-            f"{frames[0].colour}, {frames[0].depth}"
+            f"{found.pairs[0].colour}, {found.pairs[0].depth}"
         )
     left_out = len(frames) - len(whole)
     return whole, [f"{left_out} of {len(frames)} frames lack an image; left out"] if left_out else []

@@ -24,12 +24,12 @@ from mapper.sources.image_files.decoded import DecodedColour, DecodedDepth
 from mapper.sources.image_files.reading import TUM_UNITS_PER_M, bytes_of, decode_colour, decode_grey
 from mapper.sources.image_files.size import MOST_MEGAPIXELS
 from mapper.sources.image_folders.posed import (
-    PosedFrame,
     PosedFrames,
     camera_of,
     median_camera,
     pose_of_opengl,
 )
+from mapper.sources.image_folders.rgbd import FramePair
 from mapper.sources.json_files import parse_json
 from mapper.sources.listed_files import refuse_links_out
 from mapper.sources.scan_stamps import stamp_at
@@ -116,22 +116,23 @@ def read_frames(path: Path, config: SourceConfig) -> PosedFrames:
         if name.startswith("rgbd/") and name.endswith(".jpg") and name[5:-4].isdecimal()
     )
     has_confidence = any(name.endswith(".conf") for name in names)
-    frames = [
-        PosedFrame(
-            _stamp_ns(metadata, number),
+    with_depth = [number for number in numbers if f"rgbd/{number}.depth" in names]
+    pairs = [
+        FramePair(
+            (stamp_ns := _stamp_ns(metadata, number)),
             _colour(members, path, f"rgbd/{number}.jpg"),
+            stamp_ns,
             _depth(members, path, f"rgbd/{number}", metadata, f"rgbd/{number}.conf" in names),
-            _pose(metadata, number),
         )
-        for number in numbers
-        if f"rgbd/{number}.depth" in names
+        for number in with_depth
     ]
-    if len(frames) < len(numbers):
-        notes.append(f"{len(numbers) - len(frames)} of {len(numbers)} frames have no depth; left out")
+    if len(pairs) < len(numbers):
+        notes.append(f"{len(numbers) - len(pairs)} of {len(numbers)} frames have no depth; left out")
     if metadata.frameTimestamps is None:
         notes.append(f"metadata has no times of frames; its rate of {metadata.fps:g} a second is taken")
     return PosedFrames(
-        frames,
+        pairs,
+        [_pose(metadata, number) for number in with_depth],
         camera_of(path, config, stated),
         TUM_UNITS_PER_M,
         [*notes, *([NOTE] if has_confidence else [])],

@@ -8,7 +8,7 @@ from pathlib import Path
 from mapper.core.errors import SourceError
 from mapper.sources.config import SourceConfig
 from mapper.sources.image_folders.numbered import NumberedPair, stamped
-from mapper.sources.image_folders.posed import PosedFrame, PosedFrames
+from mapper.sources.image_folders.posed import PosedFrames
 from mapper.sources.image_folders.rgbd import find_calibration
 from mapper.sources.text import parse_count, parse_numbers, pose_from_matrix, rows
 
@@ -42,13 +42,8 @@ def read_frames(folder: Path, config: SourceConfig) -> PosedFrames:
     pairs, notes = stamped(images, rate_hz=config.rate_hz)
     if images and images[-1].number >= len(poses):
         notes.append(f"{path.name}: {len(poses)} poses; frames from number {len(poses)} on have none")
-    frames = [
-        PosedFrame(
-            pair.stamp_ns, pair.colour, pair.depth, poses[image.number] if image.number < len(poses) else None
-        )
-        for image, pair in zip(images, pairs, strict=True)
-    ]
+    of_images = [poses[image.number] if image.number < len(poses) else None for image in images]
     parent = folder.resolve().parent
     is_beside = not (folder / _PARAMETERS).is_file() and (parent / _PARAMETERS).is_file()
     camera = find_calibration(parent if is_beside else folder, config.camera, known=None)
-    return PosedFrames(frames, camera, _UNITS_PER_M, notes)
+    return PosedFrames(pairs, of_images, camera, _UNITS_PER_M, notes)

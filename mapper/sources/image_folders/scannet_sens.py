@@ -21,7 +21,8 @@ from mapper.sources.config import SourceConfig
 from mapper.sources.image_files.decoded import DecodedDepth, FilePart
 from mapper.sources.image_files.reading import depth_m_from
 from mapper.sources.image_folders.numbered import RATE_HZ
-from mapper.sources.image_folders.posed import PosedFrame, PosedFrames, camera_of
+from mapper.sources.image_folders.posed import PosedFrames, camera_of
+from mapper.sources.image_folders.rgbd import FramePair
 from mapper.sources.listed_files import refuse_links_out
 from mapper.sources.scan_stamps import stamp_at
 from mapper.sources.text import pose_from_matrix
@@ -84,12 +85,13 @@ def _read(file: BinaryIO, path: Path, config: SourceConfig) -> PosedFrames:
     shift = float(header["depth_shift"])
     camera = camera_of(path, config, stated)
     units_per_m = camera.depth_units_per_m or (shift if shift > 0.0 else MM_PER_M)
-    frames: list[PosedFrame] = []
+    pairs: list[FramePair] = []
+    poses = []
     notes: list[str] = []
     count, size = int(header["frames"]), path.stat().st_size
     depth_px = tuple(header["depth_px"].tolist())
     stamps_us = []
-    while len(frames) < count:
+    while len(pairs) < count:
         data = file.read(_FRAME.itemsize)
         record = np.frombuffer(data, _FRAME)[0] if len(data) == _FRAME.itemsize else None
         start = file.tell()
@@ -101,29 +103,25 @@ def _read(file: BinaryIO, path: Path, config: SourceConfig) -> PosedFrames:
             or max(colour_bytes, depth_bytes) > MOST_BYTES
             or record["stamps_us"][0] > LATEST_NS // 1000  # damaged
         ):
-            notes.append(f"{path.name}: cut off after {len(frames)} of {count} frames")
+            notes.append(f"{path.name}: cut off after {len(pairs)} of {count} frames")
             break
         stamps_us.append(int(record["stamps_us"][0]))
+        stamp_ns = 1000 * stamps_us[-1]
         part = FilePart(path, start + colour_bytes, depth_bytes, ".png")
         decode = partial(_depth_m, part, depth_px, depth_compression == _ZLIB, units_per_m)
-        frames.append(
-            PosedFrame(
-                stamps_us[-1] * 1000,
-                FilePart(path, start, colour_bytes, suffix),
-                DecodedDepth(part, decode, units_per_m),
-                pose_from_matrix(record["pose"]),
-            )
-        )
+        colour = FilePart(path, start, colour_bytes, suffix)
+        pairs.append(FramePair(stamp_ns, colour, stamp_ns, DecodedDepth(part, decode, units_per_m)))
+        poses.append(pose_from_matrix(record["pose"]))
         file.seek(start + colour_bytes + depth_bytes)
     if len(set(stamps_us)) < len(stamps_us):
         rate_hz = config.rate_hz or RATE_HZ
         notes.append(
             f"{path.name} has no times of frames; {rate_hz:g} frames a second assumed (source.rate_hz)"
         )
-        frames = [
-            replace(frame, stamp_ns=stamp_at(number, rate_hz=rate_hz)) for number, frame in enumerate(frames)
-        ]
-    return PosedFrames(frames, camera, units_per_m, notes)
+        for number, pair in enumerate(pairs):
+            stamp_ns = stamp_at(number, rate_hz=rate_hz)
+            pairs[number] = replace(pair, stamp_ns=stamp_ns, depth_stamp_ns=stamp_ns)
+    return PosedFrames(pairs, poses, camera, units_per_m, notes)
 
 
 def _depth_m(part: FilePart, size_px: tuple[int, int], is_packed: bool, units_per_m: float) -> DepthImage:

@@ -20,7 +20,8 @@ from mapper.core.units import MM_PER_M
 from mapper.sources.config import SourceConfig
 from mapper.sources.image_files.confidence import confident_depths
 from mapper.sources.image_files.decoded import DecodedColour
-from mapper.sources.image_folders.posed import PosedFrame, PosedFrames, camera_of, median_camera
+from mapper.sources.image_folders.posed import PosedFrames, camera_of, median_camera
+from mapper.sources.image_folders.rgbd import FramePair
 from mapper.sources.listed_files import refuse_links_out
 from mapper.sources.text import parse_count, parse_numbers, parse_stamp, pose_from_numbers, rows
 
@@ -69,11 +70,11 @@ def read_frames(folder: Path, config: SourceConfig) -> PosedFrames:
     )
     refuse_links_out([folder / _VIDEO, *(folder / "confidence" / name for name in names)], log=folder)
     video = Video(folder / _VIDEO)
-    frames = [
-        PosedFrame(stamp_ns, video.frame(number), depth, T)
-        for stamp_ns, number, depth, T in zip(stamps_ns, numbers, depths, poses, strict=True)
+    pairs = [
+        FramePair(stamp_ns, video.frame(number), stamp_ns, depth)
+        for stamp_ns, number, depth in zip(stamps_ns, numbers, depths, strict=True)
     ]
-    return PosedFrames(frames, camera, MM_PER_M, [*notes, *depth_notes])
+    return PosedFrames(pairs, poses, camera, MM_PER_M, [*notes, *depth_notes])
 
 
 def _matrix(path: Path) -> np.ndarray:
