@@ -35,9 +35,8 @@ from mapper.simulation.streams import Stream, noise_index, rng_of
 from mapper.sources.base import LazyFrame, Log
 from mapper.sources.calibration_file import calibration_text
 from mapper.sources.image_files.reading import TUM_UNITS_PER_M
-from mapper.sources.imu_files import write_imu
+from mapper.sources.readings_beside import write_readings
 from mapper.sources.trajectory_files import write_tum
-from mapper.sources.wheel_files import write_wheels
 
 # One filter and no search for repeats: noise has none, and it takes a third of the time.
 _COLOUR_PNG = (
@@ -237,10 +236,7 @@ def _write(folder: Path, simulator: CameraSimulator, on_progress: Callable[[int,
     write_tum(folder / "groundtruth.txt", simulator.truth)
     calibration = calibration_text(simulator.camera, depth_units_per_m=TUM_UNITS_PER_M)
     (folder / "calibration.toml").write_text(calibration, encoding="utf-8")
-    if log.wheels is not None:
-        write_wheels(folder, log.wheels, sensor=log.sensor)
-    if log.gyroscope is not None and log.accelerations is not None:
-        write_imu(folder, log.gyroscope, log.accelerations)
+    write_readings(log, folder, are_imu=True)
     unset = {"wall_distance_m"} if config.path != "wall" else set()
     settings = set_or_first(config, exclude=unset)
     moving = simulator.movers.as_json(seconds_of(simulator.truth.stamps_ns))

@@ -8,9 +8,9 @@ import numpy as np
 from mapper.core.timebase import Stamps, seconds_text_from_ns
 from mapper.sources.base import Log, Readings
 from mapper.sources.config import SourceConfig
-from mapper.sources.gnss_files import read_gnss
-from mapper.sources.imu_files import read_imu
-from mapper.sources.wheel_files import read_wheels
+from mapper.sources.gnss_files import read_gnss, write_gnss
+from mapper.sources.imu_files import read_imu, write_gyroscope, write_imu
+from mapper.sources.wheel_files import read_wheels, write_wheels
 
 _UNITS_NS = {"µs": 1_000, "ms": 1_000_000, "s": 1_000_000_000}
 """Units in which files have stamps that should be nanoseconds."""
@@ -44,6 +44,24 @@ def with_readings(log: Log, folder: Path, config: SourceConfig) -> Log:
         gnss, more = _in_log_time(gnss, log.stamps_ns, "GNSS fixes")
         log = replace(log, gnss=gnss, notes=[*log.notes, *notes, *more])
     return log
+
+
+def write_readings(log: Log, folder: Path, *, are_imu: bool = False) -> None:
+    """Write the wheels, angular velocities and GNSS fixes of a log as files that ``with_readings`` reads.
+
+    Args:
+        log: The log.
+        folder: Folder of the written log.
+        are_imu: Whether accelerations have the stamps of the angular velocities, and are in their file.
+    """
+    if log.wheels is not None:
+        write_wheels(folder, log.wheels, sensor=log.sensor)
+    if are_imu and log.gyroscope is not None and log.accelerations is not None:
+        write_imu(folder, log.gyroscope, log.accelerations)
+    elif log.gyroscope is not None:
+        write_gyroscope(folder, log.gyroscope)
+    if log.gnss is not None:
+        write_gnss(folder, log.gnss)
 
 
 def _in_log_time(

@@ -16,15 +16,13 @@ from mapper.core.trajectory import Trajectory
 from mapper.runtime.atomic import new_folder, write_bytes, write_text
 from mapper.sources.base import Accelerations, FrameRef, Log, Skipped
 from mapper.sources.calibration_file import calibration_text
-from mapper.sources.gnss_files import write_gnss
 from mapper.sources.image_files.decoded import encode_colour, encode_depth
 from mapper.sources.image_files.reading import TUM_UNITS_PER_M, image_bytes
 from mapper.sources.image_folders.mbag import HEADER
 from mapper.sources.image_folders.tum import DEVICE_POSES
-from mapper.sources.imu_files import write_gyroscope
+from mapper.sources.readings_beside import write_readings
 from mapper.sources.scan_folders.kitti_writing import write_kitti_log
 from mapper.sources.trajectory_files import write_tum
-from mapper.sources.wheel_files import write_wheels
 
 LogKind = Literal["tum", "mbag", "kitti", "mcap", "bag"]
 
@@ -137,12 +135,7 @@ def _write_images_log(
             write_tum(out / "groundtruth.txt", source.truth)
         if source.device_poses is not None:
             write_tum(out / DEVICE_POSES, source.device_poses)
-        if source.wheels is not None:
-            write_wheels(out, source.wheels, sensor=source.sensor)
-        if source.gyroscope is not None:
-            write_gyroscope(out, source.gyroscope)
-        if source.gnss is not None:
-            write_gnss(out, source.gnss)
+        write_readings(source, out)
         depth_files = {frame.depth_stamp_ns: frame.depth for frame in written}
         colour_files = {frame.stamp_ns: frame.colour for frame in written}
         write_text(out / "depth.txt", _list_text("depth maps", source.name, depth_files))

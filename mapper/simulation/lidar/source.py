@@ -30,11 +30,9 @@ from mapper.simulation.path import seconds_of
 from mapper.simulation.source import synthetic_log
 from mapper.simulation.streams import Stream, noise_index, rng_of
 from mapper.sources.base import Log
-from mapper.sources.gnss_files import write_gnss
-from mapper.sources.imu_files import write_imu
+from mapper.sources.readings_beside import write_readings
 from mapper.sources.scan_folders.kitti_writing import save_scan
 from mapper.sources.trajectory_files import write_kitti
-from mapper.sources.wheel_files import write_wheels
 
 
 def firing_times_s(sensor: LidarSensorConfig) -> Array:
@@ -179,12 +177,7 @@ def write_lidar_log(
         times = [seconds_text_from_ns(stamp_ns) for stamp_ns in log.stamps_ns.tolist()]
         (folder / "times.txt").write_text("\n".join(times) + "\n", encoding="utf-8")
         write_kitti(folder / "poses.txt", simulator.truth)
-        if log.wheels is not None:
-            write_wheels(folder, log.wheels, sensor=log.sensor)
-        if log.gyroscope is not None and log.accelerations is not None:
-            write_imu(folder, log.gyroscope, log.accelerations)
-        if log.gnss is not None:
-            write_gnss(folder, log.gnss)
+        write_readings(log, folder, are_imu=True)
         scene = {
             "config": set_or_first(config, exclude=set()),
             "ground": simulator.scene.ground.as_json(),

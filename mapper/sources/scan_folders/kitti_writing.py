@@ -11,10 +11,8 @@ from mapper.core.timebase import MAX_TRUTH_GAP_NS, Stamps, nearest, seconds_text
 from mapper.core.trajectory import Trajectory
 from mapper.runtime.atomic import write_text
 from mapper.sources.base import Log, Skipped
-from mapper.sources.gnss_files import write_gnss
-from mapper.sources.imu_files import write_gyroscope
+from mapper.sources.readings_beside import write_readings
 from mapper.sources.trajectory_files import write_kitti
-from mapper.sources.wheel_files import write_wheels
 
 _TIMED = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("t", "<f4")])
 
@@ -56,12 +54,7 @@ def write_kitti_log(
     truth = source.truth and _at(source.truth, np.array(stamps_ns, dtype=np.int64))
     if truth is not None:
         write_kitti(out / "poses.txt", truth)
-    if source.wheels is not None:
-        write_wheels(out, source.wheels, sensor=source.sensor)
-    if source.gyroscope is not None:
-        write_gyroscope(out, source.gyroscope)
-    if source.gnss is not None:
-        write_gnss(out, source.gnss)
+    write_readings(source, out)
     write_text(out / "times.txt", "".join(f"{seconds_text_from_ns(stamp_ns)}\n" for stamp_ns in stamps_ns))
     return skipped
 
