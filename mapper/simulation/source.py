@@ -32,9 +32,10 @@ from mapper.simulation.readings import measure_gnss, measure_imu, measure_wheels
 from mapper.simulation.scene import Scene, make_scene
 from mapper.simulation.shutter import Shutter
 from mapper.simulation.streams import Stream, noise_index, rng_of
-from mapper.sources.base import LazyFrame, Log
+from mapper.sources.base import Log
 from mapper.sources.calibration_file import calibration_text
 from mapper.sources.image_files.reading import TUM_UNITS_PER_M
+from mapper.sources.lazy_frame import LazyFrame
 from mapper.sources.readings_beside import write_readings
 from mapper.sources.trajectory_files import write_tum
 

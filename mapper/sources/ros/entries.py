@@ -7,11 +7,12 @@ import numpy as np
 
 from mapper.core.errors import DataError, FrameError
 from mapper.core.frames import DepthImage, Image, Scan
-from mapper.sources.base import ImageFiles, LazyFrame
+from mapper.sources.base import ImageFiles
 from mapper.sources.image_files.decoded import DecodedColour, DecodedDepth
 from mapper.sources.image_files.image_sizes import RecordedCamera
 from mapper.sources.image_folders.rgbd import RgbdEntry
 from mapper.sources.laser_scan import planar
+from mapper.sources.lazy_frame import LazyFrame
 from mapper.sources.ros.cloud_messages import scan_from
 from mapper.sources.ros.decode import decode
 from mapper.sources.ros.frame_tree import FrameTree, is_fixed

@@ -18,9 +18,10 @@ from mapper.core.geometry import Array, Transform, inverse, planar_motion
 from mapper.core.timebase import ns_from_seconds_text
 from mapper.core.trajectory import Trajectory
 from mapper.runtime.regular_files import read_text
-from mapper.sources.base import LazyFrame, Log
+from mapper.sources.base import Log
 from mapper.sources.config import SourceConfig
 from mapper.sources.laser_scan import MOST_RAD, beam_points, planar_scan, rolling
+from mapper.sources.lazy_frame import LazyFrame
 from mapper.sources.text import time_order
 
 _ENDINGS = (".log", ".clf", ".txt")

@@ -16,9 +16,10 @@ from mapper.core.rotations import pose_of_row
 from mapper.core.timebase import GPS_EPOCH_S, NS_PER_S, Stamps
 from mapper.runtime.atomic import atomic_file
 from mapper.runtime.extras import extra, require
-from mapper.sources.base import LazyFrame, Log
+from mapper.sources.base import Log
 from mapper.sources.cloud_files.parsing import MIN_POINTS
 from mapper.sources.config import SourceConfig
+from mapper.sources.lazy_frame import LazyFrame
 from mapper.sources.listed_files import refuse_links_out
 from mapper.sources.scan_stamps import stamp_at
 from mapper.sources.text import time_order, truth_from

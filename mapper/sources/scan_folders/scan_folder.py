@@ -12,11 +12,12 @@ from mapper.core.errors import FrameError, SourceError
 from mapper.core.geometry import Transform, inverse, spread_indices
 from mapper.core.timebase import NS_PER_S, Stamps
 from mapper.core.trajectory import Trajectory
-from mapper.sources.base import LazyFrame, Log
+from mapper.sources.base import Log
 from mapper.sources.cloud_files import EMPTY, ENDINGS, why_no_points
 from mapper.sources.cloud_files.las import LAS_ENDINGS, first_time_s
 from mapper.sources.config import SourceConfig
 from mapper.sources.image_folders.tum import read_truth
+from mapper.sources.lazy_frame import LazyFrame
 from mapper.sources.listed_files import refuse_links_out
 from mapper.sources.scan_folders.scans import read_scan
 from mapper.sources.scan_stamps import in_order, line_of_each, scan_stamps

@@ -11,9 +11,10 @@ import numpy as np
 
 from mapper.core.errors import DataError, FrameError, SourceError
 from mapper.core.frames import Scan
-from mapper.sources.base import LazyFrame, Log
+from mapper.sources.base import Log
 from mapper.sources.captures import ENDINGS, Datagram, captured, first_datagrams
 from mapper.sources.config import SourceConfig
+from mapper.sources.lazy_frame import LazyFrame
 from mapper.sources.ros.cloud_messages import scan_from
 from mapper.sources.ros.messages import CloudMessage
 from mapper.sources.text import time_order
