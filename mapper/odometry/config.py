@@ -87,8 +87,8 @@ class KeyframeOdometryConfig(Config):
     depth_residual: bool = True
     """bf / z is a third residual of poses and bundles; without it only pixels (Zhao et al. 2020, eq. 5–7)."""
     readout_s: float | None = None
-    """Rolling shutter: time from the first row's exposure to the last row's; 0 is a global shutter. None
-    estimates it from the log."""
+    """Rolling shutter: time from the first line's exposure to the last line's; 0 is a global shutter. Lines
+    are rows, or columns of images higher than wide. None estimates it from the log."""
     local_keyframes: NonNegativeInt = 15
     """Number of covisible keyframes whose landmarks are searched; 0 uses only the first matches."""
     min_matches: Annotated[int, Field(ge=8)] = 12

@@ -15,7 +15,7 @@ from mapper.features.frame_view import ImageView
 from mapper.features.hamming import Bits, pack
 from mapper.features.window_matching import FeatureGrid, sort_into_grid
 from mapper.odometry.camera.depth_surfaces import DepthCells, depth_cells
-from mapper.odometry.camera.pixel_motion import depth_velocity, pixel_velocity, row_phase
+from mapper.odometry.camera.pixel_motion import depth_velocity, line_phase, pixel_velocity
 from mapper.odometry.config import KeyframeOdometryConfig
 from mapper.places.vocabulary import Vocabulary
 from mapper.runtime.archived import Archivable
@@ -107,12 +107,12 @@ class ImageObservation(Archivable):
         return self.sensor_weights if moved.sum() > _FEW_MOVING * len(self) else self.weights
 
     def swept(self, sweep_camera: Array) -> "ImageObservation":
-        """Return the observation with the shift of each row by another motion of the camera taken out."""
+        """Return the observation with the shift of each line by another motion of the camera taken out."""
         if not (sweep_camera.any() or self.sweep_camera.any()):
             return self
         depth_m = np.where(self.has_depth, self.depth_m, _usual(self.depth_m))
-        pixels = self.pixels - self.row_shift(self.pixels, depth_m, sweep_camera)
-        phase = row_phase(self.pixels, self.size_px[1])
+        pixels = self.pixels - self.line_shift(self.pixels, depth_m, sweep_camera)
+        phase = line_phase(self.pixels, self.size_px)
         z = self.depth_m - phase * depth_velocity(self.pixels, depth_m, self.intrinsics, sweep_camera)
         z = np.maximum(z, 0.5 * self.depth_m)
         disparity_px = np.where(np.isnan(self.measured[:, 2]), np.nan, self.intrinsics[4] / z)
@@ -124,11 +124,11 @@ class ImageObservation(Archivable):
             unswept=self if self.unswept is None else self.unswept,
         )
 
-    def row_shift(self, pixels: Array, depth_m: Array, sweep_camera: Array | None = None) -> Array:
-        """Return by how much (N, 2) pixels shift until their row is read, from the middle row on."""
+    def line_shift(self, pixels: Array, depth_m: Array, sweep_camera: Array | None = None) -> Array:
+        """Return by how much (N, 2) pixels shift until their line is read, from the middle one on."""
         depth_m = np.maximum(depth_m, _MIN_DEPTH_M)
         sweep_camera = self.sweep_camera if sweep_camera is None else sweep_camera
-        phase = row_phase(pixels, self.size_px[1])
+        phase = line_phase(pixels, self.size_px)
         shift: Array = phase[:, np.newaxis] * pixel_velocity(pixels, depth_m, self.intrinsics, sweep_camera)
         return shift
 

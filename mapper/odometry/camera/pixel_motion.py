@@ -3,6 +3,8 @@
 import numpy as np
 from numba import njit
 
+from mapper.core.geometry import Array
+
 
 @njit(cache=True, nogil=True)
 def pixel_velocity(pixels, depth_m, intrinsics, twist_camera):  # type: ignore[no-untyped-def]
@@ -37,7 +39,16 @@ def depth_velocity(pixels, depth_m, intrinsics, twist_camera):  # type: ignore[n
     return velocity
 
 
-@njit(cache=True, nogil=True)
-def row_phase(pixels, height_px):  # type: ignore[no-untyped-def]
-    """Return (N,) when a pixel's row is read relative to the middle row, as a share of the readout time."""
-    return (pixels[:, 1] + 0.5) / height_px - 0.5
+def line_phase(pixels: Array, size_px: tuple[int, int]) -> Array:
+    """Return (N,) when a pixel's line is read relative to the middle one, as a share of the readout time.
+
+    Sensors read lines along their longer side: those of an upright image, turned after it was taken, are its
+    columns.
+
+    Args:
+        pixels: (N, 2) columns and rows.
+        size_px: Width and height of the image.
+    """
+    axis = 0 if size_px[0] < size_px[1] else 1
+    phase: Array = (pixels[:, axis] + 0.5) / size_px[axis] - 0.5
+    return phase

@@ -14,7 +14,7 @@ _KEPT = 0.95
 
 
 class ReadoutTime:
-    """Readout time of a rolling shutter: the time from the first row's exposure to the last row's.
+    """Readout time of a rolling shutter: the time from the first line's exposure to the last line's.
 
     It is one more unknown of every local bundle adjustment, after the poses and points are eliminated
     (Hedborg et al. 2012 adjust the motion within each image; here it is known from tracking, and the readout
@@ -25,7 +25,8 @@ class ReadoutTime:
         """Start at a given readout time, or at 0 if it is to be estimated.
 
         Args:
-            given_s: Seconds; negative if rows are read from the bottom. None estimates it.
+            given_s: Seconds; negative if lines are read from the bottom, or from the right of upright images.
+                None estimates it.
             windows_sharing: Number of windows that an observation takes part in.
         """
         self.seconds = given_s or 0.0
@@ -34,14 +35,19 @@ class ReadoutTime:
         self._information = _PRIOR_S**-2
         self._weighted_s = 0.0
 
-    @property
-    def sentence(self) -> str:
-        """The estimate in words; empty if there is none, or all rows are read at once."""
+    def describe(self, size_px: tuple[int, int]) -> str:
+        """Return the estimate in words; empty if there is none, or all lines are read at once.
+
+        Args:
+            size_px: Width and height of the images.
+        """
         if not self.is_estimated or self.seconds == 0.0:
             return ""
-        begin = "top" if self.seconds > 0.0 else "bottom"
+        is_upright = size_px[0] < size_px[1]
+        lines, *ends = ("columns", "left", "right") if is_upright else ("rows", "top", "bottom")
+        begin = ends[self.seconds < 0.0]
         return (
-            f"rolling shutter: rows are read within {1e3 * abs(self.seconds):.0f} ms from the {begin}, as "
+            f"rolling shutter: {lines} are read within {1e3 * abs(self.seconds):.0f} ms from the {begin}, as "
             "estimated from the log; odometry.readout_s sets it"
         )
 

@@ -150,7 +150,7 @@ class LandmarkMap:
             feature=features,
             measured=observation.measured[features],
             weights=observation.weights[features],
-            slope=-observation.row_shift(
+            slope=-observation.line_shift(
                 observation.pixels[features],
                 apply(keyframe.T_camera_world, self.landmarks["position"][ids])[:, 2],
                 keyframe.twist_camera,

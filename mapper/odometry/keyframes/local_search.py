@@ -137,7 +137,7 @@ class LocalSearch:
         The radius grows with the octave.
         """
         if observation.sweep_camera.any():
-            pixels = pixels + observation.row_shift(pixels, depth_m)
+            pixels = pixels + observation.line_shift(pixels, depth_m)
         matched: Ids = match_windows(
             SearchWindows(
                 pixels, search_px * self._map.scale_factor ** octave.astype(np.float64), octave, bits

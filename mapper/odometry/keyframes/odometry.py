@@ -154,7 +154,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
 
     def sensor_notes(self) -> Sequence[str]:
         """Return the estimated readout time of the camera's shutter, if it has any."""
-        sentence = self._map.readout.sentence
+        sentence = "" if self._last is None else self._map.readout.describe(self._last.observation.size_px)
         return [sentence] if sentence else []
 
     def calibration_warnings(self) -> Sequence[str]:

@@ -10,6 +10,7 @@ from mapper.core.geometry import Array, Points, adjoint, inverse, log
 from mapper.core.linear import solve_positive, twist_exp
 from mapper.core.timebase import NS_PER_S
 from mapper.odometry.camera.image_observation import ImageObservation
+from mapper.odometry.camera.pixel_motion import line_phase
 from mapper.odometry.camera.readout_time import ReadoutTime
 from mapper.odometry.keyframes.pose_tracker import TrackedPose
 from mapper.registration.reprojection import pose_jacobian, projection_jacobian, residual
@@ -79,7 +80,7 @@ class RollingShutter:
             np.column_stack([observation.pixels[features], observation.measured[features, 2]]),
             observation.weights[features],
             observation.intrinsics,
-            observation.size_px[1],
+            line_phase(observation.pixels[features], observation.size_px),
         )
         self.twist_camera = sweep_camera / readout_s
         return replace(
@@ -97,8 +98,8 @@ class RollingShutter:
 
 
 @njit(cache=True, nogil=True)
-def _refine(T_camera_world, expected_sweep, information, points, measured, weights, intrinsics, height_px):  # type: ignore[no-untyped-def]
-    """Return T_camera_world when the middle row was read, and the camera's motion over all rows (6,).
+def _refine(T_camera_world, expected_sweep, information, points, measured, weights, intrinsics, phases):  # type: ignore[no-untyped-def]
+    """Return T_camera_world when the middle line was read, and the camera's motion over all lines (6,).
 
     Gauss–Newton on both; ``measured`` is as it was read, and the motion has a normal prior.
     """
@@ -113,7 +114,6 @@ def _refine(T_camera_world, expected_sweep, information, points, measured, weigh
             H[6 + a, 6 + a] = information[a]
             g[6 + a] = information[a] * (expected_sweep[a] - sweep[a])
         for n in range(len(points)):
-            phase = (measured[n, 1] + 0.5) / height_px - 0.5
             x, y, z = residual(T, points[n], measured[n], intrinsics, r)
             projection_jacobian(x, y, z, intrinsics, not np.isnan(measured[n, 2]), J)
             pose_jacobian(x, y, z, J, J_pose)
@@ -121,7 +121,7 @@ def _refine(T_camera_world, expected_sweep, information, points, measured, weigh
                 for a in range(6):
                     J_both[i, a] = J_pose[i, a]
                     # A point moves against the camera; the disparity's change is taken out of it already.
-                    J_both[i, 6 + a] = -phase * J_pose[i, a] if i < 2 else 0.0
+                    J_both[i, 6 + a] = -phases[n] * J_pose[i, a] if i < 2 else 0.0
                     r[i] -= J_both[i, 6 + a] * sweep[a]
             for i in range(3):
                 for a in range(12):

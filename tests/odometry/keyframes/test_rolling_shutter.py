@@ -8,7 +8,7 @@ import pytest
 from mapper.core.geometry import apply, exp, inverse
 from mapper.core.timebase import NS_PER_S
 from mapper.odometry.base import SensorCheck
-from mapper.odometry.camera.pixel_motion import depth_velocity, pixel_velocity, row_phase
+from mapper.odometry.camera.pixel_motion import depth_velocity, line_phase, pixel_velocity
 from mapper.odometry.camera.readout_time import ReadoutTime
 from mapper.odometry.config import LocalMapConfig
 from mapper.odometry.factory import build_frame_odometry
@@ -16,7 +16,7 @@ from mapper.odometry.keyframes.bundle_adjustment import adjust, common_parameter
 from mapper.odometry.keyframes.rolling_shutter import _refine
 
 INTRINSICS = np.array([525.0, 520.0, 319.5, 239.5, 40.0])
-HEIGHT_PX = 480
+SIZE_PX, UPRIGHT_PX = (640, 480), (640, 900)
 READOUT_S = 0.02
 
 
@@ -26,11 +26,11 @@ def projected(T_camera_world, points_world):
     return pixels, z
 
 
-def read_by_rows(T_camera_world, points_world, twist, *, readout_s=READOUT_S):
-    """Return the pixels and depths of points, each projected at the time when its own row is read."""
+def read_by_lines(T_camera_world, points_world, twist, *, readout_s=READOUT_S, size_px=SIZE_PX):
+    """Return the pixels and depths of points, each projected at the time when its own line is read."""
     pixels, depth_m = projected(T_camera_world, points_world)
     for _ in range(10):
-        for n, phase in enumerate(row_phase(pixels, HEIGHT_PX) * readout_s):
+        for n, phase in enumerate(line_phase(pixels, size_px) * readout_s):
             T_then = inverse(exp(twist[:3] * phase, twist[3:] * phase)) @ T_camera_world
             pixels[n : n + 1], depth_m[n : n + 1] = projected(T_then, points_world[n : n + 1])
     return pixels, depth_m
@@ -53,18 +53,18 @@ def test_velocities_are_the_derivatives_of_the_projection():
     assert np.allclose(found, (after[1] - before[1]) / (2 * step_s), rtol=1e-5, atol=1e-5)
 
 
-def test_pose_and_motion_are_found_in_one_image():
+@pytest.mark.parametrize("size_px", [SIZE_PX, UPRIGHT_PX])
+def test_pose_and_motion_are_found_in_one_image(size_px):
     rng = np.random.default_rng(1)
     points = points_ahead(rng, 300)
     truth = exp(rng.normal(0.0, 0.05, 3), rng.normal(0.0, 0.1, 3))
     twist = np.array([0.3, -0.5, 0.4, 0.5, -0.4, 0.2])
-    pixels, _ = read_by_rows(truth, points, twist)
+    pixels, _ = read_by_lines(truth, points, twist, size_px=size_px)
     _, depth_m = projected(truth, points)
     measured = np.column_stack([pixels + rng.normal(0.0, 0.3, pixels.shape), INTRINSICS[4] / depth_m])
     loose = np.full(6, 1e-6)
-    found, sweep = _refine(
-        truth, np.zeros(6), loose, points, measured, np.full((300, 3), 10.0), INTRINSICS, HEIGHT_PX
-    )
+    weights, phases = np.full((300, 3), 10.0), line_phase(measured, size_px)
+    found, sweep = _refine(truth, np.zeros(6), loose, points, measured, weights, INTRINSICS, phases)
     assert np.linalg.norm((inverse(truth) @ found)[:3, 3]) < 0.002
     assert np.allclose(sweep[:3], READOUT_S * twist[:3], atol=0.002)
     assert np.allclose(sweep[3:], READOUT_S * twist[3:], atol=0.004)
@@ -78,12 +78,12 @@ def test_bundle_shows_the_readout_time(readout_s):
     twists = rng.normal(0.0, 0.5, (5, 6))
     edges, measured, slopes = [], [], []
     read = [
-        read_by_rows(T, points, twist, readout_s=readout_s) for T, twist in zip(poses, twists, strict=True)
+        read_by_lines(T, points, twist, readout_s=readout_s) for T, twist in zip(poses, twists, strict=True)
     ]
     for p in range(len(points)):
         for c in range(5):
             pixel, depth_m = read[c][0][p : p + 1], projected(poses[c], points[p : p + 1])[1]
-            shift = row_phase(pixel, HEIGHT_PX) * pixel_velocity(pixel, depth_m, INTRINSICS, twists[c])[0]
+            shift = line_phase(pixel, SIZE_PX) * pixel_velocity(pixel, depth_m, INTRINSICS, twists[c])[0]
             edges.append((c, p))
             measured.append([*(pixel[0] + rng.normal(0.0, 0.3, 2)), INTRINSICS[4] / depth_m[0]])
             slopes.append(-shift)
@@ -105,11 +105,12 @@ def test_readout_time_is_zero_until_it_is_certain():
     readout = ReadoutTime(None, windows_sharing=10)
     readout.learn(information=1e5, gradient=-1e5 * 0.004)
     assert readout.seconds == 0.0
-    assert readout.sentence == ""
+    assert readout.describe(SIZE_PX) == ""
     for _ in range(60):
         readout.learn(information=1e7, gradient=1e7 * (readout.seconds - 0.02))
     assert readout.seconds == pytest.approx(0.02, abs=0.0006)
-    assert "rows are read within 20 ms from the top, as estimated" in readout.sentence
+    assert "rows are read within 20 ms from the top" in readout.describe(SIZE_PX)
+    assert "columns are read within 20 ms from the left" in readout.describe(UPRIGHT_PX)
 
 
 def test_given_readout_time_is_kept():
@@ -117,12 +118,13 @@ def test_given_readout_time_is_kept():
     readout.learn(information=1e9, gradient=1e9)
     assert readout.seconds == -0.01
     assert not readout.is_estimated
-    assert readout.sentence == ""  # who gave it knows it
+    assert readout.describe(SIZE_PX) == ""  # who gave it knows it
 
 
-def test_what_the_odometry_knows_of_the_shutter_it_tells():
+def test_what_the_odometry_knows_of_the_shutter_it_tells(frames):
     odometry = build_frame_odometry(LocalMapConfig())
     assert isinstance(odometry, SensorCheck)
+    odometry.track(odometry.observe(frames[0]))
     assert odometry.sensor_notes() == []
     for _ in range(60):
         odometry._map.readout.learn(information=1e7, gradient=1e7 * (odometry._map.readout.seconds + 0.01))
