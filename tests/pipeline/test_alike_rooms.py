@@ -14,8 +14,9 @@ from mapper.pipeline.disconnected_components import largest_component
 from mapper.pipeline.solve import solve
 from mapper.pipeline.track import track_log
 from mapper.runtime.progress import SILENT
-from mapper.simulation.source import CameraSimulator, SyntheticEntry
+from mapper.simulation.source import CameraSimulator
 from mapper.sources.base import Log
+from mapper.sources.lazy_frame import LazyFrame
 from tests.support.desk_frames import DESK_WALK, desk_frames
 
 APART_M = 10.0
@@ -23,8 +24,8 @@ PAUSE_NS = 12 * NS_PER_S
 """In which the camera is carried on without images."""
 
 
-def entry(frame: RgbdFrame) -> SyntheticEntry:
-    return SyntheticEntry(frame.stamp_ns, lambda _colour: frame)
+def entry(frame: RgbdFrame) -> LazyFrame:
+    return LazyFrame(frame.stamp_ns, lambda _colour: frame)
 
 
 @pytest.fixture(scope="module")
