@@ -10,11 +10,12 @@ from numpy.typing import NDArray
 
 from mapper.core.errors import FrameError
 from mapper.core.frames import Frame, Scan
-from mapper.core.geometry import Transform, apply
+from mapper.core.geometry import Transform, apply, stride_for
 from mapper.core.timebase import NS_PER_S, nearest
 from mapper.sources.base import FrameRef, Log, WrappedEntry
 
-_LOOKED_AT, _FEWEST_PARTS, _WIDEST_PART_RAD = 16, 8, 1.5 * np.pi
+_LOOKED_AT, _FEWEST_PARTS, _MOST_DIRECTIONS = 16, 8, 2000
+_WIDEST_PART_RAD = 1.5 * np.pi
 _LONGEST_TURN_NS = NS_PER_S // 4
 """LiDARs turn 5 to 20 times a second; what turns them (a pan unit) is slower, and its tf is known."""
 _LEAST_TURNED_RAD, _SAME_RATE, _MIN_USUAL = 1e-3, 0.25, 0.75
@@ -35,12 +36,13 @@ class _MergedEntry(WrappedEntry):
     def load(self, *, colour: bool = True) -> Frame:
         scans = [self.entry.load(colour=colour).scan()]
         for entry, T_body_other in self.others:
+            if T_body_other is None:
+                scans.append(entry.load(colour=colour).scan())
+                continue
             with suppress(FrameError):  # fusing reports it
                 scan = entry.load(colour=colour).scan()
-                if T_body_other is not None:
-                    points_body = apply(T_body_other, scan.points_body.astype(np.float64)).astype(np.float32)
-                    scan = replace(scan, points_body=points_body)
-                scans.append(scan)
+                points_body = apply(T_body_other, scan.points_body.astype(np.float64)).astype(np.float32)
+                scans.append(replace(scan, points_body=points_body))
         return _merged(scans)
 
     def scan(self) -> Scan:
@@ -99,10 +101,13 @@ def _turn_of_parts_ns(log: Log) -> int | None:
         entry = log.entry_at(index)
         with suppress(FrameError):
             scan = entry.scan()
-            x, y = (scan.points_body[:, :2] - scan.origin_body[:2]).T.astype(np.float64)
+            few = scan.points_body[:: stride_for(len(scan.points_body), _MOST_DIRECTIONS)]
+            if len(few) == 0:  # the sky
+                continue
+            x, y = (few[:, :2] - scan.origin_body[:2]).T.astype(np.float64)
             direction = (x + 1j * y) / np.maximum(np.hypot(x, y), 1e-9)
             middle = direction.sum()
-            if len(direction) == 0 or np.ptp(np.angle(direction * middle.conj())) > _WIDEST_PART_RAD:
+            if np.ptp(np.angle(direction * middle.conj())) > _WIDEST_PART_RAD:
                 return None
             parts.append((entry.stamp_ns, middle))
     if len(parts) < _FEWEST_PARTS:

@@ -151,6 +151,22 @@ def test_parts_of_turns_are_joined_to_whole_ones(count, timed):
     assert with_whole_turns(half) is half
 
 
+def test_parts_without_returns_belong_to_their_turn_and_damaged_ones_cost_it():
+    sensor = LidarSensorConfig(rings=8, azimuth_steps=600)
+    whole = LidarSimulator(LidarSynthConfig(seed=6, loop_m=60.0, duration_s=1.0, sensor=sensor)).log()
+    parts = parts_of(whole, 12, timed=True)
+    entries = [parts.entry_at(k) for k in range(len(parts))]
+    for k in (0, 5):
+        seen = entries[k].load()
+        entries[k] = MemoryEntry(seen.stamp_ns, seen.select(np.zeros(len(seen.points_body), bool)))
+    entries[17] = MemoryEntry(entries[17].stamp_ns, FrameError("damaged"))
+    joined = with_whole_turns(log_in_memory(entries, sensor="lidar"))
+    np.testing.assert_array_equal(joined.stamps_ns, whole.stamps_ns)
+    assert 0 < len(joined.entry_at(0).scan().points_body) < len(whole.entry_at(0).scan().points_body)
+    with pytest.raises(FrameError):
+        joined.entry_at(1).load()
+
+
 def test_views_of_one_direction_are_no_parts_of_turns():
     sensor = LidarSensorConfig(rings=8, azimuth_steps=600)
     whole = LidarSimulator(LidarSynthConfig(seed=6, loop_m=60.0, duration_s=2.0, sensor=sensor)).log()
