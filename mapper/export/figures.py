@@ -331,9 +331,8 @@ def band_image(positions: Array, half_widths_m: Array, *, low: Array, high: Arra
     width, height = np.ceil((high - low) / pixel_m).astype(int)
     mask = np.zeros((max(height, 1), max(width, 1)), np.uint8)
     places = np.rint((positions[:, :2] - low) / pixel_m - 0.5).astype(np.int32)
-    radii = np.clip(
-        half_widths_m / pixel_m, 1.0, 2.0 * IMAGE_PX
-    )  # larger ones, which OpenCV refuses, cover all
+    # OpenCV refuses larger circles, which cover all.
+    radii = np.clip(half_widths_m / pixel_m, 1.0, 2.0 * IMAGE_PX)
     known = np.isfinite(half_widths_m)
     for index in np.flatnonzero(known).tolist():
         radius = float(radii[index])

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mapper.core.errors import DataError, SourceError
 from mapper.core.timebase import NS_PER_S, Stamps, ns_from_date_text, ns_from_seconds_text
-from mapper.sources.text import epoch_ns, parse_date, parse_stamp, rows
+from mapper.sources.text import MOST_NS, MOST_STAMP_DIGITS, epoch_ns, parse_date, parse_stamp, rows
 
 RATE_HZ = 10.0
 
@@ -24,7 +24,6 @@ _DATE = re.compile(
 _TWO_PARTS = re.compile(r"(?<!\d)(\d{10})[_-](\d{1,9})$")
 _WHOLE = re.compile(r"(?<!\d)\d+$")
 _NUMBER = re.compile(r"\d+(?=\D*$)")
-_MOST_DIGITS, _MOST_NS = 20, 2**63
 _UNIT_DIGITS = (3, 6, 9)  # of ms, µs and ns in a second
 _LIST = re.compile(
     r"(?:(?:rgb|colou?r|images?|frames?|camera|lidar|velodyne|scans?)_?)?(?:times?|(?:time_?)?stamps?)\.(?:txt|csv)",
@@ -183,10 +182,10 @@ def _key_of(word: str) -> str:
 
 def _in_one_unit(stamps: Sequence[tuple[str, str]], name: str) -> tuple[list[int], list[str]]:
     """Return nanoseconds of places and texts of stamps, and a note on a unit that their steps tell."""
-    texts = [text for _, text in stamps if text.isdecimal() and len(text) < _MOST_DIGITS]
+    texts = [text for _, text in stamps if text.isdecimal() and len(text) < MOST_STAMP_DIGITS]
     counts = [int(text) for text in texts if epoch_ns(text) is None]
     unit = unit_of_counts(counts, least_ms=_LEAST_STEP_MS) if len(counts) == len(stamps) else None
-    if unit is not None and max(counts) * unit.ns < _MOST_NS:
+    if unit is not None and max(counts) * unit.ns < MOST_NS:
         note = f"{name}: whole numbers are taken for {unit.name}: they advance by {unit.step}"
         return [count * unit.ns for count in counts], [note]
     return [

@@ -19,7 +19,8 @@ ROUNDING = 0.01
 """Error of a rotation in text of few digits; what is farther off is none."""
 _MOST_DIGITS = 9  # a year of frames at 30 Hz
 _EPOCH_DIGITS = 10  # of seconds, in the years 2001 to 2286
-_LONGEST, _MOST_NS = 20, 2**63
+MOST_STAMP_DIGITS, MOST_NS = 20, 2**63
+"""Digits of a stamp, and nanoseconds, below which it is held in 64 bits."""
 
 
 def read_lines(path: Path) -> list[str]:
@@ -64,10 +65,10 @@ def table(path: Path, *columns: str) -> Iterator[tuple[str, list[str]]]:
 def epoch_ns(text: str) -> int | None:
     """Return s, ms, µs or ns since 1970, told apart by the digits before the point, as nanoseconds."""
     whole, _, fraction = text.partition(".")
-    is_number = whole.isdecimal() and len(whole) < _LONGEST and f"{fraction}0".isdecimal()
+    is_number = whole.isdecimal() and len(whole) < MOST_STAMP_DIGITS and f"{fraction}0".isdecimal()
     units = (unit for unit in UNITS_PER_S if is_number and len(f"{int(whole) // unit}") == _EPOCH_DIGITS)
-    ns = next((int(Decimal(text) * (NS_PER_S // unit)) for unit in units), _MOST_NS)
-    return ns if ns < _MOST_NS else None
+    ns = next((int(Decimal(text) * (NS_PER_S // unit)) for unit in units), MOST_NS)
+    return ns if ns < MOST_NS else None
 
 
 def parse_stamp(text: str, *, where: str) -> int:
