@@ -39,6 +39,10 @@ _LIBRARIES = {
     RKO_LIO: "rko_lio",
 }
 """Optional libraries of methods, by the method's name."""
+_INDOORS = 0.1
+"""A depth camera sees 4 m where a LiDAR sees 40."""
+_MAX_CAMERA_TILT_RAD = 1.05
+"""A hand-held camera is tilted down to tables."""
 
 
 def methods_for(source: Log, config: CompareConfig) -> tuple[list[Method], list[str]]:
@@ -119,12 +123,6 @@ def _scan_methods(source: Log) -> list[Method]:
             )
         )
     return methods
-
-
-_INDOORS = 0.1
-"""A depth camera sees 4 m where a LiDAR sees 40."""
-_MAX_CAMERA_TILT_RAD = 1.05
-"""A hand-held camera is tilted down to tables."""
 
 
 def registrations_for(sensor: Sensor) -> list[Any]:

@@ -36,6 +36,7 @@ MAP_VOXEL_M = 0.02
 """The map has one point in each voxel: MPD cannot fall much below half of its edge."""
 
 _VLP_POINTS = 30_000  # what a VLP-16 gives in a turn; a scan with no more is not thinned further
+_RINGS, _KEPT_RINGS = 64, 16
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -296,9 +297,6 @@ def _left_out(log: Path, index: int) -> Clouds:
 @lru_cache(maxsize=2)
 def _read(path: Path) -> Scan:
     return read_scan(path)
-
-
-_RINGS, _KEPT_RINGS = 64, 16
 
 
 def moved(scan: Scan, T_new_body: Transform) -> Scan:

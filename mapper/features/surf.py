@@ -13,6 +13,13 @@ from mapper.features.config import SurfConfig
 from mapper.features.fast_hessian import SCALE_PER_PX, interest_points
 
 _SIZE_OF_OCTAVE_0 = 18.0  # pixels, between the filters of 15 and 21 in which its points are found
+DIMENSIONS = 64
+_ORIENTATION_RADIUS, _ORIENTATION_SIGMA = 6, 2.5  # in scales
+_TURN_DEG, _WINDOW_DEG, _WINDOW_STEP_DEG = 360, 59, 5  # of whole degrees, those less than 30 from a middle
+_SAMPLES = 20  # per side of the descriptor's window, one scale apart
+_CELLS = 4  # per side; each holds 5 × 5 samples
+_DESCRIPTOR_SIGMA = 3.3  # in scales
+_COARSEST_SCALE = 3.0  # beyond it the window is read from a smaller image
 
 
 class Surf:
@@ -46,16 +53,6 @@ class Surf:
             response=points[:, 3].copy(),
             descriptors=describe(gray, points, angles_rad),
         )
-
-
-DIMENSIONS = 64
-
-_ORIENTATION_RADIUS, _ORIENTATION_SIGMA = 6, 2.5  # in scales
-_TURN_DEG, _WINDOW_DEG, _WINDOW_STEP_DEG = 360, 59, 5  # of whole degrees, those less than 30 from a middle
-_SAMPLES = 20  # per side of the descriptor's window, one scale apart
-_CELLS = 4  # per side; each holds 5 × 5 samples
-_DESCRIPTOR_SIGMA = 3.3  # in scales
-_COARSEST_SCALE = 3.0  # beyond it the window is read from a smaller image
 
 
 def orientations(gray: Image, points: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -21,6 +21,8 @@ from mapper.runtime.progress import SILENT, Progress
 
 if TYPE_CHECKING:
     import gtsam
+_BAD_FIT = 100.0
+"""Mean χ² of a factor beyond which estimates may be a poor start: 4 σ in each of six directions."""
 
 
 def optimize(graph: PoseGraph, config: GraphConfig, *, progress: Progress = SILENT) -> Solution:
@@ -114,10 +116,6 @@ def _refuse_unusable(graph: PoseGraph) -> None:
     if not is_rigid(np.array(list(graph.T_world_node.values()))):
         bad = next(node for node, T in graph.T_world_node.items() if not is_rigid(T))
         raise GraphError(f"node {bad}: its estimate is not a finite rigid motion; the graph cannot be solved")
-
-
-_BAD_FIT = 100.0
-"""Mean χ² of a factor beyond which estimates may be a poor start: 4 σ in each of six directions."""
 
 
 def start_of(part: Part, config: GraphConfig) -> gtsam.Values:

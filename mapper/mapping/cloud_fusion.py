@@ -25,6 +25,13 @@ from mapper.runtime.progress import Progress
 from mapper.sources.base import CameraImages, Log
 
 _COLOURED_HEIGHTS_M = -1.0, 8.0  # the same in every scan
+_IN_FRONT = 0.8
+"""What lies nearer than this share of a depth covers it. Of ground and walls at grazing angles, points of
+one cell differ by less up to 40 m before a car, or 10 m before a small robot."""
+_LEFT = np.zeros((5, 5), np.uint8)
+_LEFT[2, :2] = 1
+_SIDES = _LEFT, _LEFT[:, ::-1].copy(), _LEFT.T.copy(), _LEFT.T[::-1].copy()
+"""Cells on each side of a point's own whose nearest points may cover it."""
 
 
 def fuse_clouds(
@@ -90,15 +97,6 @@ def fuse_clouds(
             f"cloud: {still.coloured_share:.0%} of the points have a colour by {names}, others are grey"
         )
     return still.cloud(), moving.cloud()
-
-
-_IN_FRONT = 0.8
-"""What lies nearer than this share of a depth covers it. Of ground and walls at grazing angles, points of
-one cell differ by less up to 40 m before a car, or 10 m before a small robot."""
-_LEFT = np.zeros((5, 5), np.uint8)
-_LEFT[2, :2] = 1
-_SIDES = _LEFT, _LEFT[:, ::-1].copy(), _LEFT.T.copy(), _LEFT.T[::-1].copy()
-"""Cells on each side of a point's own whose nearest points may cover it."""
 
 
 class ScanColouring:

@@ -21,6 +21,13 @@ from mapper.simulation.scene import Scene
 
 _TILE_PX = 16
 _NEAR_M = 0.02
+_TAPS_APART = 0.1
+"""Taps closer than this share of a filtered texel are one."""
+_S_AXIS = np.array([1, 1, 0, 0, 0, 0])
+_S_SIGN = np.array([-1.0, 1.0, 1.0, -1.0, 1.0, 1.0])
+_T_AXIS = np.array([2, 2, 2, 2, 1, 1])
+_T_SIGN = np.array([-1.0, -1.0, -1.0, -1.0, 1.0, -1.0])
+"""Directions of a face's columns (s) and rows (t) in the box's frame, so that print is not mirrored."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -192,16 +199,6 @@ def _slabs(
     else:
         face = 4 if iz > 0.0 else 5
     return enter, min(mx + wx, my + wy, mz + wz), face
-
-
-_TAPS_APART = 0.1
-"""Taps closer than this share of a filtered texel are one."""
-
-_S_AXIS = np.array([1, 1, 0, 0, 0, 0])
-_S_SIGN = np.array([-1.0, 1.0, 1.0, -1.0, 1.0, 1.0])
-_T_AXIS = np.array([2, 2, 2, 2, 1, 1])
-_T_SIGN = np.array([-1.0, -1.0, -1.0, -1.0, 1.0, -1.0])
-"""Directions of a face's columns (s) and rows (t) in the box's frame, so that print is not mirrored."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

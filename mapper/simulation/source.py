@@ -49,6 +49,9 @@ _COLOUR_PNG = (
 _DEPTH_PNG = (cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_SUB)
 _GOOD_JPG = (cv2.IMWRITE_JPEG_QUALITY, 92)
 _IMU_AFTER_S = 0.5  # readings go on for this time after the last stamp, beyond the last sweep
+_SKIN = (196, 148, 122)
+_SWAY_SHARE, _SWAY_HZ = 0.03, 0.4
+_HAND_BULGE = 0.15
 
 
 def camera_of(config: SynthConfig) -> PinholeCamera:
@@ -255,11 +258,6 @@ def _save_images(folder: Path, name: str, frame: RgbdFrame, *, image_format: str
     ):
         _, encoded = cv2.imencode(path.suffix, image, flags)
         path.write_bytes(encoded.tobytes())
-
-
-_SKIN = (196, 148, 122)
-_SWAY_SHARE, _SWAY_HZ = 0.03, 0.4
-_HAND_BULGE = 0.15
 
 
 def between(times_s: Array, start_s: float, duration_s: float) -> NDArray[np.bool_]:

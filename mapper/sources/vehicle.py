@@ -16,6 +16,20 @@ from mapper.core.geometry import Array, Points, Transform, apply
 from mapper.sources.base import SPREAD_FRAMES, Log, WrappedEntry
 from mapper.sources.config import BodyConfig
 
+Box = tuple[float, float, float, float, float, float]
+"""Least x y z, then largest x y z, metres, body frame."""
+_MIN_FRAMES = 8
+_MIN_STANDING_RATIO, _SURE_RATIO, _MIN_SURE_CELLS = 0.6, 0.95, 2
+"""Shares of the frames in which a cell of the vehicle has returns: at the edge of a driver who walks along,
+and in the middle. With fewer of the latter a group is a wall that the sensor happens to keep beside."""
+_MAX_STILL_WORLD_RATIO = 0.5
+"""If more of the far cells stand still, so does the sensor, or it moves along a tunnel."""
+_MAX_STEP_CELLS = 2
+"""At most one empty cell lies between two members of a group."""
+_MAX_RETURNS_RATIO = 0.3
+"""What takes up more of the view is no vehicle: it is the object that is scanned."""
+_MARGIN_M = 0.05
+
 
 def without_vehicle(log: Log, config: BodyConfig) -> Log:
     """Return a log whose frames, and those beside it, have no returns of the sensor's own vehicle."""
@@ -91,22 +105,6 @@ class _ClearedEntry(WrappedEntry):
             range_m = np.linalg.norm(points - scan.origin_body.astype(np.float32), axis=1)
             kept &= (range_m >= config.min_range_m) & (range_m <= (config.max_range_m or np.inf))
         return kept
-
-
-Box = tuple[float, float, float, float, float, float]
-"""Least x y z, then largest x y z, metres, body frame."""
-
-_MIN_FRAMES = 8
-_MIN_STANDING_RATIO, _SURE_RATIO, _MIN_SURE_CELLS = 0.6, 0.95, 2
-"""Shares of the frames in which a cell of the vehicle has returns: at the edge of a driver who walks along,
-and in the middle. With fewer of the latter a group is a wall that the sensor happens to keep beside."""
-_MAX_STILL_WORLD_RATIO = 0.5
-"""If more of the far cells stand still, so does the sensor, or it moves along a tunnel."""
-_MAX_STEP_CELLS = 2
-"""At most one empty cell lies between two members of a group."""
-_MAX_RETURNS_RATIO = 0.3
-"""What takes up more of the view is no vehicle: it is the object that is scanned."""
-_MARGIN_M = 0.05
 
 
 @dataclass(frozen=True, slots=True)

@@ -34,6 +34,14 @@ from mapper.sources.readings_beside import write_readings
 from mapper.sources.scan_folders.kitti_writing import save_scan
 from mapper.sources.trajectory_files import write_kitti
 
+_LANE_M = 1.75
+"""From the middle of the road to the middle of the oncoming lane."""
+_CYCLE_LANE_M = (1.5, 2.1)
+_PAVEMENT_M = (7.2, 7.6)
+_ROAMING_M = (1.5, 4.0)
+_LEAST_GAP_M = 12.0
+_CAR_MPS, _CYCLIST_MPS, _PEDESTRIAN_MPS = (4.0, 9.0), (3.0, 6.0), (0.7, 1.6)
+
 
 def firing_times_s(sensor: LidarSensorConfig) -> Array:
     """Return (A,) seconds after the stamp at which the columns of a sweep are fired."""
@@ -184,15 +192,6 @@ def write_lidar_log(
             "solids": simulator.scene.solids.as_json(),
         }
         write_json(folder / "scene.json", scene, indent=1)
-
-
-_LANE_M = 1.75
-"""From the middle of the road to the middle of the oncoming lane."""
-_CYCLE_LANE_M = (1.5, 2.1)
-_PAVEMENT_M = (7.2, 7.6)
-_ROAMING_M = (1.5, 4.0)
-_LEAST_GAP_M = 12.0
-_CAR_MPS, _CYCLIST_MPS, _PEDESTRIAN_MPS = (4.0, 9.0), (3.0, 6.0), (0.7, 1.6)
 
 
 @dataclass(frozen=True, slots=True)

@@ -34,6 +34,16 @@ _LEAST_FLOAT, _MOST_FLOAT, _MOST_STRANGE = 1e-12, 1e6, 0.1
 EMPTY = "the file is empty"
 _VELOVIEW = re.compile(r"points\w*:(?P<axis>[012])")
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*([eE][-+]?\d+)?|\.\d+([eE][-+]?\d+)?|nan|inf)", re.IGNORECASE)
+_WIDTHS = (3, 5, 6, 7, 8)  # x y z; with intensity and ring (nuScenes); with a time; with padding (PCL)
+_BLOCKS, _BLOCK_NUMBERS = 8, 3360  # in parts of whole records of every width up to 8
+_LEAST_STEP = 0.01
+_BETTER, _BETTER_OF_EIGHT = 0.2, 1.2
+"""Difference of logarithms of steps that shows other records: those of the right width were smaller by 0.3 in
+shuffled clouds and by 1.5 to 4 in sweeps; where upper and lower rings take turns, those of eight
+by 0.6, of padded ones by 2.5."""
+_ALIKE_RATIO = 2.0
+_LEAST_INTENSITY, _MAX_NEGATIVE_RATIO = -1.0, 0.01
+"""Coordinates are below it; times before the end of the sweep, in seconds, are not."""
 
 
 def read_bin(path: Path, columns: int | None = None) -> Columns:
@@ -203,18 +213,6 @@ def _column_name(word: str) -> str:
 def _xyz(table: Column, path: Path) -> Columns:
     _refuse_others_first(table, path)
     return {name: table[:, column] for column, name in enumerate("xyz")}
-
-
-_WIDTHS = (3, 5, 6, 7, 8)  # x y z; with intensity and ring (nuScenes); with a time; with padding (PCL)
-_BLOCKS, _BLOCK_NUMBERS = 8, 3360  # in parts of whole records of every width up to 8
-_LEAST_STEP = 0.01
-_BETTER, _BETTER_OF_EIGHT = 0.2, 1.2
-"""Difference of logarithms of steps that shows other records: those of the right width were smaller by 0.3 in
-shuffled clouds and by 1.5 to 4 in sweeps; where upper and lower rings take turns, those of eight
-by 0.6, of padded ones by 2.5."""
-_ALIKE_RATIO = 2.0
-_LEAST_INTENSITY, _MAX_NEGATIVE_RATIO = -1.0, 0.01
-"""Coordinates are below it; times before the end of the sweep, in seconds, are not."""
 
 
 def other_width(numbers: NDArray[np.float32]) -> tuple[int, bool] | None:

@@ -29,6 +29,8 @@ _VIDEO = "rgb.mp4"
 FILES = (_VIDEO, "odometry.csv", "depth/*")
 _COLUMNS = ("timestamp", "frame", "x", "y", "z", "qx", "qy", "qz", "qw")
 _INTRINSICS = ("fx", "fy", "cx", "cy")
+_KEPT = 12
+"""Frames that are kept: threads that read ahead may ask for them in another order."""
 
 
 def read_frames(folder: Path, config: SourceConfig) -> PosedFrames:
@@ -84,10 +86,6 @@ def _matrix(path: Path) -> np.ndarray:
         raise SourceError(f"{path}: want three rows of three numbers, the camera's matrix")
     K = np.array(matrix)
     return np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2]])
-
-
-_KEPT = 12
-"""Frames that are kept: threads that read ahead may ask for them in another order."""
 
 
 class Video:

@@ -44,6 +44,15 @@ POINT_FIELD_TYPES = dict(enumerate(("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f
 _EXTRINSICS_NUMBERS = 12
 _GPS_STATUS = {18: 2, 19: 2, 20: 2, 33: 1}
 """GPSStatus's own numbers of differential, RTK, RTK with floating ambiguities and WAAS, as NavSatStatus's."""
+_HEADER_BYTES = 16
+"""Four of the encapsulation (CDR) or of a counter (ROS 1), then seconds, nanoseconds, the frame's length."""
+_COUNT = ("count", "u4")
+_LIVOX_HEAD = [("timebase", "u8"), ("point_num", "u4"), ("lidar_id", "u1"), ("rsvd", "u1", 3), _COUNT]
+_LIVOX_POINT = [
+    *[("offset_time", "u4"), ("x", "f4"), ("y", "f4"), ("z", "f4")],
+    *[("reflectivity", "u1"), ("tag", "u1"), ("line", "u1")],
+]
+_VELODYNE_PACKET = [("sec", "u4"), ("nanosec", "u4"), ("data", "u1", PACKET_BYTES)]
 
 
 def decode_ros(topic: Topic, data: memoryview) -> Message:
@@ -230,17 +239,6 @@ def _pose(header: Any, child: str, p: Any, q: Any) -> PoseMessage:
 
 def _ns(stamp: Any) -> int:
     return int(stamp.sec * NS_PER_S + stamp.nanosec)
-
-
-_HEADER_BYTES = 16
-"""Four of the encapsulation (CDR) or of a counter (ROS 1), then seconds, nanoseconds, the frame's length."""
-_COUNT = ("count", "u4")
-_LIVOX_HEAD = [("timebase", "u8"), ("point_num", "u4"), ("lidar_id", "u1"), ("rsvd", "u1", 3), _COUNT]
-_LIVOX_POINT = [
-    *[("offset_time", "u4"), ("x", "f4"), ("y", "f4"), ("z", "f4")],
-    *[("reflectivity", "u1"), ("tag", "u1"), ("line", "u1")],
-]
-_VELODYNE_PACKET = [("sec", "u4"), ("nanosec", "u4"), ("data", "u1", PACKET_BYTES)]
 
 
 def decode_driver_message(topic: Topic, data: memoryview) -> CloudMessage:

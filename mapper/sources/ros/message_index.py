@@ -33,6 +33,10 @@ _TRIED = 10
 _KEPT_BYTES = 32 * MIB
 _FRAME_OFFSET = 12  # after a counter (ROS 1) or the encapsulation (CDR), seconds and nanoseconds
 _LONGEST_FRAME = 256  # bytes
+_UNPACK = {order: struct.Struct(f"{order}104x3d72x3d72x") for order in "<>"}
+"""Orientation and its covariance, angular velocity, covariance, acceleration, covariance: 37 doubles."""
+_HEADER_BYTES = 12
+_NONE = (nan,) * 6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -227,12 +231,6 @@ def _header_frame(topic: Topic, data: memoryview) -> str:
         name = bytes(data[_FRAME_OFFSET + 4 :][: min(length, _LONGEST_FRAME)])
         return name.rstrip(b"\0").decode(errors="replace").lstrip("/")
     return ""
-
-
-_UNPACK = {order: struct.Struct(f"{order}104x3d72x3d72x") for order in "<>"}
-"""Orientation and its covariance, angular velocity, covariance, acceleration, covariance: 37 doubles."""
-_HEADER_BYTES = 12
-_NONE = (nan,) * 6
 
 
 def readings_of(topic: Topic, data: memoryview) -> tuple[float, ...]:

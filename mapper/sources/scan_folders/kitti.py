@@ -39,6 +39,8 @@ _ALONG_Z_RATIO = 0.9
 _CAMERAS_NOTE = (
     "the true poses move along their z, as a camera's do; without calib.txt they count as the LiDAR's"
 )
+_FOLDERS = ("image_2", "image_02/data")
+_ENDINGS = {".png", ".jpg"}
 
 
 def recognise(path: Path) -> bool:
@@ -101,10 +103,6 @@ def _scans(sequence: Path) -> Path:
     """Return the folder of a sequence's scans, which need not exist."""
     raw = sequence / "velodyne_points" / "data"
     return raw if most_clouds(raw) else sequence / "velodyne"
-
-
-_FOLDERS = ("image_2", "image_02/data")
-_ENDINGS = {".png", ".jpg"}
 
 
 def with_images(log: Log, sequence: Path, scans: Sequence[Path]) -> Log:
