@@ -17,6 +17,7 @@ from mapper.mapping.wall_direction import WallHeading, wall_heading
 from mapper.registration.planes import (
     MAX_TILT_RAD,
     MIN_PATCHES,
+    PARALLEL_RAD,
     Patches,
     Vertical,
     patches_of,
@@ -27,6 +28,9 @@ from mapper.sources.base import Accelerations
 
 _FELT = "the accelerometer"
 _IN_LAYER = 1.0 / 3.0  # of a voxel
+_UPSIDE_DOWN = 10
+"""Patches that face down for each that faces up, above which a LiDAR hangs: outdoors no patch faces down, and
+in rooms, where the ceiling is seen as well, about as many as face up."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,11 +84,10 @@ def find_level(
     if not len(trajectory):
         raise DataError("levelling: the trajectory has no poses")
     tolerance_m = config.plane_tolerance_m
-    rough = _rough_up(scans, trajectory, accelerations, config=config, axes=axes)
-    up_guess = rough.up_world
     patches = patches_of(scans, tolerance_m=tolerance_m)
+    rough = _rough_up(patches, trajectory, accelerations, config=config, axes=axes)
     up_world, method, up_detail = _up(
-        patches, trajectory, accelerations, up_guess=up_guess, tolerance_m=tolerance_m
+        patches, trajectory, accelerations, up_guess=rough.up_world, tolerance_m=tolerance_m
     )
     if axes.stands_on_floor:
         floor = floor_below(scans, up_world, tolerance_m=tolerance_m)
@@ -94,7 +97,7 @@ def find_level(
     if axes.floor_world is not None:
         floor = weighed(floor, axes.floor_world @ up_world)
     T_level_world = _frame(trajectory.T_world_body[0], up_world, floor.height_m, axes)
-    details = [up_detail, floor.detail]
+    details = [*filter(None, [up_detail, rough.assumption, floor.detail])]
     if config.heading == "walls":
         T_level_world, heading = _turned_along_walls(T_level_world, patches)
         details.append(heading)
@@ -152,15 +155,23 @@ def level_in_plane(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _RoughUp:
-    """Direction in the world within 60° of which up is; the rest as in ``Level``."""
+    """Direction in the world within 60° of which up is.
+
+    Attributes:
+        up_world: (3,) the direction.
+        conflict: As in ``Level``.
+        is_decided: As in ``Level``.
+        assumption: Sentence on a direction that nothing in the log states; else empty.
+    """
 
     up_world: Array
     conflict: str = ""
     is_decided: bool = True
+    assumption: str = ""
 
 
 def _rough_up(
-    scans: Sequence[tuple[Scan, Transform]],
+    patches: Patches,
     trajectory: Trajectory,
     accelerations: Accelerations | None,
     *,
@@ -182,13 +193,25 @@ def _rough_up(
     if any(chosen.contradicts(other) for other in candidates):
         is_decided = accelerations is not None and accelerations.are_checked
         if axes.stands_on_floor:
-            chosen, is_decided = _above_floor(candidates, scans, config.plane_tolerance_m)
+            chosen, is_decided = _above_floor(candidates, patches, config.plane_tolerance_m)
     if config.up != "auto" and len(candidates) > 1:
         is_wanted = [(one.name == _FELT) == (config.up == "accelerometer") for one in candidates]
         chosen, is_decided = candidates[is_wanted.index(True)] if any(is_wanted) else chosen, True
     against = next((one for one in candidates if one.is_stated and chosen.contradicts(one)), None)
-    if against is None:
+    if against is None and (chosen.name == _FELT or config.up != "auto"):
         return _RoughUp(chosen.up_world)
+    if against is None:
+        assumption = "" if axes.are_stated else f"up is taken to be {chosen.name}, as nothing states it"
+        conflict = ""
+        if axes.stands_on_floor:
+            facing_up, facing_down = _facing(patches, chosen.up_world, config.plane_tolerance_m)
+            if facing_down >= MIN_PATCHES and facing_down > _UPSIDE_DOWN * facing_up:
+                conflict = (
+                    f"of the level patches {facing_down} face down and {facing_up} up: is the LiDAR mounted "
+                    f"upside down? Up is taken by {chosen.name}; level.up=-z turns the map over, "
+                    "level.up=sensor says that it is right"
+                )
+        return _RoughUp(chosen.up_world, conflict, not conflict, assumption)
     angle_deg = np.degrees(chosen.angle_to(against))
     doubt = "" if is_decided else " though nothing decides"
     conflict = (
@@ -222,17 +245,27 @@ def _candidates(
 
 
 def _above_floor(
-    candidates: Sequence["_Candidate"], scans: Sequence[tuple[Scan, Transform]], tolerance_m: float
+    candidates: Sequence["_Candidate"], patches: Patches, tolerance_m: float
 ) -> tuple["_Candidate", bool]:
     """Return the first candidate with a floor below it, and whether none with a floor contradicts it."""
+    facing = [_facing(patches, candidate.up_world, tolerance_m) for candidate in candidates]
     with_floor = [
         candidate
-        for candidate in candidates
-        if floor_below(scans, candidate.up_world, tolerance_m=tolerance_m).is_seen
+        for candidate, (up, down) in zip(candidates, facing, strict=True)
+        if up >= MIN_PATCHES and up > down
     ]
     if not with_floor:
         return candidates[0], False
     return with_floor[0], not any(with_floor[0].contradicts(other) for other in with_floor)
+
+
+def _facing(patches: Patches, up_guess: Array, tolerance_m: float) -> tuple[int, int]:
+    """Return how many patches face up, as a floor does, and down, if up is within 60° of a direction."""
+    if not len(patches):
+        return 0, 0
+    vertical = vertical_of(patches, up_guess_world=up_guess, tolerance_m=tolerance_m)
+    cosine = patches.normals_world @ vertical.up_world
+    return int((cosine > np.cos(PARALLEL_RAD)).sum()), int((cosine < -np.cos(PARALLEL_RAD)).sum())
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -107,13 +107,16 @@ def test_the_user_can_say_which_axis_of_a_camera_points_up(quarters, up):
 def street(*, is_inverted, has_ground=True, imu_is_inverted):
     """Scans of a LiDAR that drives 1.7 m above the ground beside a wall, and stated accelerations."""
     rng = np.random.default_rng(0)
-    ground = np.column_stack([rng.uniform(-20, 20, (2000, 2)), rng.normal(-1.7, 0.01, 2000)])
+    azimuth, range_m = rng.uniform(-np.pi, np.pi, 3000), np.exp(rng.uniform(np.log(2), np.log(20), 3000))
+    ground = np.column_stack(
+        [range_m * np.cos(azimuth), range_m * np.sin(azimuth), rng.normal(-1.7, 0.01, 3000)]
+    )
     wall = np.column_stack([rng.uniform(-20, 20, 500), rng.normal(8.0, 0.01, 500), rng.uniform(-1.7, 4, 500)])
     points = np.concatenate([ground, wall]) if has_ground else wall
     R_body_robot = np.diag([1.0, -1.0, -1.0]) if is_inverted else np.eye(3)
     poses = [transform(np.eye(3), [0.1 * k, 0.0, 0.0]) for k in range(100)]
     trajectory = Trajectory(np.arange(100, dtype=np.int64) * 100 * MS, np.array(poses))
-    scans = [(Scan(0, (points @ R_body_robot.T).astype(np.float32)), poses[0])]
+    scans = [(Scan(0, (points @ R_body_robot.T).astype(np.float32)), T) for T in poses[:5]]
     felt = [0.0, 0.0, -9.81 if imu_is_inverted else 9.81]
     return (
         scans,
@@ -155,3 +158,20 @@ def test_the_user_can_say_which_way_is_up(up, z_up):
     scans, trajectory, readings = street(is_inverted=True, imu_is_inverted=True)
     level = level_of(scans, trajectory, readings, LevelConfig(up=up), axes=AXES["lidar"])
     assert level.T_level_world[2, 2] == pytest.approx(z_up, abs=0.05)
+
+
+@pytest.mark.parametrize("is_inverted", [True, False])
+@pytest.mark.parametrize("up", ["auto", "sensor", "z"])
+def test_a_lidar_over_which_the_ground_is_seen_hangs_upside_down(is_inverted, up):
+    scans, trajectory, _ = street(is_inverted=is_inverted, imu_is_inverted=False)
+    level = level_of(scans, trajectory, config=LevelConfig(up=up), axes=AXES["lidar"])
+    assert ("level.up=-z" in level.conflict) == (is_inverted and up == "auto") == (not level.is_decided)
+    assert ("the sensor's z axis, as nothing states it" in level.detail) == (up == "auto")
+
+
+def test_a_lidar_between_floor_and_ceiling_may_be_upright():
+    scans, trajectory, _ = street(is_inverted=False, imu_is_inverted=False)
+    below = scans[0][0].points_body
+    both = np.concatenate([below, below * [1.0, 1.0, -1.0]]).astype(np.float32)
+    level = level_of([(Scan(0, both), T) for _, T in scans], trajectory, axes=AXES["lidar"])
+    assert not level.conflict
