@@ -74,18 +74,10 @@ def inspect(
     """
     from mapper.sources.inspection import inspect_log  # loads foxglove, which opening a log may not need
 
-    def why_untrackable(log: Log) -> str | None:
-        if log.sensor == "rgbd":
-            return None
-        from mapper.odometry.scans import scan_observation
-        from mapper.odometry.scans.adapted_lengths import adapted_to
-        from mapper.odometry.scans.config import AnyScanOdometryConfig
+    def refused(log: Log) -> str | None:
+        from mapper.pipeline.track import why_untrackable
 
-        odometry = load_config(settings=settings, sensor=log.sensor).odometry
-        odometry = adapted_to(odometry, log)
-        if not isinstance(odometry, AnyScanOdometryConfig):
-            return None
-        return scan_observation.why_untrackable(log, odometry)
+        return why_untrackable(log, load_config(settings=settings, sensor=log.sensor))
 
     def offsets(log: Log) -> "list[TimeOffset]":
         from mapper.pipeline.time_offsets import measure_time_offsets
@@ -94,9 +86,7 @@ def inspect(
         return measure_time_offsets(log, tracked_by, progress=receiver_of(progress))
 
     config = load_source_config(settings=settings)
-    return inspect_log(
-        Path(path), config, check=why_untrackable, time_offsets=offsets if time_offset else None
-    )
+    return inspect_log(Path(path), config, check=refused, time_offsets=offsets if time_offset else None)
 
 
 def read_frame(name: AnyPath, config: SourceConfig) -> tuple[Frame, Sensor]:

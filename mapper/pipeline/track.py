@@ -37,6 +37,9 @@ from mapper.sources.merged_scans import with_merged_scans
 from mapper.sources.reading_checks import ReadingChecks
 from mapper.sources.scan_frame import scan_frame_warnings
 
+_LOOKED_AT = 6
+"""Frames, spread over a log, that are tried before it is said that none can be tracked."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Start:
@@ -310,6 +313,21 @@ def session_odometry(source: Log, config: BuildConfig) -> Odometry[Any]:
         ConfigError: It needs wheels or poses and there are none.
     """
     return odometry_for(config.odometry, source, _wheel_measurements(source, config))
+
+
+def why_untrackable(source: Log, config: BuildConfig) -> str | None:
+    """Return why none of some frames, spread over a log, can be tracked; None if one can."""
+    try:
+        odometry = session_odometry(source, config)
+    except (ConfigError, DataError) as error:
+        return str(error)
+    first = None
+    for entry in source.spread_entries(_LOOKED_AT):
+        observation = _observe(odometry, entry).observation
+        if not isinstance(observation, Skipped):
+            return None
+        first = first or observation.reason
+    return first
 
 
 def _wheel_measurements(source: Log, config: BuildConfig) -> WheelMeasurements:

@@ -1,6 +1,6 @@
 """Plausibility of depth as that of the images: whether outlines in depth lie on edges of brightness."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
 from itertools import permutations
 from typing import TypeAlias
 
@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.frames import RgbdFrame
+
+Pixels: TypeAlias = NDArray[np.float32]
 
 _WIDTH_PX, _MOST_PX, _NEAR_PX = 320, 48, 4
 """Width to which images are reduced, the largest shift that is tried there, and the largest that is none."""
@@ -21,13 +23,30 @@ _LEAST_CONTRAST, _LEAST_GRADIENT = 4.0, 20.0
 alone, and less where a JPEG smooths it; 4.8 and 45 and more of rooms with texture."""
 _LEAST_SCORE, _TIMES_BETTER, SOUND_SCORE = 0.4, 1.4, 0.7
 """Registered depth has its best score within 1 px of no shift, 0.6 standard deviations of brightness or more.
-Moved by 12 px, that score is 1.4 to 5 times the best within 4 px, and mirrored 3; registered 0.7."""
+Moved by 12 px, that score is 1.4 to 5 times the best within 4 px; registered 0.7."""
 _TIMES_OTHERS = 2.0
-"""Score in that of other frames' depth: 3.4 and more if registered, 0 to 2.2 if of another time or camera."""
-_FLIPS = {"mirrored": 1, "put upside down": 0, "turned by 180°": -1}
-"""OpenCV's codes."""
+"""Score in that of other frames' depth: 3.4 and more if registered, 0 to 2.2 if of another time or camera;
+and in that of flipped depth: 1.8 to 7 if registered, 0.1 to 0.6 if it ought to be flipped."""
+_FLIPS: Mapping[str, Callable[[Pixels], Pixels]] = {
+    "": lambda edges: edges,
+    "mirrored": np.fliplr,
+    "put upside down": np.flipud,
+    "turned by 180°": lambda edges: edges[::-1, ::-1],
+}
 
-Pixels: TypeAlias = NDArray[np.float32]
+
+def why_flipped(frames: Iterable[RgbdFrame]) -> str | None:
+    """Return that depth is mirrored or turned against the images, which no pose undoes; None if it is not."""
+    pairs = [both for _, both in _outlined(frames)]
+    scores = [
+        (np.mean([_scores(gradient, flip(edges), _NEAR_PX) for gradient, edges in pairs], axis=0).max(), how)
+        for how, flip in _FLIPS.items()
+        if pairs
+    ]
+    best, how = max(scores, default=(0.0, ""))
+    if not how or best < max(SOUND_SCORE, _TIMES_OTHERS * scores[0][0]):
+        return None
+    return f"depth: its edges lie on those of the images if it is {how}; flip it, or the images"
 
 
 def outline_warnings(frames: Iterable[RgbdFrame]) -> list[str]:
@@ -36,20 +55,14 @@ def outline_warnings(frames: Iterable[RgbdFrame]) -> list[str]:
     Outlines of what stands before something else are edges of brightness too. The gradient of brightness at
     those of depth is averaged over frames for every shift of the images; it is largest at the true one.
     """
-    found = [(frame.camera.width_px, both) for frame in frames if (both := outlines(frame)) is not None]
-    if len(found) < _FEWEST_FRAMES:
-        return []
+    found = _outlined(frames)
     pairs = [both for _, both in found]
+    if not found:
+        return []
     score = np.mean([_scores(*both, _MOST_PX) for both in pairs], axis=0)
     around = slice(_MOST_PX - _NEAR_PX, _MOST_PX + _NEAR_PX + 1)
     near = float(score[around, around].max())
-    limit = max(_LEAST_SCORE, _TIMES_BETTER * near)
-    if near < SOUND_SCORE:
-        for how, code in _FLIPS.items():
-            flipped = [_scores(gradient, cv2.flip(edges, code), _NEAR_PX) for gradient, edges in pairs]
-            if np.mean(flipped, axis=0).max() >= max(limit, score.max()):
-                return [f"depth: its edges lie on those of the images if it is {how}; flip it, or the images"]
-    if score.max() >= limit:
+    if score.max() >= max(_LEAST_SCORE, _TIMES_BETTER * near):
         row, column = np.unravel_index(score.argmax(), score.shape)
         x_px, y_px = (found[0][0] / _WIDTH_PX * (int(k) - _MOST_PX) for k in (column, row))
         return [
@@ -67,6 +80,12 @@ def outline_warnings(frames: Iterable[RgbdFrame]) -> list[str]:
             "of the same time (source.depth_offset_s), and of the same camera?"
         ]
     return []
+
+
+def _outlined(frames: Iterable[RgbdFrame]) -> list[tuple[int, tuple[Pixels, Pixels]]]:
+    """Return width and outlines of the frames that have some; none of too few frames."""
+    found = [(frame.camera.width_px, both) for frame in frames if (both := outlines(frame)) is not None]
+    return found if len(found) >= _FEWEST_FRAMES else []
 
 
 def outlines(frame: RgbdFrame) -> tuple[Pixels, Pixels] | None:

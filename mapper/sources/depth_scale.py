@@ -13,6 +13,7 @@ from mapper.core.trajectory import Trajectory
 from mapper.core.units import MM_PER_M
 from mapper.sensing.wheel_kinematics import pose_at
 from mapper.sources.base import Log, read_depth
+from mapper.sources.depth_outlines import why_flipped
 from mapper.sources.image_files.reading import TUM_UNITS_PER_M
 
 _LOOKED_AT = 8
@@ -39,6 +40,11 @@ like the one and all after more like the other: usual units differ by 4 or 5, or
 _PILED_SHARE, _PILED_TIMES, _NEXT_FARTHEST = 0.01, 2.0, 0.95
 """Share of an image that is exactly the log's farthest depth if that stands for none, and how often it is
 as much as those next to it, from this ratio of the farthest on. Of what is measured 0.4 % and 0.5 times."""
+
+_WIDTH_PX, _WINDOW_PX, _STRAIGHT, _FEWEST_WINDOWS, _LEAST_INVERSE = 320, 32, 0.16, 10, 0.8
+"""Least width of the depth images in which planes are looked for, size of the windows, largest residual in
+the square of the slant (where one of z and 1/z is linear, that of the other is 0.07), and number and share of
+windows. Of seven real and made logs z is straighter than 1/z in 0 to 14 % of 14 to 354 windows."""
 
 _PAIR_WITHIN_NS = NS_PER_S // 2
 _MIN_MOTION_M = 0.03
@@ -77,7 +83,9 @@ def why_no_depth(log: Log, frames: Mapping[int, RgbdFrame]) -> str | None:
         return f"no depth in any of {len(frames)} frames looked at: all of it is 0, or the limit of 16 bits"
     least_m, most_m = _POSSIBLE_M
     if not medians_m or least_m < np.median(medians_m) < most_m:
-        return None
+        return why_flipped(frames.values())
+    if inverse := _inverse_warning(frames.values()):
+        return inverse[0]
     median_m, units_per_m = float(np.median(medians_m)), _units_per_m(log)
     setting = "source.camera.depth_factor" + ("" if units_per_m is None else f"={units_per_m:g}")
     return (
@@ -98,7 +106,8 @@ def depth_warnings(log: Log, frames: Mapping[int, RgbdFrame]) -> list[str]:
     measured = float(np.median([(frame.depth_m > 0.0).mean() for frame in frames.values()]))
     if measured < _MIN_MEASURED_SHARE:
         return [f"depth: {1.0 - measured:.1%} of the pixels measured nothing: 0, or the limit of 16 bits"]
-    if odd := _change_warning(log, frames) or _pile_warning(frames.values()):
+    values = frames.values()
+    if odd := _change_warning(log, frames) or _pile_warning(values) or _inverse_warning(values):
         return odd
     if (scale := _scale_of_log(log, frames)) is None:
         return _range_warning(log, frames.values())
@@ -193,6 +202,37 @@ def _pile_warning(frames: Collection[RgbdFrame]) -> list[str]:
     return [
         f"depth: {at_end:.0%} of it is exactly {far_m:.4g} m, the farthest: do pixels without a measurement "
         f"have this value? --set source.body.max_range_m={0.999 * far_m:.4g} leaves them out"
+    ]
+
+
+def _inverse_warning(frames: Collection[RgbdFrame]) -> list[str]:
+    """Return a sentence on depth that seems to be disparity: on a plane 1/z is linear in the pixel, z is not.
+
+    Both are fitted in windows on slanted surfaces.
+    """
+    rows, columns = np.mgrid[:_WINDOW_PX, :_WINDOW_PX] / _WINDOW_PX - 0.5
+    plane = np.column_stack([np.ones(rows.size), rows.ravel(), columns.ravel()])
+    windows = [np.empty((0, rows.size))]
+    for frame in frames:
+        step = max(1, frame.camera.width_px // _WIDTH_PX)
+        depth_m = frame.depth_m[::step, ::step]
+        if min(depth_m.shape) < _WINDOW_PX:
+            continue
+        shown = np.lib.stride_tricks.sliding_window_view(depth_m, (_WINDOW_PX, _WINDOW_PX))
+        whole = shown[:: _WINDOW_PX // 2, :: _WINDOW_PX // 2].reshape(-1, rows.size).astype(np.float64)
+        windows.append(whole[(whole > 0.0).all(axis=1)])
+    z = np.concatenate(windows)
+    values = np.stack([z, 1.0 / z])
+    values /= values.mean(axis=2, keepdims=True)
+    fits = values @ np.linalg.pinv(plane).T
+    residuals = np.linalg.norm(values - fits @ plane.T, axis=2) / np.sqrt(rows.size)
+    slanted = residuals.min(axis=0) < _STRAIGHT * np.linalg.norm(fits[0, :, 1:], axis=1) ** 2
+    of_z, of_inverse = residuals[:, slanted]
+    if len(of_z) < _FEWEST_WINDOWS or (of_z < of_inverse).mean() < _LEAST_INVERSE:
+        return []
+    return [
+        f"depth: planes are straight in it as in disparity ({(of_z < of_inverse).mean():.0%} of {len(of_z)} "
+        "windows); is it disparity or inverse depth? write focal length · baseline / disparity"
     ]
 
 

@@ -1,6 +1,6 @@
 """Facts of a log, without building anything from it."""
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -31,7 +31,8 @@ from mapper.sources.vehicle import Box, vehicle_box
 
 _MOST_LOADED = 200
 """Frames of an RGB-D log that are loaded, evenly spread: a second or two of reading, whatever its length."""
-
+_FEW_SCANS = 40
+"""Scans of a LiDAR's log that are loaded if it has no more; as text, a single one may take seconds."""
 
 _AT_STAMP = 0.05
 """Part of a sweep within which its first or last point counts as measured at the stamp."""
@@ -77,6 +78,7 @@ class LogFacts:
         kind: Format of the log.
         sensor: "rgbd", "lidar" or "lidar-2d".
         frames: Timing of its frames.
+        readable: Number of its frames that can be read, by those that were looked at.
         content: The first frame that can be read, in words, or that none can.
         images: Blur, exposure and overlap of the images; None of a LiDAR, and of small ones.
         point_times: The times of the first scan's points, in words; None without.
@@ -100,6 +102,7 @@ class LogFacts:
     kind: str
     sensor: Sensor
     frames: Timing
+    readable: int
     content: str
     images: ImageQuality | None
     point_times: str | None
@@ -196,7 +199,7 @@ def _inspected(
 ) -> Inspection:
     checks = ReadingChecks(source)
     images = ImageChecks(len(source))
-    damage = list(_damage(checks, images))  # loads grey images, before the first is loaded in colour
+    readable, damage = _damage(checks, images)  # loads grey images, before the first is loaded in colour
     first, problem = _first_frame(checks.log)
     frames = read_spread(source)
     timing = timing_of(source.stamps_ns)
@@ -205,6 +208,7 @@ def _inspected(
         kind=source.kind,
         sensor=source.sensor,
         frames=timing,
+        readable=readable,
         content=problem if first is None else _content_text(first),
         images=images.quality(),
         point_times=_times_text(first, timing) if isinstance(first, Scan) else None,
@@ -294,23 +298,28 @@ def _calibration_text(camera: PinholeCamera) -> str:
     return f"fx fy cx cy {numbers} px, distortion {distortion}"
 
 
-def _damage(checks: ReadingChecks, images: ImageChecks) -> Iterator[str]:
-    """Load frames from all over an RGB-D log, and yield a note if some cannot be read.
+def _damage(checks: ReadingChecks, images: ImageChecks) -> tuple[int, list[str]]:
+    """Load frames from all over a log; return how many can be read, and a note if some cannot.
 
     Around images that repeat all frames are loaded, so that the checks find where that begins and ends; and
-    some beside those looked at, which share their view. Scans are not loaded: as text, a single one may take
-    seconds.
+    some beside those looked at, which share their view.
     """
-    if checks.log.sensor != "rgbd":
-        return
-    step = -(-len(checks.log) // _MOST_LOADED)
-    looked_at = range(0, len(checks.log), step)
-    if reasons := _unreadable(checks.log, looked_at, images):
-        yield f"{len(reasons)} of {len(looked_at)} frames looked at cannot be read; the first: {reasons[0]}"
+    frames = len(checks.log)
+    if checks.log.sensor != "rgbd" and frames > _FEW_SCANS:
+        return frames, []
+    step = -(-frames // _MOST_LOADED)
+    looked_at = range(0, frames, step)
+    reasons = _unreadable(checks.log, looked_at, images)
+    notes = []
+    if reasons:
+        notes = [
+            f"{len(reasons)} of {len(looked_at)} frames looked at cannot be read; the first: {reasons[0]}"
+        ]
     for run in (*checks.repeated("image", fewest=2), *checks.repeated("depth", fewest=2)):
         _unreadable(checks.log, range(max(run.start - step, 0), run.start))
-        _unreadable(checks.log, range(run.stop, min(run.stop + step, len(checks.log))))
+        _unreadable(checks.log, range(run.stop, min(run.stop + step, frames)))
     _unreadable(checks.log, images.missing, images)
+    return round(frames * (1.0 - len(reasons) / len(looked_at))), notes
 
 
 def _unreadable(log: Log, indices: Iterable[int], images: ImageChecks | None = None) -> list[str]:

@@ -21,7 +21,7 @@ from mapper.simulation.config import SynthConfig, SynthWheelsConfig
 from mapper.sources import open_source
 from mapper.sources.base import Log
 from mapper.sources.config import CameraConfig, SourceConfig
-from mapper.sources.depth_scale import depth_warnings, read_spread
+from mapper.sources.depth_scale import depth_warnings, read_spread, why_no_depth
 from tests.support.command_line import mapper
 from tests.support.logs import MemoryEntry, log_in_memory
 from tests.support.tum_logs import copy_numbered
@@ -156,6 +156,21 @@ def test_units_that_fit_are_named(desk_log, factor, fitting):
     for is_assumed in (True, False):
         log = replace(desk(desk_log, factor), truth=None, are_units_assumed=is_assumed)
         assert warnings_of(log)[0].endswith(fitting)
+
+
+@pytest.mark.parametrize("scale_m", [None, 2.0, 200.0])
+def test_disparity_in_place_of_depth_is_told(desk_log, scale_m):
+    """In metres that cameras measure it is a doubt; else it is refused, as other depth out of reach."""
+    log = desk(desk_log, 5000)
+    frames = read_spread(log)
+    if scale_m is not None:
+        frames = {
+            index: replace(frame, depth_m=np.where(d := frame.depth_m, scale_m / np.maximum(d, 1e-3), d))
+            for index, frame in frames.items()
+        }
+    told = [*depth_warnings(replace(log, truth=None), frames), why_no_depth(log, frames) or ""]
+    assert any("disparity" in text for text in told) == (scale_m is not None)
+    assert ("disparity" in told[-1]) == (scale_m == 200.0)
 
 
 def test_motion_that_no_scale_fits_says_nothing_of_depth(desk_log):

@@ -102,6 +102,26 @@ def test_the_verb_prints_a_table_and_json(tmp_path):
     )
 
 
+@pytest.mark.parametrize("kind", ["given", "wheels"])
+def test_poses_that_the_settings_want_and_the_log_lacks_are_refused(tmp_path, kind):
+    text = printed(write(tmp_path / "log.mcap", shots(12)), "--set", f"odometry.kind={kind}", status=1)
+    assert f"mapper build  nothing: odometry.kind={kind}: the log has n" in text
+
+
+@pytest.mark.parametrize("left", [9, 10])
+def test_scans_that_cannot_be_read_do_not_count(tmp_path, left):
+    """Those of another frame that tf does not connect, among others, cannot be read."""
+    points = np.random.default_rng(0).uniform(1.0, 9.0, (3000, 3)).astype(np.float32)
+    frames = ["lidar"] * (left - 1) + ["other"] * 7 + ["lidar"]
+    clouds = [
+        cloud_message("/points", Scan(FIRST_NS + k * 100 * MS, points + np.float32(0.01 * k)), frame=frame)
+        for k, frame in enumerate(frames)
+    ]
+    text = printed(write(tmp_path / "log.mcap", clouds), status=int(left < 10))
+    assert ("7 of 16 clouds are in frames" in text) == (left == 9)
+    assert ("want at least 10" in text) == (left == 9)
+
+
 def test_the_exit_status_is_1_where_nothing_can_be_mapped(tmp_path, tiny_tum_log):
     only_colour = [message for message in shots(3) if message.topic == COLOR]
     log = write(tmp_path / "log.mcap", only_colour)

@@ -13,11 +13,9 @@ from mapper.features.frame_view import ScanView
 from mapper.odometry.scans.config import ScanOdometryConfig
 from mapper.odometry.scans.scan_matcher import DeskewedScan
 from mapper.registration.surfaces import prepared
-from mapper.sources.base import Log
 
 _MIN_POINTS, _MIN_PLANAR_POINTS = 100, 30
 """Fewer points left after thinning do not constrain a pose; in a plane it has half of the motions."""
-_LOOKED_AT = 6
 _FINER = 0.5  # voxel size of the first thinning, of whose points each prepared point is the mean
 
 
@@ -107,19 +105,6 @@ def observe_scan(frame: Frame, config: ScanOdometryConfig) -> ScanObservation:
     middle_s, half_s = 0.5 * (first_s + last_s), 0.5 * (last_s - first_s)
     swept = replace(thinned, times_s=times_s)
     return ScanObservation(swept, middle_s, half_s, median_m, None, config.voxel_m)
-
-
-def why_untrackable(log: Log, config: ScanOdometryConfig) -> str | None:
-    """Return why none of some scans, spread over a log, can be tracked; None if one can."""
-    first = None
-    for entry in log.spread_entries(_LOOKED_AT):
-        try:
-            observe_scan(entry.load(colour=False), config)
-        except FrameError as error:
-            first = first or str(error)
-        else:
-            return None
-    return first
 
 
 def _in_its_plane(scan: Scan) -> Scan:
