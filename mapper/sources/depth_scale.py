@@ -214,10 +214,10 @@ def _inverse_warning(frames: Collection[RgbdFrame]) -> list[str]:
     plane = np.column_stack([np.ones(rows.size), rows.ravel(), columns.ravel()])
     windows = [np.empty((0, rows.size))]
     for frame in frames:
-        step = max(1, frame.camera.width_px // _WIDTH_PX)
-        depth_m = frame.depth_m[::step, ::step]
-        if min(depth_m.shape) < _WINDOW_PX:
+        step = frame.camera.width_px // _WIDTH_PX
+        if min(step, frame.camera.height_px // _WINDOW_PX) < 1:
             continue
+        depth_m = frame.depth_m[::step, ::step]
         shown = np.lib.stride_tricks.sliding_window_view(depth_m, (_WINDOW_PX, _WINDOW_PX))
         whole = shown[:: _WINDOW_PX // 2, :: _WINDOW_PX // 2].reshape(-1, rows.size).astype(np.float64)
         windows.append(whole[(whole > 0.0).all(axis=1)])

@@ -1,11 +1,14 @@
 """Times of a sweep's points, in whatever unit and on whatever clock the sensor's driver wrote them."""
 
-from collections.abc import Iterable
+import re
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
+from enum import Enum
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mapper.core.errors import listed
 from mapper.core.frames import Scan
 from mapper.core.geometry import Array
 from mapper.core.timebase import NS_PER_S, UNITS_PER_S
@@ -23,6 +26,11 @@ TIME_FIELDS = (
     "gps_time",  # LAS: float64 seconds, of the GPS week or of the GPS epoch less 10⁹
 )
 """Names that drivers give a point's time."""
+
+_LIKE_TIME = re.compile(r"time|stamp|(?:^|_)n?secs?(?:_|$)", re.IGNORECASE)
+_MOST_IN_FLOAT32 = 1e6
+"""Seconds of which float32 tells a sixteenth."""
+_UNIT_NAMES = dict(zip(UNITS_PER_S, ("seconds", "milliseconds", "microseconds", "nanoseconds"), strict=True))
 
 MAX_SWEEP_S = 2.0
 """No sensor turns slower; points farther apart in time were put together from several sweeps."""
@@ -96,16 +104,41 @@ def relative_times_s(values: NDArray[np.number], stamp_ns: int) -> NDArray[np.fl
     return times_s
 
 
-def are_on_own_clock(values: NDArray[np.number], stamp_ns: int) -> bool:
-    """Return whether times of :func:`relative_times_s` say nothing of the stamp, where the first is taken."""
-    values = counted_on(values)
-    _, units_per_s = _middle_and_unit(values)
-    first, last = values.min(), values.max()
-    if units_per_s is None or not (np.isfinite(first) and np.isfinite(last)):
-        return False
-    first_ns = _ns(first, units_per_s)
-    sweep_ns = round(float(_less(last, first)) * (NS_PER_S // units_per_s))
-    return first_ns != 0 and _first_after_stamp_ns(first_ns, sweep_ns, stamp_ns) == 0 != first_ns - stamp_ns
+def times_told(
+    names: Sequence[str], values_of: Callable[[str], NDArray[np.number]], stamp_ns: int
+) -> tuple[list[str], list[str]]:
+    """Return unit and reference of the times of points, and what may be wrong with them, in sentences.
+
+    Args:
+        names: Fields of the first cloud.
+        values_of: Returns the values of one, of the points that measured something.
+        stamp_ns: Time of that cloud, nanoseconds.
+    """
+    name = time_field(names)
+    if name is None:
+        others = [one for one in names if _LIKE_TIME.search(one)]
+        told = f"fields {listed(others)} are not known as times of points; not deskewed"
+        return [], [told] if others else []
+    recorded = values_of(name)
+    if not len(recorded):
+        return [], []
+    if relative_times_s(recorded, stamp_ns) is None:
+        is_coarse = recorded.dtype == np.float32 and np.abs(recorded).max() > _MOST_IN_FLOAT32
+        why = ": its 32 bits are too few for seconds since 1970" if is_coarse else ""
+        return [], [f"field {name} of the first cloud holds no times{why}; not deskewed"]
+    values = counted_on(recorded)
+    middle, units_per_s = _middle_and_unit(values)
+    assert units_per_s is not None
+    sound = values[np.abs(_signed_less(values, middle)) <= MAX_SWEEP_S * units_per_s]
+    sweep_ns = round(float(_less(sound.max(), sound.min())) * (NS_PER_S // units_per_s))
+    reference = _reference(_ns(sound.min(), units_per_s), sweep_ns, stamp_ns)
+    notes = [] if values is recorded else [f"field {name} begins anew during a sweep; counted on"]
+    if reference is _Reference.OWN_CLOCK:
+        notes.append(
+            f"field {name} is on a clock of its own; the first point of each sweep is taken to be measured "
+            "at its stamp"
+        )
+    return [f"times of points: field {name}, {_UNIT_NAMES[units_per_s]} {reference.value}"], notes
 
 
 def without_untimed(scan: Scan) -> Scan:
@@ -184,12 +217,30 @@ def _ns(value: np.number, units_per_s: int) -> int:
     return round(number * (NS_PER_S // units_per_s))
 
 
-def _first_after_stamp_ns(first_ns: int, sweep_ns: int, stamp_ns: int) -> int:
-    """Return how long after the stamp the first point was measured, by the clock that its time is on."""
+class _Reference(Enum):
+    """What times count from."""
+
+    STAMP = "from the stamp"
+    SAME_CLOCK = "on the clock of the stamps"
+    OWN_CLOCK = "on a clock of their own"
+
+
+def _reference(first_ns: int, sweep_ns: int, stamp_ns: int) -> _Reference:
     limit_ns = MAX_SWEEP_S * NS_PER_S
     if -limit_ns <= first_ns <= max(sweep_ns, _USUAL_SWEEP_NS):
-        return first_ns
-    return first_ns - stamp_ns if abs(first_ns - stamp_ns) <= limit_ns else 0
+        return _Reference.STAMP
+    return _Reference.SAME_CLOCK if abs(first_ns - stamp_ns) <= limit_ns else _Reference.OWN_CLOCK
+
+
+def _first_after_stamp_ns(first_ns: int, sweep_ns: int, stamp_ns: int) -> int:
+    """Return how long after the stamp the first point was measured, by the clock that its time is on."""
+    match _reference(first_ns, sweep_ns, stamp_ns):
+        case _Reference.STAMP:
+            return first_ns
+        case _Reference.SAME_CLOCK:
+            return first_ns - stamp_ns
+        case _Reference.OWN_CLOCK:
+            return 0
 
 
 def azimuth_times_s(

@@ -1,10 +1,11 @@
 import numpy as np
 import pytest
 
-from mapper.sources.point_times import are_on_own_clock, relative_times_s, time_field
+from mapper.sources.point_times import relative_times_s, time_field, times_told
 
 STAMP_NS = 1_567_410_201_745_204_700
 SWEEP_S = np.linspace(0.0, 0.0999, 1000)
+UNITS = [(1, "field t, seconds"), (1e3, "milliseconds"), (1e6, "microseconds"), (1e9, "nanoseconds")]
 
 
 @pytest.mark.parametrize(
@@ -24,7 +25,28 @@ def test_every_unit_and_clock_becomes_seconds_after_the_stamp(values):
     times_s = relative_times_s(values, STAMP_NS)
     assert times_s.dtype == np.float32
     np.testing.assert_allclose(times_s, SWEEP_S, atol=1e-6)
-    assert are_on_own_clock(values, STAMP_NS) == (values[0] == 345_678.9)
+    (choice,), notes = times_told(["x", "t"], lambda _: values, STAMP_NS)
+    unit = np.ptp(values.astype(np.float64)) / SWEEP_S[-1]
+    name = next(name for size, name in UNITS if unit == pytest.approx(size, rel=0.01))
+    reference = "from the stamp" if values[0] == 0 else "on the clock of the stamps"
+    assert (name in choice, "own" in choice) == (True, values[0] == 345_678.9)
+    assert (reference in choice) == (len(notes) == 0)
+
+
+@pytest.mark.parametrize(
+    ("field", "values", "word"),
+    [
+        ("t", np.zeros(9, np.uint32), "holds no times"),
+        ("t", np.float32(1.7e9 + SWEEP_S), "32 bits"),
+        ("t", np.uint64(2**32 - 50_000_000 + SWEEP_S * 1e9).astype(np.uint32), "begins anew"),
+        ("point_stamp", SWEEP_S, "not known"),
+        ("ring", SWEEP_S, None),
+    ],
+)
+def test_times_that_are_not_used_or_counted_on_are_told(field, values, word):
+    _, notes = times_told(["x", field], lambda _: values, STAMP_NS)
+    assert (word is None) == (not notes)
+    assert word is None or word in notes[0]
 
 
 def test_a_stamp_at_the_end_of_the_sweep_gives_negative_times():

@@ -24,12 +24,14 @@ class RawCloud:
 
     Attributes:
         points: (N, 3) float32, metres, sensor frame.
+        names: Fields of the file.
         times: (N,) each point's time as the file has it; ``relative_times_s`` finds unit and clock.
         colors: (N, 3) uint8 RGB.
         intensities: (N,) float32.
     """
 
     points: Points32
+    names: tuple[str, ...]
     times: Column | None
     colors: NDArray[np.uint8] | None
     intensities: NDArray[np.float32] | None
@@ -68,7 +70,7 @@ def cloud_from(columns: Columns, *, path: Path, scale: float | None) -> RawCloud
         colors = None if colors is None else colors.compress(is_measured, axis=0)
         intensities = None if intensities is None else intensities.compress(is_measured)
     check_range(points, where=f"{path}", is_scaled=scale is not None)
-    return RawCloud(points, times, colors, intensities)
+    return RawCloud(points, tuple(columns), times, colors, intensities)
 
 
 def intensity_field(names: Iterable[str]) -> str | None:

@@ -172,6 +172,14 @@ def scan_from(
     return without_untimed(scan)
 
 
+def values_of_returns(points: NDArray[np.void], field: str) -> NDArray[Any]:
+    """Return a field of the points that measured something."""
+    if not {"x", "y", "z"} <= set(points.dtype.names or ()):
+        return points[field]
+    _, rows, _ = valid_returns(_coordinates(points))
+    return points[field] if rows is None else points[field][rows]
+
+
 def _coordinates(points: NDArray[np.void]) -> NDArray[np.float32]:
     """Return (N, 3) x, y and z: a view of the message where they follow each other as float32."""
     fields: Mapping[str, Any] = points.dtype.fields or {}

@@ -1,6 +1,5 @@
 """Frames of a recording's sensors: RGB-D cameras, stereo pairs, LiDARs and 2D lasers, not decoded yet."""
 
-import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -20,8 +19,9 @@ from mapper.sources.image_files.reading import TUM_UNITS_PER_M
 from mapper.sources.image_folders.pairing import depth_offset_ns
 from mapper.sources.image_folders.rgbd import RgbdEntry
 from mapper.sources.laser_scan import MAX_TILT_RAD, tilt_rad
-from mapper.sources.point_times import are_on_own_clock, counted_on, relative_times_s, time_field
+from mapper.sources.point_times import times_told
 from mapper.sources.ros.cameras import calibrate
+from mapper.sources.ros.cloud_messages import values_of_returns
 from mapper.sources.ros.entries import Located, cloud_entry, read_image, rgbd_entry, stereo_entry
 from mapper.sources.ros.frame_tree import is_fixed
 from mapper.sources.ros.image_messages import has_float_depth, size_of
@@ -43,9 +43,6 @@ from mapper.sources.stereo import refuse_settings
 from mapper.sources.velodyne_packets import require_decoder
 
 _JPEG_START = b"\xff\xd8"
-_MOST_IN_FLOAT32 = 1e6
-"""Seconds of which float32 tells a sixteenth."""
-_LIKE_TIME = re.compile(r"time|stamp|(?:^|_)n?secs?(?:_|$)", re.IGNORECASE)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,6 +56,7 @@ class RecordedFrames:
         entry_at: Makes the entry of frame 0 … N − 1.
         notes: Sentences on what was left out or assumed.
         depth_noise: Noise of their depth, where the recording states it.
+        choices: Sentences on what was recognised.
     """
 
     sensor: Sensor
@@ -67,6 +65,7 @@ class RecordedFrames:
     entry_at: Callable[[int], FrameRef]
     notes: Sequence[str]
     depth_noise: DepthNoiseConfig | None = None
+    choices: Sequence[str] = ()
 
 
 def stereo_frames(reader: RecordingReader, topics: StereoTopics, config: SourceConfig) -> RecordedFrames:
@@ -160,26 +159,10 @@ def lidar_frames(reader: RecordingReader, clouds: Series, config: SourceConfig) 
     first = _first_of(reader, clouds)
     assert isinstance(first, CloudMessage)
     notes += [f"{clouds.topic.name}: {note}" for note in first.notes]
-    fields = first.points.dtype.names or ()
-    times = time_field(fields)
-    values = None if times is None or not len(first.points) else first.points[times]
-    if values is not None and relative_times_s(values, first.stamp_ns) is None:
-        is_coarse = values.dtype == np.float32 and np.abs(values).max() > _MOST_IN_FLOAT32
-        why = ": its 32 bits are too few for seconds since 1970" if is_coarse else ""
-        notes.append(
-            f"{clouds.topic.name}: field {times} of the first cloud holds no times{why}; not deskewed"
-        )
-    elif others := [name for name in fields if times is None and _LIKE_TIME.search(name)]:
-        notes.append(
-            f"{clouds.topic.name}: fields {listed(others)} are not known as times of points; not deskewed"
-        )
-    elif values is not None and counted_on(values) is not values:
-        notes.append(f"{clouds.topic.name}: field {times} begins anew during a sweep; counted on")
-    elif values is not None and are_on_own_clock(values, first.stamp_ns):
-        notes.append(
-            f"{clouds.topic.name}: field {times} is on a clock of its own; the first point of each sweep is "
-            "taken to be measured at its stamp"
-        )
+    choices, time_notes = times_told(
+        first.points.dtype.names or (), partial(values_of_returns, first.points), first.stamp_ns
+    )
+    notes += [f"{clouds.topic.name}: {note}" for note in time_notes]
     frame, is_planar = _usual_frame(reader, clouds, frame_of(first)), clouds.topic.type in LASERS
     if is_planar and config.body_frame is None:
         config = config.model_copy(update={"body_frame": reader.base_of(frame)})
@@ -208,7 +191,14 @@ def lidar_frames(reader: RecordingReader, clouds: Series, config: SourceConfig) 
         # Before and after the others a part of the path is missing, so there they count as skipped.
         i = i[kept | ~seen(kept) | ~seen(kept[::-1])[::-1]]
     tree = reader.tree_of(body, frame)
-    return RecordedFrames("lidar-2d" if is_planar else "lidar", body, clouds.stamps_ns[i], entry_at, notes)
+    return RecordedFrames(
+        "lidar-2d" if is_planar else "lidar",
+        body,
+        clouds.stamps_ns[i],
+        entry_at,
+        notes,
+        choices=[f"{clouds.topic.name}: {choice}" for choice in choices],
+    )
 
 
 def _usual_frame(reader: RecordingReader, clouds: Series, first: str) -> str:

@@ -109,6 +109,7 @@ def recording_log(reader: RecordingReader, config: SourceConfig) -> Log:
         depth_noise=frames.depth_noise,
         choices=[
             *choice.choices,
+            *frames.choices,
             *truth_choices,
             *(one.choice if isinstance(one, CameraImages) else one for one in cameras),
             *beside_choices,

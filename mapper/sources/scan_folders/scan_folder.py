@@ -13,12 +13,13 @@ from mapper.core.geometry import Transform, inverse, spread_indices
 from mapper.core.timebase import NS_PER_S, Stamps
 from mapper.core.trajectory import Trajectory
 from mapper.sources.base import Log
-from mapper.sources.cloud_files import EMPTY, ENDINGS, why_no_points
+from mapper.sources.cloud_files import EMPTY, ENDINGS, read_cloud, why_no_points
 from mapper.sources.cloud_files.las import LAS_ENDINGS, first_time_s
 from mapper.sources.config import SourceConfig
 from mapper.sources.image_folders.tum import read_truth
 from mapper.sources.lazy_frame import LazyFrame
 from mapper.sources.listed_files import refuse_links_out
+from mapper.sources.point_times import times_told
 from mapper.sources.scan_folders.scans import read_scan
 from mapper.sources.scan_stamps import in_order, line_of_each, scan_stamps
 from mapper.sources.text import time_order, truth_from
@@ -129,6 +130,7 @@ def scan_log(
             ),
         )
 
+    choices, time_notes = _times_told(ordered[0], int(stamps_ns[order[0]]), config)
     log = Log(
         path=path,
         name=path.resolve().name,
@@ -137,9 +139,20 @@ def scan_log(
         stamps_ns=stamps_ns[order],
         entry_at=entry_at,
         truth=truth,
-        notes=[*notes, *stamp_notes, *order_notes, *truth_notes],
+        choices=choices,
+        notes=[*notes, *stamp_notes, *order_notes, *truth_notes, *time_notes],
     )
     return log, ordered
+
+
+def _times_told(path: Path, stamp_ns: int, config: SourceConfig) -> tuple[list[str], list[str]]:
+    """Return what the times of a cloud's points are, as ``times_told``; nothing of one without any."""
+    with suppress(FrameError):  # it is reported when it is read
+        cloud = read_cloud(path, scale=config.cloud_scale, bin_columns=config.bin_columns)
+        return times_told(
+            cloud.names, lambda _: np.empty(0) if cloud.times is None else cloud.times, stamp_ns
+        )
+    return [], []
 
 
 def _las_stamps(files: Sequence[Path]) -> Stamps | None:
