@@ -4,6 +4,7 @@ import os
 import re
 import stat
 import tomllib
+from codecs import BOM_UTF16_BE, BOM_UTF16_LE
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -30,7 +31,7 @@ _reads: ContextVar[set[Path] | None] = ContextVar("reads", default=None)
 
 @contextmanager
 def reads() -> Iterator[set[Path]]:
-    """Yield a set to which the path of every text file is added that is read meanwhile."""
+    """Yield a set to which the path of every file is added that is read meanwhile."""
     paths: set[Path] = set()
     token = _reads.set(paths)
     try:
@@ -51,6 +52,8 @@ def read_regular(path: Path, *, most_bytes: int, may_be_pipe: bool = False) -> b
         OSError: It cannot be read.
         DataError: It is no regular file, or larger; the message does not name it.
     """
+    if (paths := _reads.get()) is not None:
+        paths.add(path)
     wait = 0 if may_be_pipe else getattr(os, "O_NONBLOCK", 0)  # opening a pipe waits for its writer
     with os.fdopen(os.open(path, os.O_RDONLY | wait), "rb") as file:
         status = os.fstat(file.fileno())
@@ -91,6 +94,8 @@ def read_text(
 ) -> str:
     """Return the text of a file, without the byte order mark with which Windows programs begin one.
 
+    By that mark it is read as UTF-16, as PowerShell writes it.
+
     Args:
         path: File, as of :func:`read_regular`.
         error: Class of the error.
@@ -101,11 +106,11 @@ def read_text(
         MapperError: ``error``: it cannot be read, is no regular file, too large or no text; the message says
             which file.
     """
-    if (paths := _reads.get()) is not None:
-        paths.add(path)
     try:
-        text = read_regular(path, most_bytes=MOST_BYTES, may_be_pipe=may_be_pipe).decode(encoding)
-        return text.removeprefix("\ufeff")
+        data = read_regular(path, most_bytes=MOST_BYTES, may_be_pipe=may_be_pipe)
+        if data.startswith((BOM_UTF16_LE, BOM_UTF16_BE)):
+            encoding = "utf-16"
+        return data.decode(encoding).removeprefix("\ufeff")
     except OSError as why:
         raise error(f"{path}: cannot be read: {why.strerror}") from None
     except UnicodeDecodeError as why:

@@ -129,8 +129,6 @@ def _other_data(path: Path) -> str:
         return "images alone; depth images belong beside them, as in rgb/ and depth/"
     from mapper.sources.image_folders.numbered import image_places
 
-    if any(path.glob("*/*.exr")) or any(path.glob("*/*/*.exr")):
-        return "depth as OpenEXR is not read; write it as .npy of metres, or of Record3D open the .r3d"
     colour, depth, _ = image_places(path)
     if any(place.numbered for place in colour) and any(place.numbered for place in depth):
         names = listed([f"{place.name}/" for place in (*colour, *depth)])

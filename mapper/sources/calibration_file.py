@@ -11,10 +11,20 @@ from typing import Any
 import numpy as np
 
 from mapper.core.config import toml_text
-from mapper.core.errors import DataError, SourceError
+from mapper.core.errors import DataError, FrameError, SourceError
 from mapper.core.frames import NO_DISTORTION, PinholeCamera
 from mapper.runtime.regular_files import HEAD_BYTES, parse_toml, read_text
 from mapper.sources.calibration import Calibration, DepthCamera, Distortion
+from mapper.sources.calibration_formats import (
+    COLMAP,
+    INFO_KEY,
+    Numbers,
+    array_numbers,
+    colmap_numbers,
+    info_numbers,
+    text_numbers,
+    yaml_of_xml,
+)
 from mapper.sources.lens import COEFFICIENTS_TEXT, Lens
 from mapper.sources.text import pose_from_numbers
 
@@ -39,6 +49,13 @@ _FILE_NAMES = (
     "K.txt",
     "intrinsic/intrinsic_color.txt",  # ScanNet
     "intrinsic_color.txt",
+    "cameras.txt",  # COLMAP
+    "sparse/cameras.txt",
+    "sparse/0/cameras.txt",
+    "*calib*.np[yz]",
+    "*camera*.np[yz]",
+    "*intrinsic*.np[yz]",
+    "K.npy",
     "info.txt",  # BundleFusion
     "_info.txt",
     "cam.info.txt",
@@ -48,9 +65,7 @@ _FILE_NAMES = (
 )
 """Globs in a log's folder, the first that is there counts."""
 
-_BY_CONTENT = (".yaml", ".yml", ".json")
-
-_Numbers = Mapping[str, Sequence[float]]
+_BY_CONTENT = (".yaml", ".yml", ".json", ".xml")
 
 
 def calibration_files(folder: Path) -> tuple[list[Path], bool]:
@@ -68,7 +83,9 @@ def calibration_files(folder: Path) -> tuple[list[Path], bool]:
 
 
 def read_calibration(path: Path) -> Calibration:
-    """Read intrinsics from TOML, JSON, YAML, or text of a matrix or of fx fy cx cy.
+    """Read intrinsics from TOML, JSON, YAML, OpenCV's XML, COLMAP's list, or a matrix or fx fy cx cy alone.
+
+    These may be in text, or in .npy and .npz.
 
     TOML keys: fx_px fy_px cx_px cy_px, and optionally width_px height_px, distortion (k1 k2 p1 p2 k3, also k4
     k5 k6 and more as OpenCV orders them, or a fisheye's k1 k2 k3 k4), distortion_model ("equidistant"),
@@ -78,11 +95,14 @@ def read_calibration(path: Path) -> Calibration:
     Raises:
         SourceError: The file cannot be read, lacks a number, or (TOML) has a key of another meaning.
     """
-    text = read_text(path, error=SourceError)
-    numbers: _Numbers
+    is_array = path.suffix in (".npy", ".npz")
+    text = "" if is_array else read_text(path, error=SourceError)
+    numbers: Numbers
     model = ""
     try:
-        if path.suffix == ".toml":
+        if is_array:
+            numbers = array_numbers(path)
+        elif path.suffix == ".toml":
             table = dict(parse_toml(text))
             model = _lens_model(f"{table.pop('distortion_model', '')}")
             numbers = _toml_numbers(table)
@@ -91,10 +111,14 @@ def read_calibration(path: Path) -> Calibration:
                 raise DataError(f"{unknown[0]}: unknown key; known are {', '.join(sorted(_KEYS))}")
         elif path.suffix == ".json":
             numbers, model = _json_numbers(json.loads(text))
-        elif path.suffix == ".txt" and _INFO_KEY in text:
-            numbers = _info_numbers(text)
+        elif path.suffix == ".txt" and INFO_KEY in text:
+            numbers = info_numbers(text)
+        elif path.suffix == ".txt" and COLMAP.search(text):
+            numbers, model = colmap_numbers(text)
         elif path.suffix == ".txt" and not _KEY_AND_NUMBER.search(text):
-            numbers = _text_numbers(text)
+            numbers = text_numbers(text)
+        elif path.suffix == ".xml":
+            numbers, model = _yaml_numbers(yaml_of_xml(text))
         else:
             numbers, model = _yaml_numbers(text.replace("=", ":") if path.suffix == ".txt" else text)
         return _interpret(numbers, model, f"{path}")
@@ -102,6 +126,10 @@ def read_calibration(path: Path) -> Calibration:
         raise SourceError(f"{path}: not valid {path.suffix[1:].upper()}: {error}") from None
     except (DataError, OverflowError) as error:  # an integer that is too large for a float
         raise SourceError(f"{path}: {error}") from None
+    except FrameError as error:
+        raise SourceError(str(error)) from None
+    except OSError as error:
+        raise SourceError(f"{path}: cannot be read: {error.strerror}") from None
 
 
 def read_yaml(text: str, where: str) -> Calibration:
@@ -142,9 +170,18 @@ _NAMES = {
     "size": ("resolution",),
     "depth_factor": ("depth_factor", "depthmapfactor"),
     "scale_of_depth": ("depth_scale",),
-    "matrix": ("camera_matrix", "k"),
+    "matrix": ("intrinsic_matrix", "mtx", "cameramatrix", "camera_matrix", "k"),
     "intrinsics": ("intrinsics",),
-    "distortion": ("distortion", "distortion_coefficients", "distortion_coeffs", "coeffs", "d"),
+    "distortion": (
+        "dist",
+        "distcoeffs",
+        "dist_coeffs",
+        "distortion",
+        "distortion_coefficients",
+        "distortion_coeffs",
+        "coeffs",
+        "d",
+    ),
     "k1": ("k1",),
     "k2": ("k2",),
     "p1": ("p1",),
@@ -159,7 +196,7 @@ _UNITS_PER_M = (1e-3, 1e7)  # of a depth image: kilometres to tenths of a microm
 _KEYS = {name for names in _NAMES.values() for name in names}
 
 
-def _interpret(numbers: _Numbers, model: str, origin: str) -> Calibration:
+def _interpret(numbers: Numbers, model: str, origin: str) -> Calibration:
     found = {meaning: numbers[name] for meaning, names in _NAMES.items() for name in names if name in numbers}
     for meaning, values in found.items():
         if not all(map(math.isfinite, values)):
@@ -207,7 +244,7 @@ def _distortion(coefficients: Sequence[float], model: str) -> tuple[Distortion, 
     return (k1, k2, p1, p2, k3), None
 
 
-def _depth_camera(found: _Numbers, origin: str) -> DepthCamera | None:
+def _depth_camera(found: Numbers, origin: str) -> DepthCamera | None:
     if not any(name.startswith("depth_") and name != "depth_factor" for name in found):
         return None
     intrinsics, pose = found.get("depth_intrinsics", ()), found.get("depth_in_color", ())
@@ -242,15 +279,14 @@ def _toml_numbers(table: Mapping[str, Any]) -> dict[str, Sequence[float]]:
 
 
 _ANY_LINE = re.IGNORECASE | re.MULTILINE
-_INFO_KEY = "m_calibrationColorIntrinsic"
-_MAY_BE_OTHER = ("info.txt", "metadata.json", "transforms.json")
+_MAY_BE_OTHER = ("info.txt", "cameras.txt", "metadata.json", "transforms.json")
 _POLYNOMIAL_LENS = re.compile(r"radtan|plumb_bob|rational_polynomial", re.IGNORECASE)
 _OTHER_LENS = re.compile(
     r"equidistant|fisheye|kannala_?brandt|(?:^|:)\s*\"?(?P<unknown>omni|mei|eucm|ds|fov|atan)\"?\s*$",
     _ANY_LINE,
 )
 _KEY_AND_NUMBER = re.compile(
-    r"(?:fl?_?x(?:_px)?|camera_matrix|intrinsics?(?:_matrix)?(?=\"?\s*:\s*\[\s*[\d.]+\s*,)|"
+    r"(?:<camera_?matrix\b|<intrinsic_?matrix\b|<mtx\b)|(?:fl?_?x(?:_px)?|camera_?matrix|mtx|intrinsics?(?:_matrix)?(?=\"?\s*:\s*\[\s*[\d.]+\s*,)|"
     r"\bk(?=\"?\s*[:=]\s*(?:[\[-]|\S+[ ,]+\S)))\"?\s*[:=]",
     re.IGNORECASE,
 )
@@ -309,7 +345,7 @@ def _yaml_numbers(text: str) -> tuple[dict[str, Sequence[float]], str]:
     return numbers, model
 
 
-def _json_numbers(table: Any) -> tuple[_Numbers, str]:
+def _json_numbers(table: Any) -> tuple[Numbers, str]:
     """Take the matrix of Open3D and Record3D, column by column, or the numbers of Replica and nerfstudio."""
     camera = table.get("camera", table) if isinstance(table, dict) else None
     for name in ("color", "colour", "rgb") if camera is table else ():  # of a recorder by librealsense
@@ -319,7 +355,8 @@ def _json_numbers(table: Any) -> tuple[_Numbers, str]:
     model = "equidistant" if camera.get("is_fisheye") else _lens_model(f"{camera.get('camera_model', '')}")
     frames = camera.get("frames")
     first = frames[0] if isinstance(frames, list) and frames and isinstance(frames[0], dict) else {}
-    numbers = _toml_numbers({key: v for key, v in {**first, **camera}.items() if _is_numeric(v)})
+    flat = {key: _flat(value) for key, value in {**first, **camera}.items()}
+    numbers = _toml_numbers({key: v for key, v in flat.items() if _is_numeric(v)})
     if len(K := numbers.get("intrinsic_matrix", numbers.get("k", ()))) == 9:
         is_by_column = not (K[2] or K[5])
         numbers["k"] = np.reshape(K, (3, 3)).T.ravel().tolist() if is_by_column else K
@@ -330,40 +367,22 @@ def _json_numbers(table: Any) -> tuple[_Numbers, str]:
     return numbers, model
 
 
+def _flat(value: Any) -> Any:
+    """Return the numbers of a matrix in rows, or of OpenCV's, in one list; anything else as it is."""
+    if isinstance(value, dict) and f"{value.get('type_id', '')}".startswith("opencv"):
+        value = value.get("data")
+    if isinstance(value, list) and value and all(isinstance(row, list) for row in value):
+        return [one for row in value for one in row]
+    return value
+
+
 def _is_numeric(value: Any) -> bool:
     values = value if isinstance(value, list) else [value]
     return all(isinstance(one, int | float) for one in values)
 
 
-def _text_numbers(text: str) -> _Numbers:
-    """Take a matrix of 3×3, 3×4 or 4×4 numbers, or a line of fx fy cx cy and distortion coefficients.
-
-    Matrices may be in brackets, as NumPy and MATLAB print them.
-    """
-    text = text.replace(";", "\n").replace("[", " ").replace("]", " ")
-    lines = [line.split("#")[0].replace(",", " ").split() for line in text.splitlines()]
-    rows = [[float(word) for word in words] for words in lines if words]
-    if len(rows) == 1 and 4 <= len(rows[0]) <= 4 + len(NO_DISTORTION):
-        return {"intrinsics": rows[0][:4], "d": rows[0][4:] or list(NO_DISTORTION)}
-    if (len(rows), *{len(row) for row in rows}) not in ((3, 3), (3, 4), (4, 4)):
-        raise DataError(
-            "want a 3×3 matrix, or a line of fx fy cx cy; a calibration.toml beside it goes first"
-        )
-    return {"camera_matrix": [value for row in rows[:3] for value in row[:3]]}
-
-
 def _has_camera(path: Path) -> bool:
     with suppress(OSError), path.open("rb") as file:
         head = file.read(HEAD_BYTES).decode(errors="replace")
-        return _INFO_KEY in head or _KEY_AND_NUMBER.search(head) is not None
+        return any(found.search(head) for found in (_KEY_AND_NUMBER, COLMAP, re.compile(INFO_KEY)))
     return False
-
-
-def _info_numbers(text: str) -> _Numbers:
-    """Take BundleFusion's 4×4 matrix, sizes and depth units of lines "m_name = numbers"."""
-    pairs = (line.partition("=") for line in text.splitlines())
-    words = {name.strip(): value.split() for name, _, value in pairs}
-    names = {"m_colorWidth": "width", "m_colorHeight": "height", "m_depthShift": "depth_factor"}
-    numbers = {ours: [float(word) for word in words[name]] for name, ours in names.items() if name in words}
-    K = [float(word) for word in words.get(_INFO_KEY, [])]
-    return {**numbers, "camera_matrix": [*K[0:3], *K[4:7], *K[8:11]]}

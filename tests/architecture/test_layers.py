@@ -91,6 +91,7 @@ HOMES = {
     "evo": (),
     "rerun": ("mapper/export/rerun/",),
     "distributed": ("mapper/runtime/executor.py",),
+    "OpenEXR": ("mapper/sources/image_files/exr.py",),
     "lzfse": ("mapper/sources/image_folders/record3d.py",),
     "pye57": ("mapper/sources/scan_folders/e57.py",),
     "velodyne_decoder": ("mapper/sources/velodyne_packets.py",),

@@ -111,6 +111,107 @@ def test_intrinsics_beside_numbered_images_are_not_assumed(tmp_path, name, text)
     assert not any("assumed to be" in note for note in log.notes)
 
 
+def numbers_of(path):
+    found = read_calibration(path)
+    return (found.fx_px, found.fy_px, found.cx_px, found.cy_px, *found.distortion)
+
+
+K = np.array([[60.0, 0.0, 31.5], [0.0, 61.0, 23.5], [0.0, 0.0, 1.0]])
+D = [0.1, -0.2, 0.001, 0.002, 0.3]
+
+
+@pytest.mark.parametrize("name", ["left.xml", "left.yml", "left.json"])
+@pytest.mark.parametrize("key", ["camera_matrix", "cameraMatrix", "intrinsic_matrix", "K"])
+def test_intrinsics_as_opencv_stores_them(tmp_path, name, key):
+    path = tmp_path / name
+    storage = cv2.FileStorage(str(path), cv2.FileStorage_WRITE)
+    storage.write("image_width", 64)
+    storage.write(key, K)
+    storage.write({"cameraMatrix": "distCoeffs"}.get(key, "distortion_coefficients"), np.array([D]))
+    storage.write("avg_reprojection_error", 0.3)
+    storage.release()
+    assert numbers_of(path) == (60.0, 61.0, 31.5, 23.5, *D)
+    if key.startswith("camera"):
+        assert calibration_files(tmp_path) == ([path], True)
+
+
+@pytest.mark.parametrize(
+    ("name", "arrays", "is_bent"),
+    [
+        ("K.npy", K, False),
+        ("camera_matrix.npy", np.pad(K, ((0, 1), (0, 1))).astype(np.float32), False),
+        ("intrinsics.npy", np.array([60.0, 61.0, 31.5, 23.5]), False),
+        ("intrinsics.npy", np.array([[60.0, 61.0, 31.5, 23.5, *D]]), True),
+        ("calibration.npz", {"mtx": K, "dist": np.array([D]), "rvecs": np.zeros((20, 3, 1))}, True),
+        ("camera_params.npz", {"K": K, "D": np.array(D), "size": np.array([64, 48])}, True),
+    ],
+)
+def test_intrinsics_in_arrays(tmp_path, name, arrays, is_bent):
+    path = tmp_path / name
+    (lambda: np.savez(path, **arrays) if isinstance(arrays, dict) else np.save(path, arrays))()
+    assert calibration_files(tmp_path) == ([path], True)
+    assert numbers_of(path) == pytest.approx((60.0, 61.0, 31.5, 23.5, *(D if is_bent else [0.0] * 5)))
+
+
+COLMAP_HEAD = (
+    "# Camera list with one line of data per camera:\n#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n"
+)
+
+
+@pytest.mark.parametrize(
+    ("camera", "fy", "coefficients"),
+    [
+        ("SIMPLE_PINHOLE 64 48 60 32 24", 60.0, []),
+        ("PINHOLE 64 48 60 61 32 24", 61.0, []),
+        ("SIMPLE_RADIAL 64 48 60 32 24 0.1", 60.0, [0.1]),
+        ("RADIAL 64 48 60 32 24 0.1 -0.2", 60.0, [0.1, -0.2]),
+        ("OPENCV 64 48 60 61 32 24 0.1 -0.2 0.001 0.002", 61.0, D[:4]),
+    ],
+)
+@pytest.mark.parametrize("place", [".", "sparse/0"])
+def test_the_first_pixel_of_colmap_s_camera_is_half_a_pixel_from_its_corner(
+    tmp_path, camera, fy, coefficients, place
+):
+    path = tmp_path / place / "cameras.txt"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(f"{COLMAP_HEAD}# Number of cameras: 1\n1 {camera}\n")
+    assert calibration_files(tmp_path) == ([path], True)
+    assert numbers_of(path) == (60.0, fy, 31.5, 23.5, *coefficients, *[0.0] * (5 - len(coefficients)))
+    assert read_calibration(path).size_px == (64, 48)
+
+
+def test_lenses_of_colmap(tmp_path):
+    path = tmp_path / "cameras.txt"
+    path.write_text(f"{COLMAP_HEAD}1 OPENCV_FISHEYE 64 48 60 61 32 24 0.1 -0.2 0.001 0.002\n")
+    assert read_calibration(path).lens.is_fisheye
+    path.write_text(f"{COLMAP_HEAD}1 FULL_OPENCV 64 48 60 61 32 24 {' '.join(map(str, D))} 0.1 0.2 0.3\n")
+    assert read_calibration(path).lens.coefficients == [*D, 0.1, 0.2, 0.3]
+    for cameras, why in (
+        ("1 FOV 64 48 60 61 32 24 0.1\n", "FOV with 5 parameters; known are"),
+        ("1 PINHOLE 64 48 60 61 32 24\n2 PINHOLE 64 48 60 61 33 24\n", "2 different cameras"),
+    ):
+        path.write_text(COLMAP_HEAD + cameras)
+        with pytest.raises(SourceError, match=why):
+            read_calibration(path)
+
+
+def test_text_of_windows_is_read_by_its_mark(tmp_path):
+    for encoding in ("utf-16", "utf-8-sig"):
+        (tmp_path / "K.txt").write_text(MATRIX, encoding=encoding)
+        assert read_calibration(tmp_path / "K.txt").fx_px == 60.0
+    (tmp_path / "camera.toml").write_bytes(TOML.encode("utf-16-be"))
+    with pytest.raises(SourceError, match=r"camera\.toml"):
+        read_calibration(tmp_path / "camera.toml")
+
+
+@pytest.mark.parametrize("name", ["K.npy", "calibration.npz"])
+@pytest.mark.parametrize("data", [b"", b"PK\x03\x04 cut", b"\x93NUMPY\x01\x00\x10\x00{'descr': "])
+def test_damaged_arrays_of_intrinsics_are_refused_in_words(tmp_path, name, data):
+    (tmp_path / name).write_bytes(data)
+    with pytest.raises(SourceError, match=name):
+        read_calibration(tmp_path / name)
+
+
 def test_intrinsics_beside_the_only_sequence_of_a_folder_are_found(tmp_path):
     for i in range(3):
         stem = tmp_path / "seq-01" / f"frame-{i:06d}"

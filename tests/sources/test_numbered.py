@@ -4,11 +4,12 @@ import cv2
 import numpy as np
 import pytest
 
-from mapper.core.errors import FrameError, SourceError
+from mapper.core.errors import DependencyError, FrameError, SourceError
 from mapper.core.geometry import exp
 from mapper.sources import open_source
 from mapper.sources.config import SourceConfig
 from mapper.sources.depth_scale import read_spread, why_no_depth
+from mapper.sources.image_files.reading import read_array_m
 from tests.support.tum_logs import CALIBRATION, write_picture
 
 POSES = [exp(np.array([0.1 * i, -0.2, 0.3 * i]), np.array([i, 2.0, -0.5 * i])) for i in range(4)]
@@ -227,7 +228,12 @@ def with_depth(folder, ending, depth):
     for path in (folder / "depth").iterdir():
         path.unlink()
         other = path.with_suffix(ending)
-        np.save(other, depth) if ending == ".npy" else cv2.imwrite(str(other), depth)
+        if ending == ".exr":
+            write_exr(other, Z=depth)
+        elif ending == ".npy":
+            np.save(other, depth)
+        else:
+            cv2.imwrite(str(other), depth)
     return open_source(folder)
 
 
@@ -236,6 +242,8 @@ def with_depth(folder, ending, depth):
     [
         (".tiff", np.float32, 1.0, 400, 1),
         (".npy", np.float32, 1.0, 400, 1),
+        (".pfm", np.float32, 1.0, 400, 1),
+        (".exr", np.float32, 1.0, 400, 1),
         (".tiff", np.uint16, 0.001, 2, 1000),
     ],
 )
@@ -250,6 +258,38 @@ def test_depth_is_metres_in_floats_and_else_millimetres_and_doubted_where_it_is_
     if kind is np.float32:
         with pytest.raises(FrameError, match="depth_factor=1000"):
             with_depth(tmp_path / "c", ending, np.full((48, 64), 1e5, kind))[0]
+
+
+def write_exr(path, **channels):
+    library = pytest.importorskip("OpenEXR")
+    header = {"compression": library.ZIP_COMPRESSION, "type": library.scanlineimage}
+    with library.File(header, {name.replace("__", "."): values for name, values in channels.items()}) as file:
+        file.write(str(path))
+
+
+@pytest.mark.parametrize("name", ["Z", "View__Depth__Z", "V", "R"])
+@pytest.mark.parametrize("kind", [np.float16, np.float32])
+def test_the_channel_of_depth_of_openexr_is_found_and_what_is_far_off_is_no_depth(tmp_path, name, kind):
+    depth_m = np.full((48, 64), 1.5, kind)
+    depth_m[0] = np.inf if kind is np.float16 else 1e10  # as Blender writes pixels that show nothing
+    write_exr(tmp_path / "0.exr", **{name: depth_m, "A": np.ones_like(depth_m)})
+    found_m = read_array_m(tmp_path / "0.exr", 1000.0, 1.0)
+    np.testing.assert_array_equal(found_m, np.where(depth_m > 2.0, 0.0, depth_m))
+
+
+def test_openexr_that_cannot_be_read_is_refused_in_words(tmp_path, monkeypatch):
+    write_exr(tmp_path / "0.exr", A=np.ones((48, 64), np.float32))
+    other = (tmp_path / "0.exr").read_bytes()
+    write_exr(tmp_path / "0.exr", Z=np.ones((48, 64), np.float32))
+    whole = (tmp_path / "0.exr").read_bytes()
+    huge = whole.replace((63).to_bytes(4, "little"), (10**7).to_bytes(4, "little"))
+    for data, why in ((other, "channels A; want"), (whole[:400], "not a sound"), (huge, "megapixels")):
+        (tmp_path / "0.exr").write_bytes(data)
+        with pytest.raises(FrameError, match=why):
+            read_array_m(tmp_path / "0.exr", 1000.0, 1.0)
+    monkeypatch.setattr("mapper.runtime.extras.find_spec", lambda _: None)
+    with pytest.raises(DependencyError, match=r"octree-mapper\[exr\]"):
+        with_depth(tmp_path / "log", ".exr", np.ones((48, 64), np.float32))
 
 
 def test_folders_whose_numbers_do_not_meet_are_named(tmp_path):

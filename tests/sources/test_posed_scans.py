@@ -234,14 +234,6 @@ def test_nerfs_angle_of_view_and_names_without_ending_are_read(shots, tmp_path):
     assert (found.cx_px, found.cy_px) == (0.5 * (found.width_px - 1), 0.5 * (found.height_px - 1))
 
 
-def test_depth_of_openexr_is_refused_by_name(tmp_path):
-    for name in ("rgb/0.png", "depth/0.exr"):
-        (tmp_path / name).parent.mkdir()
-        (tmp_path / name).write_bytes(b"v/1\1")
-    with pytest.raises(SourceError, match="OpenEXR"):
-        open_source(tmp_path)
-
-
 def test_an_image_of_endless_width_is_refused(shots, tmp_path):
     folder = WRITERS["polycam"][0](tmp_path / "scan", shots)
     first = min((folder / "keyframes/cameras").iterdir())

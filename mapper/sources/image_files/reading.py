@@ -17,14 +17,14 @@ from mapper.core.units import MM_PER_M
 from mapper.runtime.regular_files import MOST_BYTES, read_regular
 from mapper.sources.base import ImageFile
 from mapper.sources.cloud_files.parsing import MAX_RANGE_M, load_array
-from mapper.sources.image_files import jpeg, png
+from mapper.sources.image_files import exr, jpeg, png
 from mapper.sources.image_files.decoded import SATURATED, DecodedColour, DecodedDepth
 from mapper.sources.image_files.size import check_pixels
 
 TUM_UNITS_PER_M = 5000.0
 """16-bit units of a metre in which depth in metres goes into files: 0.2 mm (Sturm et al. 2012)."""
 
-ARRAYS = (".npy", ".tif", ".tiff")
+ARRAYS = (".npy", ".tif", ".tiff", ".pfm", ".exr")
 """Endings of depth images that may be of floating-point numbers."""
 
 # A camera's calibration holds for the pixels as stored, so a rotation tag must not turn them.
@@ -109,10 +109,10 @@ def read_depth_m(path: ImageFile, units_per_m: float) -> DepthImage:
 
 
 def read_array_m(path: ImageFile, units_per_m: float, float_units_per_m: float) -> DepthImage:
-    """Return the (H, W) float32 depth in metres of a .npy or TIFF file; 0 is no measurement, and so is NaN.
+    """Return the (H, W) float32 depth in metres of a file of ``ARRAYS``; 0 and NaN are no measurement.
 
     Args:
-        path: Array of (H, W), (H, W, 1) or (1, H, W) numbers, or a TIFF of 16 bits or float32.
+        path: Array of (H, W), (H, W, 1) or (1, H, W) numbers, or an image of 16 bits or floats.
         units_per_m: Units per metre of whole numbers.
         float_units_per_m: Units per metre of others.
 
@@ -127,27 +127,44 @@ def read_array_m(path: ImageFile, units_per_m: float, float_units_per_m: float) 
 
 
 def has_floats(path: ImageFile) -> bool:
-    """Return whether a depth image is a .npy or TIFF file of floating-point numbers; a damaged one is not."""
+    """Return whether a depth image is a file of floating-point numbers; a damaged one is not."""
     with suppress(FrameError):
         return path.suffix in ARRAYS and _array_of(path).dtype.kind == "f"
     return False
 
 
 def _array_of(path: ImageFile) -> NDArray[Any]:
-    """Return the (H, W) numbers of a .npy or TIFF file of depth.
+    """Return the (H, W) numbers of a file of depth.
 
     Raises:
         FrameError: The file is missing, damaged or no such array.
     """
     data = bytes_of(path)
-    array: NDArray[Any] = (
-        load_array(BytesIO(data), path) if path.suffix == ".npy" else decode_depth(data, f"{path}")
-    )
+    array: NDArray[Any]
+    if path.suffix == ".npy":
+        array = load_array(BytesIO(data), path)
+    elif data.startswith(exr.START):
+        array = exr.decode(_of_sound_size(data, f"{path}"), f"{path}")
+    else:
+        array = decode_depth(data, f"{path}")
     if array.ndim == 3 and 1 in (array.shape[0], array.shape[2]):
         array = array[0] if array.shape[0] == 1 else array[..., 0]
     if array.ndim != 2 or array.dtype.kind not in "uif" or not array.size:
         raise FrameError(f"{path}: array of {array.dtype} {array.shape}, want rows and columns of depth")
     return array
+
+
+def _of_sound_size(data: bytes, where: str) -> bytes:
+    """Return the bytes of an image that may be decoded.
+
+    Raises:
+        FrameError: It is too large.
+    """
+    try:
+        check_pixels(data)
+    except DataError as error:
+        raise FrameError(f"{where}: {error}") from None
+    return data
 
 
 def decode_depth_units(data: bytes, where: str) -> NDArray[np.uint16]:

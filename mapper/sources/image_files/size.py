@@ -4,14 +4,14 @@ import re
 import struct
 
 from mapper.core.errors import DataError
-from mapper.sources.image_files import jpeg, png
+from mapper.sources.image_files import exr, jpeg, png
 
 MOST_MEGAPIXELS = 100
 """Size of the largest image that is decoded: depth cameras have a megapixel, industrial cameras up to fifty,
 and a file of a few megabytes can announce, and hold, thousands."""
 
 _BMP_SIZE = struct.Struct("<18xii")  # width, and height, which is negative where rows run downwards
-_PNM_HEADER = re.compile(rb"P[1-6](?:\s+|#[^\n]*\n)+(\d{1,9})(?:\s+|#[^\n]*\n)+(\d{1,9})\s")
+_PNM_HEADER = re.compile(rb"P[1-6f](?:\s+|#[^\n]*\n)+(\d{1,9})(?:\s+|#[^\n]*\n)+(\d{1,9})\s")
 _TIFF_WIDTH, _TIFF_HEIGHT, _TIFF_SHORT = 256, 257, 3  # tags, and the type of a 16-bit value
 
 
@@ -35,6 +35,8 @@ def size_of(data: bytes) -> tuple[int, int]:
             return png.size_of(data)
         if data.startswith(jpeg.START):
             return jpeg.size_of(data)
+        if data.startswith(exr.START):
+            return exr.size_of(data)
         if data.startswith(b"BM"):
             width_px, height_px = _BMP_SIZE.unpack_from(data)
             return abs(width_px), abs(height_px)

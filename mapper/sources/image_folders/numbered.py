@@ -4,7 +4,7 @@
 (``rgb*``, ``color*``, ``image*``) and depth (``depth*``) in two folders and the poses in one ``.log``. Names
 such as ``000001-000000033369.jpg`` carry a number and microseconds; others carry a number only, and stamps
 follow from the frame rate. BundleFusion's are named as 7-Scenes', with info.txt; ScanNet's extracted folders
-are as Redwood's, with a pose file a frame. Depth may be .npy.
+are as Redwood's, with a pose file a frame. Depth may be .npy, PFM or OpenEXR.
 """
 
 import re
@@ -31,8 +31,8 @@ LOOKED_FOR = "frame-000000.color.png and .depth.png (7-Scenes), numbered images 
 
 _COLOUR_FOLDER = re.compile(r"rgb|colou?r|image", re.IGNORECASE)
 _DEPTH_FOLDER = re.compile(r"(?:^|[^a-z])depth", re.IGNORECASE)
-_DEPTH_ENDINGS = frozenset({".npy"})
-_IMAGE_ENDINGS = frozenset({".png", ".jpg", ".jpeg", ".pgm", ".ppm", ".tif", ".tiff", ".bmp"})
+_DEPTH_ENDINGS = frozenset({".npy", ".pfm", ".exr"})
+_IMAGE_ENDINGS = frozenset({".png", ".jpg", ".jpeg", ".pgm", ".ppm", ".tif", ".tiff", ".bmp", ".webp"})
 _NUMBERED = re.compile(r"\D*(?P<number>\d{1,18})(?:-(?P<microseconds>\d+))?\D*")
 _SEVEN_SCENES = re.compile(r"frame-\d+\.color\.\w+")
 

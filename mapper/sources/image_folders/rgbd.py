@@ -24,6 +24,7 @@ from mapper.sources.calibration import (
 from mapper.sources.calibration_file import calibration_files, read_calibration
 from mapper.sources.config import CameraConfig
 from mapper.sources.depth_camera_pose import with_depth_pose
+from mapper.sources.image_files import exr
 from mapper.sources.image_files.decoded import DecodedColour, DecodedDepth
 from mapper.sources.image_files.image_sizes import RecordedCamera, Size, recorded_camera
 from mapper.sources.image_files.reading import (
@@ -157,6 +158,8 @@ def rgbd_log(
     units_per_m = calibration.depth_units_per_m or depth_units_per_m
     float_units_per_m = calibration.depth_units_per_m or 1.0
     array = next((pair.depth for pair in pairs if pair.depth.suffix in ARRAYS), None)
+    if array is not None and array.suffix == ".exr":
+        exr.require_decoder()
     recorded_units_per_m = (float_units_per_m if has_floats(array) else units_per_m) if array else None
     pairs = [_with_array(pair, units_per_m, float_units_per_m) for pair in pairs]
     accelerations, acceleration_notes = read_accelerations(folder)
