@@ -105,9 +105,8 @@ def _log_rows(log: "LogFacts") -> list[tuple[str, str]]:
         )
     if log.vehicle is not None:
         numbers = ",".join(f"{v:g}" for v in log.vehicle)
-        rows.append(
-            ("own vehicle", f"returns that stay in place near the sensor: --set source.body.box=[{numbers}]")
-        )
+        left_out = f"build leaves out returns that stay in place near the sensor: source.body.box=[{numbers}]"
+        rows.append(("own vehicle", f"{left_out}; source.body.find_box=false keeps them"))
     rows += [("note", note) for note in log.notes]
     rows += [("warning", warning) for warning in log.warnings]
     return rows + [("next time", advice) for advice in (log.images.advice if log.images else ())]

@@ -31,6 +31,7 @@ from mapper.runtime.regular_files import AnyPath
 from mapper.sources import open_source
 from mapper.sources.base import Log
 from mapper.sources.trajectory_files import write_tum
+from mapper.sources.vehicle import clear_vehicle
 
 TABLES, REPORT = "tables.md", "comparison.json"
 ODOMETRY, REGISTRATION, TRIALS = "odometry.csv", "registration.csv", "trials.csv"
@@ -75,6 +76,7 @@ def compare(
     """
     config = overridden(CompareConfig(methods=tuple(methods)), settings=settings)
     source = log if isinstance(log, Log) else open_source(Path(log), config.source)
+    source, _ = clear_vehicle(source, config.source, progress=receiver_of(progress))
     plan = json.dumps(_manifest(source.path, config), indent=2, ensure_ascii=False) + "\n"
     with atomic_folder(
         Path(out), _FOLDER, overwrite=overwrite, keeps=lambda partial: _kept_of(partial, plan)

@@ -13,6 +13,7 @@ from mapper.runtime.result_paths import RUNS, name_of, place_of
 from mapper.sources import open_source
 from mapper.sources.base import Log
 from mapper.sources.config import SourceConfig
+from mapper.sources.vehicle import clear_vehicle
 
 
 def localise(
@@ -49,6 +50,8 @@ def localise(
     base = finished.config.model_copy(update={"source": SourceConfig()})
     config = overridden(base, settings=settings)
     source = log if isinstance(log, Log) else open_source(path, config.source)
+    source, own = clear_vehicle(source, config.source)
+    config = config.model_copy(update={"source": own})
     for note in source.sentences:
         receiver.note(note)
     return localise_log(source, finished, config, folder, progress=receiver, overwrite=overwrite)

@@ -33,6 +33,7 @@ from mapper.runtime.progress import SILENT, Progress
 from mapper.sources.base import Log
 from mapper.sources.config import SourceConfig
 from mapper.sources.multi_session_log import chained
+from mapper.sources.vehicle import clear_vehicle
 
 _FIXED_BY_FIRST_SESSION = ("odometry", "level")
 
@@ -72,6 +73,8 @@ def append(
     edits = edits_text(run.path)
     wanted = parse_edits(edits, run.path)
     first = run.open_log()
+    second, own = clear_vehicle(second, config.source)
+    config = config.model_copy(update={"source": own})
     source = chained(first, second)
     for note in source.sentences:
         progress.note(note)

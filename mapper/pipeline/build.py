@@ -51,6 +51,7 @@ from mapper.sensing.sweep_motion import motion_during
 from mapper.sources.base import Log
 from mapper.sources.depth_time import depth_time_offset
 from mapper.sources.trajectory_files import write_tum
+from mapper.sources.vehicle import clear_vehicle
 
 
 def build(
@@ -90,6 +91,8 @@ def build(
             by another version was not finished there.
     """
     check_stamps(source.stamps_ns)
+    source, own = clear_vehicle(source, config.source, progress=progress)
+    config = config.model_copy(update={"source": own})
     warnings = noted_log_warnings(source, progress)
     poses = odometry if isinstance(odometry, Trajectory) else None
     if odometry is not None and poses is None:

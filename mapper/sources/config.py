@@ -96,17 +96,21 @@ class WheelsConfig(Config):
 
 
 class BodyConfig(Config):
-    """The sensor's own vehicle, whose returns no part of mapper gets to see: neither tracking nor maps.
-
-    ``mapper inspect`` proposes the box, from returns that stand still while the sensor moves.
-    """
+    """The sensor's own vehicle, whose returns no part of mapper gets to see: neither tracking nor maps."""
 
     box: tuple[float, float, float, float, float, float] | None = None
     """Least x y z, then largest x y z, metres, body frame: returns inside are the vehicle's or driver's."""
+    find_box: bool = True
+    """Without a box a build finds that of returns that stand still near the sensor while it moves."""
     min_range_m: NonNegativeFloat = 0.0
     """Nearer returns are left out."""
     max_range_m: PositiveFloat | None = None
     """Farther returns are left out, and free no space either: see ``octree.max_range_m`` for that."""
+
+    @property
+    def finds_box(self) -> bool:
+        """Whether the box is to be found."""
+        return self.find_box and self.box is None
 
     @property
     def clears(self) -> bool:

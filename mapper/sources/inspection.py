@@ -160,14 +160,14 @@ def inspect_log(
         SourceError: It is no log of a known format, or is damaged beyond reading.
     """
     if not ((path.is_dir() or path.is_file()) and format_of(path) == RECORDING):
-        return _inspected(path, [], open_source(path, config), check, time_offsets)
+        return _inspected(path, [], open_source(path, config), config, check, time_offsets)
     reader = RecordingReader(recordings.open_recording(path))
     topics = [_topic(series) for series in reader.series.values()]
     try:
         log = selected(recording_log(reader, config), config)
     except (DependencyError, SourceError) as error:
         return Inspection(path, topics, None, str(error))
-    return _inspected(path, topics, log, check, time_offsets)
+    return _inspected(path, topics, log, config, check, time_offsets)
 
 
 def timing_of(stamps_ns: Stamps) -> Timing:
@@ -194,6 +194,7 @@ def _inspected(
     path: Path,
     topics: Sequence[TopicFacts],
     source: Log,
+    config: SourceConfig,
     check: Callable[[Log], str | None],
     time_offsets: Callable[[Log], Sequence[TimeOffset]] | None,
 ) -> Inspection:
@@ -231,7 +232,7 @@ def _inspected(
             *outline_warnings(frames.values()),
             *scan_frame_warnings(source),
         ],
-        vehicle=vehicle_box(source),
+        vehicle=vehicle_box(source) if config.body.finds_box else None,
     )
     why = problem or why_no_depth(source, frames) or _unwritable(source) or check(source)
     offsets = None if why is not None or time_offsets is None else time_offsets(source)

@@ -1,7 +1,4 @@
-"""The sensor's own vehicle: its removal from the frames of a log, and a proposal of its box.
-
-The box is that of returns that stand still while the sensor moves.
-"""
+"""The sensor's own vehicle: the box of returns that stand still while the sensor moves, and their removal."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -13,8 +10,9 @@ from mapper.core.clusters import cluster_numbers
 from mapper.core.errors import FrameError
 from mapper.core.frames import Frame, RgbdFrame, Scan, Sensor
 from mapper.core.geometry import Array, Points, Transform, apply
+from mapper.runtime.progress import SILENT, Progress
 from mapper.sources.base import SPREAD_FRAMES, Log, WrappedEntry
-from mapper.sources.config import BodyConfig
+from mapper.sources.config import BodyConfig, SourceConfig
 
 Box = tuple[float, float, float, float, float, float]
 """Least x y z, then largest x y z, metres, body frame."""
@@ -29,6 +27,25 @@ _MAX_STEP_CELLS = 2
 _MAX_RETURNS_RATIO = 0.3
 """What takes up more of the view is no vehicle: it is the object that is scanned."""
 _MARGIN_M = 0.05
+
+
+def clear_vehicle(log: Log, config: SourceConfig, *, progress: Progress = SILENT) -> tuple[Log, SourceConfig]:
+    """Return a log without the returns of its own vehicle, and its settings with the box that was found.
+
+    Both are returned as they are where the settings have a box or want none, or no vehicle is seen.
+    """
+    box = vehicle_box(log) if config.body.finds_box else None
+    if box is None:
+        return log, config
+    body = BodyConfig(box=box)
+    numbers = ",".join(f"{value:g}" for value in box)
+    note = (
+        f"returns that stay in place near the sensor are left out, as its own vehicle's: "
+        f"source.body.box=[{numbers}]; source.body.find_box=false keeps them"
+    )
+    progress.note(note)
+    cleared = replace(without_vehicle(log, body), notes=[*log.notes, note])
+    return cleared, config.model_copy(update={"body": config.body.model_copy(update={"box": box})})
 
 
 def without_vehicle(log: Log, config: BodyConfig) -> Log:

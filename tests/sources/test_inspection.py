@@ -148,7 +148,7 @@ def test_a_log_of_too_few_frames_cannot_be_mapped(tiny_tum_log):
     assert json.loads(printed(log, "--json", status=1))["problem"].startswith("only 3 frames were read")
 
 
-def test_the_box_of_the_vehicle_is_printed_as_the_setting_that_clears_it(tmp_path):
+def test_the_box_of_the_vehicle_is_printed_with_the_setting_that_keeps_it(tmp_path):
     rng = np.random.default_rng(0)
     for k in range(10):
         vehicle = rng.uniform((-1.0, -0.5, -0.4), (-0.6, 0.5, -0.3), (300, 3))
@@ -158,7 +158,7 @@ def test_the_box_of_the_vehicle_is_printed_as_the_setting_that_clears_it(tmp_pat
         np.save(tmp_path / f"{k:06d}.npy", cloud)
 
     told = invoke("inspect", tmp_path).stdout
-    setting = re.search(r"--set (source\.body\.box=\[[-0-9.,]+\])", told).group(1)
+    setting = re.search(r"source\.body\.find_box=false", told).group()
     assert "own vehicle" not in invoke("inspect", tmp_path, "--set", setting).stdout
     assert len(json.loads(invoke("inspect", tmp_path, "--json").stdout)["log"]["vehicle"]) == 6
 

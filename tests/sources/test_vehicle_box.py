@@ -5,8 +5,7 @@ import pytest
 
 from mapper.core.frames import PinholeCamera, RgbdFrame, Scan
 from mapper.sources.config import BodyConfig, SourceConfig
-from mapper.sources.selection import selected
-from mapper.sources.vehicle import vehicle_box
+from mapper.sources.vehicle import clear_vehicle, vehicle_box
 from tests.support.logs import MemoryEntry, log_in_memory
 from tests.support.street_scans import on_street, street, view
 
@@ -44,11 +43,20 @@ def test_the_box_holds_vehicle_and_driver_and_little_else():
     assert (lower >= own.min(axis=0) - 0.4).all()
     assert (upper <= own.max(axis=0) + 0.4).all()
 
-    left = selected(log, SourceConfig(body=BodyConfig(box=box)))
+    left, config = clear_vehicle(log, SourceConfig())
+    assert config.body.box == box
+    assert len(left.notes) == len(log.notes) + 1
     assert vehicle_box(left) is None
     kept = sum(len(entry.scan().points_body) for entry in left.entries())
     total = sum(len(entry.scan().points_body) for entry in log.entries())
     assert total - kept == pytest.approx(len(own), rel=0.03)
+
+
+@pytest.mark.parametrize("body", [{"find_box": False}, {"box": (9.0, 9.0, 9.0, 10.0, 10.0, 10.0)}])
+def test_nothing_is_cleared_against_the_settings(body):
+    log, _ = street_log(vehicle=True)
+    config = SourceConfig(body=BodyConfig(**body))
+    assert clear_vehicle(log, config) == (log, config)
 
 
 @pytest.mark.parametrize(

@@ -93,10 +93,12 @@ def _nclt_columns(path: Path, size: int) -> Columns | None:
     if size % _NCLT.itemsize or not size:
         return None
     records = np.fromfile(path, _NCLT)
+    if records["laser"].max() >= _NCLT_LASERS:
+        return None
     floats = np.abs(records[: len(records) // 2 * 2].view(_FLOAT32))
     with np.errstate(invalid="ignore"):
         is_strange = ~((floats == 0.0) | ((floats > _LEAST_FLOAT) & (floats < _MOST_FLOAT)))
-    if records["laser"].max() >= _NCLT_LASERS or is_strange.mean() < _MOST_STRANGE:
+    if is_strange.mean() < _MOST_STRANGE:
         return None
     x, y, z = (records["xyz"].astype(np.float32) * np.float32(_NCLT_UNIT_M) - np.float32(_NCLT_ORIGIN_M)).T
     return {"x": x, "y": -y, "z": -z, "intensity": records["intensity"]}
