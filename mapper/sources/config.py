@@ -147,13 +147,15 @@ class SourceConfig(Config):
     depth_offset_s: OffsetS | None = None
     """Added to the stamps of depth images before they are paired with colour images: how much later they show
     the scene than their stamps say. None pairs them as stamped, and fuses them at the time that the images
-    show. ``mapper inspect --time-offset`` measures it, and the next three."""
+    show. ``mapper inspect --time-offset`` measures it, and the next four."""
     imu_offset_s: OffsetS = 0.0
     """Added to the stamps of accelerations and angular velocities."""
     wheels_offset_s: OffsetS = 0.0
     """Added to the stamps of wheel odometry."""
     truth_offset_s: OffsetS = 0.0
     """Added to the stamps of the true poses."""
+    images_offset_s: OffsetS = 0.0
+    """Added to the stamps of the images that colour a LiDAR's cloud."""
     rate_hz: PositiveFloat | None = None
     """Frames per second of numbered files without stamps; None is the format's own (30, Poznań, scans 10)."""
     camera: CameraConfig | None = None

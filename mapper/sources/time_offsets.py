@@ -23,21 +23,25 @@ class TimeOffset:
     """Time offset of one of a log's sensors.
 
     Attributes:
-        sensor: "depth", "gyroscope", "wheels", "truth" or "device poses".
+        sensor: "depth", "gyroscope", "wheels", "truth" or "device poses", or the name of a sensor beside.
         late_s: How much later its stamps are than those of frames of the same moment; None if that cannot be
             told.
         sigma_s: Standard deviation of it.
         remedy: What corrects it, as an option or in words; empty where nothing need.
+        is_measured: Whether it was looked for.
     """
 
     sensor: str
     late_s: float | None
     sigma_s: float | None
     remedy: str = ""
+    is_measured: bool = True
 
     @property
     def found(self) -> str:
         """The offset in words, without the remedy."""
+        if not self.is_measured:
+            return "not measured; a build doubts LiDARs and depth cameras that lie beside the tracked one"
         if self.late_s is None or self.sigma_s is None:
             return "cannot be told: too little motion, too few frames, or no agreement"
         side = "late" if self.late_s >= 0.0 else "early"
@@ -87,7 +91,8 @@ def peak_of(at_s: NDArray[np.floating], score: NDArray[np.floating]) -> float:
 
 def with_time_offsets(log: Log, config: SourceConfig) -> Log:
     """Return a log whose readings and poses have the settings' offsets added to their stamps."""
-    if not (config.truth_offset_s or config.wheels_offset_s or config.imu_offset_s):
+    offsets_s = (config.truth_offset_s, config.wheels_offset_s, config.imu_offset_s, config.images_offset_s)
+    if not any(offsets_s):
         return log
 
     def moved(readings: Readings | None, offset_s: float) -> Readings | None:
@@ -101,4 +106,8 @@ def with_time_offsets(log: Log, config: SourceConfig) -> Log:
         wheels=moved(log.wheels, config.wheels_offset_s),
         gyroscope=moved(log.gyroscope, config.imu_offset_s),
         accelerations=moved(log.accelerations, config.imu_offset_s),
+        images=[
+            replace(one, stamps_ns=one.stamps_ns + round(config.images_offset_s * NS_PER_S))
+            for one in log.images
+        ],
     )
