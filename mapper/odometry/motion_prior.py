@@ -64,7 +64,7 @@ class MotionPrior:
         self._measured = 0
         self._next_fit = _FIRST_FIT
         self._used = self._uncovered = 0
-        self._rejected_ns = -1
+        self._rejected: tuple[int, float] | None = None
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the state without what is made again when it is needed."""
@@ -179,19 +179,26 @@ class MotionPrior:
     def reject(self, begin_ns: int, end_ns: int, R_begin_end: Array) -> bool:
         """Return whether the gyroscope rules out a rotation (3, 3) of the body between two times.
 
-        Each frame that is rejected counts as an error of the gyroscope, so that one that has become wrong
-        soon rejects nothing.
+        Each frame of which a pose is rejected and none accepted counts as an error of the gyroscope, so that
+        one that has become wrong soon rejects nothing.
         """
+        if self._rejected is not None and self._rejected[0] != end_ns:
+            self._errors.append(self._rejected[1])
+            self._rejected = None
         found = self._turn(begin_ns, end_ns)
         if found is None or len(self._errors) < _FEWEST_ERRORS:
             return False
         sigma_rad = math.hypot(found[1], float(np.median(self._errors)) / _MEDIAN_LENGTH)
         off_rad = float(np.linalg.norm(rotation_log(found[0].T @ R_begin_end)))
-        is_ruled_out = off_rad > max(_CONTRADICTION_RAD, _CONTRADICTION_SIGMAS * sigma_rad)
-        if is_ruled_out and end_ns != self._rejected_ns:
-            self._rejected_ns = end_ns
-            self._errors.append(off_rad)
-        return is_ruled_out
+        if off_rad <= max(_CONTRADICTION_RAD, _CONTRADICTION_SIGMAS * sigma_rad):
+            return False
+        self._rejected = self._rejected or (end_ns, off_rad)
+        return True
+
+    def accept(self, end_ns: int) -> None:
+        """Take over that a frame has a pose that was not rejected, whatever was rejected before."""
+        if self._rejected is not None and self._rejected[0] == end_ns:
+            self._rejected = None
 
     @property
     def calibration(self) -> GyroscopeCalibration | None:

@@ -26,6 +26,26 @@ class Spread:
     is_by_wheels: bool = False
 
 
+class _Errors:
+    """Errors of predictions of one kind: running medians of their lengths, in rad and m."""
+
+    def __init__(self) -> None:
+        self._turns, self._shifts = RunningMedian(memory=_ERRORS), RunningMedian(memory=_ERRORS)
+
+    def __len__(self) -> int:
+        return len(self._turns)
+
+    def add(self, error: Transform, time_s2: float = 1.0) -> None:
+        """Add that of one prediction, in units of a time squared if it is an acceleration's."""
+        self._turns.add(angle_between(np.eye(3), error[:3, :3]) / time_s2)
+        self._shifts.add(float(np.linalg.norm(error[:3, 3])) / time_s2)
+
+    @property
+    def sigmas(self) -> tuple[float, float]:
+        """Standard deviations of rotation and translation."""
+        return self._turns.median / _MEDIAN_LENGTH, self._shifts.median / _MEDIAN_LENGTH
+
+
 class MotionModel:
     """Motion of the body in the middle of each sweep.
 
@@ -44,8 +64,7 @@ class MotionModel:
         self._elapsed_s = 0.0
         self._placed = 0
         self._covariance = np.zeros((6, 6))
-        self._turn_errors, self._shift_errors = RunningMedian(memory=_ERRORS), RunningMedian(memory=_ERRORS)
-        self._wheel_turns, self._wheel_shifts = RunningMedian(memory=_ERRORS), RunningMedian(memory=_ERRORS)
+        self._of_velocity, self._of_gyroscope, self._of_wheels = _Errors(), _Errors(), _Errors()
 
     def elapsed_s(self, time_ns: int) -> float:
         """Return the seconds since the last scan that was placed."""
@@ -55,6 +74,11 @@ class MotionModel:
         """Return T_world_body (4, 4) at a time, by the gyroscope, or if the velocity stays."""
         velocity_mps = self.T_world_last[:3, :3].T @ self._velocity_world
         return self.T_world_last @ self.prior.predict(self._time_ns, time_ns, self.twist, velocity_mps)
+
+    def is_ruled_out(self, time_ns: int, T_world_body: Transform) -> bool:
+        """Return whether the gyroscope rules out a pose (4, 4) at a time."""
+        R_last_body = self.T_world_last[:3, :3].T @ T_world_body[:3, :3]
+        return self.prior.reject(self._time_ns, time_ns, R_last_body)
 
     def is_by_wheels(self, time_ns: int) -> bool:
         """Return whether the wheels predict the pose at a time."""
@@ -96,10 +120,15 @@ class MotionModel:
         rolled = self.prior.rolled(self._time_ns, time_ns)
         if rolled is not None:
             return self._spread_of_wheels(rolled)
-        if len(self._turn_errors) < _FEWEST_ERRORS:
+        is_turned = self.prior.turn(self._time_ns, time_ns) is not None
+        is_known = is_turned and len(self._of_gyroscope) >= _FEWEST_ERRORS
+        return self._spread_by(self._of_gyroscope if is_known else self._of_velocity, time_ns)
+
+    def _spread_by(self, errors: _Errors, time_ns: int) -> Spread | None:
+        if len(errors) < _FEWEST_ERRORS:
             return None
         elapsed_s = self.elapsed_s(time_ns)
-        rotation, translation = self._accelerations()
+        rotation, translation = errors.sigmas
         moved = float(np.linalg.norm(self.twist.translation_mps)) * elapsed_s
         turned = float(np.linalg.norm(self.twist.rotation_radps)) * elapsed_s
         time_s2 = _time_s2(elapsed_s, self._elapsed_s)
@@ -111,9 +140,7 @@ class MotionModel:
     def _spread_of_wheels(self, rolled: Transform) -> Spread:
         """Return the spread of a motion by the wheels: the errors that they had, and those of most wheels."""
         moved, turned = float(np.linalg.norm(rolled[:3, 3])), angle_between(np.eye(3), rolled[:3, :3])
-        rotation, translation = (
-            errors.median / _MEDIAN_LENGTH for errors in (self._wheel_turns, self._wheel_shifts)
-        )
+        rotation, translation = self._of_wheels.sigmas
         return Spread(
             float(np.hypot(rotation, _LEAST_RAD + _WHEELS_SHARE * turned)),
             float(np.hypot(translation, _LEAST_M + _WHEELS_SHARE * moved)),
@@ -122,15 +149,11 @@ class MotionModel:
 
     def acceleration(self, time_ns: int, T_world_body: Transform, twist: Twist) -> float:
         """Return the angular acceleration to a velocity at a pose, at least the usual one, rad/s²."""
-        usual, elapsed_s = self._accelerations()[0], self.elapsed_s(time_ns)
+        usual, elapsed_s = self._of_velocity.sigmas[0], self.elapsed_s(time_ns)
         if elapsed_s < _MIN_ELAPSED_S:
             return usual
         change = twist.rotation_radps - self.mean_twist(time_ns, T_world_body).rotation_radps
         return max(usual, 2.0 * float(np.linalg.norm(change)) / elapsed_s)
-
-    def _accelerations(self) -> tuple[float, float]:
-        """Return the standard deviations of the accelerations that predictions lacked, rad/s² and m/s²."""
-        return self._turn_errors.median / _MEDIAN_LENGTH, self._shift_errors.median / _MEDIAN_LENGTH
 
     def velocity(self, time_ns: int, T_world_body: Transform) -> tuple[Twist, Array]:
         """Return the expected velocity at a pose, and its (6, 6) covariance, rotation before translation.
@@ -148,7 +171,9 @@ class MotionModel:
 
     def velocity_sigmas(self, time_ns: int) -> Array:
         """Return (6,) standard deviations of what the velocity changes until a time, rad/s and m/s."""
-        spread, elapsed_s = self.spread(time_ns), self.elapsed_s(time_ns)
+        rolled, elapsed_s = self.prior.rolled(self._time_ns, time_ns), self.elapsed_s(time_ns)
+        by_velocity = self._spread_by(self._of_velocity, time_ns)
+        spread = by_velocity if rolled is None else self._spread_of_wheels(rolled)
         if spread is None or elapsed_s < _MIN_ELAPSED_S:
             sigmas = float(np.linalg.norm(self.twist.rotation_radps)), 0.0  # it may just have begun to turn
         else:
@@ -180,18 +205,18 @@ class MotionModel:
         """
         elapsed_s = self.elapsed_s(time_ns)
         self._placed += 1
+        self.prior.accept(time_ns)
         if elapsed_s >= _MIN_ELAPSED_S:
             if is_certain and self._placed > 1:  # the first is predicted without a velocity
                 constant = self.twist.over(elapsed_s)
                 T_last_body = inverse(self.T_world_last) @ T_world_body
                 error = inverse(self.predicted(time_ns)) @ T_world_body
-                lengths = angle_between(np.eye(3), error[:3, :3]), float(np.linalg.norm(error[:3, 3]))
-                if self.is_by_wheels(time_ns):
-                    self._wheel_turns.add(lengths[0])
-                    self._wheel_shifts.add(lengths[1])
                 time_s2 = _time_s2(elapsed_s, self._elapsed_s)
-                self._turn_errors.add(lengths[0] / time_s2)
-                self._shift_errors.add(lengths[1] / time_s2)
+                self._of_velocity.add(inverse(constant) @ T_last_body, time_s2)
+                if self.is_by_wheels(time_ns):
+                    self._of_wheels.add(error)
+                elif self.prior.turn(self._time_ns, time_ns) is not None:
+                    self._of_gyroscope.add(error, time_s2)
                 self.prior.learn_slip(self._time_ns, time_ns, T_last_body)
                 self.prior.learn(self._time_ns, time_ns, T_last_body[:3, :3], constant[:3, :3])
             if measured is None:

@@ -1,7 +1,8 @@
 """Search of a scan's pose: from the prediction, and where that fits less than most, by other hypotheses."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -46,11 +47,12 @@ class KnownPath:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Scan:
-    """A scan with the pose that is predicted for it."""
+    """A scan with the pose that is predicted for it, and what rules out another."""
 
     deskewed: DeskewedScan
     T_world_predicted: Transform
     spread: Spread | None
+    is_ruled_out: Callable[[Transform], bool]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,7 +94,9 @@ class PoseSearch:
             time_ns: Time of the middle of the sweep.
             T_world_guess: (4, 4) where the matcher begins; None is the predicted pose.
         """
-        scan = _Scan(deskewed, path.motion.predicted(time_ns), path.motion.spread(time_ns))
+        motion = path.motion
+        is_ruled_out = partial(motion.is_ruled_out, time_ns)
+        scan = _Scan(deskewed, motion.predicted(time_ns), motion.spread(time_ns), is_ruled_out)
         tracked = found = self._track(scan, path.keyframes, T_world_guess)
         if found is None or (not self._believes_all and self._assessment.is_suspect(found)):
             found = self._search(scan, path, found)
@@ -153,9 +157,9 @@ class PoseSearch:
         return _best(candidates)
 
     def _candidate(self, scan: _Scan, hypothesis: _Hypothesis) -> PoseCandidate | None:
-        """Return a hypothesis with its fit, fused with the prediction; None if it fits nothing."""
+        """Return a hypothesis with its fit, fused with the prediction; None if it is none, or cannot be."""
         keyframe, T_world_found = hypothesis.keyframe, hypothesis.T_world_middle
-        if T_world_found is None:
+        if T_world_found is None or scan.is_ruled_out(T_world_found):
             return None
         T_key_scan = inverse(keyframe.T_world_middle) @ T_world_found
         fit = fit_of(

@@ -1,4 +1,4 @@
-"""Hand-held scans at 2 Hz in fast turns, tracked with the gyroscope of the log."""
+"""Scans at 2 Hz in fast turns, tracked with the gyroscope of the log."""
 
 from dataclasses import replace
 
@@ -7,7 +7,10 @@ from scipy.spatial.transform import Rotation
 
 from mapper.core.geometry import fit_rigid
 from mapper.odometry.factory import odometry_for
+from mapper.odometry.motion_prior import MotionPrior
 from mapper.odometry.scans.config import GicpOdometryConfig
+from mapper.odometry.scans.motion_model import MotionModel
+from mapper.sensing.gyroscope import Gyroscope
 from mapper.simulation.config import LidarSensorConfig, LidarSynthConfig, SynthImuConfig
 from mapper.simulation.lidar.source import LidarSimulator
 
@@ -39,3 +42,42 @@ def test_a_gyroscope_whose_mounting_is_stated_keeps_the_path():
     assert np.sqrt((errors_m**2).mean()) < 0.03
     assert not any(result.doubts for result in results)
     assert any("offset 7 ±" in note for note in odometry.gyroscope_notes())
+
+
+def swinging_model(frames: int) -> tuple[MotionModel, list[int], np.ndarray]:
+    """A motion model after some frames at 2 Hz of a body that swings; its gyroscope ends after 20 s."""
+    readings_s = np.arange(0.0, 20.0, 0.005)
+    rates = np.column_stack([0.3 * np.cos(1.1 * readings_s), np.zeros(4000), 2.0 * np.cos(1.7 * readings_s)])
+    rates[:, 0] += 1e-3 * np.random.default_rng(1).standard_normal(4000)
+    gyroscope = Gyroscope("imu", np.round(readings_s * 1e9).astype(np.int64), rates, np.eye(3))
+    stamps_ns = (np.arange(0.5, 30.0, 0.5) * 1e9).astype(np.int64).tolist()
+    turns = Rotation.from_rotvec(0.005 * rates)
+    R = [Rotation.identity()]
+    for turn in turns:
+        R.append(R[-1] * turn)
+    T = np.tile(np.eye(4), (len(stamps_ns), 1, 1))
+    T[:, :3, :3] = [R[min(stamp_ns // 5_000_000, 4000)].as_matrix() for stamp_ns in stamps_ns]
+    model = MotionModel(stamps_ns[0], T[0], MotionPrior(gyroscope))
+    for k in range(1, frames):
+        model.follow(stamps_ns[k], T[k])
+    return model, stamps_ns, T
+
+
+def test_a_pose_is_ruled_out_that_turns_otherwise_than_the_gyroscope():
+    model, stamps_ns, T = swinging_model(30)
+    half_turn = np.diag([-1.0, -1.0, 1.0, 1.0])
+    assert model.is_ruled_out(stamps_ns[30], T[30] @ half_turn)
+    assert not model.is_ruled_out(stamps_ns[30], T[30])
+    for _ in range(20):  # of one frame, of which the right pose is accepted
+        model.is_ruled_out(stamps_ns[30], T[30] @ half_turn)
+    model.follow(stamps_ns[30], T[30])
+    assert model.is_ruled_out(stamps_ns[31], T[31] @ half_turn)
+
+
+def test_where_the_gyroscope_has_no_readings_constant_velocity_errs_as_it_does():
+    """Not as the gyroscope does: a pose would be taken for a surprise, and a bent sweep for a rigid one."""
+    known, stamps_ns, _ = swinging_model(35)
+    unknown, _, _ = swinging_model(40)
+    by_gyroscope, by_velocity = known.spread(stamps_ns[35]), unknown.spread(stamps_ns[40])
+    assert by_velocity.rotation_rad > 5.0 * by_gyroscope.rotation_rad
+    assert known.velocity_sigmas(stamps_ns[35])[0] > 0.3  # its velocity changes, whoever predicts the pose
