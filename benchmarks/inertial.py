@@ -89,7 +89,7 @@ def _saturated(log: Log) -> Log:
 def _changed(log: Log, change: Callable[[Array], Array]) -> Log:
     assert log.gyroscope is not None
     changed = replace(log.gyroscope, rates_radps=change(log.gyroscope.rates_radps))
-    sound, _ = changed.without_saturation()
+    sound, _ = changed.without_faults()
     return replace(log, gyroscope=sound)
 
 

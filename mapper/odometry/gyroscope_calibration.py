@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.geometry import Array, rotation_exp
-from mapper.core.timebase import NS_PER_S, Stamps
+from mapper.core.timebase import GAP_INTERVALS, NS_PER_S, Stamps
 from mapper.core.units import unit_of_gravity
 from mapper.sensing.gyroscope import Gyroscope
 from mapper.sensing.inertial import InertialReadings
@@ -96,8 +96,8 @@ def body_readings(log: Log, calibration: GyroscopeCalibration) -> InertialReadin
     """Return a log's angular velocities and accelerations of the body; None where they cannot be told.
 
     Accelerations have to be as long as gravity in m/s² or g, and a mounting is one of both readings only if
-    it is certain and right-handed. They are interpolated at the times of the angular velocities, and moved to
-    the body's origin where the log states the unit's place.
+    it is certain and right-handed. They are interpolated at the times of the angular velocities, not across
+    gaps, and moved to the body's origin where the log states the unit's place.
     """
     gyroscope, felt = log.gyroscope, log.accelerations
     mounting_rad = float(np.sqrt(np.diag(calibration.covariance)[:3].max()))
@@ -109,8 +109,14 @@ def body_readings(log: Log, calibration: GyroscopeCalibration) -> InertialReadin
     if felt.are_axes_stated and gyroscope.R_body_imu is not None:
         R_body_felt = R_body_felt @ gyroscope.R_body_imu.T
     stamps_ns = felt.stamps_ns - round(calibration.offset_s * NS_PER_S)
+    if unit is None or len(stamps_ns) < 2:
+        return None
+    intervals_ns = np.diff(stamps_ns)
+    after = np.searchsorted(stamps_ns, turned.stamps_ns).clip(1, len(stamps_ns) - 1)
+    longest_ns = max(turned.gap_ns, GAP_INTERVALS * float(np.median(intervals_ns)))
     inside = (turned.stamps_ns >= stamps_ns[0]) & (turned.stamps_ns <= stamps_ns[-1])
-    if unit is None or inside.sum() < 2:
+    inside &= intervals_ns[after - 1] <= longest_ns
+    if inside.sum() < 2:
         return None
     at_ns = turned.stamps_ns[inside]
     felt_body = unit * felt.acceleration_mps2 @ R_body_felt.T

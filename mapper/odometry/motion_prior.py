@@ -186,7 +186,7 @@ class MotionPrior:
             self._errors.append(self._rejected[1])
             self._rejected = None
         found = self._turn(begin_ns, end_ns)
-        if found is None or len(self._errors) < _FEWEST_ERRORS:
+        if found is None or len(self._errors) < _FEWEST_ERRORS or not self._is_better(*found):
             return False
         sigma_rad = math.hypot(found[1], float(np.median(self._errors)) / _MEDIAN_LENGTH)
         off_rad = float(np.linalg.norm(rotation_log(found[0].T @ R_begin_end)))

@@ -220,7 +220,7 @@ def _bridge_window(
             tracking,
             f"by the IMU {placed} of {lost} lost frames are placed, the motion of {weak.sum() - lost} that "
             "surfaces leave open or it contradicts is smoothed, and "
-            f"{len(connected.factors) - len(graph.factors)} parts of the path are connected; it knows the "
+            f"{len(connected.factors) - len(replaced.factors)} parts of the path are connected; it knows the "
             f"velocity to ±{path.velocity_sigmas_mps[weak].max():.2g} m/s",
         )
     return replace(

@@ -8,8 +8,13 @@ from numpy.typing import NDArray
 from mapper.core.geometry import Array
 from mapper.core.timebase import GAP_INTERVALS, NS_PER_S, Stamps
 
-_LEAST_GAP_NS = 20_000_000
-"""Readings farther apart than this, and than ``GAP_INTERVALS`` of their usual ones, have a gap between."""
+_LEAST_GAP_NS = 50_000_000
+"""Readings farther apart than this, and than ``GAP_INTERVALS`` of their usual ones, have a gap between: those
+of 20 Hz show the motion of a hand, and so do others of which some are lost."""
+_BURST = 20
+"""Readings over which the usual interval is measured: drivers stamp some of them at once."""
+_FROZEN_NS, _FROZEN_READINGS = NS_PER_S // 5, 10
+"""Time, and number of readings, for which no unit that works repeats the very same one: its noise differs."""
 _SATURATED_READINGS, _LEAST_SATURATED = 5, 1.0
 """Readings that have exactly the largest number of the log are at the end of their range; angular velocities
 beyond 1 rad/s."""
@@ -47,7 +52,10 @@ class Gyroscope:
     interval_ns: int = field(init=False)
 
     def __post_init__(self) -> None:
-        usual_ns = int(np.median(np.diff(self.stamps_ns))) if len(self) > 1 else 0
+        count = min(_BURST, len(self) - 1)
+        usual_ns = (
+            int(np.median(self.stamps_ns[count:] - self.stamps_ns[:-count])) // count if count > 0 else 0
+        )
         object.__setattr__(self, "interval_ns", usual_ns)
 
     def __len__(self) -> int:
@@ -58,20 +66,27 @@ class Gyroscope:
         """Time between two readings beyond which the rotation between them is unknown."""
         return max(round(GAP_INTERVALS * self.interval_ns), _LEAST_GAP_NS)
 
-    def without_saturation(self) -> tuple["Gyroscope | None", list[str]]:
-        """Return the readings within the unit's range, None if there are none, and notes on them and on gaps.
+    def without_faults(self) -> tuple["Gyroscope | None", list[str]]:
+        """Return the readings of a unit that works, None if there are none, and notes on others and on gaps.
 
-        The unit turned faster than a reading at the end of its range says; what is left has a gap there.
+        It turned faster than a reading at the end of its range says, and a frozen one says nothing; what is
+        left has a gap there.
         """
         notes = []
         kept = self
-        if (found := range_end(self.rates_radps, beyond=_LEAST_SATURATED)) is not None:
+        if (frozen := self._are_frozen()).any():
+            notes.append(
+                f"{self.name}: {frozen.sum()} of {len(self)} angular velocities repeat those before, for "
+                f"{_FROZEN_NS / NS_PER_S:g} s and longer; was the unit frozen? Left out"
+            )
+            kept = self._of(~frozen)
+        if (found := range_end(kept.rates_radps, beyond=_LEAST_SATURATED)) is not None:
             limit, saturated = found
             notes.append(
-                f"{self.name}: {saturated.sum()} of {len(self)} angular velocities are at the end of the "
+                f"{self.name}: {saturated.sum()} of {len(kept)} angular velocities are at the end of the "
                 f"gyroscope's range, {limit:g}; left out"
             )
-            kept = self._of(~saturated)
+            kept = kept._of(~saturated)
         if len(kept) < 2:
             return None, [*notes, f"{self.name}: no angular velocities"]
         intervals_ns = np.diff(kept.stamps_ns)
@@ -111,6 +126,14 @@ class Gyroscope:
         """Return the (M, 3) readings at (M,) times, on the lines between them."""
         columns = [np.interp(stamps_ns, self.stamps_ns, column) for column in self.rates_radps.T]
         return np.stack(columns, axis=1)
+
+    def _are_frozen(self) -> NDArray[np.bool_]:
+        """Return which (N,) readings repeat the one before, in runs that no noise leaves."""
+        repeats = np.zeros(len(self), np.bool_)
+        repeats[1:] = (self.rates_radps[1:] == self.rates_radps[:-1]).all(axis=1)
+        run = np.cumsum(~repeats)
+        fewest = max(_FROZEN_READINGS, _FROZEN_NS // max(self.interval_ns, 1))
+        return np.asarray(repeats & (np.bincount(run)[run] > fewest))
 
     def _of(self, kept: NDArray[np.bool_]) -> "Gyroscope":
         return replace(self, stamps_ns=self.stamps_ns[kept], rates_radps=self.rates_radps[kept])

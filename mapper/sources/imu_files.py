@@ -124,7 +124,7 @@ def gyroscope_of(name: str, stamps_ns: Stamps, rates_radps: Array) -> tuple[Gyro
         rates_radps: (N, 3) in the unit's own axes.
     """
     stamps_ns, rates_radps, notes = _finite(name, stamps_ns, rates_radps, what="angular velocities")
-    sound, more = Gyroscope(name, stamps_ns, rates_radps).without_saturation()
+    sound, more = Gyroscope(name, stamps_ns, rates_radps).without_faults()
     return sound, [*notes, *more]
 
 

@@ -156,6 +156,10 @@ def test_a_rotation_is_rejected_that_the_gyroscope_rules_out():
     _, _, other = swinging(16)
     _, _, unrelated = predictions(readings(times_s, rates), *frames(times_s, other))
     assert not unrelated.reject(begin_ns, end_ns, wrong)
+    slow = Rotation.from_rotvec(np.outer(0.02 * np.arange(40), [0.0, 0.0, 1.0])).as_matrix()
+    _, used, unused = predictions(readings(times_s, 0.0 * rates), stamps_ns[:40], slow)
+    assert not used[8:].any()  # constant velocity predicts all of it, and a gyroscope that is still little
+    assert not unused.reject(begin_ns, end_ns, rotation_exp(np.array([0.0, 0.0, 1.5])))
 
 
 def test_a_gyroscope_that_has_become_wrong_soon_rejects_nothing():

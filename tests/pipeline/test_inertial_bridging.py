@@ -239,6 +239,18 @@ def test_accelerations_that_contradict_the_path_are_not_used_and_named(fault):
     assert [warning.kind for warning in found.warnings] == ["imu"]
 
 
+def test_a_gap_of_the_accelerations_is_one_of_the_readings():
+    log_, _, _ = made(5)
+    felt = log_.accelerations
+    kept = (felt.stamps_ns < START_NS + 5 * NS_PER_S) | (felt.stamps_ns > START_NS + 6 * NS_PER_S)
+    gapped = replace(felt, stamps_ns=felt.stamps_ns[kept], acceleration_mps2=felt.acceleration_mps2[kept])
+    whole, found = (body_readings(replace(log_, accelerations=one), CALIBRATION) for one in (felt, gapped))
+    second = START_NS + np.arange(3, 10) * NS_PER_S
+    spans = [(int(begin_ns), int(begin_ns) + NS_PER_S) for begin_ns in second]
+    assert [whole.covers(*span) for span in spans] == [True] * 7
+    assert [found.covers(*span) for span in spans] == [True, False, False, True, True, True, True]
+
+
 @pytest.mark.parametrize(("factor", "notes"), [(1.0 / 9.80665, 0), (-1.0, 1)], ids=["in g", "reversed"])
 def test_accelerations_in_g_and_of_the_opposite_sign_bridge_as_well(factor, notes):
     log_, tracking, truth = made(6, lost=range(70, 90))

@@ -1,6 +1,7 @@
-"""Gyroscope: integration of its angular velocities, gaps, and readings at the end of its range."""
+"""Gyroscope: integration of its angular velocities, gaps, and readings that are none."""
 
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 
 from mapper.core.timebase import NS_PER_S
@@ -48,20 +49,38 @@ def test_rotations_over_gaps_and_beyond_the_ends_are_unknown():
     begins = np.array([0, 400_000_000, 800_000_000, 1_900_000_000, -1])
     known = gapped.rotations(begins, begins + 200_000_000, np.zeros(3))[1]
     assert known.tolist() == [True, False, True, False, False]
-    assert len(gapped.without_saturation()[1]) == 1
+    assert len(gapped.without_faults()[1]) == 1
 
 
 def test_readings_at_the_end_of_the_range_are_left_out():
     gyroscope, _ = turning()
     rates = np.clip(gyroscope.rates_radps, -2.5, 2.5)
-    sound, notes = Gyroscope("/imu", gyroscope.stamps_ns, rates).without_saturation()
+    sound, notes = Gyroscope("/imu", gyroscope.stamps_ns, rates).without_faults()
     assert sound is None
     assert "2.5" in notes[0]
     rates = gyroscope.rates_radps.copy()
     rates[100:120, 0] = 9.0
-    sound, notes = Gyroscope("/imu", gyroscope.stamps_ns, rates).without_saturation()
+    sound, notes = Gyroscope("/imu", gyroscope.stamps_ns, rates).without_faults()
     assert len(sound) == len(gyroscope) - 20
     assert len(notes) == 2
+
+
+@pytest.mark.parametrize(("repeats", "left"), [(5, 401), (200, 201), (400, None)])
+def test_readings_of_a_frozen_unit_are_left_out(repeats, left):
+    gyroscope, _ = turning()
+    rates = gyroscope.rates_radps.copy()
+    rates[1 : 1 + repeats] = rates[0]
+    sound, notes = Gyroscope("/imu", gyroscope.stamps_ns, rates).without_faults()
+    assert (None if sound is None else len(sound)) == left
+    assert len(notes) == (left != 401) + (left is None) + (left == 201)
+
+
+def test_readings_that_a_driver_stamps_in_bursts_have_their_rate():
+    gyroscope, _ = turning()
+    bursts_ns = gyroscope.stamps_ns // 50_000_000 * 50_000_000 + gyroscope.stamps_ns % 50_000_000 // 50
+    in_bursts = Gyroscope("/imu", bursts_ns, gyroscope.rates_radps)
+    assert in_bursts.interval_ns == pytest.approx(gyroscope.interval_ns, rel=0.02)
+    assert in_bursts.without_faults()[1] == []
 
 
 def test_vectors_of_rotations_are_scipys():

@@ -179,7 +179,7 @@ class RecordingReader:
             series.imu[order, :3],
             None if T_body_imu is None else T_body_imu[:3, :3],
         )
-        sound, more = gyroscope.without_saturation()
+        sound, more = gyroscope.without_faults()
         return sound, [*notes, *more]
 
     def gnss(self, series: Series | None, *, body: str) -> tuple[GnssFixes | None, list[str]]:
