@@ -86,9 +86,20 @@ class Calibration:
         """
         if self.size_px not in (None, (width_px, height_px)):
             width, height = self.size_px or (0, 0)
+            settings = "--set source.camera.fx_px=… and so on"
+            if width * height_px == height * width_px:
+                resized = PinholeCamera(
+                    width, height, self.fx_px, self.fy_px, self.cx_px, self.cy_px
+                ).resized(width_px, height_px)
+                names = zip(("fx", "fy", "cx", "cy"), resized.intrinsics, strict=True)
+                settings = " ".join(f"--set source.camera.{name}_px={value:.6g}" for name, value in names)
+                if any(self.distortion):
+                    bent = ",".join(f"{value:g}" for value in self.distortion)
+                    settings += f" --set source.camera.distortion=[{bent}]"
+                settings = f"if they are resized, {settings}"
             raise SourceError(
                 f"{self.origin}: holds for {width}×{height} px, but the images have {width_px}×{height_px}; "
-                "give theirs with --set source.camera.fx_px=… and so on"
+                f"give theirs: {settings}"
             )
         self._refuse_disorder(width_px, height_px)
         numbers = (self.fx_px, self.fy_px, self.cx_px, self.cy_px)

@@ -8,7 +8,6 @@ from enum import Enum
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.core.errors import listed
 from mapper.core.frames import Scan
 from mapper.core.geometry import Array
 from mapper.core.timebase import NS_PER_S, UNITS_PER_S
@@ -27,7 +26,10 @@ TIME_FIELDS = (
 )
 """Names that drivers give a point's time."""
 
-_LIKE_TIME = re.compile(r"time|stamp|(?:^|_)n?secs?(?:_|$)", re.IGNORECASE)
+_LIKE_TIME = re.compile(r"time|stamp|^(?:d?t|t_?offset)(?:_?[num]?s)?$", re.IGNORECASE)
+"""Other names of times, whose values must increase from point to point as times do."""
+_MOST_BACK = 0.02
+"""Share of the steps from point to point that go back to an earlier column: each ring's first, if at all."""
 _MOST_IN_FLOAT32 = 1e6
 """Seconds of which float32 tells a sixteenth."""
 _UNIT_NAMES = dict(zip(UNITS_PER_S, ("seconds", "milliseconds", "microseconds", "nanoseconds"), strict=True))
@@ -56,8 +58,17 @@ order."""
 
 
 def time_field(names: Iterable[str]) -> str | None:
-    """Return the first name, in the case it is written in, that drivers give a point's time."""
-    return next((name for name in names if name.lower() in TIME_FIELDS), None)
+    """Return the first name, in its own case, that drivers give a point's time, or that is like one."""
+    names = list(names)
+    known = (name for name in names if name.lower() in TIME_FIELDS)
+    return next(known, next(filter(_LIKE_TIME.search, names), None))
+
+
+def field_times_s(name: str, values: NDArray[np.number], stamp_ns: int) -> NDArray[np.float32] | None:
+    """Return the times in a field as :func:`relative_times_s`; None too of names like it without an order."""
+    if name.lower() not in TIME_FIELDS and (values[1:] < values[:-1]).sum() > _MOST_BACK * len(values):
+        return None
+    return relative_times_s(values, stamp_ns)
 
 
 def relative_times_s(values: NDArray[np.number], stamp_ns: int) -> NDArray[np.float32] | None:
@@ -116,13 +127,11 @@ def times_told(
     """
     name = time_field(names)
     if name is None:
-        others = [one for one in names if _LIKE_TIME.search(one)]
-        told = f"fields {listed(others)} are not known as times of points; not deskewed"
-        return [], [told] if others else []
+        return [], []
     recorded = values_of(name)
     if not len(recorded):
         return [], []
-    if relative_times_s(recorded, stamp_ns) is None:
+    if field_times_s(name, recorded, stamp_ns) is None:
         is_coarse = recorded.dtype == np.float32 and np.abs(recorded).max() > _MOST_IN_FLOAT32
         why = ": its 32 bits are too few for seconds since 1970" if is_coarse else ""
         return [], [f"field {name} of the first cloud holds no times{why}; not deskewed"]

@@ -93,7 +93,8 @@ def test_every_dialect_gives_the_same_camera(tmp_path, name, text):
     path.write_text(text)
     calibration = read_calibration(path)
     assert calibration.camera(width_px=640, height_px=480) == WANT
-    with pytest.raises(SourceError, match=r"holds for 640×480 px, but the images have 320×240"):
+    why = r"holds for 640×480 px, but the images have 320×240.* if they are resized, .*fx_px=\d"
+    with pytest.raises(SourceError, match=why):
         calibration.camera(width_px=320, height_px=240)
     assert calibration.depth_units_per_m is None
 

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from mapper.sources.point_times import relative_times_s, time_field, times_told
+from mapper.sources.point_times import field_times_s, relative_times_s, time_field, times_told
 
 STAMP_NS = 1_567_410_201_745_204_700
 SWEEP_S = np.linspace(0.0, 0.0999, 1000)
@@ -39,12 +39,14 @@ def test_every_unit_and_clock_becomes_seconds_after_the_stamp(values):
         ("t", np.zeros(9, np.uint32), "holds no times"),
         ("t", np.float32(1.7e9 + SWEEP_S), "32 bits"),
         ("t", np.uint64(2**32 - 50_000_000 + SWEEP_S * 1e9).astype(np.uint32), "begins anew"),
-        ("point_stamp", SWEEP_S, "not known"),
+        ("point_stamp", SWEEP_S[::-1], "holds no times"),
+        ("time_of_flight", np.random.default_rng(0).uniform(0.0, 600.0, 1000), "holds no times"),
         ("ring", SWEEP_S, None),
     ],
 )
 def test_times_that_are_not_used_or_counted_on_are_told(field, values, word):
-    _, notes = times_told(["x", field], lambda _: values, STAMP_NS)
+    choices, notes = times_told(["x", field], lambda _: values, STAMP_NS)
+    assert bool(choices) == (word == "begins anew")
     assert (word is None) == (not notes)
     assert word is None or word in notes[0]
 
@@ -158,3 +160,12 @@ def test_zeros_of_returns_without_a_time_are_none_but_those_of_a_first_column_st
         np.testing.assert_allclose(found_s[known], columns[known], atol=1e-6)
     times_s[np.arange(len(times_s)) % 5 > 0] = 0
     assert relative_times_s(times_s, STAMP_NS) is None
+
+
+@pytest.mark.parametrize("name", ["time_us", "rel_time", "t_ns", "dt", "ts", "tOffset", "timeStampUs"])
+@pytest.mark.parametrize("rings", [1, 16])
+def test_a_field_called_like_a_time_is_one_if_it_increases_along_the_rings(name, rings):
+    values = np.tile(np.round(SWEEP_S * 1e6), rings).astype(np.int32)
+    assert time_field(["x", "intensity", name]) == name
+    times_s = field_times_s(name, values, STAMP_NS)
+    np.testing.assert_allclose(times_s, np.tile(SWEEP_S, rings), atol=1e-6)

@@ -25,7 +25,7 @@ class RawCloud:
     Attributes:
         points: (N, 3) float32, metres, sensor frame.
         names: Fields of the file.
-        times: (N,) each point's time as the file has it; ``relative_times_s`` finds unit and clock.
+        times: (N,) each point's time as the file has it; ``field_times_s`` finds unit and clock.
         colors: (N, 3) uint8 RGB.
         intensities: (N,) float32.
     """

@@ -10,7 +10,7 @@ from mapper.core.errors import DataError, FrameError
 from mapper.core.frames import Scan
 from mapper.core.geometry import Transform, apply
 from mapper.sources.cloud_files.raw import check_range, intensities_of, intensity_field
-from mapper.sources.point_times import relative_times_s, time_field, without_untimed
+from mapper.sources.point_times import field_times_s, time_field, without_untimed
 from mapper.sources.ros.messages import CloudMessage
 from mapper.sources.valid_returns import FARTHEST_M, valid_returns
 
@@ -165,7 +165,7 @@ def scan_from(
         points_body,
         origin_body=T_body_points[:3, 3],
         colors=_colours(points, names, kept) if with_colours else None,
-        times_s=None if times is None else relative_times_s(points[times][kept], message.stamp_ns),
+        times_s=None if times is None else field_times_s(times, points[times][kept], message.stamp_ns),
         far_returns=far,
         intensities=intensities_of(points[intensity][kept]) if with_colours and intensity else None,
     )

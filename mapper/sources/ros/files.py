@@ -16,6 +16,7 @@ from mapper.sources.ros.recording import Recording
 from mapper.sources.ros.source import recording_log
 
 _ENDINGS = (".mcap", ".bag", ".db3")
+_MAGIC = {b"\x89MCAP0\r\n": ".mcap", b"#ROSBAG V2.0": ".bag", b"SQLite format 3\0": ".db3"}
 _UNFINISHED = ".active"
 """What rosbag appends to the name while it records, and leaves where it is killed."""
 _PACKED = ".zstd"
@@ -25,10 +26,12 @@ _IN_FOLDERS = (".mcap", ".db3", _PACKED, ".bag")
 
 
 def recognise(path: Path) -> bool:
-    """Return whether a path is named as a recording, or is a folder of the parts of one."""
+    """Return whether a path is a recording by its name or bytes, or is a folder of the parts of one."""
     if path.is_dir():
         return bool(_parts(path))
-    return path.suffix.lower() in (*_ENDINGS, _PACKED, _UNFINISHED) and path.is_file()
+    if not path.is_file():
+        return False
+    return path.suffix.lower() in (*_ENDINGS, _PACKED, _UNFINISHED) or bool(_ending_by_bytes(path))
 
 
 def read_log(path: Path, config: SourceConfig) -> Log:
@@ -96,9 +99,17 @@ def _named_by_rosbag2(folder: Path) -> list[str]:
     return []
 
 
+def _ending_by_bytes(path: Path) -> str:
+    """Return the ending that a file's first bytes stand for; empty where they tell none."""
+    with suppress(OSError), path.open("rb") as file:
+        head = file.read(max(map(len, _MAGIC)))
+        return next((ending for magic, ending in _MAGIC.items() if head.startswith(magic)), "")
+    return ""
+
+
 def _opened(path: Path) -> Recording:
     # Each reader loads a library that the others do not need.
-    ending = path.suffix.lower()
+    ending = _ending_by_bytes(path) or path.suffix.lower()
     if ending == ".mcap":
         from mapper.sources.ros.mcap_file import open_mcap
 

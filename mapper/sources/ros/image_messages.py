@@ -15,6 +15,7 @@ from mapper.core.errors import FrameError
 from mapper.core.frames import DepthImage, Image
 from mapper.core.units import MM_PER_M
 from mapper.sources.image_files import png
+from mapper.sources.image_files.decoded import SATURATED
 from mapper.sources.image_files.reading import (
     decode_colour,
     decode_depth,
@@ -64,7 +65,26 @@ _COLOUR = _COLOUR_8 | {
     for name, encoding in _COLOUR_8.items()
     if "8" in name and name not in ("mono8", "8UC1")  # those of 16 bits are depth
 }
-_DEPTH = {"16UC1": "u2", "mono16": "u2", "16SC1": "i2", "32FC1": "f4", "64FC1": "f8"}
+_COLOUR_ALIASES = {
+    **{name.removesuffix("8"): name for name in ("rgb8", "bgr8", "rgba8", "bgra8")},
+    "rgb24": "rgb8",
+    "bgr24": "bgr8",
+    "rgb888": "rgb8",
+    "bgr888": "bgr8",
+    "yuy2": "yuyv",
+    **dict.fromkeys(("gray", "grey", "gray8", "grey8", "y8", "mono"), "mono8"),
+}
+"""Names of other libraries."""
+_DEPTH = {
+    "16UC1": "u2",
+    "mono16": "u2",
+    "16SC1": "i2",
+    "32FC1": "f4",
+    "64FC1": "f8",
+    "32SC1": "i4",
+    "Z16": "u2",
+}
+_DEPTH_KINDS = {name.lower(): kind for name, kind in _DEPTH.items()}
 _TIFF_STARTS = (b"II*\x00", b"MM\x00*")
 _IMAGE_STARTS = (b"\xff\xd8", b"\x89PNG", b"BM", *_TIFF_STARTS, b"RIFF", b"P")
 DEPTH_HEADER = struct.Struct("<iff")  # compressedDepth's: how it is stored, and two parameters of that
@@ -73,7 +93,7 @@ DEPTH_HEADER = struct.Struct("<iff")  # compressedDepth's: how it is stored, and
 def is_depth(message: ImageMessage) -> bool:
     """Return whether an image is of depth: by its bytes, else by what its encoding or format says."""
     if isinstance(message, PixelsMessage):
-        return message.encoding in _DEPTH
+        return _depth_kind(message) is not None
     head = bytes(_without_header(message)[:64])
     is_called_depth = "compressedDepth" in message.format or message.format.startswith(tuple(_DEPTH))
     return is_called_depth or png.is_grey16(head) or _is_float_tiff(message)
@@ -116,7 +136,9 @@ def image_of(message: ImageMessage, *, colour: bool, where: str) -> Image:
         data = bytes(message.data)
         _refuse_video(data, message.format, where=where)
         return decode_colour(data, where) if colour else decode_grey(data, where)
-    encoding = _COLOUR.get(message.encoding) or _COLOUR.get(message.encoding.lower())
+    name = message.encoding.strip()
+    lower = name.lower()
+    encoding = _COLOUR.get(name) or _COLOUR.get(_COLOUR_ALIASES.get(lower, lower))
     if encoding is None:
         data = bytes(message.data)
         if data.startswith(_IMAGE_STARTS[:2]):  # of a webcam's driver
@@ -154,7 +176,7 @@ def depth_m_of(
         return _depth_m_of_file(
             message, units_per_m=units_per_m, float_units_per_m=float_units_per_m, where=where
         )
-    kind = _DEPTH.get(message.encoding)
+    kind = _depth_kind(message)
     if kind is None:
         raise FrameError(f"{where}: depth encoded as {message.encoding}; known are {', '.join(_DEPTH)}")
     order = ">" if message.is_big_endian else "<"
@@ -163,7 +185,13 @@ def depth_m_of(
         return valid_depth(pixels, float_units_per_m, where=where)
     if message.is_big_endian and _roughness(pixels) > _roughness(pixels.byteswap()):
         pixels = pixels.byteswap()  # drivers label what they do not swap
-    return depth_m_from(np.ascontiguousarray(np.maximum(pixels, 0), dtype=np.uint16), units_per_m)
+    units = pixels if kind == "u2" else np.clip(pixels, 0, SATURATED)
+    return depth_m_from(np.ascontiguousarray(units, dtype=np.uint16), units_per_m)
+
+
+def _depth_kind(message: PixelsMessage) -> str | None:
+    """Return NumPy's name of the numbers of a depth image; None of other images."""
+    return _DEPTH_KINDS.get(message.encoding.strip().lower())
 
 
 def _roughness(units: NDArray[Any]) -> float:
@@ -182,7 +210,7 @@ def depth_file_of(message: ImageMessage) -> bytes | None:
 def has_float_depth(message: ImageMessage) -> bool:
     """Return whether depth is stored as 32-bit numbers, or was before it was compressed."""
     if isinstance(message, PixelsMessage):
-        return _DEPTH.get(message.encoding, "").startswith("f")
+        return (_depth_kind(message) or "").startswith("f")
     return message.format.startswith("32FC1") or _is_float_tiff(message)
 
 

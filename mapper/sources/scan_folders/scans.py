@@ -7,7 +7,7 @@ from mapper.core.frames import Scan
 from mapper.core.timebase import NS_PER_S
 from mapper.sources.cloud_files import read_cloud
 from mapper.sources.cloud_files.parsing import MIN_POINTS
-from mapper.sources.point_times import relative_times_s, without_untimed
+from mapper.sources.point_times import field_times_s, time_field, without_untimed
 from mapper.sources.valid_returns import FARTHEST_M, valid_returns
 
 
@@ -41,14 +41,14 @@ def read_scan(
             "no sensor reaches"
         )
     kept = slice(None) if valid is None else valid
-    times = None if cloud.times is None else cloud.times[kept]
+    name, times = time_field(cloud.names) or "", None if cloud.times is None else cloud.times[kept]
     if times is not None and rows is not None:  # on the clock of the stamp, which may begin with 0
         times = times - stamp_ns / NS_PER_S
     scan = Scan(
         stamp_ns=stamp_ns,
         points_body=points_body,
         colors=cloud.colors[kept] if colour and cloud.colors is not None else None,
-        times_s=None if times is None else relative_times_s(times, stamp_ns),
+        times_s=None if times is None else field_times_s(name, times, stamp_ns),
         far_returns=far,
         intensities=cloud.intensities[kept] if colour and cloud.intensities is not None else None,
     )

@@ -74,7 +74,8 @@ def test_fields_of_other_names(tmp_path):
         names = {"x": "X", "y": "Y", "z": "Z", times: name}
         log = open_source(write(tmp_path / f"{k}.mcap", [renamed(one, names) for one in messages]))
         np.testing.assert_array_equal(log[0].points_body, points)
-        assert [name in note for note in log.notes] == [True] * (k == 0)
+        assert (log[0].times_s is None) == (k == 1)
+        assert [name in choice for choice in log.choices if "times" in choice] == [True] * (k == 0)
 
 
 def test_clouds_in_millimetres_are_refused_and_the_setting_reads_them(tmp_path):

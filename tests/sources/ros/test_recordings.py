@@ -48,6 +48,15 @@ def bulky(n):
 
 
 @pytest.mark.parametrize("name", KINDS)
+@pytest.mark.parametrize("other", ["a.bag", "a.mcap", "recording", "a.db3"])
+def test_a_recording_is_known_by_its_bytes(tmp_path, name, other):
+    path = write(tmp_path / name, shots(2))
+    file = path if path.is_file() else next(path.glob("*.db3"), None) or next(path.glob("*.mcap"))
+    log = open_source(file.rename(tmp_path / other))
+    assert (log.sensor, len(log)) == ("rgbd", 2)
+
+
+@pytest.mark.parametrize("name", KINDS)
 def test_a_recording_is_a_log_by_the_stamps_of_its_headers(tmp_path, name):
     """Folders are recorded a nanosecond a message."""
     source = open_source(write(tmp_path / name, shots(6)))

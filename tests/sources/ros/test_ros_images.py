@@ -235,7 +235,19 @@ def test_depth_is_in_the_order_of_bytes_that_makes_it_smooth():
 
 
 def test_what_an_encoding_is_called_is_read_by_its_content():
-    np.testing.assert_array_equal(image_of(pixels(BGR, "BGR8"), colour=True, where="m"), RGB)
+    for encoding in ("BGR8", "bgr", "bgr24", "8UC3 "):
+        np.testing.assert_array_equal(image_of(pixels(BGR, encoding), colour=True, where="m"), RGB)
+    np.testing.assert_array_equal(image_of(pixels(GREY, "gray8"), colour=True, where="m"), GREY)
+    units = np.add.outer(np.arange(48), np.arange(64)).astype(np.uint16)
+    for encoding, kind in (
+        ("Z16", np.uint16),
+        ("MONO16", np.uint16),
+        ("16UC1 ", np.uint16),
+        ("32SC1", np.int32),
+    ):
+        depth = pixels(units.astype(kind), encoding)
+        assert is_depth(depth)
+        np.testing.assert_array_equal(depth_m_of(depth, units_per_m=1.0, where="m"), units)
     message = replace(pixels(RGB, "mjpeg"), data=memoryview(encoded(BGR, ".png")))
     np.testing.assert_array_equal(image_of(message, colour=True, where="m"), RGB)
 
