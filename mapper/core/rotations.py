@@ -1,5 +1,7 @@
 """Conversions of rotations from and to quaternions (always xyzw) and Euler angles, as files have them."""
 
+from itertools import permutations, product
+
 import numpy as np
 
 from mapper.core.errors import DataError
@@ -89,3 +91,14 @@ def euler_from_rotation(R: Array) -> tuple[float, float, float]:
     if abs(sine) >= _GIMBAL_SINE:
         return 0.0, pitch, float(np.arctan2(-R[0, 1], R[1, 1]))
     return float(np.arctan2(R[2, 1], R[2, 2])), pitch, float(np.arctan2(R[1, 0], R[0, 0]))
+
+
+def right_angled_frames() -> list[Array]:
+    """Return the 48 matrices (3, 3) that permute and flip axes; half of them are rotations."""
+    frames = []
+    for order in permutations(range(3)):
+        for signs in product((1.0, -1.0), repeat=3):
+            R = np.zeros((3, 3))
+            R[range(3), order] = signs
+            frames.append(R)
+    return frames

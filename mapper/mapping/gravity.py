@@ -1,10 +1,9 @@
 """Gravity's direction by an accelerometer, in the world of a path."""
 
-from itertools import permutations, product
-
 import numpy as np
 
 from mapper.core.geometry import Array, stride_for
+from mapper.core.rotations import right_angled_frames
 from mapper.core.timebase import nearest
 from mapper.core.trajectory import Trajectory
 from mapper.registration.planes import MAX_TILT_RAD, PARALLEL_RAD
@@ -50,7 +49,7 @@ def up_by_accelerometer(
     if len(readings) < _MIN_READINGS:
         return None, f"accelerometer: only {len(readings)} readings near a pose, want {_MIN_READINGS}"
     found = []
-    for R_body_sensor in _right_angled_frames():
+    for R_body_sensor in right_angled_frames():
         mean, spread_rad = _mean_direction(readings @ R_body_sensor.T, R_world_body)
         if mean @ up_guess > np.cos(MAX_TILT_RAD):
             found.append((spread_rad, mean))
@@ -99,14 +98,3 @@ def _matched_readings(accelerations: Accelerations, trajectory: Trajectory) -> t
     pose, gap_ns = nearest(trajectory.stamps_ns, stamps_ns)
     usable &= (np.abs(lengths - median) <= 0.2 * median) & (gap_ns <= _MAX_READING_GAP_NS)
     return readings[usable] / lengths[usable, None], trajectory.T_world_body[pose[usable], :3, :3]
-
-
-def _right_angled_frames() -> list[Array]:
-    """Return the 48 matrices that permute and flip axes: gravity's sign may be flipped, too."""
-    frames = []
-    for order in permutations(range(3)):
-        for signs in product((1.0, -1.0), repeat=3):
-            R = np.zeros((3, 3))
-            R[range(3), order] = signs
-            frames.append(R)
-    return frames

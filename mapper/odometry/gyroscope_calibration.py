@@ -95,19 +95,17 @@ def with_body_rates(log: Log, calibration: GyroscopeCalibration | None) -> Log:
 def body_readings(log: Log, calibration: GyroscopeCalibration) -> InertialReadings | None:
     """Return a log's angular velocities and accelerations of the body; None where they cannot be told.
 
-    Accelerations have to be as long as gravity in m/s² or g, and a mounting is one of both readings only if
-    it is certain and right-handed. They are interpolated at the times of the angular velocities, not across
-    gaps, and moved to the body's origin where the log states the unit's place.
+    Accelerations have to be as long as gravity in m/s² or g, and the mounting certain. They are interpolated
+    at the times of the angular velocities, not across gaps, and moved to the body's origin where the log
+    states the unit's place.
     """
     gyroscope, felt = log.gyroscope, log.accelerations
     mounting_rad = float(np.sqrt(np.diag(calibration.covariance)[:3].max()))
-    if gyroscope is None or felt is None or calibration.scale < 0.0 or mounting_rad > CERTAIN_RAD:
+    if gyroscope is None or felt is None or mounting_rad > CERTAIN_RAD:
         return None
     unit = unit_of_gravity(float(np.median(np.linalg.norm(felt.acceleration_mps2, axis=1))))
     turned = calibration.applied_to(gyroscope)
-    R_body_felt = calibration.R_body_imu
-    if felt.are_axes_stated and gyroscope.R_body_imu is not None:
-        R_body_felt = R_body_felt @ gyroscope.R_body_imu.T
+    R_body_felt = mounting_of_accelerations(log, calibration)
     stamps_ns = felt.stamps_ns - round(calibration.offset_s * NS_PER_S)
     if unit is None or len(stamps_ns) < 2:
         return None
@@ -123,6 +121,16 @@ def body_readings(log: Log, calibration: GyroscopeCalibration) -> InertialReadin
     accelerations = np.column_stack([np.interp(at_ns, stamps_ns, column) for column in felt_body.T])
     readings = InertialReadings(at_ns, turned.rates_radps[inside], accelerations, turned.gap_ns)
     return readings if felt.place_body is None else readings.moved_from(felt.place_body)
+
+
+def mounting_of_accelerations(log: Log, calibration: GyroscopeCalibration) -> Array:
+    """Return the mounting (3, 3) of a log's accelerations, if their axes are those of its gyroscope."""
+    gyroscope, felt = log.gyroscope, log.accelerations
+    assert gyroscope is not None
+    assert felt is not None
+    if felt.are_axes_stated and gyroscope.R_body_imu is not None:
+        return calibration.R_body_imu @ gyroscope.R_body_imu.T
+    return calibration.R_body_imu
 
 
 def uncalibrated(gyroscope: Gyroscope) -> GyroscopeCalibration:

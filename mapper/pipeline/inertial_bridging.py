@@ -17,7 +17,11 @@ from mapper.graph.inertial_smoothing import SmoothedPath, smooth_path
 from mapper.graph.measurement_covariance import information_of
 from mapper.graph.model import BetweenFactor, PoseGraph
 from mapper.odometry.base import FrameResult
-from mapper.odometry.gyroscope_calibration import body_readings, with_body_rates
+from mapper.odometry.gyroscope_calibration import (
+    body_readings,
+    mounting_of_accelerations,
+    with_body_rates,
+)
 from mapper.pipeline.disconnected_components import largest_component
 from mapper.pipeline.tracking_result import TrackingResult
 from mapper.run.manifest import RunWarning
@@ -56,7 +60,7 @@ def bridge(source: Log, tracking: TrackingResult, *, progress: Progress) -> Trac
         tracking = replace(tracking, warnings=(*tracking.warnings, *warnings))
     readings = body_readings(source, calibration)
     if readings is None:
-        sentence = "accelerations are not used: their unit, or their mounting on the body, is not known"
+        sentence = "accelerations are not used: their unit, axes or mounting on the body are not known"
         progress.note(sentence)
         return _with_note(tracking, sentence)
     # A frame that no reading reaches from the one before begins another window, at the first known pose.
@@ -73,10 +77,11 @@ def bridge(source: Log, tracking: TrackingResult, *, progress: Progress) -> Trac
 
 
 def check_accelerations(source: Log, tracking: TrackingResult) -> tuple[Log, tuple[RunWarning, ...], bool]:
-    """Return the log with accelerations that point up at rest, warnings, and whether that is known.
+    """Return the log with accelerations in the gyroscope's axes that point up at rest, and warnings.
 
-    The path's changes of velocity tell the sign, which gravity alone does not, and whether the frames'
-    lengths are metres; where accelerations explain too little of these changes, neither is known.
+    Third whether the sign is known. The path's changes of velocity tell axes and sign, which gravity alone
+    does not, and whether the frames' lengths are metres; where accelerations explain too little of these
+    changes, neither sign nor lengths are known. Without accelerations where their axes are not known.
 
     Args:
         source: The log.
@@ -85,15 +90,35 @@ def check_accelerations(source: Log, tracking: TrackingResult) -> tuple[Log, tup
     whole = largest_component(tracking, progress=SILENT)
     sure = tuple(track for track in whole.tracked if not track.diagnostics.unobservable)
     felt = source.accelerations
-    if tracking.gyroscope is None or felt is None or not sure:
+    calibration = tracking.gyroscope
+    readings = None if calibration is None or felt is None else body_readings(source, calibration)
+    if calibration is None or felt is None or readings is None:
         return source, (), False
-    readings = body_readings(source, tracking.gyroscope)
+    are_stated = calibration.scale > 0.0
+    if not sure:
+        return source if are_stated else replace(source, accelerations=None), (), False
     trajectory = replace(whole, tracks=sure).tracked_trajectory()
+    warnings = []
+    axes = readings.felt_axes(
+        mounting_of_accelerations(source, calibration),
+        trajectory.stamps_ns,
+        trajectory.T_world_body,
+        are_stated=are_stated,
+    )
+    if axes is None:
+        return replace(source, accelerations=None), (), False
+    if not np.array_equal(axes, np.eye(3)):
+        felt = replace(felt, acceleration_mps2=felt.acceleration_mps2 @ axes.T)
+        source = replace(source, accelerations=felt)
+        readings = body_readings(source, calibration)
+        sentence = (
+            f"the accelerometer's axes are not the gyroscope's, as the path shows; {_named(axes)} is used"
+        )
+        warnings.append(RunWarning(kind="imu", sentence=sentence))
     found = readings and readings.path_scale(trajectory.stamps_ns, trajectory.T_world_body)
     if not found:
-        return source, (), False
+        return source, tuple(warnings), False
     scale, sigma = found
-    warnings = []
     if scale < -_CERTAIN * sigma:
         source = replace(source, accelerations=replace(felt, acceleration_mps2=-felt.acceleration_mps2))
         sentence = "accelerations have the opposite sign, as changes of velocity show; they are used reversed"
@@ -112,12 +137,18 @@ def check_accelerations(source: Log, tracking: TrackingResult) -> tuple[Log, tup
     return source, tuple(warnings), True
 
 
+def _named(axes: Array) -> str:
+    """Return what axes are in those of readings, as (y, -x, z)."""
+    names = [("-" if axis.sum() < 0.0 else "") + "xyz"[int(np.abs(axis).argmax())] for axis in axes]
+    return f"({', '.join(names)})"
+
+
 def with_body_readings(source: Log, tracking: TrackingResult) -> Log:
     """Return the log with what its inertial unit measures of the body, as far as the path shows that."""
     if tracking.gyroscope is None:
         return source
-    source, _, is_sign_known = check_accelerations(source, tracking)
-    readings = body_readings(source, tracking.gyroscope)
+    checked, _, is_sign_known = check_accelerations(source, tracking)
+    readings = body_readings(checked, tracking.gyroscope)
     if readings is not None:
         felt = Accelerations(
             readings.stamps_ns,

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mapper.core.geometry import Array
-from mapper.core.rotations import rotation_from_quaternion
+from mapper.core.rotations import right_angled_frames, rotation_from_quaternion
 from mapper.core.running_median import SIGMAS_PER_MAD
 from mapper.core.timebase import NS_PER_S, Stamps
 
@@ -20,6 +20,8 @@ _CERTAIN_CHI2 = 16.3
 """99.9 % of χ² with three degrees of freedom."""
 _TURN_S = 0.02  # on either side: of single readings the angular acceleration would be noise
 _ITERATIONS = 5
+_CLEARLY = 0.5
+"""Share of what others leave that the right axes of an accelerometer leave at most."""
 _UNEXPLAINED = 0.5
 """Median of what accelerations leave of the path's changes of velocity, relative to theirs, that is too much:
 of a sensor that hardly moves, errors of the poses would be taken for the motion."""
@@ -116,6 +118,39 @@ class InertialReadings:
             return None  # nothing is explained where nothing moved, either
         return float(found[0]), float(np.sqrt(covariance[0, 0]))
 
+    def felt_axes(
+        self, R_body_unit: Array, stamps_ns: Stamps, T_world_body: Array, *, are_stated: bool
+    ) -> Array | None:
+        """Return what (3, 3) the accelerometer's axes are in those of the gyroscope, but for their sign.
+
+        Of all right-angled ones those under which accelerations agree best with the path, by the least
+        squares of ``at_body``: with others gravity turns with the body. None where others agree as well.
+
+        Args:
+            R_body_unit: (3, 3) mounting by which the accelerations became the body's.
+            stamps_ns: (M,) increasing times.
+            T_world_body: (M, 4, 4) poses then, in one world.
+            are_stated: Whether both have the same axes unless the path shows otherwise.
+        """
+        triples = self._triples(stamps_ns, T_world_body)
+        if triples is None:
+            return np.eye(3) if are_stated else None
+        costs = []
+        for axes in right_angled_frames():
+            if np.linalg.det(axes) < 0.0:
+                continue
+            felt_mps = np.einsum("njk,jk->n", triples.felt_by_axes, R_body_unit @ axes @ R_body_unit.T)
+            left = []
+            for opposite in (1.0, -1.0):
+                off_mps = triples.moved_mps - opposite * felt_mps
+                left.append(np.median(np.abs(off_mps - triples.columns @ _fit(triples.columns, off_mps)[0])))
+            costs.append((float(min(left)), axes))
+        costs.sort(key=lambda one: one[0])
+        (least, best), stated = costs[0], next(cost for cost, axes in costs if np.trace(axes) == 3.0)
+        if are_stated and least >= _CLEARLY * stated:
+            return np.eye(3)
+        return best if least < _CLEARLY * costs[1][0] else None
+
     def _lever_turns(self) -> Array:
         """Return (N, 3, 3) what a lever arm is multiplied by: [α]× + [ω]×²."""
         x, y, z = self.rates_radps.T
@@ -143,7 +178,6 @@ class InertialReadings:
         nearest = np.where(poses_s[after] - times_s < times_s - poses_s[after - 1], after, after - 1)
         turned = self.rates_radps * (times_s - poses_s[nearest])[:, None]
         R_world_body = T_world_body[nearest, :3, :3] @ _rotations(turned)
-        felt = np.einsum("nij,nj->ni", R_world_body, self.accelerations_mps2)
         turns, positions = R_world_body @ self._lever_turns(), T_world_body[:, :3, 3]
         columns, felts, moves = [], [], []
         for k in range(0, len(poses_s), max(1, len(poses_s) // _MOST_TRIPLES)):
@@ -160,7 +194,7 @@ class InertialReadings:
             weights = np.minimum(rising, falling) * np.gradient(times_s[s])
             weighted = [np.einsum("n,nij->ij", weights, one[s]) for one in (R_world_body, turns)]
             columns.append(np.hstack([weights.sum() * np.eye(3), -weighted[0], -weighted[1]]))
-            felts.append(weights @ felt[s])
+            felts.append(np.einsum("n,nij,nk->ijk", weights, R_world_body[s], self.accelerations_mps2[s]))
             moves.append(
                 (positions[end] - positions[k]) / after_s - (positions[k] - positions[begin]) / before_s
             )
@@ -188,13 +222,19 @@ class _Triples:
 
     Attributes:
         columns: (3 T, 9) what gravity, the accelerations' bias and the unit's place add to them.
-        felt_mps: (3 T,) by double integrals of the accelerations.
+        felt_by_axes: (3 T, 3, 3) by double integrals of the accelerations: what each of these adds, by the
+            axis of the body along which it is taken.
         moved_mps: (3 T,) by the poses.
     """
 
     columns: Array
-    felt_mps: Array
+    felt_by_axes: Array
     moved_mps: Array
+
+    @property
+    def felt_mps(self) -> Array:
+        """(3 T,) by double integrals of the accelerations."""
+        return np.asarray(np.einsum("njj->n", self.felt_by_axes))
 
 
 def _fit(A: Array, b: Array) -> tuple[Array, Array]:

@@ -222,21 +222,55 @@ def test_readings_of_a_unit_whose_place_is_stated_are_those_at_the_origin():
     assert np.median(np.linalg.norm(unstated, axis=1)) > 0.03
 
 
-def flipped(log_):
-    return replace(log_.accelerations, acceleration_mps2=log_.accelerations.acceleration_mps2 * [1, -1, 1])
-
-
 def late(log_):
     return replace(log_.accelerations, stamps_ns=log_.accelerations.stamps_ns + NS_PER_S // 2)
 
 
-@pytest.mark.parametrize("fault", [flipped, late])
+def of_another_walk(_):
+    return made(12)[0].accelerations
+
+
+@pytest.mark.parametrize("fault", [late, of_another_walk])
 def test_accelerations_that_contradict_the_path_are_not_used_and_named(fault):
     log_, tracking, _ = made(5, lost=range(70, 90))
     found = bridge(replace(log_, accelerations=fault(log_)), tracking, progress=SILENT)
     assert len(components(found.graph)) == 2
     assert found.tracks == tracking.tracks
     assert [warning.kind for warning in found.warnings] == ["imu"]
+
+
+FLIPPED, TURNED = np.diag([1.0, -1.0, 1.0]), np.eye(3)[[1, 2, 0]]
+
+
+@pytest.mark.parametrize("seed", [5, 6])
+@pytest.mark.parametrize(
+    ("of_rates", "of_felt", "notes"),
+    [(np.eye(3), FLIPPED, 2), (np.eye(3), TURNED, 1), (FLIPPED, np.eye(3), 1), (FLIPPED, FLIPPED, 1)],
+    ids=["flipped", "turned", "gyroscope flipped", "both flipped"],
+)
+def test_accelerations_in_other_axes_than_the_angular_velocities_bridge_as_well(
+    seed, of_rates, of_felt, notes
+):
+    log_, tracking, truth = made(seed, lost=range(70, 90))
+    gyroscope, felt = log_.gyroscope, log_.accelerations
+    log_ = replace(
+        log_,
+        gyroscope=replace(gyroscope, rates_radps=gyroscope.rates_radps @ of_rates),
+        accelerations=replace(felt, acceleration_mps2=felt.acceleration_mps2 @ of_felt),
+    )
+    handed = float(np.linalg.det(of_rates))
+    calibration = replace(CALIBRATION, scale=handed, R_body_imu=handed * CALIBRATION.R_body_imu @ of_rates)
+    found = bridge(log_, replace(tracking, gyroscope=calibration), progress=SILENT)
+    assert len(components(found.graph)) == 1
+    assert np.linalg.norm(relative(found, truth, 69, 95)[3:]) < 0.04
+    assert len(found.warnings) == notes + 1
+
+
+def test_accelerations_of_a_gyroscope_with_a_flipped_axis_are_not_used_where_the_path_is_short():
+    log_, tracking, _ = made(4, seconds=2.2)
+    left_handed = replace(tracking, gyroscope=replace(CALIBRATION, scale=-1.0))
+    assert check_accelerations(log_, tracking)[0].accelerations is not None
+    assert check_accelerations(log_, left_handed)[0].accelerations is None
 
 
 def test_a_gap_of_the_accelerations_is_one_of_the_readings():
