@@ -87,7 +87,7 @@ class Calibration:
         if self.size_px not in (None, (width_px, height_px)):
             width, height = self.size_px or (0, 0)
             settings = "--set source.camera.fx_px=… and so on"
-            if width * height_px == height * width_px:
+            if width * height_px == height * width_px and self.origin != PRIMESENSE.origin:
                 resized = PinholeCamera(
                     width, height, self.fx_px, self.fy_px, self.cx_px, self.cy_px
                 ).resized(width_px, height_px)

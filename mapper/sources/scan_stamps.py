@@ -17,6 +17,7 @@ from mapper.sources.text import MOST_NS, MOST_STAMP_DIGITS, epoch_ns, parse_date
 RATE_HZ = 10.0
 
 _DECIMAL = re.compile(r"(?<!\d)\d{1,10}\.\d+$")
+_DECIMAL_MS = re.compile(r"(?<!\d)\d{13}\.\d+$")  # since 1970, as librealsense's rs-convert writes them
 _DECIMAL_FIRST = re.compile(r"(?<!\d)\d{10}\.\d+(?=[_-]\d+$)")  # and a counter
 _DATE = re.compile(
     r"(?<!\d)((?:19|20)\d\d)[-_]?(\d\d)[-_]?(\d\d)[-_T]?(\d\d)[-_h]?(\d\d)[-_m]?(\d\d)(?:[-_.](\d{1,9}))?Z?$"
@@ -271,6 +272,8 @@ def _stamp_in(stem: str) -> int | None:
         year, month, day, hour, minute, second, fraction = found.groups(default="0")
         with suppress(DataError):
             return ns_from_date_text(f"{year}-{month}-{day} {hour}:{minute}:{second}.{fraction}")
+    if found := _DECIMAL_MS.search(stem):
+        return epoch_ns(found[0])
     if found := _DECIMAL.search(stem) or _DECIMAL_FIRST.search(stem):
         return ns_from_seconds_text(found[0])
     if found := _TWO_PARTS.search(stem):

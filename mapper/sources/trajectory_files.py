@@ -14,21 +14,22 @@ from mapper.core.timebase import Stamps, ns_from_seconds_text, seconds_text_from
 from mapper.core.trajectory import Trajectory
 from mapper.runtime.atomic import write_text
 from mapper.runtime.regular_files import read_text
-from mapper.sources.text import ROUNDING, poses_from_numbers
+from mapper.sources.text import ROUNDING, epoch_ns, poses_from_numbers
 
 _EUROC = re.compile(r"\s*\d{16,19}\s*,")
 _W_FIRST = re.compile(r"\bq\w*w\b.*\bq\w*x\b")
 _MULRAN_COLUMNS = 13
 _LAST_ROW = [0.0, 0.0, 0.0, 1.0]
 _NUMBER = re.compile(r"[-+.]?\d|nan|inf", re.IGNORECASE)
+_DECIMAL_COMMA = re.compile(r"[-+]?\d+(?:,\d+)?(?:e[-+]?\d+)?", re.IGNORECASE)
 
 
 def read_tum(path: Path) -> Trajectory:
     """Read ``stamp tx ty tz qx qy qz qw`` lines (Sturm et al. 2012), or EuRoC's (Burri et al. 2016).
 
     EuRoC's have whole nanoseconds, commas, w before x, and velocities and biases after the pose, which are
-    left out. A header above the first pose that names qw before qx sets the order, too. Quaternions are
-    normalised.
+    left out. A header above the first pose that names qw before qx sets the order, too. Stamps may be ms, µs
+    or ns since 1970, and semicolons separate columns. Quaternions are normalised.
 
     Of two poses with the same stamp the first counts: fr2_desk's truth rounds two samples to one stamp.
 
@@ -43,7 +44,8 @@ def read_tum(path: Path) -> Trajectory:
         if len(words) != 8:
             raise DataError(f"{place}: {len(words)} columns, want 8: stamp tx ty tz qx qy qz qw")
         try:
-            stamp_ns, pose = ns_from_seconds_text(words[0]), [float(word) for word in words[1:]]
+            stamp_ns, pose = epoch_ns(words[0]), [float(word) for word in words[1:]]
+            stamp_ns = ns_from_seconds_text(words[0]) if stamp_ns is None else stamp_ns
         except (DataError, ValueError) as error:
             raise DataError(f"{place}: {error}") from None
         if not all(map(math.isfinite, pose)):
@@ -154,7 +156,7 @@ def tum_rows(path: Path) -> Iterator[tuple[int, list[str]]]:
     """
     is_w_first = has_begun = False
     for number, line in enumerate(read_text(path, may_be_pipe=True).splitlines(), start=1):
-        words = line.replace(",", " ").split()
+        words = _words(line)
         is_comment = bool(words) and words[0].startswith("#")
         if not has_begun and (is_comment or not any(map(_NUMBER.match, words))):
             is_w_first = is_w_first or _W_FIRST.search(line.lower()) is not None
@@ -187,6 +189,14 @@ def _refuse_another_csv(place: str, words: list[str]) -> None:
 
 def _rows(path: Path) -> Iterable[tuple[int, list[str]]]:
     for number, line in enumerate(read_text(path, may_be_pipe=True).splitlines(), start=1):
-        words = line.replace(",", " ").split()
+        words = _words(line)
         if words and not words[0].startswith("#"):
             yield number, words
+
+
+def _words(line: str) -> list[str]:
+    """Return the words of a line, separated by blanks, commas or semicolons; decimal commas become points."""
+    words = line.replace(";", " ").split()
+    if len(words) > 1 and any("," in word for word in words) and all(map(_DECIMAL_COMMA.fullmatch, words)):
+        return [word.replace(",", ".") for word in words]
+    return " ".join(words).replace(",", " ").split()

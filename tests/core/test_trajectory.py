@@ -42,6 +42,17 @@ def test_tum_accepts_commas_comments_and_unnormalised_quaternions(tmp_path):
     np.testing.assert_array_equal(trajectory.T_world_body[:, :3, :3], [np.eye(3)] * 2)
 
 
+@pytest.mark.parametrize(
+    "line", ["{};1.5;2;3;0;0;0;1", "{}; 1.5; 2; 3; 0; 0; 0; 1", "{} 1,5 2 3 0 0 0 1", "{};1,5;2,0;3;0;0;0;1"]
+)
+@pytest.mark.parametrize("stamp", ["1305031102", "1305031102000", "1305031102000000000"])
+def test_tum_accepts_semicolons_decimal_commas_and_units_of_stamps(tmp_path, line, stamp):
+    (tmp_path / "t.csv").write_text(line.format(stamp))
+    trajectory = read_tum(tmp_path / "t.csv")
+    assert trajectory.stamps_ns.tolist() == [1_305_031_102_000_000_000]
+    np.testing.assert_array_equal(trajectory.positions_world, [[1.5, 2.0, 3.0]])
+
+
 EUROC_HEADER = (
     "#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z []"
 )

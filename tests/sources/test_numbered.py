@@ -104,7 +104,14 @@ def test_images_without_a_partner_are_counted(tmp_path):
 
 @pytest.mark.parametrize(
     ("colour", "depth"),
-    [("rgb_png", "depth_png"), ("color_left", "depth"), ("Images", "Depth"), ("colour", "kinect-depth")],
+    [
+        ("rgb_png", "depth_png"),
+        ("color_left", "depth"),
+        ("Images", "Depth"),
+        ("colour", "kinect-depth"),
+        ("img", "dpt"),
+        ("frames", "depth"),
+    ],
 )
 def test_folders_of_other_names_are_found(tmp_path, colour, depth):
     folder = redwood(tmp_path, [f"{i}" for i in range(7)], colour=colour)

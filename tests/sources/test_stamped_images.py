@@ -34,6 +34,8 @@ def written(folder, colour="rgb/{}.png", depth="depth/{}.png", name=seconds, lat
         ("{}_color.jpg", "{}_depth.png", seconds),
         ("color/frame_{}.jpg", "aligned_depth/{}.png", lambda stamp_ns: stamp_ns),
         ("images/{}.png", "depth/{}.png", lambda stamp_ns: stamp_ns // 1000),
+        # librealsense's rs-convert -p out
+        ("out_Color_{}.png", "out_Depth_{}.png", lambda ns: f"{ns // 10**6}.{ns // 1000 % 1000:03d}000000"),
     ],
 )
 def test_images_named_by_their_stamps_need_no_list(tmp_path, colour, depth, name):
@@ -50,7 +52,7 @@ def test_depth_before_colour_pairs_by_time_and_not_by_its_place(tmp_path):
     assert log.entry_at(0).files.depth_stamp_ns == log.stamps_ns[0]
 
 
-@pytest.mark.parametrize("name", ["associations.txt", "associate.txt", "assoc.txt"])
+@pytest.mark.parametrize("name", ["associations.txt", "associate.txt", "assoc.txt", "desk.txt"])
 @pytest.mark.parametrize("is_depth_first", [False, True])
 def test_a_list_of_pairs_takes_the_place_of_both_lists(tmp_path, name, is_depth_first):
     lines = ["# rgb depth", ""]

@@ -9,6 +9,7 @@ are as Redwood's, with a pose file a frame. Depth may be .npy, PFM or OpenEXR.
 
 import re
 from collections.abc import Mapping, Sequence, Set
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -17,10 +18,12 @@ from mapper.core.errors import SourceError
 from mapper.core.geometry import Transform
 from mapper.core.trajectory import Trajectory
 from mapper.core.units import MM_PER_M
+from mapper.runtime.regular_files import HEAD_BYTES
 from mapper.sources.base import ImageFile, Log
 from mapper.sources.calibration import PRIMESENSE, SEVEN_SCENES
 from mapper.sources.calibration_file import calibration_files
 from mapper.sources.config import SourceConfig
+from mapper.sources.image_files import png
 from mapper.sources.image_folders.pairing import ordered_pairs
 from mapper.sources.image_folders.rgbd import FramePair, assumed_camera_note, find_calibration, rgbd_log
 from mapper.sources.scan_stamps import Wording, listed_stamps, stamp_at, stamps_list, unit_of_counts
@@ -160,19 +163,33 @@ def find_images(folder: Path) -> NumberedImages | None:
 
 
 def image_places(folder: Path) -> tuple[Sequence[Place], Sequence[Place], tuple[Place, Place]]:
-    """Return a folder's folders of colour and those of depth images, and both kinds side by side in it."""
+    """Return a folder's folders of colour and those of depth images, and both kinds side by side in it.
+
+    Where none is called depth, those whose first image is a PNG of 16 bits are; where none is called colour,
+    all others are.
+    """
     inside = sorted((path for path in folder.iterdir() if path.is_dir()), key=lambda p: (len(p.name), p.name))
+    are_depth = [_DEPTH_FOLDER.search(path.name) is not None for path in inside]
+    if not any(are_depth):
+        are_depth = [_begins_with_depth(path) for path in inside]
+    others = [path for path, is_depth in zip(inside, are_depth, strict=True) if not is_depth]
+    called = [path for path in others if _COLOUR_FOLDER.match(path.name)]
+    colour_places = [_in_folder(path) for path in (called or others if any(are_depth) else called)]
     depth_places = [
         _in_folder(path, endings=_IMAGE_ENDINGS | _DEPTH_ENDINGS)
-        for path in inside
-        if _DEPTH_FOLDER.search(path.name)
-    ]
-    colour_places = [
-        _in_folder(path)
-        for path in inside
-        if _COLOUR_FOLDER.match(path.name) and not _DEPTH_FOLDER.search(path.name)
+        for path, is_depth in zip(inside, are_depth, strict=True)
+        if is_depth
     ]
     return colour_places, depth_places, (_in_folder(folder, r"colou?r|rgb"), _in_folder(folder, r"depth"))
+
+
+def _begins_with_depth(folder: Path) -> bool:
+    first = next((path for path in sorted(folder.glob("*.png")) if path.is_file()), None)
+    with suppress(OSError):
+        if first is not None:
+            with first.open("rb") as file:
+                return png.is_grey16(file.read(HEAD_BYTES))
+    return False
 
 
 def stamped(

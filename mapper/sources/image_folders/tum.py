@@ -1,12 +1,13 @@
 """TUM RGB-D folders: rgb.txt, depth.txt, groundtruth.txt (Sturm et al. 2012).
 
-Without these lists the pairs of associations.txt are read: ``stamp rgb/name stamp depth/name``. OpenLORIS
-(Shi et al. 2020) calls the lists color.txt and aligned_depth.txt.
+Without these lists the pairs of associations.txt, or of another text of such lines, are read: ``stamp
+rgb/name stamp depth/name``. OpenLORIS (Shi et al. 2020) calls the lists color.txt and aligned_depth.txt.
 """
 
 import math
 import re
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from mapper.core.errors import DataError, SourceError
 from mapper.core.timebase import NS_PER_S
 from mapper.core.trajectory import Trajectory
 from mapper.core.units import MM_PER_M
+from mapper.runtime.regular_files import HEAD_BYTES
 from mapper.sources.base import Log
 from mapper.sources.calibration import freiburg_camera
 from mapper.sources.config import SourceConfig
@@ -45,6 +47,7 @@ _LISTS = (("rgb.txt", "depth.txt"), ("color.txt", "aligned_depth.txt"))
 _FEWEST_COUNTED = 10
 """Images a second apart, to the nanosecond, that are counted rather than timed."""
 _BASE_NOTE = ("the truth of OpenLORIS is that of the robot's base, not of the camera",)
+_IMAGES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".npy", ".exr", ".pfm")
 _ASSOCIATIONS = ("associations.txt", "associated.txt", "association.txt", "associate.txt", "assoc.txt")
 
 
@@ -165,7 +168,23 @@ def _lists(folder: Path) -> tuple[str, str] | None:
 
 
 def _associations(folder: Path) -> Path | None:
-    return next((path for name in _ASSOCIATIONS if (path := folder / name).is_file()), None)
+    """Return the list of pairs in a folder, by its name, or by its first line, which names two images."""
+    named = (folder / name for name in _ASSOCIATIONS)
+    if not folder.is_dir():
+        return None
+    return next(filter(Path.is_file, named), None) or next(
+        (path for path in sorted(folder.glob("*.txt")) if path.is_file() and _pairs_images(path)), None
+    )
+
+
+def _pairs_images(path: Path) -> bool:
+    with suppress(OSError), path.open("rb") as file:
+        lines = file.read(HEAD_BYTES).decode(errors="replace").splitlines()
+        words = next((line.replace(",", " ").split() for line in lines if line.strip()[:1].isdigit()), [])
+        with suppress(SourceError):
+            images = [within(path.parent, name, where=f"{path}") for name in words[1::2]]
+            return len(words) == 4 and all(one.suffix.lower() in _IMAGES and one.is_file() for one in images)
+    return False
 
 
 def _read_associations(path: Path, notes: list[str]) -> tuple[ImageList, ImageList]:
