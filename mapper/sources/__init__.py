@@ -127,6 +127,8 @@ def _other_data(path: Path) -> str:
     endings = {inner.suffix.lower() for inner in path.iterdir() if inner.is_file()}
     if endings and endings <= _IMAGES:
         return "images alone; depth images belong beside them, as in rgb/ and depth/"
+    if len(endings) == 1 and (what := _OTHER_FILES.get(*endings)):
+        return f"files {endings.pop()}: {what}"
     from mapper.sources.image_folders.numbered import image_places
 
     colour, depth, _ = image_places(path)

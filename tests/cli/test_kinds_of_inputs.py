@@ -115,6 +115,10 @@ def test_data_that_are_no_logs_are_named(tmp_path):
     for name, what in (("walk.mp4", "video"), ("log.zip", "archive"), ("log.tar.gz", "archive"), *others):
         (tmp_path / name).write_bytes(b"")
         named[tmp_path / name] = what
+    named[(tmp_path / "arrays")] = "NumPy"
+    (tmp_path / "arrays").mkdir()
+    for name in ("0.npz", "1.npz"):
+        (tmp_path / "arrays" / name).write_bytes(b"")
     named["https://example.org/log.bag"] = "download"
     for path, what in named.items():
         said = invoke("inspect", path)

@@ -33,6 +33,8 @@ _ONE_HEADER = Lock()
 """NumPy parses an array's header with ``ast``, which counts its recursion for all threads together in Python
 3.11 and may find it wrong."""
 
+_HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+
 
 @contextmanager
 def refusing_damage(path: object, *, what: str) -> Iterator[None]:
@@ -59,6 +61,11 @@ def load_array(stream: BinaryIO, where: object) -> NDArray[Any]:
         FrameError: It is damaged, or holds objects.
     """
     with refusing_damage(where, what="npy"), _ONE_HEADER:
+        begin = stream.tell()
+        version = np.lib.format.read_magic(stream)
+        if version in _HEADERS and _HEADERS[version](stream)[2].hasobject:
+            raise FrameError(f"{where}: objects of Python, which are not read; save an array of numbers")
+        stream.seek(begin)
         return np.lib.format.read_array(stream, allow_pickle=False)
 
 

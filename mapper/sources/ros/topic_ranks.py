@@ -57,6 +57,13 @@ def plain_rank(name: str) -> tuple[int, ...]:
     return int("packets" in name), name.count("/")
 
 
+def imu_rank(name: str, tracked: Series | None, is_of_camera: bool) -> tuple[int, ...]:
+    """Rank those in the tracked topic's namespaces first, and beside a LiDAR those of cameras last."""
+    is_of_another = not is_of_camera and re.search("camera|realsense|zed|oak", name.lower()) is not None
+    shared = 0 if tracked is None else shared_namespaces(name, tracked.topic.name)
+    return -shared, int(is_of_another), *plain_rank(name)
+
+
 def fix_rank(topic: Topic) -> tuple[int, ...]:
     """Rank fixes before sentences, and a receiver's before those that a filter made of several sensors."""
     is_filtered = any(word in topic.name.lower() for word in ("filter", "fused", "odom"))

@@ -6,8 +6,6 @@ from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 
-import numpy as np
-
 from mapper.core.errors import SourceError
 from mapper.sources.config import TopicsConfig
 from mapper.sources.ros.frame_tree import BY_TF, is_fixed
@@ -32,6 +30,7 @@ from mapper.sources.ros.topic_ranks import (
     color_rank,
     depth_rank,
     fix_rank,
+    imu_rank,
     info_of,
     infos_beside,
     is_called_rectified,
@@ -40,7 +39,13 @@ from mapper.sources.ros.topic_ranks import (
     shared_namespaces,
     without_those_of_depth,
 )
-from mapper.sources.ros.unused_topics import feels_gravity, unused_notes, usual_acceleration, what_there_is
+from mapper.sources.ros.unused_topics import (
+    feels_gravity,
+    turns,
+    unused_notes,
+    usual_acceleration,
+    what_there_is,
+)
 
 TRUTH, WHEELS = "/ground_truth", "/wheel_odometry"
 
@@ -174,11 +179,12 @@ def choose(
     def is_in_tf(name: str) -> bool:
         return frame_of(firsts.get(name)) in frames_of_tf
 
-    imu = _best(imus, lambda name: (not is_in_tf(name), *plain_rank(name)))
-    gyroscope = imu if imu is not None and _turns(imu) and config.gyroscope is None else None
+    tracked = points if color is None or depth is None or config.points is not None else color
+    imu = _best(imus, lambda name: (not is_in_tf(name), *imu_rank(name, tracked, tracked is color)))
+    gyroscope = imu if imu is not None and turns(imu) and config.gyroscope is None else None
     if gyroscope is None:
         gyroscope = pick.one(
-            "gyroscope", config.gyroscope, IMUS, plain_rank, where=lambda name: _turns(series[name])
+            "gyroscope", config.gyroscope, IMUS, plain_rank, where=lambda name: turns(series[name])
         )
     gnss = pick.one(
         "gnss", config.gnss, FIXES, lambda name: fix_rank(series[name].topic), where=lambda _name: True
@@ -412,8 +418,3 @@ def _cameras(
         if frame and info is not None:
             found.setdefault(frame, ImageTopics(one, info))
     return list(found.values())
-
-
-def _turns(series: Series) -> bool:
-    """Return whether a topic has angular velocities: an accelerometer's are empty."""
-    return bool((np.nan_to_num(series.imu[:, :3]) != 0.0).any())

@@ -71,6 +71,11 @@ def feels_gravity(series: Series) -> bool:
     return unit_of_gravity(usual_acceleration(series)) is not None
 
 
+def turns(series: Series) -> bool:
+    """Return whether a topic has angular velocities: an accelerometer's are empty."""
+    return bool((np.nan_to_num(series.imu[:, :3]) != 0.0).any())
+
+
 def usual_acceleration(series: Series) -> float:
     """Return the median length of an accelerometer's readings."""
     return float(np.median(np.linalg.norm(np.nan_to_num(series.imu[:, 3:]), axis=1)))

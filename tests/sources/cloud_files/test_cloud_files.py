@@ -122,16 +122,6 @@ def test_every_format_gives_its_points(tmp_path, ending):
     np.testing.assert_allclose(cloud.points, POINTS, atol=1e-4)
 
 
-def test_columns_of_veloview_are_found(tmp_path):
-    path = tmp_path / "frame (0001).csv"
-    names = '"intensity","laser_id","timestamp","Points_m_XYZ:0","Points_m_XYZ:1","Points_m_XYZ:2"'
-    table = np.column_stack([np.full(N, 7), np.zeros(N), TIMES, POINTS])
-    np.savetxt(path, table, delimiter=",", header=names, comments="")
-    cloud = read_cloud(path)
-    np.testing.assert_allclose(cloud.points, POINTS, atol=1e-4)
-    np.testing.assert_allclose(cloud.times, TIMES)
-
-
 def test_an_array_of_a_row_for_each_coordinate_is_read(tmp_path):
     np.save(tmp_path / "cloud.npy", POINTS.T)
     np.testing.assert_allclose(read_cloud(tmp_path / "cloud.npy").points, POINTS, atol=1e-5)
@@ -279,7 +269,7 @@ def test_npy_of_any_shape(tmp_path, array):
             (array, "want numbers, (N, 3) or wider")
             for array in (np.zeros(30), np.zeros((30, 2)), np.full((30, 3), "x"))
         ),
-        (np.array([None]), "Object arrays"),
+        (np.array([None]), "objects of Python"),
         (np.full((N, 3), np.nan), "0 of 60 points measured anything; want 10 or more"),
         (np.zeros((N, 3)), "0 of 60 points measured anything"),
         (np.eye(3)[:1], "1 of 1 points measured anything"),

@@ -152,3 +152,17 @@ def test_a_first_cloud_in_a_frame_of_its_own_does_not_leave_out_the_others(tmp_p
     assert (len(log[1:]), log.body_frame) == (len(STAMPS_NS), "lidar")
     assert len(log[1].points_body)
     assert sum("1 of 5 clouds" in note for note in log.notes) == 1
+
+
+@pytest.mark.parametrize(
+    ("points", "names", "chosen"),
+    [
+        ("/points", ["/camera/imu", "/imu/data"], "/imu/data"),
+        ("/ouster/points", ["/imu", "/ouster/imu"], "/ouster/imu"),
+    ],
+)
+def test_of_imus_that_tf_does_not_know_one_beside_the_lidar_is_chosen(tmp_path, points, names, chosen):
+    clouds = [cloud(t)._replace(topic=points) for t in STAMPS_NS]
+    readings = [imu(t, 9.81)._replace(topic=name) for name in names for t in STAMPS_NS]
+    log = opened(tmp_path / "a.mcap", [*clouds, *readings])
+    assert sum(f"accelerations {chosen}," in choice for choice in log.choices) == 1
