@@ -9,7 +9,6 @@ from pathlib import Path
 from mapper.core.errors import SourceError
 from mapper.sources.config import TopicsConfig
 from mapper.sources.ros.frame_tree import BY_TF, is_fixed
-from mapper.sources.ros.image_messages import encoding_of, is_depth, is_mono16
 from mapper.sources.ros.message_index import Series
 from mapper.sources.ros.messages import (
     CAMERAS,
@@ -21,7 +20,6 @@ from mapper.sources.ros.messages import (
     ODOMETRY,
     POSES,
     READ,
-    ImageMessage,
     Message,
     frame_of,
 )
@@ -34,17 +32,19 @@ from mapper.sources.ros.topic_ranks import (
     info_of,
     infos_beside,
     is_called_rectified,
-    is_infrared,
     plain_rank,
     shared_namespaces,
     without_those_of_depth,
 )
 from mapper.sources.ros.unused_topics import (
     feels_gravity,
+    holds_other_numbers,
+    shows_depth,
     turns,
     unused_notes,
     usual_acceleration,
     what_there_is,
+    why_no_depths,
 )
 
 TRUTH, WHEELS = "/ground_truth", "/wheel_odometry"
@@ -162,14 +162,13 @@ def choose(
         SourceError: A chosen topic is not there or of another type, or nothing can be mapped.
     """
     pick = _Picker(series, path)
-    depths = {
-        name
-        for name, first in firsts.items()
-        if isinstance(first, ImageMessage)
-        and is_depth(first)
-        and not (is_infrared(name) and is_mono16(first))
-    }
-    colors = pick.candidates("color", config.color, IMAGES, where=lambda name: name not in depths)
+    depths = {name for name, first in firsts.items() if shows_depth(name, first)}
+    colors = pick.candidates(
+        "color",
+        config.color,
+        IMAGES,
+        where=lambda name: not (name in depths or holds_other_numbers(name)),
+    )
     depth_images = pick.candidates("depth", config.depth, IMAGES, where=depths.__contains__)
     color, depth = _of_one_camera(colors, depth_images, firsts)
     clouds = pick.candidates("points", config.points, CLOUDS, where=lambda name: len(series[name]) > 1)
@@ -245,11 +244,7 @@ def choose(
         strange = [one for one in series.values() if one.topic.type not in READ]
         unread = [
             *unused_notes(strange, firsts, image_reason=None),
-            *(
-                f"{name} is {encoding_of(first)!r}, not depth of 16 bits or 32-bit numbers (16UC1, 32FC1)"
-                for name, first in firsts.items()
-                if isinstance(first, ImageMessage) and "depth" in name.lower() and name not in depths
-            ),
+            *why_no_depths(firsts, depths),
         ]
         found = what_there_is(color, depth, series.values())
         raise SourceError("; ".join([f"{path}: nothing to map: {found}", *unread]))

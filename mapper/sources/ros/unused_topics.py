@@ -1,14 +1,16 @@
 """Topics of a recording that are not used, with the reason, as notes and refusals name them."""
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 
 import numpy as np
 
 from mapper.core.errors import listed
 from mapper.core.units import unit_of_gravity
+from mapper.sources.ros.image_messages import encoding_of, is_depth, is_mono16
 from mapper.sources.ros.message_index import Series
-from mapper.sources.ros.messages import CLOUDS, FIXES, IMAGES, IMUS, POSES, READ, Message
+from mapper.sources.ros.messages import CLOUDS, FIXES, IMAGES, IMUS, POSES, READ, ImageMessage, Message
+from mapper.sources.ros.topic_ranks import is_infrared
 
 _BOOKKEEPING = re.compile(
     r"(?:action|bond|builtin_interfaces|control|diagnostic|dynamic_reconfigure|lifecycle|map|nav|rcl_interfaces"
@@ -18,6 +20,8 @@ _BOOKKEEPING = re.compile(
 """Beginnings of types of messages about programs, plans and pictures, which no sensor measured."""
 _PACKED = re.compile("video|ffmpeg|theora|compressed", re.IGNORECASE)
 """Words in types of videos and of packed clouds."""
+_OTHER_NUMBERS = re.compile("disparity|confidence", re.IGNORECASE)
+"""Words in topics of images of numbers that are no depth."""
 _PACKETS = re.compile(
     r"(?:UdpFrame|(?:Udp|Pandar|Rslidar|Robosense)(?:Scan|Packet)|NebulaPackets?)$", re.IGNORECASE
 )
@@ -64,6 +68,29 @@ def unused_notes(
         if kind is not None:
             kinds.setdefault(kind, []).append(name)
     return [f"{kind}: {listed(names)}" for kind, names in kinds.items()]
+
+
+def shows_depth(name: str, first: Message | None) -> bool:
+    """Return whether a topic's images are of depth, by its first message and its name."""
+    if not isinstance(first, ImageMessage) or holds_other_numbers(name):
+        return False
+    return is_depth(first) and not (is_infrared(name) and is_mono16(first))
+
+
+def holds_other_numbers(name: str) -> bool:
+    """Return whether a topic's name says that its images are neither depth nor colour."""
+    return _OTHER_NUMBERS.search(name) is not None
+
+
+def why_no_depths(firsts: Mapping[str, Message], depths: Collection[str]) -> Iterator[str]:
+    """Yield why images that are called depth or disparity are none of ``depths``."""
+    for name, first in firsts.items():
+        if not isinstance(first, ImageMessage) or name in depths:
+            continue
+        if is_depth(first) and holds_other_numbers(name):
+            yield f"{name} is called no depth; of disparity that is focal length · baseline / disparity"
+        elif "depth" in name.lower():
+            yield f"{name} is {encoding_of(first)!r}, not depth of 16 bits or 32-bit numbers (16UC1, 32FC1)"
 
 
 def feels_gravity(series: Series) -> bool:

@@ -166,3 +166,12 @@ def test_of_imus_that_tf_does_not_know_one_beside_the_lidar_is_chosen(tmp_path, 
     readings = [imu(t, 9.81)._replace(topic=name) for name in names for t in STAMPS_NS]
     log = opened(tmp_path / "a.mcap", [*clouds, *readings])
     assert sum(f"accelerations {chosen}," in choice for choice in log.choices) == 1
+
+
+def test_images_of_disparity_are_no_depth(tmp_path):
+    disparity = [one._replace(topic="/cam/disparity") if one.topic == DEPTH else one for one in shots(3)]
+    with pytest.raises(SourceError, match=r"/cam/disparity is called no depth; .*baseline"):
+        opened(tmp_path / "a.mcap", disparity)
+    confidence = [one._replace(topic="/cam/confidence_rgb") for one in shots(3) if one.topic == DEPTH]
+    log = opened(tmp_path / "b.mcap", [*shots(3), *confidence])
+    assert sum(f"colour {COLOR}, depth {DEPTH}" in choice for choice in log.choices) == 1
