@@ -2,7 +2,8 @@
 
 Turns of 180°/s by hand, two scans or images a second, a tunnel of 50 m, 2 s with a covered lens or without
 frames, stairs; and faults of the readings: another unit, a flipped axis, 50 ms of delay, a gyroscope that
-saturates. "worse" marks what errs more than 1.05 times as much as without readings.
+saturates. "worse" marks what errs more than 1.05 times as much as without readings; NEES/6 is that of poses
+relative to those 1 s before.
 
     python -m benchmarks.inertial --seeds 51 52 53
 """
@@ -15,6 +16,8 @@ import numpy as np
 
 from mapper.config.loading import load_config
 from mapper.core.geometry import Array, fit_rigid
+from mapper.core.timebase import NS_PER_S
+from mapper.evaluators.metrics.consistency import window_nees
 from mapper.evaluators.metrics.silent_failures import check_doubts
 from mapper.pipeline.inertial_bridging import bridge
 from mapper.pipeline.solve import solve
@@ -120,12 +123,15 @@ def row(name: str, log: Log, tracking: TrackingResult, best_m: float) -> tuple[s
     off_m = np.linalg.norm(trajectory.positions_world @ T[:3, :3].T + T[:3, 3] - true, axis=1)
     ate_m = float(np.sqrt(np.mean(off_m**2)))
     check = check_doubts(stored.trajectory, stored.records, log.truth)
+    nees = window_nees(
+        tracking.trajectory(), tracking.graph, stored.records, log.truth, window_ns=NS_PER_S
+    ).mean
     lost = len(tracking.tracks) - len(tracking.placed)
     doubtful = len(tracking.placed) - len(tracking.tracked)
     flag = "" if not best_m or ate_m <= 1.05 * best_m else " worse"
     text = (
         f"{name:44} {ate_m:8.4f} m {off_m.max():7.3f} m, {lost:3} lost {doubtful:3} doubtful of "
-        f"{len(tracking.tracks):3}, {check.silent} silent{flag}"
+        f"{len(tracking.tracks):3}, {check.silent} silent, NEES/6 {nees:.2f}{flag}"
     )
     return text, ate_m
 

@@ -67,6 +67,8 @@ def georeference(tracking: TrackingResult, fixes: GnssFixes | None, config: Grap
     if fixes is None or not config.gnss.use:
         return Georeferenced(tracking)
     weight: Weight = "doubt"
+    trajectory = tracking.tracked_trajectory()
+    fixes = fixes.in_degrees(trajectory.stamps_ns, trajectory.positions_world)
     try:
         return _placed(tracking, fixes, config)
     except TooShortError as error:

@@ -18,6 +18,7 @@ _LARGEST_SIGMA_M = 1e4
 _FASTEST_MPS = 50.0
 """Of a vehicle with a sensor that maps."""
 _JUMP_SIGMAS = 5.0
+_DEGREE = np.pi / 180.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -105,6 +106,24 @@ class GnssFixes:
                 f"{max(jumps):.1f} m (beyond {_FASTEST_MPS:g} m/s and {_JUMP_SIGMAS:g} σ)"
             )
         return kept, notes
+
+    def in_degrees(self, stamps_ns: Stamps, positions: Array) -> "GnssFixes":
+        """Return the fixes in degrees: those π/180 times as spread as a path are in radians.
+
+        Args:
+            stamps_ns: (N,) times of the path.
+            positions: (N, 3) positions then, metres, whatever their frame.
+        """
+        since_s, at_s = ((ns - stamps_ns[0]) / NS_PER_S for ns in (stamps_ns, self.stamps_ns))
+        beside = (at_s >= 0.0) & (at_s <= since_s[-1])
+        if not beside.any() or (np.abs(self.geodetic[:, :2]) > [0.5 * np.pi, np.pi]).any():
+            return self
+        path_m = np.column_stack([np.interp(at_s[beside], since_s, column) for column in positions.T])
+        fixes_m = ecef_from_geodetic(self.geodetic[beside] * [1.0, 1.0, 0.0])
+        if fixes_m.std(axis=0).max() >= np.sqrt(_DEGREE) * path_m.std(axis=0).max():
+            return self
+        degrees = self.geodetic / [_DEGREE, _DEGREE, 1.0]
+        return replace(self, name=f"{self.name} (in radians, as its path is)", geodetic=degrees)
 
     def jumps(self) -> list[float]:
         """Return the lengths of steps between consecutive fixes that no motion explains, metres."""

@@ -154,6 +154,28 @@ def test_fixes_that_contradict_the_path_are_left_out(fault):
     assert refused(tracked(truth(), 2), wrong) == "doubt"
 
 
+@pytest.mark.parametrize("duration_s", [2.0, 10.0, DURATION_S])
+def test_fixes_in_radians_are_those_in_degrees(duration_s):
+    """Of a short path they are as near to each other as the fixes of a receiver that stands."""
+    before = tracked(truth(duration_s=duration_s), 2)
+    fixes = fixes_of(2, duration_s=duration_s)
+    radians = replace(fixes, geodetic=fixes.geodetic * [np.pi / 180.0, np.pi / 180.0, 1.0])
+    expected, found = (georeference(before, one, CONFIG) for one in (fixes, radians))
+    np.testing.assert_allclose(found.T_map_world, expected.T_map_world, atol=1e-6)
+    assert (found.report is None) == (expected.report is None)
+    assert ["radians" in warning.sentence for one in (expected, found) for warning in one.warnings] == [
+        False,
+        True,
+    ]
+
+
+def test_fixes_in_degrees_near_the_equator_are_no_radians():
+    known = truth()
+    placed = georeference(tracked(known, 2), fixes_of(2, latitude_deg=0.0, longitude_deg=0.0), CONFIG)
+    assert placed.report is not None
+    assert abs(placed.report.latitude_deg) < 0.01
+
+
 def test_an_antenna_of_unknown_place_makes_fixes_less_accurate():
     known = truth()
     before = tracked(known, 8)
