@@ -56,6 +56,8 @@ _FILE_NAMES = (
     "*camera*.np[yz]",
     "*intrinsic*.np[yz]",
     "K.npy",
+    "calib/*.yaml",  # RTAB-Map's export
+    "*_calib/*.yaml",
     "info.txt",  # BundleFusion
     "_info.txt",
     "cam.info.txt",

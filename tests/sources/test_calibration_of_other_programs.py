@@ -84,6 +84,7 @@ FILES = [
     ("intrinsic/intrinsic_color.txt", "60 0 31.5 0\n0 61 23.5 0\n0 0 1 0\n0 0 0 1\n"),
     ("info.txt", INFO),
     ("sensors.yaml", OPENLORIS),
+    ("calib/000.yaml", KALIBR.replace("[0.1, -0.2, 0.001, 0.002]", "[0.0, 0.0, 0.0, 0.0]")),
     ("intrinsics.txt", "60 31.5 61 23.5"),
     ("intrinsics.K.txt", MATRIX),
     ("cam.info.txt", "width = 64\nheight = 48\nfx = 60\nfy = 61\ncx = 31.5\ncy = 23.5\n"),

@@ -169,6 +169,33 @@ def test_redwood_trajectory_counts_images_from_zero(tmp_path):
     np.testing.assert_allclose(source.truth.T_world_body, [POSES[0], POSES[2]], atol=1e-6)
 
 
+@pytest.mark.parametrize("name", ["traj.txt", "poses.txt", "poses/{}.txt"])
+@pytest.mark.parametrize("rows", [3, 4])
+def test_a_matrix_a_line_or_a_file_is_the_truth(tmp_path, name, rows):
+    folder = redwood(tmp_path, ["2", "3", "10"])
+    T = np.array([exp([0.0, 0.0, 0.1 * k], [0.5 * k, 0.0, 0.0]) for k in range(3)])
+    texts = [" ".join(f"{value:.9f}" for value in one[:rows].ravel()) for one in T]
+    if "{}" in name:
+        (folder / "poses").mkdir()
+        for number, one in zip((2, 3, 10), T, strict=True):
+            (folder / name.format(number)).write_text(matrix_text(one))
+    else:
+        (folder / name).write_text("\n".join(texts))
+    log = open_source(folder)
+    np.testing.assert_allclose(log.truth.T_world_body, T, atol=1e-6)
+    if "{}" not in name:
+        (folder / name).write_text("\n".join(texts[:2]))
+        log = open_source(folder)
+        assert (log.truth, sum("is not used: 2 poses for 3" in note for note in log.notes)) == (None, 1)
+
+
+def test_poses_of_another_kind_are_not_used_and_named(tmp_path):
+    folder = redwood(tmp_path, ["0", "1"])
+    (folder / "poses.txt").write_text("1 2 3 0 0 0 1\n1 2 3 0 0 0 1\n")
+    log = open_source(folder)
+    assert (log.truth, sum("poses.txt is not used: 7 columns" in note for note in log.notes)) == (None, 1)
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [

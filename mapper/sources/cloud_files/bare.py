@@ -33,7 +33,7 @@ _LEAST_FLOAT, _MOST_FLOAT, _MOST_STRANGE = 1e-12, 1e6, 0.1
 """Sizes of float32 in a cloud's file, other than 0, and the share of others from which they are none."""
 EMPTY = "the file is empty"
 _VELOVIEW = re.compile(r"points\w*:(?P<axis>[012])")
-_IN_METRES = re.compile(r"(?P<axis>[xyz])[_([]?m[)\]]?")
+_IN_METRES = re.compile(r"(?P<axis>[xyz])[_([]*m[)\]]?")
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*([eE][-+]?\d+)?|\.\d+([eE][-+]?\d+)?|nan|inf)", re.IGNORECASE)
 _WIDTHS = (3, 5, 6, 7, 8)  # x y z; with intensity and ring (nuScenes); with a time; with padding (PCL)
 _BLOCKS, _BLOCK_NUMBERS = 8, 3360  # in parts of whole records of every width up to 8
@@ -61,7 +61,8 @@ def read_bin(path: Path, columns: int | None = None) -> Columns:
     if columns is None and (of_nclt := _nclt_columns(path, size)):
         return of_nclt
     numbers = np.fromfile(path, _FLOAT32) if size % _FLOAT32.itemsize == 0 else np.empty(0, _FLOAT32)
-    if columns is None and (other := other_width(numbers)):
+    is_by_column = columns is None and len(numbers) % KITTIS == 0 and _is_by_column(numbers)
+    if columns is None and not is_by_column and (other := other_width(numbers)):
         width, is_certain = other
         if is_certain:
             doubles = ", unless they are 4 float64: save these as .npy" if width == 8 else ""
@@ -80,10 +81,21 @@ def read_bin(path: Path, columns: int | None = None) -> Columns:
             f"{path}: {size} bytes, want a multiple of {record_bytes}, {what}; copy it again if it was cut, "
             "else --set source.bin_columns to the numbers of a record"
         )
-    records = numbers.reshape(-1, columns or KITTIS)
+    records = numbers.reshape(KITTIS, -1).T if is_by_column else numbers.reshape(-1, columns or KITTIS)
     _refuse_others_first(records, path)
     names = ("x", "y", "z", "intensity") if records.shape[1] in _WITH_INTENSITY else ("x", "y", "z")
     return {name: records[:, column] for column, name in enumerate(names)}
+
+
+def _is_by_column(numbers: NDArray[np.float32]) -> bool:
+    """Return whether all x come first, then all y, z and intensities, as in the Oxford RobotCar's files.
+
+    Intensities are not negative, as no quarter of a file of records is.
+    """
+    if len(numbers) < 10 * MIN_POINTS * KITTIS:
+        return False
+    negative = (numbers.reshape(KITTIS, -1) < 0.0).mean(axis=1)
+    return bool(negative[3] == 0.0 and negative[:3].max() > _MAX_NEGATIVE_RATIO)
 
 
 def _nclt_columns(path: Path, size: int) -> Columns | None:
@@ -152,12 +164,27 @@ def read_text(path: Path) -> Columns:
         values = np.loadtxt(StringIO(text), skiprows=skipped, ndmin=2)
     if len(names) == values.shape[1]:
         return {name: values[:, column] for column, name in enumerate(names)}
+    if {"x", "y", "z"} <= set(names) and names[:3] != ["x", "y", "z"]:
+        raise FrameError(
+            f"{path}: a header of {len(names)} names, but {values.shape[1]} columns; want as many"
+        )
     return _xyz(values, path)
 
 
 def _in_blanks(text: str) -> str:
-    """Return lines whose numbers are separated by blanks, with decimal points."""
+    """Return lines whose words are separated by blanks, with decimal points; names of two words are one."""
+    begin = 0
+    for _ in range(HEADER_LINES):
+        end = text.find("\n", begin)
+        if end < 0 or _NUMBER.match(text, begin):
+            break
+        begin = end + 1
+    header = [
+        re.sub(r"(?<=[^\s,;]) +(?=[^\s,;])", "_", line) if re.search("[,;\t]", line) else line
+        for line in text[:begin].split("\n")
+    ]
     is_decimal = ";" in text and "." not in text
+    text = "\n".join(header) + text[begin:]
     return text.replace(",", "." if is_decimal else " ").replace(";", " ")
 
 

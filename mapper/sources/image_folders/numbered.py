@@ -26,7 +26,15 @@ from mapper.sources.config import SourceConfig
 from mapper.sources.image_files import png
 from mapper.sources.image_folders.pairing import ordered_pairs
 from mapper.sources.image_folders.rgbd import FramePair, assumed_camera_note, find_calibration, rgbd_log
-from mapper.sources.scan_stamps import Wording, listed_stamps, stamp_at, stamps_list, unit_of_counts
+from mapper.sources.image_folders.tum import read_truth
+from mapper.sources.scan_stamps import (
+    Wording,
+    line_of_each,
+    listed_stamps,
+    stamp_at,
+    stamps_list,
+    unit_of_counts,
+)
 from mapper.sources.text import parse_count, parse_numbers, pose_from_matrix, rows, truth_from
 
 RATE_HZ = 30.0
@@ -37,6 +45,8 @@ _DEPTH_FOLDER = re.compile(r"(?:^|[^a-z])depth", re.IGNORECASE)
 _DEPTH_ENDINGS = frozenset({".npy", ".pfm", ".exr"})
 _IMAGE_ENDINGS = frozenset({".png", ".jpg", ".jpeg", ".pgm", ".ppm", ".tif", ".tiff", ".bmp", ".webp"})
 _NUMBERED = re.compile(r"\D*(?P<number>\d{1,18})(?:-(?P<microseconds>\d+))?\D*")
+_POSES = ("groundtruth.txt", "poses.txt", "pose.txt")
+_TRAJECTORIES = ("*traj*.log", "*traj*.txt", "*.log", *_POSES)
 _SEVEN_SCENES = re.compile(r"frame-\d+\.color\.\w+")
 
 
@@ -265,20 +275,42 @@ def _common(colour: Place, depth: Place) -> Set[int]:
 def _read_truth(
     folder: Path, images: Sequence[NumberedPair], pairs: Sequence[FramePair]
 ) -> tuple[Trajectory | None, list[str]]:
-    """Read one pose file a frame if there are any, else a Redwood trajectory."""
+    """Read one pose file a frame if there are any, else a trajectory: Redwood's, TUM's, or matrices."""
     poses: list[tuple[int, Transform | None]] = []
     for image, pair in zip(images, pairs, strict=True):
         beside = image.colour.with_name(f"{image.colour.stem.split('.')[0]}.pose.txt")
-        path = beside if beside.is_file() else folder / "pose" / f"{image.colour.stem}.txt"
-        if path.is_file():
+        places = [beside, *(folder / name / f"{image.colour.stem}.txt" for name in ("pose", "poses"))]
+        path = next(filter(Path.is_file, places), None)
+        if path is not None:
             matrix = [_row_of_4(path, number, words) for number, words in rows(path)]
             poses.append((pair.stamp_ns, _pose_of(matrix, path)))
     if poses:
         return truth_from(poses, what="pose files")
-    trajectories = [
-        path for name in ("*traj*.log", "*traj*.txt", "*.log") for path in sorted(folder.glob(name))
-    ]
-    return _read_redwood(trajectories[0], pairs) if trajectories else (None, [])
+    path = next((one for name in _TRAJECTORIES for one in sorted(folder.glob(name))), None)
+    if path is None:
+        return None, []
+    columns = len(next(rows(path), (0, []))[1])
+    if columns in (12, 16):
+        return _read_matrices(path, images, pairs)
+    if columns == 8:
+        return read_truth(path)
+    if path.name in _POSES:
+        return None, [f"{path.name} is not used: {columns} columns, want 8 of TUM's, or 12 or 16 of a matrix"]
+    return _read_redwood(path, pairs)
+
+
+def _read_matrices(
+    path: Path, images: Sequence[NumberedPair], pairs: Sequence[FramePair]
+) -> tuple[Trajectory | None, list[str]]:
+    """Read a 3×4 or 4×4 matrix a line: of each image, or of the number of each, counted from 0."""
+    lines = [parse_numbers(words, where=f"{path}:{number}") for number, words in rows(path)]
+    at = line_of_each([image.colour for image in images], len(lines))
+    if at is None or at.max() >= len(lines):
+        return None, [f"{path.name} is not used: {len(lines)} poses for {len(pairs)} pairs of images"]
+    poses = [pose_from_matrix(lines[k].reshape(-1, 4)) if len(lines[k]) in (12, 16) else None for k in at]
+    return truth_from(
+        [(pair.stamp_ns, pose) for pair, pose in zip(pairs, poses, strict=True)], what=path.name
+    )
 
 
 def _read_redwood(path: Path, pairs: Sequence[FramePair]) -> tuple[Trajectory | None, list[str]]:
