@@ -12,6 +12,8 @@ from mapper.sensing.wheel_kinematics import without_jumps
 MAX_TILT_RAD = np.radians(5.0)
 """A plane tilted by less is taken as parallel to the floor: what is measured 10 m away is 4 cm nearer."""
 
+_TIMES_FARTHEST = 10.0
+"""Ratio of the nearest range to the largest that is possible from which they are in different units."""
 MOST_RAD = 4.0 * np.pi
 """Angle of a scan that is no damage: that of two turns."""
 
@@ -53,7 +55,15 @@ def laser_records(
     is_one = step_rad == 0.0 and len(ranges_m) > 1
     if is_one or not np.isfinite([first_rad, step_rad]).all() or abs(step_rad) * len(ranges_m) > MOST_RAD:
         raise DataError(
-            f"{len(ranges_m)} beams from {first_rad:g} rad by {step_rad:g} rad: no laser's directions"
+            f"{len(ranges_m)} beams from {first_rad:g} rad by {step_rad:g} rad: no laser's directions; "
+            "want radians, and a step that is not 0"
+        )
+    with np.errstate(invalid="ignore"):
+        found_m = ranges_m[np.isfinite(ranges_m) & (np.asarray(ranges_m) > 0.0)]
+    if len(found_m) and found_m.min() > _TIMES_FARTHEST * limits_m[1] > 0.0:
+        raise DataError(
+            f"ranges of {found_m.min():g} to {found_m.max():g} m, range_max is {limits_m[1]:g} m; are they "
+            "millimetres? want metres"
         )
     points, beams = beam_points(ranges_m, first_rad=first_rad, step_rad=step_rad, limits_m=limits_m)
     columns = dict(zip("xyz", points.T, strict=True))

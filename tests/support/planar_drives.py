@@ -308,12 +308,18 @@ def write_carmen(path: Path, drive: Drive, *, message: str = "FLASER", is_relati
 
 
 def write_ros(
-    path: Path, drive: Drive, *, odometry: str = "topic", yaw_mount: float = 0.0, pitch_mount: float = 0.0
+    path: Path,
+    drive: Drive,
+    *,
+    odometry: str = "topic",
+    yaw_mount: float = 0.0,
+    pitch_mount: float = 0.0,
+    tied: str = "laser",
 ) -> Path:
     """Write /scan, and /odom as a topic or as the transform odom → base_link, into a bag or a folder."""
     laser = drive.laser
     mounting = transform(rotation_exp(np.array([0.0, pitch_mount, yaw_mount])), [laser.x_m, 0.0, laser.z_m])
-    messages = [transforms(("base_link", "laser", mounting), stamp_ns=FIRST_NS)]
+    messages = [transforms(("base_link", tied, mounting), stamp_ns=FIRST_NS)]
     for time_s, (x, y, yaw) in zip(drive.readings_s, drive.readings, strict=True):
         stamp_ns = FIRST_NS + round(1e9 * time_s)
         T_odom_base = transform(rotation_exp(np.array([0.0, 0.0, yaw])), [x, y, 0.0])

@@ -129,17 +129,28 @@ class RecordingReader:
         if child and config.body_in_base is None and self.tree.find(child, body) is not None:
             return self._carried(wheels, child, body), notes
         if config.body_in_base is None:
-            notes.append(
-                f"{series.topic.name}: tf does not tie {child or 'it'} to {body}, which is taken to be "
-                "at its origin, looking forward; a config file can set source.wheels.body_in_base"
-            )
+            notes.append(f"{series.topic.name}: {_untied(child, body)}")
         return replace(wheels, T_world_body=wheels.T_world_body @ mounting(config, sensor)), notes
 
-    def wheels_by_tf(self, body: str) -> tuple[Trajectory | None, list[str]]:
-        """Return T_odom_body by the transforms that a robot's base publishes (REP 105), and a note."""
+    def wheels_by_tf(
+        self, body: str, *, config: WheelsConfig, sensor: Sensor
+    ) -> tuple[Trajectory | None, list[str]]:
+        """Return T_odom_body by the transforms that a robot's base publishes (REP 105), and a note.
+
+        Where tf does not tie the two the base is taken as for a topic.
+        """
         odom = next((frame for frame in self.tree.frames if frame.split("/")[-1] == "odom"), None)
-        wheels = None if odom is None else self.whole_tree.path_in(odom, body)
-        return wheels, [] if wheels is None else [f"wheel odometry by tf: {odom} → {body}"]
+        if odom is None:
+            return None, []
+        wheels = self.whole_tree.path_in(odom, body)
+        if wheels is not None:
+            return wheels, [f"wheel odometry by tf: {odom} → {body}"]
+        base = self.tree.carried_by(odom)
+        wheels = None if base is None else self.whole_tree.path_in(odom, base)
+        if wheels is None:
+            return None, []
+        wheels = replace(wheels, T_world_body=wheels.T_world_body @ mounting(config, sensor))
+        return wheels, [f"wheel odometry by tf: {odom} → {base}; {_untied(base, body)}"]
 
     def accelerations(self, series: Series | None, *, body: str) -> tuple[Accelerations | None, list[str]]:
         """Return the readings of a topic, in the body's axes where tf ties the two, and notes."""
@@ -302,3 +313,10 @@ def _trajectory(poses: Sequence[PoseMessage], *, what: str) -> tuple[Trajectory 
         return None, [*notes, f"{what}: no usable pose"]
     stamps_ns = np.array([pose.stamp_ns for pose in poses], dtype=np.int64)[usable]
     return Trajectory(stamps_ns, pose_of_row(numbers[usable])), notes
+
+
+def _untied(base: str | None, body: str) -> str:
+    return (
+        f"tf does not tie {base or 'it'} to {body}, which is taken to be at its origin, looking forward; a "
+        "config file can set source.wheels.body_in_base"
+    )

@@ -75,7 +75,7 @@ def recording_log(reader: RecordingReader, config: SourceConfig) -> Log:
         choice.wheels, body=frames.body, config=config.wheels, sensor=frames.sensor
     )
     if choice.wheels is None and frames.sensor == "lidar-2d":
-        wheels, wheel_notes = reader.wheels_by_tf(frames.body)
+        wheels, wheel_notes = reader.wheels_by_tf(frames.body, config=config.wheels, sensor=frames.sensor)
     wheels, use_notes = (rolling if frames.sensor == "lidar-2d" else usable)(wheels)
     wheel_notes = [*wheel_notes, *use_notes]
     gnss, gnss_notes = reader.gnss(choice.gnss, body=frames.body)

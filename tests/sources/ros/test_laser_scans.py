@@ -38,6 +38,13 @@ def test_scans_are_of_the_robot_with_its_wheels(tmp_path, driven, name, odometry
     assert log.wheels.positions_world[:, :2] == pytest.approx(driven.readings[:, :2], abs=1e-6)
 
 
+@pytest.mark.parametrize("odometry", ["topic", "tf"])
+def test_wheels_of_a_base_that_nothing_ties_to_the_laser_are_taken_as_its_own(tmp_path, driven, odometry):
+    log = open_source(write_ros(tmp_path / "run.bag", driven, odometry=odometry, tied="other"))
+    assert log.wheels.positions_world[:, :2] == pytest.approx(driven.readings[:, :2], abs=1e-6)
+    assert sum("does not tie base_link to laser" in note for note in log.notes) == 1
+
+
 def test_turned_laser_sees_the_same(tmp_path, driven):
     straight = open_source(write_ros(tmp_path / "straight", driven))[3]
     turned = open_source(write_ros(tmp_path / "turned", driven, yaw_mount=1.0))[3]
@@ -96,3 +103,14 @@ def test_beams_of_one_direction_are_no_scan(driven):
     with pytest.raises(DataError, match="no laser's directions"):
         laser_records(driven.ranges_m[0], step_rad=0.0, **beams)
     assert len(laser_records(np.array([2.0]), step_rad=0.0, **beams)) == 1
+
+
+@pytest.mark.parametrize("limit_m", [8.0, np.inf])
+def test_ranges_in_other_units_than_their_limit_are_refused(driven, limit_m):
+    ranges_m = 1000.0 * driven.ranges_m[0]
+    beams = {"first_rad": -1.0, "step_rad": 0.01, "limits_m": (0.0, limit_m), "intensities": np.zeros(0)}
+    if np.isfinite(limit_m):
+        with pytest.raises(DataError, match="millimetres"):
+            laser_records(ranges_m, **beams)
+    else:
+        assert len(laser_records(ranges_m, **beams)) == np.isfinite(ranges_m).sum()
