@@ -111,9 +111,13 @@ def open_source(path: Path, config: SourceConfig = _DEFAULTS) -> "Log":
         return selected(log, config)
     if (path / MANIFEST_NAME).is_file():
         raise SourceError(f"{path}: holds what mapper made, not a log; mapper eval {path} judges it")
+    above = path.absolute().parent
+    outer = f"; the folder it is in, {above}, is one" if format_of(above) else ""
     if what := _other_data(path):
-        raise SourceError(f"{path}: {what}")
-    hint = "; of clouds it has one, want two or more" if most_clouds(path) == 1 else _inner_hint(path)
+        raise SourceError(f"{path}: {what}{outer}")
+    hint = (
+        outer or "; of clouds it has one, want two or more" if most_clouds(path) == 1 else _inner_hint(path)
+    )
     raise SourceError(
         f"{path}: not a log of a known format (TUM, 7-Scenes, KITTI, EuRoC, clouds, exports of apps, .mcap, "
         f".bag, .db3, .mbag, .e57 …); docs/your-sensor.md has them all{hint}"
