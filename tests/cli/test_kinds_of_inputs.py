@@ -123,3 +123,10 @@ def test_data_that_are_no_logs_are_named(tmp_path):
     for path, what in named.items():
         said = invoke("inspect", path)
         assert (said.exit_code, what in said.stderr, UNKNOWN in said.stderr) == (1, True, False), said.stderr
+
+
+@pytest.mark.parametrize("within", ["rgb", "rgb.txt", "calibration.toml"])
+def test_of_a_part_of_a_log_the_log_is_named(tiny_tum_log, within):
+    log = tiny_tum_log(3)
+    said = invoke("inspect", log / within)
+    assert (said.exit_code, f"the folder it is in, {log}, is one" in said.stderr) == (1, True)
