@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from mapper.core.errors import DataError, FrameError
 from mapper.core.frames import Scan
 from mapper.core.geometry import Transform, apply
+from mapper.core.units import MM_PER_M
 from mapper.sources.cloud_files.raw import check_range, intensities_of, intensity_field
 from mapper.sources.point_times import field_times_s, time_field, without_untimed
 from mapper.sources.ros.messages import CloudMessage
@@ -19,6 +20,8 @@ Field = tuple[str, int, str, int]
 
 _SEPARATE_COLOURS = (("r", "g", "b"), ("red", "green", "blue"))
 _PACKED_COLOURS = ("rgb", "rgba")
+_LEAST_COORDINATE = 1e-9
+"""Coordinates are larger, or 0; of bytes in the wrong order many are not."""
 _LIVOX_FIELDS = {"tag", "line"}
 _LIVOX_NOISE = 0b1111
 """Bits of a Livox point's tag that are not zero for noise: by its position (stray points between near and far
@@ -40,7 +43,8 @@ def usable_fields(
     fields: dict[str, Field] = {}
     notes: list[str] = []
     for stated_name, offset, number, count in stated:
-        name = stated_name.lower() if stated_name in ("X", "Y", "Z") else stated_name
+        name = stated_name.strip("\0 ")
+        name = name.lower() if name in ("X", "Y", "Z") else name
         kind = types.get(number)
         if kind is None:
             why = f"its type {number} is not known"
@@ -107,6 +111,23 @@ def structured(
         raise DataError(
             f"a cloud of {rows}×{columns} points of {point_bytes} bytes in {len(data)} bytes: {error}"
         ) from None
+
+
+def in_true_order(points: NDArray[np.void]) -> tuple[NDArray[np.void], list[str]]:
+    """Return points whose bytes are in the order that makes coordinates of x, and a note on another one."""
+    swapped = points.view(points.dtype.newbyteorder())
+    if "x" not in (points.dtype.names or ()) or _plausible(swapped["x"]) <= _plausible(points["x"]):
+        return points, []
+    return swapped, ["is_bigendian is wrong: its bytes are in the other order"]
+
+
+def _plausible(values: NDArray[Any]) -> float:
+    """Return the share of numbers that may be coordinates, in metres or millimetres; 0 is none."""
+    with np.errstate(invalid="ignore"):  # of the wrong order, they may be signalling NaN
+        sizes = np.abs(values.astype(np.float64))
+    return (
+        float(((sizes > _LEAST_COORDINATE) & (sizes < FARTHEST_M * MM_PER_M)).mean()) if len(sizes) else 0.0
+    )
 
 
 def without_noise(points: NDArray[np.void]) -> tuple[NDArray[np.void], list[str]]:

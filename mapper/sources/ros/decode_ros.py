@@ -18,7 +18,7 @@ from mapper.core.geometry import is_rigid, transform
 from mapper.core.rotations import row_of_pose
 from mapper.core.timebase import NS_PER_S
 from mapper.sources.laser_scan import laser_records
-from mapper.sources.ros.cloud_messages import structured, usable_fields, without_noise
+from mapper.sources.ros.cloud_messages import in_true_order, structured, usable_fields, without_noise
 from mapper.sources.ros.messages import (
     DRIVER_CLOUDS,
     EXTRINSICS,
@@ -120,6 +120,9 @@ def _cloud(m: Any) -> CloudMessage:
         shape=(m.height, m.width),
         row_bytes=m.row_step,
     )
+    if m.is_bigendian:
+        points, order_notes = in_true_order(points)
+        notes += order_notes
     points, noise_notes = without_noise(points)
     return CloudMessage(_ns(m.header.stamp), m.header.frame_id, points, notes=[*notes, *noise_notes])
 

@@ -3,7 +3,7 @@ import pytest
 
 from mapper.core.errors import DataError, FrameError
 from mapper.core.frames import Scan
-from mapper.sources.ros.cloud_messages import scan_from, structured, usable_fields
+from mapper.sources.ros.cloud_messages import in_true_order, scan_from, structured, usable_fields
 from mapper.sources.ros.decode_ros import POINT_FIELD_TYPES, decode_ros
 from mapper.sources.ros.encode_ros import cloud_message
 from mapper.sources.ros.messages import CloudMessage
@@ -178,3 +178,26 @@ def test_returns_are_gathered_in_order_wherever_coordinates_lie(fields, missing)
     np.testing.assert_array_equal(again, measured)
     message[:] = bytes(len(message))  # what was read is no view of it
     np.testing.assert_array_equal(again, measured)
+
+
+@pytest.mark.parametrize("kind", ["f4", "f8", "i4"])
+@pytest.mark.parametrize("stated", "<>")
+@pytest.mark.parametrize("stored", "<>")
+def test_points_are_in_the_order_of_bytes_that_makes_coordinates(kind, stated, stored):
+    points = np.round(some_points() * 100.0)
+    records = np.empty(len(points), [(name, f"{stored}{kind}") for name in "xyz"])
+    for axis, name in enumerate("xyz"):
+        records[name] = points[:, axis]
+    size = np.dtype(kind).itemsize
+    fields = [(name, size * axis, f"{stated}{kind}", 1) for axis, name in enumerate("xyz")]
+    data = memoryview(records.tobytes())
+    as_stated = structured(data, fields, point_bytes=3 * size, shape=(1, len(points)))
+    found, notes = in_true_order(as_stated)
+    np.testing.assert_array_equal(np.column_stack([found[name] for name in "xyz"]), points)
+    assert len(notes) == (stated != stored)
+
+
+def test_names_of_fields_are_read_without_what_pads_them():
+    stated = [("x\0", 0, 7, 1), ("y ", 4, 7, 1), (" Z", 8, 7, 1)]
+    fields, notes = usable_fields(stated, POINT_FIELD_TYPES, order="<", point_bytes=12)
+    assert ([field[0] for field in fields], notes) == (["x", "y", "z"], [])
