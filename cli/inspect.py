@@ -42,7 +42,7 @@ def inspect(
     problem, plan = found.problem, ""
     if found.log is not None:
         config = load_config(settings, sensor=found.log.sensor)
-        if problem is None and (frames := found.log.readable) < config.min_tracked_frames:
+        if problem is None and (frames := found.log.usable) < config.min_tracked_frames:
             problem = too_few_text(frames, config.min_tracked_frames, found.log.notes)
         plan = (
             f"{found.log.sensor} frames, odometry {config.odometry.kind}, loops {config.loops.kind}, "

@@ -78,7 +78,7 @@ class LogFacts:
         kind: Format of the log.
         sensor: "rgbd", "lidar" or "lidar-2d".
         frames: Timing of its frames.
-        readable: Number of its frames that can be read, by those that were looked at.
+        usable: Number of its frames that can be read and do not repeat one before, by those looked at.
         content: The first frame that can be read, in words, or that none can.
         images: Blur, exposure and overlap of the images; None of a LiDAR, and of small ones.
         point_times: The times of the first scan's points, in words; None without.
@@ -102,7 +102,7 @@ class LogFacts:
     kind: str
     sensor: Sensor
     frames: Timing
-    readable: int
+    usable: int
     content: str
     images: ImageQuality | None
     point_times: str | None
@@ -209,7 +209,7 @@ def _inspected(
         kind=source.kind,
         sensor=source.sensor,
         frames=timing,
-        readable=readable,
+        usable=readable - len(checks.doubts()),
         content=problem if first is None else _content_text(first),
         images=images.quality(),
         point_times=_times_text(first, timing) if isinstance(first, Scan) else None,

@@ -122,6 +122,18 @@ def test_scans_that_cannot_be_read_do_not_count(tmp_path, left):
     assert ("want at least 10" in text) == (left == 9)
 
 
+@pytest.mark.parametrize("still", [0, 11])
+def test_scans_of_a_frozen_lidar_do_not_count(tmp_path, still):
+    points = np.random.default_rng(0).uniform(1.0, 9.0, (3000, 3)).astype(np.float32)
+    moved = [0.01 * max(k - still, 0) for k in range(14)]
+    clouds = [
+        cloud_message("/points", Scan(FIRST_NS + k * 100 * MS, points + np.float32(m)), frame="lidar")
+        for k, m in enumerate(moved)
+    ]
+    text = printed(write(tmp_path / "log.mcap", clouds), status=int(still > 0))
+    assert ("frozen? " in text or "frozen?\n" in text) == (still > 0)
+
+
 def test_the_exit_status_is_1_where_nothing_can_be_mapped(tmp_path, tiny_tum_log):
     only_colour = [message for message in shots(3) if message.topic == COLOR]
     log = write(tmp_path / "log.mcap", only_colour)
