@@ -1,6 +1,8 @@
 """Inertial readings beside a log: ``imu.csv`` as of EuRoC, or angular velocities in ``gyroscope.txt``."""
 
+import re
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -8,12 +10,17 @@ import numpy as np
 from mapper.core.errors import SourceError
 from mapper.core.geometry import Array
 from mapper.core.timebase import Stamps, seconds_text_from_ns
+from mapper.core.units import unit_of_gravity
 from mapper.sensing.gyroscope import Gyroscope, range_end
 from mapper.sources.base import Accelerations
 from mapper.sources.text import parse_numbers, parse_stamp, read_lines, rows, table, time_order
 
 BOTH, RATES = "imu.csv", "gyroscope.txt"
 _COLUMNS = np.dtype([("stamp_ns", "<i8"), ("rates", "<f8", 3), ("accelerations", "<f8", 3)])
+_NAMES = (BOTH, "imu.txt", "IMU.csv", "imu_data.csv", "imu_data.txt")
+_BETWEEN = r"\s*[,;]\s*|\s+"
+_RATES, _ACCELERATIONS = "(?:w|g(?!rav)|ang(?!le)|omega|rot(?!ation_?[xyz]$))", "(?:a(?!ng|lpha)|lin)"
+"""Beginnings of the names of columns."""
 _STRAY_COLUMNS = ("timestamp", "a_x", "a_y", "a_z", "alpha_x", "alpha_y", "alpha_z")
 _SHAKEN = 1.2
 """The end of a range is beyond this many times gravity: of those at rest many are the largest."""
@@ -29,7 +36,7 @@ def read_imu(folder: Path) -> tuple[Gyroscope | None, Accelerations | None, list
 
     Args:
         folder: Folder that may hold ``imu.csv`` (``stamp_ns,wx,wy,wz,ax,ay,az``, its first line EuRoC's, or
-            Stray Scanner's, of which the angular velocities are read) or
+            Stray Scanner's, of which the angular velocities are read, or one that names the columns) or
             ``gyroscope.txt`` (``stamp wx wy wz``); rad/s and m/s², in the unit's own axes.
 
     Raises:
@@ -44,15 +51,16 @@ def read_imu(folder: Path) -> tuple[Gyroscope | None, Accelerations | None, list
         stamps = np.array(stamps_ns, np.int64)
         gyroscope, notes = gyroscope_of(path.name, stamps, np.array(rates, np.float64).reshape(-1, 3))
         return gyroscope, None, notes
-    path = folder / BOTH
-    if not path.is_file():
+    named = [one for name in _NAMES if (one := folder / name).is_file()]
+    if not named:
         return None, None, []
+    path = named[0]
     lines = read_lines(path)
     if lines and all(name in lines[0] for name in _STRAY_COLUMNS):
         return _stray_rates(path, lines)
-    if not lines or "w_RS_S_x" not in lines[0]:
-        return None, None, [f"{path.name}: its first line is not EuRoC's; not used"]
-    return _readings(path, lines)
+    if lines and "w_RS_S_x" in lines[0]:
+        return _readings(path, lines)
+    return _by_columns(path)
 
 
 def read_euroc_imu(path: Path) -> tuple[Gyroscope | None, Accelerations | None, list[str]]:
@@ -74,6 +82,65 @@ def _readings(path: Path, lines: Sequence[str]) -> tuple[Gyroscope | None, Accel
     gyroscope, notes = gyroscope_of(path.name, readings["stamp_ns"], readings["rates"])
     accelerations, more = accelerations_of(path.name, readings["stamp_ns"], readings["accelerations"])
     return gyroscope, accelerations, list(dict.fromkeys([*notes, *more]))
+
+
+def _by_columns(path: Path) -> tuple[Gyroscope | None, Accelerations | None, list[str]]:
+    """Return the readings of a table whose header names its columns, or of seven: a stamp, and two by three.
+
+    Without a header those that feel gravity are the accelerations. The header tells degrees, the length g.
+    """
+    lines = [(number, line) for number, line in enumerate(read_lines(path), start=1) if line.strip()]
+    header = next((line for _, line in lines[:1] if not _is_number(re.split(_BETWEEN, line.strip())[0])), "")
+    found = [(number, re.split(_BETWEEN, line.strip())) for number, line in lines[1 if header else 0 :]]
+    width = len(found[0][1]) if found else 0
+    at = _columns_of(header, width) if header else list(range(7)) * (width == 7)
+    if not at or any(len(words) != width for _, words in found):
+        return (
+            None,
+            None,
+            [f"{path.name}: its columns are not known, want {BOTH_HEADER.lstrip('#')}; not used"],
+        )
+    stamps_ns = np.array([parse_stamp(words[at[0]], where=f"{path}:{n}") for n, words in found], np.int64)
+    numbers = [parse_numbers([words[k] for k in at[1:]], where=f"{path}:{n}") for n, words in found]
+    first, second = np.array(numbers)[:, :3], np.array(numbers)[:, 3:]
+    if not header and _feels_gravity(first) and not _feels_gravity(second):
+        first, second = second, first
+    if re.search("deg|°", header):
+        first = np.radians(first)
+    if second.size and _feels_gravity(second):
+        second = second * (unit_of_gravity(_usual_length(second)) or 1.0)
+    gyroscope, notes = gyroscope_of(path.name, stamps_ns, first)
+    accelerations, more = accelerations_of(path.name, stamps_ns, second) if second.size else (None, [])
+    return gyroscope, accelerations, list(dict.fromkeys([*notes, *more]))
+
+
+def _columns_of(header: str, width: int) -> list[int]:
+    """Return the columns of the stamp, of the angular velocities, and of the accelerations where named."""
+    words = re.sub(r"[\[(][^\])]*[\])]", "", header).strip("# \t").lower()
+    separator = next((one for one in ",;\t" if one in words), None)
+    names = [word.strip().strip('"') for word in words.split(separator)]
+    of = {
+        kind: [k for axis in "xyz" for k, name in enumerate(names) if re.fullmatch(f"{begin}.*{axis}", name)]
+        for kind, begin in (("rates", _RATES), ("accelerations", _ACCELERATIONS))
+    }
+    stamps = [k for k, name in enumerate(names) if re.match("time|stamp|t$|sec", name)]
+    if len(names) != width or not stamps or len(of["rates"]) != 3:
+        return []
+    return [stamps[0], *of["rates"], *(of["accelerations"] if len(of["accelerations"]) == 3 else [])]
+
+
+def _is_number(word: str) -> bool:
+    with suppress(ValueError):
+        return bool(float(word) or True)
+    return False
+
+
+def _feels_gravity(readings: Array) -> bool:
+    return unit_of_gravity(_usual_length(readings)) is not None
+
+
+def _usual_length(readings: Array) -> float:
+    return float(np.median(np.linalg.norm(readings, axis=1)))
 
 
 def write_gyroscope(folder: Path, gyroscope: Gyroscope) -> None:

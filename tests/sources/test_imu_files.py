@@ -26,6 +26,34 @@ def test_angular_velocities_that_are_not_finite_are_counted(tmp_path):
     assert [note for note in notes if "2 of 4" in note]
 
 
+RATES, FELT = [0.1, -0.2, 0.3], [0.5, 0.0, 9.8]
+IN_DEGREES = "time [s]\tgyro_x [deg/s]\tgyro_y [deg/s]\tgyro_z [deg/s]\tacc_x [g]\tacc_y [g]\tacc_z [g]"
+
+
+@pytest.mark.parametrize("name", ["imu.csv", "imu.txt", "imu_data.csv"])
+@pytest.mark.parametrize(
+    ("header", "columns"),
+    [
+        ("timestamp,gx,gy,gz,ax,ay,az", [*RATES, *FELT]),
+        ("# t ax ay az wx wy wz", [*FELT, *RATES]),
+        ("time,qx,qy,qz,qw,angular_velocity_x,angular_velocity_y,angular_velocity_z,linear_acceleration_x,"
+         "linear_acceleration_y,linear_acceleration_z", [0, 0, 0, 1, *RATES, *FELT]),
+        ("timestamp;accel_x;accel_y;accel_z;gyro_x;gyro_y;gyro_z;mag_x", [*FELT, *RATES, 40]),
+        (IN_DEGREES, [*np.degrees(RATES), *(np.array(FELT) / 9.80665)]),
+        ("", [*RATES, *FELT]),
+        ("", [*FELT, *RATES]),
+    ],
+)  # fmt: skip
+def test_columns_are_found_by_their_names_or_by_gravity(tmp_path, name, header, columns):
+    separator = next((one for one in ";\t," if one in header), " ")
+    rows = [[f"{1_700_000_000 + k}.5", *(f"{value:.9g}" for value in columns)] for k in range(3)]
+    (tmp_path / name).write_text("\n".join([header, *(separator.join(row) for row in rows)]))
+    gyroscope, accelerations, _ = read_imu(tmp_path)
+    assert gyroscope.stamps_ns.tolist() == [(1_700_000_000 + k) * 10**9 + 500_000_000 for k in range(3)]
+    np.testing.assert_allclose(gyroscope.rates_radps, np.tile(RATES, (3, 1)), atol=1e-6)
+    np.testing.assert_allclose(accelerations.acceleration_mps2, np.tile(FELT, (3, 1)), rtol=1e-3)
+
+
 def test_a_csv_of_another_layout_is_named_and_not_used(tmp_path):
     (tmp_path / "imu.csv").write_text("timestamp, a_x, a_y, a_z\n1,2,3,4\n")
     assert read_imu(tmp_path)[:2] == (None, None)
