@@ -8,7 +8,7 @@ import numpy as np
 
 from mapper.core.errors import DataError, SourceError
 from mapper.core.frames import Sensor
-from mapper.core.geometry import Transform, inverse, transform
+from mapper.core.geometry import Transform, exp, inverse, transform
 from mapper.core.trajectory import Trajectory
 from mapper.sensing.wheel_kinematics import driven, without_jumps
 from mapper.sources.config import WheelsConfig
@@ -16,7 +16,7 @@ from mapper.sources.text import parse_numbers, parse_stamp, pose_from_numbers, r
 from mapper.sources.trajectory_files import read_tum, write_tum
 
 POSES, READINGS = "wheels.txt", "encoders.txt"
-_POSE_COLUMNS = 8
+_POSE_COLUMNS, _PLANAR_COLUMNS = 8, 4
 
 LOOKING_FORWARD: Mapping[Sensor, Transform] = {
     "rgbd": transform(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.zeros(3)),
@@ -46,8 +46,8 @@ def read_wheels(
     """Return T_odom_body of a log's wheels, if its folder has a file of them, a sentence on it, and notes.
 
     Args:
-        folder: Folder that may hold ``wheels.txt`` (``stamp tx ty tz qx qy qz qw`` of the base) or
-            ``encoders.txt`` (``stamp path_m steering_rad``).
+        folder: Folder that may hold ``wheels.txt`` (``stamp tx ty tz qx qy qz qw`` of the base, or ``stamp x
+            y yaw_rad``) or ``encoders.txt`` (``stamp path_m steering_rad``).
         config: The wheelbase, and where the body is.
         sensor: Sensor whose frame is the body's.
 
@@ -81,8 +81,11 @@ def read_wheels_file(
     Raises:
         SourceError: As above.
     """
-    if path.name == POSES or len(next(rows(path), (0, []))[1]) == _POSE_COLUMNS:
-        notes: list[str] = []
+    columns = len(" ".join(next(rows(path), (0, []))[1]).replace(",", " ").split())
+    notes: list[str] = []
+    if path.name == POSES and columns == _PLANAR_COLUMNS:
+        T_odom_base, notes = _planar(path)
+    elif path.name == POSES or columns == _POSE_COLUMNS:
         try:
             T_odom_base = read_tum(path)
         except DataError as error:
@@ -109,6 +112,22 @@ def write_wheels(folder: Path, wheels: Trajectory, *, sensor: Sensor) -> None:
     """
     T_odom_base = wheels.T_world_body @ inverse(LOOKING_FORWARD[sensor])
     write_tum(folder / POSES, replace(wheels, T_world_body=T_odom_base))
+
+
+def _planar(path: Path) -> tuple[Trajectory, list[str]]:
+    """Return poses in the plane, in time order, and notes."""
+    stamps_ns, numbers = [], []
+    for where, words in table(path, "stamp", "x", "y", "yaw_rad"):
+        stamps_ns.append(parse_stamp(words[0], where=where))
+        numbers.append(parse_numbers(words[1:], where=where))
+        if not np.isfinite(numbers[-1]).all():
+            raise SourceError(f"{where}: want finite x, y and yaw")
+    stamps = np.array(stamps_ns, dtype=np.int64)
+    order, notes = time_order(stamps, what=path.name)
+    poses = [exp(np.array([0.0, 0.0, yaw]), np.zeros(3)) for _, _, yaw in numbers]
+    T = np.array(poses)[order]
+    T[:, :2, 3] = np.array(numbers)[order, :2]
+    return Trajectory(stamps[order], T), notes
 
 
 def _integrated(path: Path, wheelbase_m: float | None, wheelbase_by: str) -> tuple[Trajectory, list[str]]:

@@ -32,6 +32,20 @@ def test_poses_beside_a_log_are_led_to_a_camera_that_looks_forward(tiny_tum_log)
     np.testing.assert_allclose(wheels.T_world_body[0][:3, 3], [0.1, 0.0, 0.4], atol=1e-12)
 
 
+@pytest.mark.parametrize("header", ["", "timestamp,x,y,yaw\n", "# stamp x y yaw\n"])
+def test_poses_in_the_plane_are_read(tiny_tum_log, header):
+    log = tiny_tum_log(3)
+    base = arc(4, turn_rad=0.2)
+    stamps_s = (base.stamps_ns - base.stamps_ns[0] + FIRST_NS) / S
+    yaw = np.arctan2(base.T_world_body[:, 1, 0], base.T_world_body[:, 0, 0])
+    rows = np.column_stack([stamps_s, base.positions_world[:, :2], yaw])[::-1]
+    text = "\n".join(",".join(f"{value:.9f}" for value in row) for row in rows)
+    (log / "wheels.txt").write_text(header + text)
+    wheels = open_source(log).wheels
+    expected = base.T_world_body @ transform(R_BASE_OPTICAL, np.zeros(3))
+    np.testing.assert_allclose(wheels.T_world_body, expected, atol=1e-6)
+
+
 def test_encoders_beside_a_log_want_a_wheelbase(tiny_tum_log):
     log = tiny_tum_log(3)
     first_s, second_s = FIRST_NS // S, FIRST_NS // S + 1
