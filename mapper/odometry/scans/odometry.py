@@ -39,12 +39,13 @@ _DISPLACED = 0.5
 class ScanOdometry(FrameOdometry[ScanObservation]):
     """Odometry by constant-velocity prediction, a scan matcher, and acceptance by this log's medians.
 
-    A pose is compared with the last keyframe: the share of the points that have a partner there, the share
-    that agrees in the direction where the least does, the points in space that rays passed, and the jump from
-    the predicted pose. Where these differ from the log's medians, other hypotheses are tried; a pose that
-    still differs is doubtful, and where next to nothing agrees, lost. A doubtful scan does not enter the map;
-    if it is far, it is a keyframe with an inflated covariance, from which tracking goes on once another scan
-    fits it and not the keyframe before.
+    A pose is compared with the last keyframes and the last scan: the share of the points that have a partner
+    there, the share that agrees in the direction where the least does, the points in space that rays passed,
+    and the jump from the predicted pose. Where these differ from the log's medians, other hypotheses are
+    tried; a pose that still differs is doubtful, and where next to nothing agrees, lost. A scan of which the
+    keyframe shows little is the next keyframe. A doubtful scan does not enter the map; if it is far, it is a
+    keyframe with an inflated covariance, from which tracking goes on once another scan fits it and not the
+    keyframe before.
     Keyframes are the nodes, numbered from 0, each with a factor to an earlier one. Motions that the surfaces
     do not show are predicted, with a covariance that grows until they are seen again.
     """
@@ -164,7 +165,8 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
         motion: Motion = self._motion.twist if placed.sweep is None else placed.sweep
         T_world_body = found.T_world_middle @ motion.over(-observation.middle_s)
         T_key_body = inverse(found.keyframe.T_world_body) @ T_world_body
-        is_keyframe = found.fits_last or is_far(T_key_body, self._config)
+        is_new = self._assessment.shows_less(found) and not is_doubtful
+        is_keyframe = is_new or is_far(T_key_body, self._config)
         at_stamp = observation.middle_s**2 * placed.velocity_covariance
         scan = ScanKeyframe(self._next_node, deskewed, found.T_world_middle, T_world_body, at_stamp)
         if not is_doubtful:

@@ -37,6 +37,10 @@ class PoseAssessment:
             or not self.fits(candidate)
         )
 
+    def shows_less(self, candidate: PoseCandidate) -> bool:
+        """Return whether the keyframe alone shows less of a scan than the log's scans do of each other."""
+        return candidate.fit.overlap < self._config.usual_ratio * self.statistics.median.overlap
+
     def fits(self, candidate: PoseCandidate) -> bool:
         """Return whether a pose fits as the log's scans do."""
         log, shares = self.statistics, candidate.shares
@@ -61,11 +65,11 @@ class PoseAssessment:
         return share < (self._config.lost_ratio if speaks_against else 0.5 * self._config.lost_ratio)
 
     def doubts(self, candidate: PoseCandidate) -> tuple[Doubt, ...]:
-        """Return what speaks against a pose; empty if it is believed, as one that fits the last scan is.
+        """Return what speaks against a pose; empty if it is believed.
 
         Little overlap alone is a new room, and a jump alone a sudden turn.
         """
-        if self._config.usual_ratio == 0.0 or candidate.fits_last:
+        if self._config.usual_ratio == 0.0:
             return ()
         log, shares = self.statistics, candidate.shares
         little = log.has_little_overlap(shares, usual_ratio=self._config.usual_ratio)

@@ -83,11 +83,10 @@ class PoseCandidate:
         keyframe: Keyframe that it was compared with.
         T_world_middle: (4, 4) the pose.
         fit: Fit to that keyframe.
-        shares: Shares of the fit that are compared with those of the log.
+        shares: Shares on this keyframe and the scans about it, compared with those of the log.
         jump: Deviation from the predicted pose.
         open_m: (6,) errors of the motions that were predicted instead of measured.
         method: Step that found it.
-        fits_last: It is doubtful or lost by this keyframe, and fits the last scan well.
     """
 
     keyframe: ScanKeyframe
@@ -97,7 +96,6 @@ class PoseCandidate:
     jump: Jump
     open_m: Array
     method: str
-    fits_last: bool = False
 
     @property
     def is_measured(self) -> bool:

@@ -11,7 +11,7 @@ from mapper.odometry.scans.config import ScanOdometryConfig
 from mapper.odometry.scans.motion_model import MotionModel, Spread
 from mapper.odometry.scans.pose_assessment import PoseAssessment
 from mapper.odometry.scans.pose_candidate import PoseCandidate, Shares, fuse_with_prediction, jump_between
-from mapper.odometry.scans.scan_fit import ScanFit, ScanKeyframe, contradiction, described, fit_of
+from mapper.odometry.scans.scan_fit import ScanFit, ScanKeyframe, contradiction, described, fit_of, shares_on
 from mapper.odometry.scans.scan_matcher import DeskewedScan, ScanMatcher
 from mapper.registration.base import Aligner
 from mapper.registration.factory import build_registration
@@ -44,15 +44,21 @@ class KnownPath:
     is_last_sure: bool
     motion: MotionModel
 
+    @property
+    def sure_scans(self) -> Sequence[ScanKeyframe]:
+        """The last keyframes, and the last scan if its pose is not in doubt."""
+        return (*self.keyframes, *((self.last,) if self.last is not None and self.is_last_sure else ()))
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Scan:
-    """A scan with the pose that is predicted for it, and what rules out another."""
+    """A scan with the pose that is predicted for it, what rules out another, and the sure scans before it."""
 
     deskewed: DeskewedScan
     T_world_predicted: Transform
     spread: Spread | None
     is_ruled_out: Callable[[Transform], bool]
+    before: Sequence[ScanKeyframe]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -96,26 +102,13 @@ class PoseSearch:
         """
         motion = path.motion
         is_ruled_out = partial(motion.is_ruled_out, time_ns)
-        scan = _Scan(deskewed, motion.predicted(time_ns), motion.spread(time_ns), is_ruled_out)
-        tracked = found = self._track(scan, path.keyframes, T_world_guess)
+        scan = _Scan(
+            deskewed, motion.predicted(time_ns), motion.spread(time_ns), is_ruled_out, path.sure_scans
+        )
+        found = self._track(scan, path.keyframes, T_world_guess)
         if found is None or (not self._believes_all and self._assessment.is_suspect(found)):
             found = self._search(scan, path, found)
-        is_lost = found is None or self._assessment.is_lost(found)
-        if found is not None and not is_lost and not self._assessment.doubts(found):
-            return found
-        if tracked is not None and self._fits_last(scan, path, tracked):
-            return replace(tracked, fits_last=True)
-        return None if is_lost else found
-
-    def _fits_last(self, scan: _Scan, path: KnownPath, tracked: PoseCandidate) -> bool:
-        """Return whether a scan fits the last one as the log's scans fit keyframes.
-
-        A sensor that tilts soon sees another part of the scene than its keyframe.
-        """
-        if path.last is None or not path.is_last_sure:
-            return False
-        beside = self._candidate(scan, _Hypothesis(tracked.T_world_middle, path.last, 0, tracked.method))
-        return beside is not None and beside.is_measured and not self._assessment.is_suspect(beside)
+        return None if found is None or self._assessment.is_lost(found) else found
 
     def _track(
         self, scan: _Scan, keyframes: Sequence[ScanKeyframe], T_world_guess: Transform | None
@@ -180,8 +173,21 @@ class PoseSearch:
             T_world_middle = in_plane(T_world_middle)
             fit = self._fit_again(scan, keyframe, fit, T_world_found, T_world_middle)
         jump = jump_between(scan.T_world_predicted, T_world_middle, scan.spread)
-        shares = Shares(fit.overlap, fit.agreement, fit.contradicting)
+        shares = self._shares_of(fit, scan, keyframe, T_world_found)
         return PoseCandidate(keyframe, T_world_middle, fit, shares, jump, open_m, hypothesis.method)
+
+    def _shares_of(
+        self, fit: ScanFit, scan: _Scan, keyframe: ScanKeyframe, T_world_middle: Transform
+    ) -> Shares:
+        """Return the shares on all sure scans; on one in doubt alone, and of planar scans on the keyframe."""
+        overlap, agreement = fit.overlap, fit.agreement
+        if not fit.is_planar and any(one is keyframe for one in scan.before):
+            others = [one for one in scan.before if one is not keyframe]
+            reach_m = self._config.max_pair_distance_m
+            overlap, agreement = shares_on(
+                fit, others, scan.deskewed, T_world_middle, max_pair_distance_m=reach_m
+            )
+        return Shares(overlap, agreement, fit.contradicting)
 
     def _fit_again(
         self,

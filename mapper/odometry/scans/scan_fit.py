@@ -1,5 +1,6 @@
 """Fit of a scan to a keyframe under a motion: overlap, agreement by direction, free space, observability."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -7,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.frames import Points32
-from mapper.core.geometry import Array, Transform, apply
+from mapper.core.geometry import Array, Transform, apply, inverse
 from mapper.core.linear import gram
 from mapper.odometry.scans.scan_fit_kernels import count_showing, pair_rows
 from mapper.odometry.scans.scan_matcher import DeskewedScan
@@ -93,6 +94,8 @@ class ScanFit:
         observability: (6,) of the degeneracy's motions: probability that surfaces show it, not chance.
         unobservable: Names of the motions that are rather not measured, as in "translation along x".
         is_planar: The scans are planar: z and tilt are not measured, but known to be 0.
+        paired: (N,) which of the scan's prepared points have a partner in range.
+        agreeing: (N,) which of them lie on the surfaces.
     """
 
     overlap: float
@@ -106,6 +109,8 @@ class ScanFit:
     observability: Array
     unobservable: str
     is_planar: bool
+    paired: NDArray[np.bool_]
+    agreeing: NDArray[np.bool_]
 
 
 def described(deskewed: DeskewedScan) -> ScanDescription:
@@ -207,7 +212,42 @@ def fit_of(
         observability=observability,
         unobservable=unobservable,
         is_planar=is_planar,
+        paired=distances_m <= reach_m,
+        agreeing=agree,
     )
+
+
+def shares_on(
+    fit: ScanFit,
+    others: Iterable[ScanKeyframe],
+    deskewed: DeskewedScan,
+    T_world_scan: Transform,
+    *,
+    max_pair_distance_m: float,
+) -> tuple[float, float]:
+    """Return overlap and agreement with a keyframe and, where it shows nothing, with other scans.
+
+    One scan shows little of what the next sees of a narrow view, from sparse rings or while it turns; the
+    first of several that shows a point's surroundings decides whether it agrees.
+
+    Args:
+        fit: To the keyframe, at the same pose.
+        others: The other scans.
+        deskewed: The scan.
+        T_world_scan: (4, 4) its pose in the middle of its sweep.
+        max_pair_distance_m: Largest distance between the points of a pair.
+    """
+    source, paired, agreeing = deskewed.prepared, fit.paired.copy(), fit.agreeing.copy()
+    for other in others:
+        alone = np.flatnonzero(~paired)
+        target = other.deskewed.prepared
+        points = apply(inverse(other.T_world_middle) @ T_world_scan, source.points[alone])
+        indices, distances_m = target.nearest(points)
+        normals = target.normals[indices]
+        off_m = np.abs(np.einsum("ni,ni->n", normals, points - target.points[indices]))
+        paired[alone] = near = distances_m <= max_pair_distance_m
+        agreeing[alone] = near & (off_m <= _SURFACE_VOXELS * source.voxel_m) & normals.any(axis=1)
+    return float(paired.mean()), weakest_direction(source.normals, agreeing)[0]
 
 
 def _in_sight(keyframe: ScanDescription, points_key: Array) -> NDArray[np.bool_]:
