@@ -16,6 +16,8 @@ from mapper.sources.base import Log
 _STATED_RAD, _UNSTATED_RAD = 0.1, 2.0  # a mounting in tf is right to some degrees, or wrong altogether
 _BIAS_RADPS, _OFFSET_S = 0.02, 0.05  # of units without calibration, and of unsynchronised clocks
 _TRIED_OFFSETS_S = 0.025 * np.arange(-10, 11)
+_FAR_OFFSETS_S, _FEWEST_TURNS, _LEAST_CORRELATION = 0.05 * np.arange(-200, 201), 20, 0.9
+"""Offsets that are only told, and turns and correlation of speeds that tell them."""
 _ITERATIONS = 8
 _KERNEL = 2.4  # Cauchy's, in standard deviations
 _LEAST_SIGMA_RAD = 1e-4
@@ -242,12 +244,45 @@ def _closed_form(
 
 
 def _speed_ratio(gyroscope: Gyroscope, begins_ns: Stamps, ends_ns: Stamps, measured: Array) -> float:
+    turned = _angles(gyroscope, begins_ns, ends_ns)
+    return float(np.median(np.linalg.norm(measured, axis=1) / np.maximum(turned, 1e-9)))
+
+
+def _angles(gyroscope: Gyroscope, begins_ns: Stamps, ends_ns: Stamps) -> Array:
+    """Return the (M,) integrals of the readings' lengths between pairs of times; NaN beyond the readings."""
     speeds = np.linalg.norm(gyroscope.rates_radps, axis=1)
     seconds = (gyroscope.stamps_ns - gyroscope.stamps_ns[0]) / NS_PER_S
     travelled = np.concatenate([[0.0], np.cumsum(np.diff(seconds) * 0.5 * (speeds[1:] + speeds[:-1]))])
-    begin, end = ((ns - gyroscope.stamps_ns[0]) / NS_PER_S for ns in (begins_ns, ends_ns))
-    turned = np.interp(end, seconds, travelled) - np.interp(begin, seconds, travelled)
-    return float(np.median(np.linalg.norm(measured, axis=1) / np.maximum(turned, 1e-9)))
+    begun, ended = (
+        np.interp((ns - gyroscope.stamps_ns[0]) / NS_PER_S, seconds, travelled, left=np.nan, right=np.nan)
+        for ns in (begins_ns, ends_ns)
+    )
+    return np.asarray(ended - begun, np.float64)
+
+
+def offset_by_speeds(
+    gyroscope: Gyroscope, begins_ns: Stamps, ends_ns: Stamps, R_begin_end: Array
+) -> float | None:
+    """Return the seconds added to frames' stamps at which their turns are as fast as the readings say.
+
+    Whatever mounting and unit are, within 10 s; None where at no offset they are.
+
+    Args:
+        gyroscope: The readings.
+        begins_ns: (M,) times of frames.
+        ends_ns: (M,) times of the frames after them.
+        R_begin_end: (M, 3, 3) measured rotations of the body between them.
+    """
+    seconds = (ends_ns - begins_ns) / NS_PER_S
+    measured = np.linalg.norm(_logs(R_begin_end), axis=1) / seconds
+    best = _LEAST_CORRELATION, None
+    for offset_s in _FAR_OFFSETS_S.tolist():
+        shift_ns = round(offset_s * NS_PER_S)
+        turned = _angles(gyroscope, begins_ns + shift_ns, ends_ns + shift_ns) / seconds
+        known = np.isfinite(turned)
+        if known.sum() >= _FEWEST_TURNS and turned[known].std() > 0.0 and measured[known].std() > 0.0:
+            best = max(best, (float(np.corrcoef(turned[known], measured[known])[0, 1]), offset_s))
+    return best[1]
 
 
 def _prior_sigmas(gyroscope: Gyroscope) -> Array:

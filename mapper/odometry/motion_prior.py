@@ -9,13 +9,14 @@ import numpy as np
 from mapper.core.deskew import SampledMotion, Twist
 from mapper.core.geometry import Array, Transform, inverse, rotation_log
 from mapper.core.running_median import RunningMedian
-from mapper.core.timebase import NS_PER_S
+from mapper.core.timebase import NS_PER_S, Stamps
 from mapper.core.trajectory import Trajectory
 from mapper.odometry.gyroscope_calibration import (
     CERTAIN_RAD,
     DEGREES,
     GyroscopeCalibration,
     calibrate,
+    offset_by_speeds,
     uncalibrated,
 )
 from mapper.sensing.gyroscope import Gyroscope
@@ -32,7 +33,7 @@ _SLIPPED, _STANDING_M = 0.5, 0.05
 they slip, their mounting or their clock is wrong."""
 _MOST_BETWEEN_READINGS_NS = NS_PER_S
 _ANOTHER_RAD = 0.2  # of a mounting that contradicts tf's
-_ANOTHER_UNIT = 1.25
+_ANOTHER_UNIT, _ANOTHER_CLOCK_S = 1.25, 0.2
 _CONTRADICTION_RAD, _CONTRADICTION_SIGMAS = 0.2, 6.0  # far beyond any error but that of a wrong pose
 
 
@@ -242,6 +243,13 @@ class MotionPrior:
                 f"{name}: no readings at the times of {self._uncovered} of "
                 f"{self._uncovered + self._measured} frames; has it another clock?"
             )
+        offset_s = offset_by_speeds(gyroscope, *self._turns_measured()) if self._intervals else None
+        if offset_s is not None and abs(offset_s - found.offset_s) > _ANOTHER_CLOCK_S:
+            late = f"{abs(offset_s):.2f} s {'late' if offset_s > 0.0 else 'early'}"
+            notes.append(
+                f"{name}: its stamps are {late}, by the turns of the frames; is its clock right? "
+                f"source.imu_offset_s={-offset_s:.2f} corrects that"
+            )
         if not self._used and self._measured:
             notes.append(
                 f"{name}: not used: constant velocity predicts the frames' rotations as well or better"
@@ -257,8 +265,7 @@ class MotionPrior:
 
     def _fit(self, gyroscope: Gyroscope) -> None:
         """Calibrate by all intervals, and compute the last errors again."""
-        begins_ns, ends_ns = (np.array([one[k] for one in self._intervals], np.int64) for k in (0, 1))
-        R_begin_end = np.array([one[2] for one in self._intervals])
+        begins_ns, ends_ns, R_begin_end = self._turns_measured()
         self._calibration = calibrate(gyroscope, begins_ns, ends_ns, R_begin_end)
         self._of_body = None
         count = len(self._errors)
@@ -268,6 +275,11 @@ class MotionPrior:
             float(np.linalg.norm(rotation_log(turned.T @ measured)))
             for turned, measured in zip(R_turned, R_begin_end[-count:], strict=True)
         )
+
+    def _turns_measured(self) -> tuple[Stamps, Stamps, Array]:
+        """Return the (M,) times before and after, and the (M, 3, 3) rotations between, of the last frames."""
+        begins_ns, ends_ns = (np.array([one[k] for one in self._intervals], np.int64) for k in (0, 1))
+        return begins_ns, ends_ns, np.array([one[2] for one in self._intervals])
 
     def _turn(self, begin_ns: int, end_ns: int) -> tuple[Array, float] | None:
         """Return the gyroscope's rotation and its standard deviation by the calibration alone."""

@@ -182,6 +182,21 @@ def test_a_gyroscope_of_another_clock_is_named():
     assert [note for note in prior.notes() if "clock" in note] == prior.notes()
 
 
+@pytest.mark.parametrize("offset_s", [3.0, -4.5])
+def test_a_clock_that_is_seconds_off_is_named_with_the_setting_that_corrects_it(offset_s):
+    times_s, rates, R = swinging(14)
+    _, _, prior = predictions(
+        readings(times_s, rates, offset_s=offset_s, unit=180.0 / np.pi), *frames(times_s, R)
+    )
+    assert sum(f"source.imu_offset_s={-offset_s:.2f}" in note for note in prior.notes()) == 1
+    for right_s in (0.012, 0.5):  # which the calibration finds
+        _, _, prior = predictions(readings(times_s, rates, offset_s=right_s), *frames(times_s, R))
+        assert not any("source.imu_offset_s" in note for note in prior.notes())
+    _, _, other = swinging(15)
+    _, _, unrelated = predictions(readings(times_s, rates), *frames(times_s, other))
+    assert not any("source.imu_offset_s" in note for note in unrelated.notes())
+
+
 def test_without_a_gyroscope_the_velocity_stays():
     prior = MotionPrior(None)
     np.testing.assert_array_equal(prior.predict(0, NS_PER_S, STILL, np.ones(3)), np.eye(4))
