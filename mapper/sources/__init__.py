@@ -112,11 +112,14 @@ def open_source(path: Path, config: SourceConfig = _DEFAULTS) -> "Log":
     if (path / MANIFEST_NAME).is_file():
         raise SourceError(f"{path}: holds what mapper made, not a log; mapper eval {path} judges it")
     above = path.absolute().parent
-    outer = f"; the folder it is in, {above}, is one" if format_of(above) else ""
     if what := _other_data(path):
-        raise SourceError(f"{path}: {what}{outer if path.is_dir() else ''}")
-    one = "; of clouds it has one, want two or more" if most_clouds(path) == 1 else ""
-    hint = outer or one or _inner_hint(path)
+        within = f"; the folder it is in, {above}, is one" if path.is_dir() and format_of(above) else ""
+        raise SourceError(f"{path}: {what}{within}")
+    if path.is_file():
+        hint = f"; the folder it is in, {above}, is one" if format_of(above) else ""
+    else:
+        one = "; of clouds it has one, want two or more" if most_clouds(path) == 1 else ""
+        hint = one or _inner_hint(path)
     raise SourceError(
         f"{path}: not a log of a known format (TUM, 7-Scenes, KITTI, EuRoC, clouds, exports of apps, .mcap, "
         f".bag, .db3, .mbag, .e57 …); docs/your-sensor.md has them all{hint}"

@@ -64,7 +64,8 @@ def test_encoders_beside_a_log_want_a_wheelbase(tiny_tum_log):
         ("encoders.txt", "1.0 2.0\n", r"encoders.txt:1: 2 columns, want 3: stamp path_m steering_rad"),
         ("encoders.txt", "1.0 2.0 1.6\n", r"encoders.txt:1: .* within ±π/2 rad"),
         ("encoders.txt", "# none\n", r"encoders.txt: no readings"),
-        ("wheels.txt", "1.0 0 0 0\n", r"wheels.txt:1: 4 columns, want 8"),
+        ("wheels.txt", "1.0 0 0 0 0\n", r"wheels.txt:1: 5 columns, want 8"),
+        ("wheels.txt", "1.0 0 0 nan\n", r"wheels.txt:1: want finite x, y and yaw"),
     ],
 )
 def test_malformed_files_are_named(tiny_tum_log, name, text, why):
