@@ -152,7 +152,7 @@ def test_poses_that_are_the_odometry_have_no_offset(tmp_path):
 
 def test_a_log_of_scans_alone_says_that_nothing_is_compared(tmp_path):
     for index in range(12):
-        points = np.random.default_rng(0).uniform(0.0, 9.0, (500, 4)).astype("<f4")
+        points = np.random.default_rng(index).uniform(0.0, 9.0, (500, 4)).astype("<f4")
         (tmp_path / f"{index:06d}.bin").write_bytes(points.tobytes())
     shown = mapper("inspect", tmp_path, "--time-offset").output
     assert sum(line.startswith("time ") for line in shown.splitlines()) == 1
