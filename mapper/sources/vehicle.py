@@ -24,6 +24,8 @@ _MAX_STILL_WORLD_RATIO = 0.5
 """If more of the far cells stand still, so does the sensor, or it moves along a tunnel."""
 _MAX_STEP_CELLS = 2
 """At most one empty cell lies between two members of a group."""
+_LEVEL_CELLS, _CEILING_M = 2, 1.0
+"""Height of a level layer above a LiDAR, and distance from which on it is a ceiling, which stands still."""
 _MAX_RETURNS_RATIO = 0.3
 """What takes up more of the view is no vehicle: it is the object that is scanned."""
 _MARGIN_M = 0.05
@@ -166,17 +168,11 @@ def vehicle_box(log: Log) -> Box | None:
     world = still[far & (standing >= 2.0 / len(clouds))]
     if not far.any() or (len(world) and world.mean() > _MAX_STILL_WORLD_RATIO):
         return None
-    joined = cluster_numbers(cells[still], _MAX_STEP_CELLS, norm=np.inf)
-    still_range_m = range_m[still]
-    own = np.array(
-        [
-            (standing[still][members := joined == label] >= _SURE_RATIO).sum() >= _MIN_SURE_CELLS
-            and still_range_m[members].max() <= scale.vehicle_m
-            for label in range(joined.max(initial=-1) + 1)
-        ],
-        np.bool_,
-    )
-    own_cells = cells[still][own[joined]] if len(own) else cells[:0]
+    cells, standing, range_m = cells[still], standing[still], range_m[still]
+    group_of = cluster_numbers(cells, _MAX_STEP_CELLS, norm=np.inf)
+    groups = [group_of == number for number in range(group_of.max(initial=-1) + 1)]
+    own = [one for one in groups if _is_vehicle(cells[one], standing[one], range_m[one], scale)]
+    own_cells = cells[np.any(own, axis=0)] if own else cells[:0]
     if not len(own_cells):
         return None
     lower = own_cells.min(axis=0) * scale.cell_m - _MARGIN_M
@@ -186,6 +182,14 @@ def vehicle_box(log: Log) -> Box | None:
         return None
     x_low, y_low, z_low, x_high, y_high, z_high = (round(float(v), 3) for v in (*lower, *upper))
     return x_low, y_low, z_low, x_high, y_high, z_high
+
+
+def _is_vehicle(cells: NDArray[np.int64], standing: Array, range_m: Array, scale: _Scale) -> bool:
+    """Return whether a group of cells is near, stands for sure, and is no ceiling seen in a few rings."""
+    is_sure = (standing >= _SURE_RATIO).sum() >= _MIN_SURE_CELLS and range_m.max() <= scale.vehicle_m
+    is_level = np.ptp(cells[:, 2]) < _LEVEL_CELLS and cells[:, 2].min() >= 0
+    is_ceiling = scale.ground_m is not None and is_level and range_m.min() >= _CEILING_M
+    return bool(is_sure and not is_ceiling)
 
 
 def _clouds(log: Log, scale: _Scale) -> tuple[list[Points], int]:

@@ -1,5 +1,7 @@
 """Box of the sensor's own vehicle, proposed from returns that stand still in the body frame."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -50,6 +52,22 @@ def test_the_box_holds_vehicle_and_driver_and_little_else():
     kept = sum(len(entry.scan().points_body) for entry in left.entries())
     total = sum(len(entry.scan().points_body) for entry in log.entries())
     assert total - kept == pytest.approx(len(own), rel=0.03)
+
+
+def test_rings_on_a_ceiling_are_no_vehicle():
+    log, _ = street_log(vehicle=False)
+    azimuth = np.linspace(0.0, 2.0 * np.pi, 300)
+    rings = [1.3 / np.tan(elevation) for elevation in (0.79, 0.68, 0.58, 0.47, 0.37)]
+    ceiling = np.concatenate(
+        [np.column_stack([r * np.cos(azimuth), r * np.sin(azimuth), 0.0 * azimuth + 1.3]) for r in rings]
+    )
+
+    def under_it(index):
+        scan = log.entry_at(index).scan()
+        points = np.concatenate([scan.points_body, ceiling.astype(np.float32)])
+        return MemoryEntry(index, Scan(index, points))
+
+    assert vehicle_box(replace(log, entry_at=under_it)) is None
 
 
 @pytest.mark.parametrize("body", [{"find_box": False}, {"box": (9.0, 9.0, 9.0, 10.0, 10.0, 10.0)}])
