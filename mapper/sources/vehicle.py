@@ -135,18 +135,20 @@ class _Scale:
         vehicle_m: The vehicle is within this distance.
         around_m: Returns up to here are used to distinguish walls that stand beside it.
         ground_m: Height up to which returns are the ground's; None where up is not known.
+        step: One of this number of returns is counted.
     """
 
     cell_m: float
     vehicle_m: float
     around_m: float
     ground_m: float | None
+    step: int
 
 
 _SCALES: Mapping[Sensor, _Scale] = {
-    "lidar": _Scale(cell_m=0.25, vehicle_m=4.0, around_m=12.0, ground_m=0.3),
-    "rgbd": _Scale(cell_m=0.05, vehicle_m=1.0, around_m=3.0, ground_m=None),
-    "lidar-2d": _Scale(cell_m=0.05, vehicle_m=1.0, around_m=3.0, ground_m=None),
+    "lidar": _Scale(cell_m=0.25, vehicle_m=4.0, around_m=12.0, ground_m=0.3, step=1),
+    "rgbd": _Scale(cell_m=0.05, vehicle_m=1.0, around_m=3.0, ground_m=None, step=8),
+    "lidar-2d": _Scale(cell_m=0.05, vehicle_m=1.0, around_m=3.0, ground_m=None, step=1),
 }
 
 
@@ -198,7 +200,7 @@ def _clouds(log: Log, scale: _Scale) -> tuple[list[Points], int]:
     returns = 0
     for entry in log.spread_entries(SPREAD_FRAMES):
         try:
-            points = entry.scan().points_body
+            points = entry.scan().points_body[:: scale.step]
         except FrameError:
             continue
         points = points.astype(np.float64)
