@@ -29,6 +29,8 @@ BOTH_HEADER = (
     "a_RS_S_x [m s^-2],a_RS_S_y [m s^-2],a_RS_S_z [m s^-2]"
 )
 """First line of the file (Burri et al. 2016)."""
+_MOST_READING = 1e9
+"""Readings in the smallest unit in use, mdeg/s, are below it."""
 
 
 def read_imu(folder: Path) -> tuple[Gyroscope | None, Accelerations | None, list[str]]:
@@ -140,7 +142,7 @@ def _feels_gravity(readings: Array) -> bool:
 
 
 def _usual_length(readings: Array) -> float:
-    return float(np.median(np.linalg.norm(readings, axis=1)))
+    return float(np.median(np.linalg.norm(np.clip(readings, -_MOST_READING, _MOST_READING), axis=1)))
 
 
 def write_gyroscope(folder: Path, gyroscope: Gyroscope) -> None:
@@ -218,8 +220,10 @@ def saturation_notes(name: str, accelerations: Array) -> list[str]:
 
 
 def _finite(name: str, stamps_ns: Stamps, values: Array, *, what: str) -> tuple[Stamps, Array, list[str]]:
-    are_finite = np.isfinite(values).all(axis=1)
+    are_finite = (np.abs(values) < _MOST_READING).all(axis=1)
     order, notes = time_order(stamps_ns[are_finite], what=name)
     if left_out := int((~are_finite).sum()):
-        notes.append(f"{name}: {left_out} of {len(values)} {what} are not finite; left out")
+        notes.append(
+            f"{name}: {left_out} of {len(values)} {what} are not finite or above {_MOST_READING:g}; left out"
+        )
     return stamps_ns[are_finite][order], values[are_finite][order], notes

@@ -26,6 +26,14 @@ def test_angular_velocities_that_are_not_finite_are_counted(tmp_path):
     assert [note for note in notes if "2 of 4" in note]
 
 
+def test_accelerations_that_no_unit_measures_are_counted(tmp_path):
+    rows = [f"{k} 0 0 0.1 0 0 {-1e300 if k == 2 else 9.8:g}" for k in range(1, 6)]
+    (tmp_path / "imu.txt").write_text("\n".join(rows))
+    gyroscope, accelerations, notes = read_imu(tmp_path)
+    assert (len(gyroscope), len(accelerations.stamps_ns)) == (5, 4)
+    assert [note for note in notes if "1 of 5" in note]
+
+
 RATES, FELT = [0.1, -0.2, 0.3], [0.5, 0.0, 9.8]
 IN_DEGREES = "time [s]\tgyro_x [deg/s]\tgyro_y [deg/s]\tgyro_z [deg/s]\tacc_x [g]\tacc_y [g]\tacc_z [g]"
 
