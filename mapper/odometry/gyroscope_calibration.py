@@ -1,5 +1,6 @@
 """Calibration of a gyroscope by the rotations that an odometry measures: mounting, bias, clock and unit."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from math import pi
 
@@ -244,20 +245,20 @@ def _closed_form(
 
 
 def _speed_ratio(gyroscope: Gyroscope, begins_ns: Stamps, ends_ns: Stamps, measured: Array) -> float:
-    turned = _angles(gyroscope, begins_ns, ends_ns)
+    turned = _turns(gyroscope)(begins_ns, ends_ns)
     return float(np.median(np.linalg.norm(measured, axis=1) / np.maximum(turned, 1e-9)))
 
 
-def _angles(gyroscope: Gyroscope, begins_ns: Stamps, ends_ns: Stamps) -> Array:
-    """Return the (M,) integrals of the readings' lengths between pairs of times; NaN beyond the readings."""
-    speeds = np.linalg.norm(gyroscope.rates_radps, axis=1)
-    seconds = (gyroscope.stamps_ns - gyroscope.stamps_ns[0]) / NS_PER_S
-    travelled = np.concatenate([[0.0], np.cumsum(np.diff(seconds) * 0.5 * (speeds[1:] + speeds[:-1]))])
-    begun, ended = (
-        np.interp((ns - gyroscope.stamps_ns[0]) / NS_PER_S, seconds, travelled, left=np.nan, right=np.nan)
-        for ns in (begins_ns, ends_ns)
-    )
-    return np.asarray(ended - begun, np.float64)
+def _turns(gyroscope: Gyroscope) -> Callable[[Stamps, Stamps], Array]:
+    """Return the function of the (M,) angles turned between pairs of times; NaN beyond the readings."""
+    first_ns, turned_rad = gyroscope.stamps_ns[0], gyroscope.turned_rad()
+    since_s = (gyroscope.stamps_ns - first_ns) / NS_PER_S
+
+    def turned_until(times_ns: Stamps) -> Array:
+        at_s = (times_ns - first_ns) / NS_PER_S
+        return np.asarray(np.interp(at_s, since_s, turned_rad, left=np.nan, right=np.nan), np.float64)
+
+    return lambda begins_ns, ends_ns: turned_until(ends_ns) - turned_until(begins_ns)
 
 
 def offset_by_speeds(
@@ -275,10 +276,10 @@ def offset_by_speeds(
     """
     seconds = (ends_ns - begins_ns) / NS_PER_S
     measured = np.linalg.norm(_logs(R_begin_end), axis=1) / seconds
-    best = _LEAST_CORRELATION, None
+    turns, best = _turns(gyroscope), (_LEAST_CORRELATION, None)
     for offset_s in _FAR_OFFSETS_S.tolist():
         shift_ns = round(offset_s * NS_PER_S)
-        turned = _angles(gyroscope, begins_ns + shift_ns, ends_ns + shift_ns) / seconds
+        turned = turns(begins_ns + shift_ns, ends_ns + shift_ns) / seconds
         known = np.isfinite(turned)
         if known.sum() >= _FEWEST_TURNS and turned[known].std() > 0.0 and measured[known].std() > 0.0:
             best = max(best, (float(np.corrcoef(turned[known], measured[known])[0, 1]), offset_s))

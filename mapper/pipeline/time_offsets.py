@@ -106,11 +106,7 @@ def _estimates(path: Trajectory, other: Trajectory | Gyroscope | CameraImages) -
     if isinstance(other, CameraImages):
         return [_delays_s(_motions(path)[1], _turns_of(other))]
     if isinstance(other, Gyroscope):
-        speeds = np.linalg.norm(other.rates_radps, axis=1)
-        turned = np.concatenate(
-            [[0.0], np.cumsum(np.diff(other.stamps_ns) * 0.5 * (speeds[1:] + speeds[:-1]))]
-        )
-        return [_delays_s(_motions(path)[1], _Motion(other.stamps_ns, turned))]
+        return [_delays_s(_motions(path)[1], _Motion(other.stamps_ns, other.turned_rad()))]
     both = zip(_motions(path), _motions(other), strict=True)
     return [_delays_s(own, others) for own, others in both]
 

@@ -127,6 +127,12 @@ class Gyroscope:
         columns = [np.interp(stamps_ns, self.stamps_ns, column) for column in self.rates_radps.T]
         return np.stack(columns, axis=1)
 
+    def turned_rad(self) -> Array:
+        """Return (N,) the angle turned until each reading, about whatever axes."""
+        speeds_radps = np.linalg.norm(self.rates_radps, axis=1)
+        steps_s = np.diff(self.stamps_ns) / NS_PER_S
+        return np.concatenate([[0.0], np.cumsum(0.5 * steps_s * (speeds_radps[1:] + speeds_radps[:-1]))])
+
     def _are_frozen(self) -> NDArray[np.bool_]:
         """Return which (N,) readings repeat the one before, in runs that no noise leaves."""
         repeats = np.zeros(len(self), np.bool_)
