@@ -198,19 +198,11 @@ def _rough_up(
         is_wanted = [(one.name == _FELT) == (config.up == "accelerometer") for one in candidates]
         chosen, is_decided = candidates[is_wanted.index(True)] if any(is_wanted) else chosen, True
     against = next((one for one in candidates if one.is_stated and chosen.contradicts(one)), None)
-    if against is None and (chosen.name == _FELT or config.up != "auto"):
-        return _RoughUp(chosen.up_world)
     if against is None:
+        if chosen.name == _FELT or config.up != "auto":
+            return _RoughUp(chosen.up_world)
         assumption = "" if axes.are_stated else f"up is taken to be {chosen.name}, as nothing states it"
-        conflict = ""
-        if axes.stands_on_floor:
-            facing_up, facing_down = _facing(patches, chosen.up_world, config.plane_tolerance_m)
-            if facing_down >= MIN_PATCHES and facing_down > _UPSIDE_DOWN * facing_up:
-                conflict = (
-                    f"of the level patches {facing_down} face down and {facing_up} up: is the LiDAR mounted "
-                    f"upside down? Up is taken by {chosen.name}; level.up=-z turns the map over, "
-                    "level.up=sensor says that it is right"
-                )
+        conflict = _hanging(chosen, patches, config.plane_tolerance_m) if axes.stands_on_floor else ""
         return _RoughUp(chosen.up_world, conflict, not conflict, assumption)
     angle_deg = np.degrees(chosen.angle_to(against))
     doubt = "" if is_decided else " though nothing decides"
@@ -257,6 +249,18 @@ def _above_floor(
     if not with_floor:
         return candidates[0], False
     return with_floor[0], not any(with_floor[0].contradicts(other) for other in with_floor)
+
+
+def _hanging(chosen: "_Candidate", patches: Patches, tolerance_m: float) -> str:
+    """Return that a LiDAR seems to hang upside down; empty if it does not."""
+    facing_up, facing_down = _facing(patches, chosen.up_world, tolerance_m)
+    if facing_down < MIN_PATCHES or facing_down <= _UPSIDE_DOWN * facing_up:
+        return ""
+    return (
+        f"of the level patches {facing_down} face down and {facing_up} up: is the LiDAR mounted "
+        f"upside down? Up is taken by {chosen.name}; level.up=-z turns the map over, "
+        "level.up=sensor says that it is right"
+    )
 
 
 def _facing(patches: Patches, up_guess: Array, tolerance_m: float) -> tuple[int, int]:

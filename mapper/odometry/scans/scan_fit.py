@@ -162,7 +162,8 @@ def fit_of(
     reach_m = (
         np.maximum(max_pair_distance_m, keyframe.spacing_m[indices]) if is_planar else max_pair_distance_m
     )
-    near = np.flatnonzero(distances_m <= reach_m)
+    paired = distances_m <= reach_m
+    near = np.flatnonzero(paired)
     if len(near) < _MIN_PAIRS:
         return None
     points = source.points[near]
@@ -183,7 +184,7 @@ def fit_of(
     if np.einsum("ni,ni->", rows[:, 3:], own_rows[:, 3:]) <= 0.0:
         return None
     agree = np.zeros(len(source.points), dtype=bool)
-    agree[near] = (np.abs(residuals_m) <= _SURFACE_VOXELS * source.voxel_m) & rows[:, 3:].any(axis=1)
+    agree[near] = _lie_on(residuals_m, rows[:, 3:], source.voxel_m)
     counting, seen = source.normals, len(source.points)
     if is_planar:
         in_sight = _in_sight(keyframe.description, points_key) | agree
@@ -212,7 +213,7 @@ def fit_of(
         observability=observability,
         unobservable=unobservable,
         is_planar=is_planar,
-        paired=distances_m <= reach_m,
+        paired=paired,
         agreeing=agree,
     )
 
@@ -244,10 +245,16 @@ def shares_on(
         points = apply(inverse(other.T_world_middle) @ T_world_scan, source.points[alone])
         indices, distances_m = target.nearest(points)
         normals = target.normals[indices]
-        off_m = np.abs(np.einsum("ni,ni->n", normals, points - target.points[indices]))
+        off_m = np.einsum("ni,ni->n", normals, points - target.points[indices])
         paired[alone] = near = distances_m <= max_pair_distance_m
-        agreeing[alone] = near & (off_m <= _SURFACE_VOXELS * source.voxel_m) & normals.any(axis=1)
+        agreeing[alone] = near & _lie_on(off_m, normals, source.voxel_m)
     return float(paired.mean()), weakest_direction(source.normals, agreeing)[0]
+
+
+def _lie_on(off_m: Array, normals: Array, voxel_m: float) -> NDArray[np.bool_]:
+    """Return which (N,) points lie on surfaces, by their distances from these and the normals."""
+    on_surfaces: NDArray[np.bool_] = (np.abs(off_m) <= _SURFACE_VOXELS * voxel_m) & normals.any(axis=1)
+    return on_surfaces
 
 
 def _in_sight(keyframe: ScanDescription, points_key: Array) -> NDArray[np.bool_]:

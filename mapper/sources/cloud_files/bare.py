@@ -94,8 +94,10 @@ def _is_by_column(numbers: NDArray[np.float32]) -> bool:
     """
     if len(numbers) < 10 * MIN_POINTS * KITTIS:
         return False
-    negative = (numbers.reshape(KITTIS, -1) < 0.0).mean(axis=1)
-    return bool(negative[3] == 0.0 and negative[:3].max() > _MAX_NEGATIVE_RATIO)
+    *coordinates, intensities = numbers.reshape(KITTIS, -1)
+    if (intensities < 0.0).any():
+        return False
+    return max(float((column < 0.0).mean()) for column in coordinates) > _MAX_NEGATIVE_RATIO
 
 
 def _nclt_columns(path: Path, size: int) -> Columns | None:
