@@ -1,5 +1,6 @@
 """Pose graphs as g2o text (Kümmerle et al. 2011), as GTSAM, g2o and SE-Sync read it, and TORO's in 2D."""
 
+from collections import Counter
 from collections.abc import Callable, Container, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -10,9 +11,10 @@ from typing import get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.core.errors import GraphError, MapperError
+from mapper.core.errors import GraphError, MapperError, listed
 from mapper.core.geometry import Array
 from mapper.core.rotations import pose_of_row, row_of_pose
+from mapper.graph.components import by_odometry
 from mapper.graph.model import BetweenFactor, Origin, PoseGraph
 from mapper.runtime.atomic import write_text
 from mapper.runtime.progress import SILENT, Progress
@@ -73,6 +75,8 @@ def _as_gtsam_takes(information: Array) -> tuple[Array, NDArray[np.bool_]]:
     return taken, ~positive
 
 
+_Row = tuple[int, list[int], str, Array]
+"""Line, ids, note and pose of a vertex or an edge."""
 _ORIGINS: tuple[Origin, ...] = get_args(Origin)
 _PARAMETERS = "PARAMS_"
 """Begins tags of sensors' mountings, which the g2o library writes; no edge that is read here uses one."""
@@ -122,33 +126,39 @@ def read_g2o(path: Path, *, guess_loops: bool = False, progress: Progress = SILE
 
     A vertex without a stamp gets its id as nanoseconds, which only orders it. A 2D edge holds the
     three motions out of its plane with its own largest information. Information with a negative
-    eigenvalue, as in the published cubicle graph, is what GTSAM's Cholesky factor makes of it.
+    eigenvalue, as in the published cubicle graph, is what GTSAM's Cholesky factor makes of it. Of edges
+    alone the poses are chained, each to an earlier id by the edge between the nearest.
 
     Args:
         path: The file.
         guess_loops: An edge without an origin is a loop unless it joins a vertex to the next one, by the ids
             or in the file, whichever has more edges between neighbours; otherwise it counts as odometry.
-        progress: Receives a note of how many edges have such information or none, and of priors, which are
-            left out.
+        progress: Receives a note of how many edges have such information or none, of poses that are chained,
+            and of priors and landmarks, which are left out.
 
     Raises:
-        GraphError: The file cannot be read, has no vertices, or a line has an unknown tag, a wrong
-            number of columns, a number that is not finite, an id that is unknown or taken, or
+        GraphError: The file cannot be read, has no poses, or a line has an unknown tag, a wrong number of
+            columns, a number that is not finite, an id that is unknown or taken, or
             information whose diagonal is not positive; the message names file and line. Or loops are to
             be guessed, and edges join fewer than half of the neighbours in either order.
     """
     tables = _tables(path, progress)
     graph = PoseGraph()
-    for line, (node,), note, T_world_node in _in_order(path, tables, _VERTICES):
+    edges = _in_order(path, tables, _EDGES)
+    vertices = _in_order(path, tables, _VERTICES)
+    are_chained = not vertices
+    if are_chained:
+        line_of = {node: line for line, ids, _, _ in edges for node in ids}
+        vertices = [(line_of[node], [node], "", np.eye(4)) for node in sorted(line_of)]
+    for line, (node,), note, T_world_node in vertices:
         try:
             graph.add_node(node, int(_noted(note, "stamp_ns", str(node))), T_world_node)
         except (MapperError, ValueError) as error:
             raise GraphError(f"{path}:{line}: {error}") from None
     if not graph.T_world_node:
-        raise GraphError(f"{path}: no vertices; want g2o text with {' or '.join(_VERTICES)} lines")
+        raise GraphError(f"{path}: no poses; want g2o text with {' or '.join(_FORMS)} lines")
     graph.fixed = _fixed(path, tables.get(_FIX, _Table()), graph)
     informations = _informations(path, tables, progress)
-    edges = _in_order(path, tables, _EDGES)
     rank = {}
     if guess_loops and not all(note.split()[:1] == ["origin"] for _, _, note, _ in edges):
         rank = _order_of_travel(path, list(graph.T_world_node), [ids for _, ids, _, _ in edges])
@@ -159,6 +169,10 @@ def read_g2o(path: Path, *, guess_loops: bool = False, progress: Progress = SILE
             graph.add_factors([BetweenFactor(i, j, T_i_j, informations[line], _origin(note, unnamed))])
         except MapperError as error:
             raise GraphError(f"{path}:{line}: {error}") from None
+    if are_chained:
+        progress.note(f"{path}: no vertices; {len(vertices)} initial poses are chained along its edges")
+        nearest_first = sorted(graph.factors, key=lambda factor: abs(factor.j - factor.i))
+        graph = graph.with_poses(by_odometry(graph.with_factors(nearest_first)))
     return graph
 
 
@@ -236,7 +250,18 @@ _TORO = {"VERTEX2": "VERTEX_SE2", "EDGE2": "EDGE_SE2"}
 _TORO_EDGE = [0, 1, 2, 3, 4, 5, 6, 9, 7, 10, 8]
 """Of ids, motion and I₁₁ I₁₂ I₂₂ I₃₃ I₁₃ I₂₃ the order that g2o has."""
 _FIX = "FIX"
-_PRIORS = frozenset({"EDGE_SE3_PRIOR", "EDGE_PRIOR_SE2", "EDGE_PRIOR_SE2_XY", "EDGE_SE2_PRIOR"})
+_LANDMARKS = frozenset({"VERTEX_XY", "VERTEX_TRACKXYZ"})
+_LEFT_OUT = {
+    **dict.fromkeys(
+        ("EDGE_SE3_PRIOR", "EDGE_PRIOR_SE2", "EDGE_PRIOR_SE2_XY", "EDGE_SE2_PRIOR"), "priors on single poses"
+    ),
+    **dict.fromkeys(_LANDMARKS, "landmarks"),
+    **dict.fromkeys(
+        ("EDGE_SE2_XY", "EDGE_BEARING_SE2_XY", "EDGE_SE3_TRACKXYZ", "EDGE_PROJECT_DEPTH"),
+        "sightings of landmarks",
+    ),
+}
+"""What lines are that are not solved, by their tags, of which g2o's library has these."""
 _FORTRAN = str.maketrans("Dd", "ee")
 """Fortran writes exponents as 1.0D+00."""
 _IDENTITY_INFORMATION = {n: ["1" if i == j else "0" for i in range(n) for j in range(i, n)] for n in (3, 6)}
@@ -246,15 +271,18 @@ _IDENTITY_INFORMATION = {n: ["1" if i == j else "0" for i in range(n) for j in r
 def _tables(path: Path, progress: Progress) -> dict[str, _Table]:
     """Sort the lines by their tags; numbers are checked in bulk afterwards."""
     tables: dict[str, _Table] = {}
-    priors = uninformed = 0
+    left_out = Counter[str]()
+    landmarks = set[str]()
+    uninformed = 0
     lines = read_text(path, error=GraphError).splitlines()
     for line, text in enumerate(lines, start=1):
         body, _, note = text.partition("#")
         tag, *words = body.split() or [""]
         if tag == "" or tag.startswith(_PARAMETERS):
             continue
-        if tag in _PRIORS:
-            priors += 1
+        if tag in _LEFT_OUT:
+            left_out[_LEFT_OUT[tag]] += 1
+            landmarks.update(words[:1] if tag in _LANDMARKS else [])
             continue
         if tag in _TORO:
             words = [words[k] for k in _TORO_EDGE] if len(words) == len(_TORO_EDGE) else words
@@ -277,8 +305,11 @@ def _tables(path: Path, progress: Progress) -> dict[str, _Table]:
             raise GraphError(f"{path}:{line}: {error}{remedy}") from None
         table.lines.append(line)
         table.notes.append(note)
-    if priors:
-        progress.note(f"{path}: {priors} priors on single poses are left out; edges alone are solved")
+    if (fixed := tables.get(_FIX)) is not None:
+        fixed.ids = [[one for one in ids if f"{one}" not in landmarks] for ids in fixed.ids]
+    if left_out:
+        counts = listed([f"{number} {what}" for what, number in left_out.items()])
+        progress.note(f"{path}: {counts} are left out; edges between poses alone are solved")
     if uninformed:
         progress.note(f"{path}: {uninformed} edges have no information; it is taken as identity")
     for table in tables.values():
@@ -300,11 +331,9 @@ def _floats(words: Sequence[str]) -> list[float]:
         raise
 
 
-def _in_order(
-    path: Path, tables: dict[str, _Table], forms: dict[str, _Form]
-) -> list[tuple[int, list[int], str, Array]]:
-    """Return (line, ids, note, pose) of some tags' lines in the file's order."""
-    rows: list[tuple[int, list[int], str, Array]] = []
+def _in_order(path: Path, tables: dict[str, _Table], forms: dict[str, _Form]) -> list[_Row]:
+    """Return some tags' lines in the file's order."""
+    rows: list[_Row] = []
     for tag, table in tables.items():
         if tag not in forms:
             continue

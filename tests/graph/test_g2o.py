@@ -210,6 +210,20 @@ def test_gtsam_reads_a_graph_of_toro_alike(tmp_path):
     assert initial.size() == 2
 
 
+def test_edges_alone_are_chained_from_near_ids(tmp_path):
+    edges = [(0, 3, 9.0), (0, 1, 1.0), (2, 1, -1.0), (2, 3, 1.0)]
+    lines = [f"EDGE_SE2 {i} {j} {x} 0 0 1 0 0 1 0 1" for i, j, x in edges]
+    (tmp_path / "edges.g2o").write_text("\n".join(lines))
+    assert [T[0, 3] for T in read_g2o(tmp_path / "edges.g2o").T_world_node.values()] == [0.0, 1.0, 2.0, 3.0]
+
+
+def test_landmarks_are_left_out(tmp_path):
+    landmarks = "VERTEX_TRACKXYZ 7 1 0 2\nEDGE_SE3_TRACKXYZ 0 7 0 1 0 2 1 0 0 1 0 1\nVERTEX_XY 8 1 0\nFIX 7\n"
+    (tmp_path / "landmarks.g2o").write_text(VERTICES + landmarks + EDGE)
+    graph = read_g2o(tmp_path / "landmarks.g2o")
+    assert (list(graph.T_world_node), len(graph.factors), graph.fixed) == ([0, 1], 1, ())
+
+
 def test_exponents_of_fortran_are_read(tmp_path):
     (tmp_path / "e.g2o").write_text(VERTICES.replace(" 1 1 0", " 1 1.25e+01 0") + EDGE)
     (tmp_path / "D.g2o").write_text(VERTICES.replace(" 1 1 0", " 1 1.25D+01 0") + EDGE)
@@ -264,7 +278,7 @@ def test_a_bad_file_is_named(tmp_path):
     with pytest.raises(GraphError, match="byte 0 is not UTF-8"):
         read_g2o(path)
     path.write_text("\n")
-    with pytest.raises(GraphError, match="no vertices"):
+    with pytest.raises(GraphError, match="no poses"):
         read_g2o(path)
     with pytest.raises(GraphError, match="without nodes"):
         write_g2o(path, PoseGraph())
