@@ -97,10 +97,7 @@ def outlines(frame: RgbdFrame) -> tuple[Pixels, Pixels] | None:
     if camera.width_px < _WIDTH_PX:
         return None
     size_px = _WIDTH_PX, round(camera.height_px * _WIDTH_PX / camera.width_px)
-    depth_m = cv2.resize(frame.depth_m, size_px, interpolation=cv2.INTER_NEAREST)
-    around = np.ones((3, 3), np.uint8)
-    nearest_m = cv2.erode(np.where(depth_m > 0.0, depth_m, np.float32(_FAR_M)), around)
-    edges = ((depth_m > 0.0) & (cv2.dilate(depth_m, around) > OUTLINE_STEP * nearest_m)).astype(np.float32)
+    edges = _depth_edges(frame.depth_m, size_px)
     grey = cv2.resize(frame.gray, size_px, interpolation=cv2.INTER_AREA).astype(np.float32)
     gradient = np.hypot(cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1))
     usual, most = np.percentile(gradient, (50.0, 95.0))
@@ -109,6 +106,22 @@ def outlines(frame: RgbdFrame) -> tuple[Pixels, Pixels] | None:
         return None
     gradient = np.minimum(gradient, float(most))
     return (gradient - gradient.mean()) / gradient.std(), edges
+
+
+def may_be_depth(image: Pixels) -> bool:
+    """Return whether (H, W) numbers, 0 for none, have as few outlines as depth: grey images have more."""
+    size_px = _WIDTH_PX, round(image.shape[0] * _WIDTH_PX / image.shape[1])
+    return bool(_depth_edges(image, size_px).mean() <= _MOST_SHARE)
+
+
+def _depth_edges(depth_m: Pixels, size_px: tuple[int, int]) -> Pixels:
+    """Return 1 at outlines in depth, in an image of this size."""
+    depth_m = cv2.resize(depth_m, size_px, interpolation=cv2.INTER_NEAREST)
+    around = np.ones((3, 3), np.uint8)
+    nearest_m = cv2.erode(np.where(depth_m > 0.0, depth_m, np.float32(_FAR_M)), around)
+    is_edge = (depth_m > 0.0) & (cv2.dilate(depth_m, around) > OUTLINE_STEP * nearest_m)
+    edges: Pixels = is_edge.astype(np.float32)
+    return edges
 
 
 def _scores(gradient: Pixels, edges: Pixels, most_px: int) -> Pixels:

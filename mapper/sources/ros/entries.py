@@ -16,7 +16,7 @@ from mapper.sources.lazy_frame import LazyFrame
 from mapper.sources.ros.cloud_messages import scan_from
 from mapper.sources.ros.decode import decode
 from mapper.sources.ros.frame_tree import FrameTree, is_fixed
-from mapper.sources.ros.image_messages import depth_file_of, depth_m_of, image_of
+from mapper.sources.ros.image_messages import depth_file_of, depth_m_of, image_of, is_depth
 from mapper.sources.ros.messages import CloudMessage, FileMessage, ImageMessage, Message, frame_of
 from mapper.sources.ros.recording import Place, Recording, Topic
 from mapper.sources.stereo import StereoCamera
@@ -66,6 +66,7 @@ def rgbd_entry(
     units_per_m: float,
     float_units_per_m: float | None,
     colour_suffix: str,
+    shift: int,
 ) -> RgbdEntry:
     """Return the entry of a colour and a depth message; the body is the camera.
 
@@ -78,6 +79,7 @@ def rgbd_entry(
         units_per_m: 16-bit depth units per metre.
         float_units_per_m: Units per metre of depth that is recorded as 32-bit numbers; None if it is not.
         colour_suffix: Ending of a colour image's file.
+        shift: Bits below those that are used of a grey image of 16.
     """
 
     def depth_m() -> DepthImage:
@@ -89,7 +91,7 @@ def rgbd_entry(
         )
 
     def image(in_colour: bool) -> Image:
-        return image_of(colour.image(), colour=in_colour, where=f"{colour}")
+        return image_of(colour.image(), colour=in_colour, shift=shift, where=f"{colour}")
 
     return RgbdEntry(
         colour.stamp_ns,
@@ -134,7 +136,7 @@ def read_image(image: Located, in_colour: bool) -> Image:
 
 
 def _file_of(message: ImageMessage) -> bytes | None:
-    return bytes(message.data) if isinstance(message, FileMessage) else None
+    return bytes(message.data) if isinstance(message, FileMessage) and not is_depth(message) else None
 
 
 def cloud_entry(

@@ -104,6 +104,17 @@ def is_mono16(message: ImageMessage) -> bool:
     return encoding_of(message).startswith("mono16")
 
 
+def unused_bits(message: ImageMessage, *, where: str) -> int:
+    """Return how far a grey image of 16 bits is shifted to use 8: sensors of 10 or 12 leave the others 0.
+
+    Raises:
+        FrameError: The image is damaged.
+    """
+    if not is_depth(message) or has_float_depth(message):
+        return 8
+    return max(int(np.percentile(_units(message, where=where), 99.9)).bit_length() - 8, 0)
+
+
 def encoding_of(message: ImageMessage) -> str:
     """Return what an image is called to be encoded as."""
     return message.encoding if isinstance(message, PixelsMessage) else message.format
@@ -126,12 +137,21 @@ def size_of(message: ImageMessage, *, where: str) -> tuple[int, int]:
     return width_px, height_px
 
 
-def image_of(message: ImageMessage, *, colour: bool, where: str) -> Image:
+def image_of(message: ImageMessage, *, colour: bool, shift: int = 8, where: str) -> Image:
     """Return an image as (H, W, 3) RGB, or as (H, W) grey if it is or shall be.
 
+    Args:
+        message: Pixels or a file; one channel of 16 bits is grey.
+        colour: False returns a grey image.
+        shift: Bits below those that are used of one channel of 16.
+        where: Name of the image in an error.
+
     Raises:
-        FrameError: The image is damaged, or in an encoding that is not read; ``where`` is what it names.
+        FrameError: The image is damaged, or in an encoding that is not read.
     """
+    if is_depth(message) and not has_float_depth(message):
+        grey: Image = np.minimum(_units(message, where=where) >> shift, 255).astype(np.uint8)
+        return grey
     if isinstance(message, FileMessage):
         data = bytes(message.data)
         _refuse_video(data, message.format, where=where)
@@ -176,17 +196,26 @@ def depth_m_of(
         return _depth_m_of_file(
             message, units_per_m=units_per_m, float_units_per_m=float_units_per_m, where=where
         )
+    units = _units(message, where=where)
+    if units.dtype.kind == "f":
+        return valid_depth(units, float_units_per_m, where=where)
+    return depth_m_from(units, units_per_m)
+
+
+def _units(message: ImageMessage, *, where: str) -> NDArray[Any]:
+    """Return (H, W) numbers as an image of one channel has them, whole ones as uint16."""
+    if isinstance(message, FileMessage):
+        return decode_depth(bytes(_without_header(message)), where)
     kind = _depth_kind(message)
     if kind is None:
         raise FrameError(f"{where}: depth encoded as {message.encoding}; known are {', '.join(_DEPTH)}")
     order = ">" if message.is_big_endian else "<"
     pixels = _pixels(message, order + kind, 1, where=where)
     if kind.startswith("f"):
-        return valid_depth(pixels, float_units_per_m, where=where)
+        return pixels
     if message.is_big_endian and _roughness(pixels) > _roughness(pixels.byteswap()):
         pixels = pixels.byteswap()  # drivers label what they do not swap
-    units = pixels if kind == "u2" else np.clip(pixels, 0, SATURATED)
-    return depth_m_from(np.ascontiguousarray(units, dtype=np.uint16), units_per_m)
+    return np.ascontiguousarray(pixels if kind == "u2" else np.clip(pixels, 0, SATURATED), dtype=np.uint16)
 
 
 def _depth_kind(message: PixelsMessage) -> str | None:

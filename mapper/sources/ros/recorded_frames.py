@@ -24,7 +24,7 @@ from mapper.sources.ros.cameras import calibrate
 from mapper.sources.ros.cloud_messages import values_of_returns
 from mapper.sources.ros.entries import Located, cloud_entry, read_image, rgbd_entry, stereo_entry
 from mapper.sources.ros.frame_tree import is_fixed
-from mapper.sources.ros.image_messages import has_float_depth, size_of
+from mapper.sources.ros.image_messages import has_float_depth, size_of, unused_bits
 from mapper.sources.ros.message_index import Series, why_unread
 from mapper.sources.ros.message_order import ordered, paired
 from mapper.sources.ros.messages import (
@@ -118,6 +118,7 @@ def rgbd_frames(reader: RecordingReader, topics: CameraTopics, config: SourceCon
     float_units_per_m = (factor or 1.0) if has_float_depth(first_depth) else None
     stated = factor or calibration.depth_units_per_m
     units_per_m = (stated or MM_PER_M) if float_units_per_m is None else TUM_UNITS_PER_M
+    shift = unused_bits(first_color, where=f"{where}: {color.topic.name}")
     is_jpeg = isinstance(first_color, FileMessage) and bytes(first_color.data[:2]) == _JPEG_START
 
     def entry_of(camera: RecordedCamera, index: int) -> RgbdEntry:
@@ -128,6 +129,7 @@ def rgbd_frames(reader: RecordingReader, topics: CameraTopics, config: SourceCon
             units_per_m=units_per_m,
             float_units_per_m=float_units_per_m,
             colour_suffix=".jpg" if is_jpeg else ".png",
+            shift=shift,
         )
 
     camera_of = partial(

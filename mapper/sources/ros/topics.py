@@ -37,9 +37,9 @@ from mapper.sources.ros.topic_ranks import (
     without_those_of_depth,
 )
 from mapper.sources.ros.unused_topics import (
+    depth_topics,
     feels_gravity,
     holds_other_numbers,
-    shows_depth,
     turns,
     unused_notes,
     usual_acceleration,
@@ -162,13 +162,14 @@ def choose(
         SourceError: A chosen topic is not there or of another type, or nothing can be mapped.
     """
     pick = _Picker(series, path)
-    depths = {name for name, first in firsts.items() if shows_depth(name, first)}
+    depths, greys = depth_topics(firsts)
     colors = pick.candidates(
         "color",
         config.color,
         IMAGES,
         where=lambda name: not (name in depths or holds_other_numbers(name)),
     )
+    colors = [one for one in colors if one.topic.name not in greys] or colors
     depth_images = pick.candidates("depth", config.depth, IMAGES, where=depths.__contains__)
     color, depth = _of_one_camera(colors, depth_images, firsts)
     clouds = pick.candidates("points", config.points, CLOUDS, where=lambda name: len(series[name]) > 1)
@@ -209,7 +210,7 @@ def choose(
     )
     if camera is not None and config.points is None:
         frames, own = camera, camera.own_info
-        others = len(colors) * len(depth_images) > 1
+        others = len(colors) * len(depth_images) > 1 or bool(greys)
         chosen = f"colour {camera.color.topic.name}, depth {camera.depth.topic.name}"
         choices = [_choice_note(chosen, "color=… and source.topics.depth", others=others)]
         if info is not None and own not in (None, info):
@@ -244,7 +245,7 @@ def choose(
         strange = [one for one in series.values() if one.topic.type not in READ]
         unread = [
             *unused_notes(strange, firsts, image_reason=None),
-            *why_no_depths(firsts, depths),
+            *why_no_depths(firsts, depths, greys),
         ]
         found = what_there_is(color, depth, series.values())
         raise SourceError("; ".join([f"{path}: nothing to map: {found}", *unread]))

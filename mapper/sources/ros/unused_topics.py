@@ -1,13 +1,15 @@
 """Topics of a recording that are not used, with the reason, as notes and refusals name them."""
 
 import re
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
 
 import numpy as np
 
-from mapper.core.errors import listed
-from mapper.core.units import unit_of_gravity
-from mapper.sources.ros.image_messages import encoding_of, is_depth, is_mono16
+from mapper.core.errors import FrameError, listed
+from mapper.core.units import MM_PER_M, unit_of_gravity
+from mapper.sources.depth_outlines import may_be_depth
+from mapper.sources.ros.image_messages import depth_m_of, encoding_of, has_float_depth, is_depth, is_mono16
 from mapper.sources.ros.message_index import Series
 from mapper.sources.ros.messages import CLOUDS, FIXES, IMAGES, IMUS, POSES, READ, ImageMessage, Message
 from mapper.sources.ros.topic_ranks import is_infrared
@@ -70,11 +72,33 @@ def unused_notes(
     return [f"{kind}: {listed(names)}" for kind, names in kinds.items()]
 
 
-def shows_depth(name: str, first: Message | None) -> bool:
-    """Return whether a topic's images are of depth, by its first message and its name."""
-    if not isinstance(first, ImageMessage) or holds_other_numbers(name):
-        return False
-    return is_depth(first) and not (is_infrared(name) and is_mono16(first))
+def depth_topics(firsts: Mapping[str, Message]) -> tuple[set[str], set[str]]:
+    """Return the topics of depth images, and those of grey ones of 16 bits.
+
+    They are told apart by the outlines in the first image of topics that are called infrared or mono16, and
+    of all where there are no other images, but for those that are called depth.
+    """
+    images = {
+        name: first
+        for name, first in firsts.items()
+        if isinstance(first, ImageMessage) and not holds_other_numbers(name)
+    }
+    depths = {name for name, first in images.items() if is_depth(first)}
+    is_alone = len(depths) == len(images) > 1
+    greys = {
+        name
+        for name in depths
+        if (is_alone or is_infrared(name) or is_mono16(images[name]))
+        and "depth" not in name.lower()
+        and not _may_be_depth(images[name], name)
+    }
+    return depths - greys, greys
+
+
+def _may_be_depth(first: ImageMessage, name: str) -> bool:
+    with suppress(FrameError):  # it is told when it is read
+        return has_float_depth(first) or may_be_depth(depth_m_of(first, units_per_m=MM_PER_M, where=name))
+    return True
 
 
 def holds_other_numbers(name: str) -> bool:
@@ -82,8 +106,10 @@ def holds_other_numbers(name: str) -> bool:
     return _OTHER_NUMBERS.search(name) is not None
 
 
-def why_no_depths(firsts: Mapping[str, Message], depths: Collection[str]) -> Iterator[str]:
-    """Yield why images that are called depth or disparity are none of ``depths``."""
+def why_no_depths(firsts: Mapping[str, Message], depths: set[str], greys: set[str]) -> Iterator[str]:
+    """Yield why images that are called depth or disparity are none, and how to tell depth from grey."""
+    if len(both := sorted(depths | greys)) > 1:
+        yield f"of 16 bits are {listed(both)}: source.topics.color=… and .depth=… say which is which"
     for name, first in firsts.items():
         if not isinstance(first, ImageMessage) or name in depths:
             continue

@@ -126,18 +126,6 @@ def test_topics_that_are_not_used_are_named_with_the_reason(tmp_path):
     assert any(note.endswith(": /fish/image_raw") for note in both.notes)
 
 
-def test_infrared_of_16_bits_is_not_taken_for_depth(tmp_path):
-    messages = [message for message in shots(3) if message.topic != DEPTH]
-    for i, t in enumerate(stamps(3)):
-        messages += [image(t, f"/cam/{name}/image", picture(i)[1], "16UC1") for name in ("ir", "z")]
-    assert opened(tmp_path / "a.mcap", messages).choices[0].startswith(f"colour {COLOR}, depth /cam/z/image")
-    infrared = [one._replace(topic="/cam/ir/image") if one.topic == DEPTH else one for one in shots(3)]
-    for i, t in enumerate(stamps(3)):
-        infrared[3 * i] = image(t, "/cam/ir/image", picture(i)[1], "mono16")
-    with pytest.raises(SourceError, match="neither depth images"):
-        opened(tmp_path / "b.mcap", infrared)
-
-
 def test_the_likeliest_of_several_topics_is_taken_and_another_can_be_chosen(tmp_path):
     messages = []
     for i, t in enumerate(stamps(3)):
