@@ -177,8 +177,8 @@ class SourceConfig(Config):
     cloud_scale: PositiveFloat | None = None
     """Metres per unit of a LiDAR log's points; None is 1, and refuses what looks like millimetres."""
     bin_columns: int | None = Field(default=None, ge=3, le=64)
-    """float32 numbers of a point in a LiDAR log's .bin files, of which the first three are x y z, e.g. 5 for
-    nuScenes; None is KITTI's 4, and refuses what shows another number."""
+    """float32 numbers of a point in a LiDAR log's .bin files, of which the first three are x y z, e.g. 8
+    for padded ones; None is KITTI's 4, or 5 and 6 with rings, and refuses what shows another number."""
     point_time_scale: float = 1.0
     """Factor on the times of a LiDAR's points: 0 for scans that were deskewed already, -1 for times that
     count backwards, 0.1 for shares of sweeps of 0.1 s. The warning ``sweep`` reports which fits."""

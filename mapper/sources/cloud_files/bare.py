@@ -24,8 +24,10 @@ KITTIS = 4
 """Width of records of x y z intensity, in float32."""
 _FLOAT32 = np.dtype("<f4")
 _MAX_CLASS = 1000
-_WITH_INTENSITY = (KITTIS, 5)
-"""Widths of records whose fourth number is an intensity: KITTI's, and nuScenes' with a ring after it."""
+_NAMES = ("x", "y", "z", "intensity", "ring", "time")
+_WITH_INTENSITY, _WITH_RINGS = (KITTIS, 5), (5, 6)
+"""Widths of records that are the first of these: KITTI's, and nuScenes' and Boreas' with rings."""
+_MOST_RINGS, _LONGEST_S = 256, 1.0
 _WIDE_M = 10.0
 _NCLT = np.dtype([("xyz", "<u2", 3), ("intensity", "u1"), ("laser", "u1")])
 _NCLT_UNIT_M, _NCLT_ORIGIN_M, _NCLT_LASERS = 0.005, 100.0, 32
@@ -52,7 +54,8 @@ def read_bin(path: Path, columns: int | None = None) -> Columns:
 
     Args:
         path: The file.
-        columns: Numbers of a record; None is the four of KITTI (Geiger et al. 2013), and checked.
+        columns: Numbers of a record; None is the four of KITTI (Geiger et al. 2013), and checked, or five or
+            six with the numbers of rings.
 
     Raises:
         FrameError: The file is not a whole number of records, or of other ones.
@@ -64,16 +67,19 @@ def read_bin(path: Path, columns: int | None = None) -> Columns:
     is_by_column = columns is None and len(numbers) % KITTIS == 0 and _is_by_column(numbers)
     if columns is None and not is_by_column and (other := other_width(numbers)):
         width, is_certain = other
-        if is_certain:
+        if is_certain and _has_rings(numbers.reshape(-1, width)):
+            columns = width
+        elif is_certain:
             doubles = ", unless they are 4 float64: save these as .npy" if width == 8 else ""
             raise FrameError(
                 f"{path}: records of {width} float32, not KITTI's 4 (x y z intensity); "
                 f"--set source.bin_columns={width} takes the first 3 for x y z{doubles}"
             )
-        raise FrameError(
-            f"{path}: every fourth float32 is negative as coordinates are, not as KITTI's intensities; "
-            f"--set source.bin_columns={width} if records have {width}, or {KITTIS} if they have 4"
-        )
+        else:
+            raise FrameError(
+                f"{path}: every fourth float32 is negative as coordinates are, not as KITTI's intensities; "
+                f"--set source.bin_columns={width} if records have {width}, or {KITTIS} if they have 4"
+            )
     record_bytes = (columns or KITTIS) * _FLOAT32.itemsize
     if size % record_bytes:
         what = "KITTI's float32 x y z intensity" if columns is None else f"{columns} float32"
@@ -83,8 +89,21 @@ def read_bin(path: Path, columns: int | None = None) -> Columns:
         )
     records = numbers.reshape(KITTIS, -1).T if is_by_column else numbers.reshape(-1, columns or KITTIS)
     _refuse_others_first(records, path)
-    names = ("x", "y", "z", "intensity") if records.shape[1] in _WITH_INTENSITY else ("x", "y", "z")
-    return {name: records[:, column] for column, name in enumerate(names)}
+    known = len(_NAMES) if _has_rings(records) else KITTIS if records.shape[1] in _WITH_INTENSITY else 3
+    return dict(zip(_NAMES[:known], records.T, strict=False))
+
+
+def _has_rings(records: Column) -> bool:
+    """Return whether records are x y z, intensity, ring and perhaps time, by what these can be."""
+    if records.shape[1] not in _WITH_RINGS:
+        return False
+    intensities, rings, *times = records[:, 3:].T
+    return bool(
+        (intensities >= 0.0).all()
+        and (rings == np.rint(rings)).all()
+        and 0.0 <= rings.min() < rings.max() < _MOST_RINGS
+        and all(np.abs(one).max() <= _LONGEST_S for one in times)
+    )
 
 
 def _is_by_column(numbers: NDArray[np.float32]) -> bool:

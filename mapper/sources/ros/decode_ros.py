@@ -248,7 +248,7 @@ def decode_driver_message(topic: Topic, data: memoryview) -> CloudMessage:
     """Return the points of a CustomMsg of livox_ros_driver or of a VelodyneScan, with times after the stamp.
 
     Raises:
-        DataError: Its packets are damaged, or of a Velodyne that is not known.
+        DataError: Its packets are damaged, or of a Velodyne that is not known, or its fields are others.
         ValueError: It has fewer bytes than its number of points or packets needs.
         DependencyError: The library that decodes packets is not installed.
     """
@@ -277,4 +277,6 @@ def _unpack(
     count = int(np.frombuffer(data, head_type, count=1, offset=start)["count"][0])
     elements = bytes(data[start + head_type.itemsize :]) + b"\0\0\0"  # the last one is not padded
     element_type = np.dtype(element, align=is_cdr).newbyteorder(order)
+    if (spare := len(elements) - count * element_type.itemsize) >= element_type.itemsize:
+        raise DataError(f"{spare} bytes after {count} elements: a {topic.type} with other fields")
     return sec * NS_PER_S + nanosec, frame, np.frombuffer(elements, element_type, count=count)

@@ -66,9 +66,7 @@ class _Contents(Contents):
         self._topics: dict[int, Topic] = {}
 
     def _add_channel(self, channel: Channel) -> None:
-        type_ = self._schemas.get(channel.schema_id, "")
-        if channel.message_encoding == "ros1":  # a bag that was converted
-            type_ = ros2_name(type_)
+        type_ = ros2_name(self._schemas.get(channel.schema_id, ""))  # of a bag that was converted
         self._topics[channel.id] = Topic(channel.topic, type_, channel.message_encoding)
 
     def split(self, data: memoryview) -> Iterator[Part]:

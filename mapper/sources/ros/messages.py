@@ -200,9 +200,7 @@ PIXELS = frozenset({"sensor_msgs/msg/Image", "foxglove.RawImage"})
 FILES = frozenset({"sensor_msgs/msg/CompressedImage", "foxglove.CompressedImage"})
 IMAGES = PIXELS | FILES
 CAMERAS = frozenset({"sensor_msgs/msg/CameraInfo", "foxglove.CameraCalibration"})
-LIVOX = frozenset(
-    f"{package}/msg/CustomMsg" for package in ("livox_ros_driver", "livox_ros_driver2", "livox_interfaces")
-)
+LIVOX = frozenset({"livox_ros_driver/msg/CustomMsg"})
 VELODYNE = frozenset({"velodyne_msgs/msg/VelodyneScan"})
 DRIVER_CLOUDS = LIVOX | VELODYNE
 OUSTER_PACKETS = frozenset(

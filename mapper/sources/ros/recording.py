@@ -32,9 +32,14 @@ class Topic:
 
 
 def ros2_name(type_: str) -> str:
-    """Return what ROS 2 calls a message type of ROS 1: "sensor_msgs/msg/Image" for "sensor_msgs/Image"."""
+    """Return what ROS 2 calls a message type of ROS 1: "sensor_msgs/msg/Image" for "sensor_msgs/Image".
+
+    Copies of Livox' CustomMsg in other packages are called as the first is; their size tells if they are any.
+    """
     package, slash, name = type_.partition("/")
-    return type_ if not slash or name.startswith("msg/") else f"{package}/msg/{name}"
+    if slash and name.rpartition("/")[2] == "CustomMsg":
+        return "livox_ros_driver/msg/CustomMsg"
+    return type_ if not slash or "/" in name else f"{package}/msg/{name}"
 
 
 class Place(NamedTuple):

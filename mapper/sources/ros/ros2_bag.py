@@ -8,7 +8,7 @@ from pathlib import Path
 
 from mapper.core.errors import DataError, FrameError, SourceError
 from mapper.runtime.regular_files import MOST_BYTES
-from mapper.sources.ros.recording import Place, Recorded, Recording, Topic
+from mapper.sources.ros.recording import Place, Recorded, Recording, Topic, ros2_name
 
 _MOST_EARLY_SHARE = 0.1
 """Share of a file's messages that may be older than the last of the files before it: latched ones repeat."""
@@ -35,7 +35,9 @@ class DatabaseRecording:
             reason = " ".join(str(error).split())  # it may quote the table's definition
             raise SourceError(f"{path}: not a .db3 file that rosbag2 wrote: {reason}") from None
         self._topics = {
-            number: Topic(*texts) for number, *texts in rows if all(isinstance(text, str) for text in texts)
+            number: Topic(texts[0], ros2_name(texts[1]), texts[2])
+            for number, *texts in rows
+            if all(isinstance(text, str) for text in texts)
         }
 
     def messages(self) -> Iterator[Recorded]:

@@ -116,6 +116,7 @@ def scan_log(
     )
     order, order_notes = time_order(stamps_ns, what="scans")
     ordered = [files[k] for k in order]
+    bin_columns, choices, time_notes = _told_by(ordered[0], int(stamps_ns[order[0]]), config)
 
     def entry_at(index: int) -> LazyFrame:
         stamp_ns = int(stamps_ns[order[index]])
@@ -126,11 +127,10 @@ def scan_log(
                 stamp_ns,
                 colour=colour,
                 scale=config.cloud_scale,
-                bin_columns=config.bin_columns,
+                bin_columns=bin_columns,
             ),
         )
 
-    choices, time_notes = _times_told(ordered[0], int(stamps_ns[order[0]]), config)
     log = Log(
         path=path,
         name=path.resolve().name,
@@ -145,14 +145,19 @@ def scan_log(
     return log, ordered
 
 
-def _times_told(path: Path, stamp_ns: int, config: SourceConfig) -> tuple[list[str], list[str]]:
-    """Return what the times of a cloud's points are, as ``times_told``; nothing of one without any."""
+def _told_by(path: Path, stamp_ns: int, config: SourceConfig) -> tuple[int | None, list[str], list[str]]:
+    """Return the numbers of a record that all clouds have, and what the times of a cloud's points are."""
+    columns = config.bin_columns
     with suppress(FrameError):  # it is reported when it is read
-        cloud = read_cloud(path, scale=config.cloud_scale, bin_columns=config.bin_columns)
-        return times_told(
+        cloud = read_cloud(path, scale=config.cloud_scale, bin_columns=columns)
+        choices, notes = times_told(
             cloud.names, lambda _: np.empty(0) if cloud.times is None else cloud.times, stamp_ns
         )
-    return [], []
+        if path.suffix.lower() == ".bin" and columns is None and "ring" in cloud.names:
+            columns = len(cloud.names)
+            choices.append(f"records of {columns} float32: {' '.join(cloud.names)}; source.bin_columns")
+        return columns, choices, notes
+    return columns, [], []
 
 
 def _las_stamps(files: Sequence[Path]) -> Stamps | None:

@@ -6,8 +6,6 @@ import pytest
 from mapper.core.errors import FrameError
 from mapper.sources import open_source
 from mapper.sources.cloud_files import read_cloud
-from mapper.sources.config import SourceConfig
-from tests.support.command_line import mapper
 
 N = 1680  # whole records of every width up to 8
 
@@ -62,8 +60,8 @@ def test_kittis_records_may_be_padded(tmp_path, rows):
 RING, TIME = np.tile(np.arange(16), N // 16), np.linspace(0.0, 0.1, N)
 OTHERS = {
     3: [],
-    5: [INTENSITIES["byte"], RING],
-    6: [INTENSITIES["byte"], RING, TIME],
+    5: [INTENSITIES["byte"], TIME],
+    6: [INTENSITIES["byte"], TIME, RING],
     7: [INTENSITIES["share"], RING, TIME, INTENSITIES["byte"]],
     8: [np.ones(N), INTENSITIES["share"], np.zeros((N, 3))],
 }
@@ -78,6 +76,27 @@ def test_other_records_are_told_and_the_remedy_works(tmp_path, width, columns, s
     with pytest.raises(FrameError, match=rf"records of {width} float32, .*source.bin_columns={width} takes"):
         read_cloud(path)
     np.testing.assert_array_equal(read_cloud(path, bin_columns=width).points, xyz.astype(np.float32))
+
+
+@pytest.mark.parametrize("shuffled", [False, True])
+@pytest.mark.parametrize("times", [[], [TIME - 0.05]])
+def test_records_with_rings_are_read(tmp_path, times, shuffled):
+    xyz = sweep(shuffled=shuffled)
+    cloud = read_cloud(written(tmp_path / "a.bin", xyz, INTENSITIES["byte"], RING, *times))
+    np.testing.assert_array_equal(cloud.points, xyz.astype(np.float32))
+    np.testing.assert_array_equal(cloud.intensities, INTENSITIES["byte"])
+    for found, expected in zip([] if cloud.times is None else [cloud.times], times, strict=True):
+        np.testing.assert_array_equal(found, expected.astype(np.float32))
+
+
+def test_a_cloud_of_a_log_is_read_as_the_first_is(tmp_path):
+    for k in range(3):
+        rows = slice(None) if k < 2 else slice(0, 20)  # too few to tell the width of
+        columns = [values[rows] for values in (sweep(), INTENSITIES["byte"], RING, TIME)]
+        written(tmp_path / f"{k}.bin", *columns)
+    last = open_source(tmp_path).entry_at(2).load()
+    np.testing.assert_array_equal(last.points_body, sweep()[:20].astype(np.float32))
+    np.testing.assert_allclose(last.times_s, TIME[:20], atol=1e-7)
 
 
 def test_what_shows_no_width_is_refused_if_its_intensities_are_like_coordinates(tmp_path):
@@ -100,13 +119,11 @@ def test_a_cut_file_is_told_as_one(tmp_path):
         read_cloud(path, bin_columns=5)
 
 
-def test_scans_of_nuscenes_have_their_stamps_and_a_setting_reads_them(tmp_path):
+def test_scans_of_nuscenes_have_their_stamps(tmp_path):
     stamps_ns = [1532402927647951000 + i * 50_000_000 for i in range(3)]
     for stamp_ns in stamps_ns:
-        written(tmp_path / f"n015__LIDAR_TOP__{stamp_ns // 1000}.pcd.bin", sweep(), *OTHERS[5])
-    refused = mapper("inspect", tmp_path, status=1)
-    assert "--set source.bin_columns=5" in refused.stderr
-    log = open_source(tmp_path, SourceConfig(bin_columns=5))
+        written(tmp_path / f"n015__LIDAR_TOP__{stamp_ns // 1000}.pcd.bin", sweep(), INTENSITIES["byte"], RING)
+    log = open_source(tmp_path)
     assert log.stamps_ns.tolist() == stamps_ns
     assert len(log.entry_at(0).load().points_body) == N
 

@@ -24,7 +24,12 @@ def simulator():
 
 @pytest.mark.parametrize(
     ("name", "package"),
-    [("a.bag", "livox_ros_driver"), ("a", "livox_ros_driver"), ("a", "livox_ros_driver2")],
+    [
+        ("a.bag", "livox_ros_driver"),
+        ("a", "livox_ros_driver"),
+        ("a", "livox_ros_driver2"),
+        ("b.bag", "my_livox"),
+    ],
 )
 @pytest.mark.parametrize("frame", ["livox_frame", "four"])  # lengths that shift what follows
 def test_livox_points_and_times_are_read_bit_by_bit(tmp_path, simulator, name, package, frame):
@@ -93,7 +98,7 @@ def test_packets_without_their_library_are_refused_with_the_install_line(tmp_pat
 
 
 @pytest.mark.parametrize("encoding", ["cdr", "ros1"])
-@pytest.mark.parametrize("type_", ["livox_ros_driver2/msg/CustomMsg", "velodyne_msgs/msg/VelodyneScan"])
+@pytest.mark.parametrize("type_", ["livox_ros_driver/msg/CustomMsg", "velodyne_msgs/msg/VelodyneScan"])
 @pytest.mark.parametrize("size", [0, 3, 12, 17, 24, 40, 200, 1300])
 def test_damaged_messages_are_refused(encoding, type_, size):
     data = memoryview(b"\0\1" + bytes(range(1, 255)) * 8)[:size]
