@@ -82,6 +82,7 @@ _LONGEST, _FIRST, _NOW = range(3)  # stretches of scans without a hit
 _DEPTH_ERROR_SIGMAS = 12.0
 """Error of depth by the noise of depth. It is that of a pixel of disparity, whose noise is 0.07 to 0.08 px in
 cameras of structured light; both grow with the square of depth (Khoshelham & Oude Elberink 2012)."""
+_AROUND = np.array([(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1)])
 _BELOW = np.array([(x, y, -z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (1, 2)])
 
 
@@ -178,7 +179,9 @@ def remove_moving_objects(
             near, before = hit & removed[slots], hit & counted[slots]
             if np.array_equal(near, before):
                 continue
-            neighbours = neighbours_of(scan.codes)
+            rows = _rows_around(scan.codes, near.any(axis=1))
+            hit, slots, near, before = hit[rows], slots[rows], near[rows], before[rows]
+            neighbours = neighbours_of(scan.codes[rows])
             for counts in (adjacent, nearby):
                 near, before = (dilate(plane, neighbours, absent=NONE_SET) for plane in (near, before))
                 _count_one(hit & near & ~before, slots, ever, starts, counts)
@@ -256,6 +259,13 @@ def _codes_below(codes: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return the codes of the voxels up to two below some, and up to one aside of these."""
     around = (keys_of(np.unique(codes))[:, np.newaxis] + _BELOW).reshape(-1, 3)
     return np.unique(codes_of_keys(around[((around >= 0) & (around < KEY_COUNT)).all(axis=1)]))
+
+
+def _rows_around(codes: NDArray[np.int64], chosen: NDArray[np.bool_]) -> NDArray[np.intp]:
+    """Return the rows of the chosen ones of (B,) blocks, and of those that touch one of them."""
+    keys = keys_of(codes[chosen])[:, np.newaxis] + _AROUND
+    around = np.unique(codes_of_keys(keys[((keys >= 0) & (keys < KEY_COUNT // BLOCK_EDGE)).all(axis=-1)]))
+    return np.flatnonzero(_are_among(codes, voxel_index(len(around), around)))
 
 
 @njit(cache=True, nogil=True)

@@ -203,9 +203,9 @@ def _clouds(log: Log, scale: _Scale) -> tuple[list[Points], int]:
             points = entry.scan().points_body[:: scale.step]
         except FrameError:
             continue
-        points = points.astype(np.float64)
         returns += len(points)
-        clouds.append(points[np.linalg.norm(points, axis=1) <= scale.around_m])
+        is_around = np.einsum("nk,nk->n", points, points) <= scale.around_m**2
+        clouds.append(points[is_around].astype(np.float64))
     if scale.ground_m is not None and clouds:
         limit_m = _ground_m(np.concatenate([points[:, 2] for points in clouds])) + scale.ground_m
         clouds = [points[points[:, 2] > limit_m] for points in clouds]
