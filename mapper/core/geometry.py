@@ -88,7 +88,7 @@ def skew(v: Array) -> Array:
 
 def rotation_exp(rotation_rad: Array) -> Array:
     """Return the (3, 3) rotation of a (3,) rotation vector in radians (Rodrigues 1840)."""
-    angle = float(np.linalg.norm(rotation_rad))
+    angle = math.sqrt(rotation_rad @ rotation_rad)
     K = skew(rotation_rad)
     if angle < _SMALL_ANGLE_RAD:
         return np.eye(3) + K + 0.5 * K @ K
@@ -108,8 +108,8 @@ def turn_to_z(up: Array) -> Array:
 def rotation_log(R: Array) -> Array:
     """Return the (3,) rotation vector, at most π long, of a (3, 3) rotation."""
     w = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
-    sine, cosine = 0.5 * float(np.linalg.norm(w)), 0.5 * (float(np.trace(R)) - 1.0)
-    angle = float(np.arctan2(sine, cosine))
+    sine, cosine = 0.5 * math.sqrt(w @ w), 0.5 * float(R[0, 0] + R[1, 1] + R[2, 2] - 1.0)
+    angle = math.atan2(sine, cosine)
     if angle < _SMALL_ANGLE_RAD:
         return 0.5 * w
     if sine > 1e-6 or cosine > 0.0:
@@ -134,24 +134,31 @@ def exp(rotation_rad: Array, translation_m: Array) -> Transform:
 
 def log(T_a_b: Transform) -> tuple[Array, Array]:
     """Return the twist (rotation_rad (3,), translation_m (3,)) with ``exp(*log(T)) == T``."""
-    rotation_rad = rotation_log(T_a_b[:3, :3])
-    translation_m = np.linalg.solve(_left_jacobian(rotation_rad), T_a_b[:3, 3])
-    return rotation_rad, np.asarray(translation_m, dtype=np.float64)
+    rotation_rad, t = rotation_log(T_a_b[:3, :3]), T_a_b[:3, 3]
+    angle = math.sqrt(rotation_rad @ rotation_rad)
+    # The inverse left Jacobian in closed form, and its series at small angles (Barfoot 2017, eq. 7.76b).
+    b = (1.0 - 0.5 * angle / math.tan(0.5 * angle)) / angle**2 if angle > 1e-4 else 1.0 / 12.0
+    K = skew(rotation_rad)
+    Kt = K @ t
+    translation_m: Array = t - 0.5 * Kt + b * (K @ Kt)
+    return rotation_rad, translation_m
 
 
 def adjoint(T_a_b: Transform) -> Array:
     """Return the (6, 6) map of twists (rotation, translation) of b to a (Murray, Li & Sastry 1994, §2.4)."""
     R, t = T_a_b[:3, :3], T_a_b[:3, 3]
-    zero = np.zeros((3, 3))
-    return np.block([[R, zero], [skew(t) @ R, R]])
+    adjoint_a_b = np.zeros((6, 6))
+    adjoint_a_b[:3, :3] = adjoint_a_b[3:, 3:] = R
+    adjoint_a_b[3:, :3] = skew(t) @ R
+    return adjoint_a_b
 
 
 def _left_jacobian(rotation_rad: Array) -> Array:
-    angle = float(np.linalg.norm(rotation_rad))
+    angle = math.sqrt(rotation_rad @ rotation_rad)
     K = skew(rotation_rad)
     if angle < 1e-4:  # series: the closed form loses digits here
         return np.eye(3) + 0.5 * K + K @ K / 6.0
-    a, b = (1.0 - np.cos(angle)) / angle**2, (angle - np.sin(angle)) / angle**3
+    a, b = 2.0 * (np.sin(0.5 * angle) / angle) ** 2, (angle - np.sin(angle)) / angle**3
     V: Array = np.eye(3) + a * K + b * K @ K
     return V
 
