@@ -12,8 +12,10 @@ from typing import Any
 from mapper.cli.answer import Answer, rows_text
 from mapper.evaluators.metrics.evaluate import (
     ATE_RMSE,
+    ATE_WITH_LEVER_ARM,
     ATE_WITHOUT_OFFSET,
     CLOCK_OFFSET,
+    LEVER_ARM,
     PATH_LENGTH,
     RPE_RMSE_M,
     RPE_RMSE_RAD,
@@ -151,6 +153,9 @@ def _accuracy_text(metrics: Sequence[Metric]) -> str:
     if RPE_RMSE_M in found and RPE_RMSE_RAD in found:
         steps = (_value_text(found[quantity]) for quantity in (RPE_RMSE_M, RPE_RMSE_RAD))
         text += f"; from frame to frame {' and '.join(steps)}"
+    if LEVER_ARM in found:
+        lever_m, rmse_m = (found[quantity].value for quantity in (LEVER_ARM, ATE_WITH_LEVER_ARM))
+        text += f"; of positions alone, which fit a point {lever_m:.2f} m beside to {rmse_m:.4f} m"
     if CLOCK_OFFSET in found:
         late_s, rmse_m = (found[quantity].value for quantity in (CLOCK_OFFSET, ATE_WITHOUT_OFFSET))
         how = "late" if late_s > 0.0 else "early"

@@ -14,7 +14,7 @@ from mapper.core.errors import DataError, FrameError
 from mapper.core.frames import Sensor
 from mapper.core.geometry import inverse
 from mapper.core.timebase import MAX_TRUTH_GAP_NS, Stamps
-from mapper.core.trajectory import Trajectory, trajectory_from
+from mapper.core.trajectory import Trajectory, trajectory_from, with_rotations
 from mapper.evaluators.compare.catalogue import methods_for
 from mapper.evaluators.compare.config import CompareConfig, TrialsConfig
 from mapper.evaluators.compare.methods import FrameReader, Method, PreparedFrame, Tracker, reason_of
@@ -297,7 +297,8 @@ class MethodRun:
 
 def _truth_during(source: Log, frames_ns: Stamps) -> Trajectory | None:
     """Return the true poses from the first frame to the last; None if there are none."""
-    if source.truth is None:
+    posed = with_rotations(source.truth)
+    if posed is None:
         return None
-    truth = source.truth.during(frames_ns[0] - MAX_TRUTH_GAP_NS, frames_ns[-1] + MAX_TRUTH_GAP_NS)
+    truth = posed.during(frames_ns[0] - MAX_TRUTH_GAP_NS, frames_ns[-1] + MAX_TRUTH_GAP_NS)
     return truth if len(truth) else None

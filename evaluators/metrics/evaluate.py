@@ -10,7 +10,7 @@ import numpy as np
 
 from mapper.core.errors import DataError, SourceError
 from mapper.core.timebase import Stamps
-from mapper.core.trajectory import Trajectory
+from mapper.core.trajectory import Positions, Trajectory, with_rotations
 from mapper.evaluators.metrics.clock_offset import clock_offset
 from mapper.evaluators.metrics.coverage import frame_coverage, time_coverage
 from mapper.evaluators.metrics.metric import Metric, shown, text_table
@@ -22,6 +22,7 @@ from mapper.evaluators.metrics.trajectory_errors import (
     align,
     associate,
     ate,
+    lever_arm,
     rpe,
     start_end_offset,
 )
@@ -45,6 +46,8 @@ RPE_RMSE_M, RPE_RMSE_RAD = "RPE translation RMSE", "RPE rotation RMSE"
 PATH_LENGTH, START_TO_END = "path length", "start-to-end offset"
 CLOCK_OFFSET = "clock offset of the truth"
 ATE_WITHOUT_OFFSET = f"{CLOCK_OFFSET}: {ATE_RMSE} without it"
+LEVER_ARM = "lever arm of the true positions"
+ATE_WITH_LEVER_ARM = f"{LEVER_ARM}: {ATE_RMSE} with it"
 """Quantities of metrics that a summary of a run shows."""
 
 _CLOCK_NS = 1_000_000
@@ -158,7 +161,8 @@ def run_metrics(run: Run, truth: Trajectory | None) -> list[Metric]:
     from mapper.evaluators.metrics.consistency import drift_metrics  # need GTSAM, which few verbs do
     from mapper.evaluators.metrics.loops import agreement_of_loops, loop_metrics_of_run
 
-    right = [] if truth is None else loop_metrics_of_run(run, truth)
+    posed = with_rotations(truth)
+    right = [] if posed is None else loop_metrics_of_run(run, posed)
     return [*right, *drift_metrics(run.poses), *agreement_of_loops(run.graph)]
 
 
@@ -174,7 +178,8 @@ def assess(
 ) -> Assessment:
     """Return path length, start-to-end offset and coverage, and with truth ATE, RPE and relative errors.
 
-    The names state the alignment. RPE compares consecutive matched poses.
+    The names state the alignment. RPE compares consecutive matched poses. Of true positions without rotations
+    there is ATE alone: of the body's origin, and of the point on the body that fits them best.
 
     Args:
         estimate: The trajectory.
@@ -202,6 +207,9 @@ def assess(
     matched = associate(estimate, truth, max_gap_s=max_gap_s, names=names)
     similarity = align(matched, alignment)
     aligned = similarity.moved(matched)
+    if isinstance(truth, Positions):
+        errors = [*_position_errors(aligned, alignment), *_lever_metrics(matched, alignment)]
+        return Assessment((*errors, *_clock_metrics(estimate, truth, alignment), *own), aligned)
     lengths = segment_errors(aligned, lengths_for(truth.path_length_m) if lengths_m is None else lengths_m)
     metrics = [
         *_against_truth(aligned, alignment),
@@ -213,8 +221,8 @@ def assess(
     return Assessment(tuple(metrics), aligned, lengths)
 
 
-def _against_truth(aligned: Matched, alignment: AlignmentKind) -> list[Metric]:
-    position, steps = ate(aligned), rpe(aligned)
+def _position_errors(aligned: Matched, alignment: AlignmentKind) -> list[Metric]:
+    position = ate(aligned)
     how = ALIGNED[alignment]
     return [
         Metric("matched poses", len(aligned), "pairs"),
@@ -224,9 +232,22 @@ def _against_truth(aligned: Matched, alignment: AlignmentKind) -> list[Metric]:
         Metric("ATE std", position.std, "m", how),
         Metric("ATE min", position.min, "m", how),
         Metric("ATE max", position.max, "m", how),
+    ]
+
+
+def _against_truth(aligned: Matched, alignment: AlignmentKind) -> list[Metric]:
+    steps = rpe(aligned)
+    return [
+        *_position_errors(aligned, alignment),
         Metric(RPE_RMSE_M, steps.translation_m.rmse, "m", "consecutive"),
         Metric(RPE_RMSE_RAD, steps.rotation_rad.rmse, "rad", "consecutive"),
     ]
+
+
+def _lever_metrics(matched: Matched, alignment: AlignmentKind) -> list[Metric]:
+    """Return how far from the body's origin the point of the true positions seems to lie, and ATE with it."""
+    lever, rmse_m = lever_arm(matched, alignment)
+    return [Metric(LEVER_ARM, float(np.linalg.norm(lever)), "m"), Metric(ATE_WITH_LEVER_ARM, rmse_m, "m")]
 
 
 def _alignment_metrics(matched: Matched, similarity: Similarity, alignment: AlignmentKind) -> list[Metric]:

@@ -8,6 +8,7 @@ import numpy as np
 from mapper.core.errors import DataError
 from mapper.core.frames import Points32
 from mapper.core.geometry import Transform, apply, inverse, mean_rotation, transform
+from mapper.core.trajectory import with_rotations
 from mapper.evaluators.metrics.map_reference import Reference, check_occupancy
 from mapper.evaluators.metrics.metric import Metric
 from mapper.evaluators.metrics.occupancy import OccupancyCheck, check_metrics
@@ -116,9 +117,9 @@ def _aligned_by_truth(run: Run) -> Transform:
 
     Positions alone would leave a log that hardly leaves its place to turn about it.
     """
-    truth = run.truth
+    truth = with_rotations(run.truth)
     if truth is None:
-        raise DataError(f"{run.path}: its log has no truth to lay a reference by; pass --map-world map")
+        raise DataError(f"{run.path}: its log has no true poses to lay a reference by; pass --map-world map")
     matched = associate(run.trajectory, truth, names=(str(run.path), "its truth"))
     R_map, R_truth = matched.T_map_body[:, :3, :3], matched.T_truth_body[:, :3, :3]
     R = mean_rotation(R_map @ np.swapaxes(R_truth, 1, 2), np.ones(len(matched)))

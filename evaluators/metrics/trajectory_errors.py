@@ -25,6 +25,8 @@ AlignmentKind = Literal["none", "yaw", "se3", "sim3"]
 DeltaUnit = Literal["frames", "m", "s"]
 
 _DELTA_TOLERANCE_RATIO = 0.1
+_LEVER_STEPS, _LEAST_TURN = 20, 0.1
+"""Rounds of the fit of a point on the body, and the share of the largest turns from which others count."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -158,6 +160,28 @@ def _fit_yaw(target: Points, source: Points) -> Transform:
     sine, cosine = covariance[1, 0] - covariance[0, 1], covariance[0, 0] + covariance[1, 1]
     R = rotation_exp(np.array([0.0, 0.0, np.arctan2(sine, cosine)]))
     return transform(R, target_mean - R @ source_mean)
+
+
+def lever_arm(matched: Matched, kind: AlignmentKind) -> tuple[Points, float]:
+    """Return the point of the body, (3,) metres, whose positions fit the true ones best, and their RMSE.
+
+    Alignment and point are fitted in turns; turns that the body never makes leave the point undetermined
+    along their axes, where it is taken as near as can be.
+    """
+    R_map_body = matched.T_map_body[:, :3, :3]
+    lever = np.zeros(3)
+    moved = matched
+    for _ in range(_LEVER_STEPS):
+        T_map_point = matched.T_map_body.copy()
+        T_map_point[:, :3, 3] += R_map_body @ lever
+        moved = Matched(matched.stamps_ns, T_map_point, matched.T_truth_body)
+        moved = align(moved, kind).moved(moved)
+        missing = (moved.T_truth_body - moved.T_map_body)[:, :3, 3]
+        turned = moved.T_map_body[:, :3, :3]
+        rows = (turned - turned.mean(axis=0)).reshape(-1, 3)
+        step, *_ = np.linalg.lstsq(rows, (missing - missing.mean(axis=0)).ravel(), rcond=_LEAST_TURN)
+        lever = lever + step
+    return lever, ate(moved).rmse
 
 
 def ate(matched: Matched) -> Statistics:

@@ -16,6 +16,7 @@ from mapper.core.errors import MapperError, SourceError
 from mapper.core.frames import Scan
 from mapper.core.geometry import Transform, apply, inverse, transform
 from mapper.core.rotations import rotation_from_euler, rotation_from_quaternion
+from mapper.core.trajectory import with_rotations
 from mapper.core.voxel_grid import thin
 from mapper.run.input_logs import fingerprint
 from mapper.sources import open_source
@@ -274,9 +275,10 @@ def _of_log(folder: Path) -> list[Pair]:
 
 def _posed(log: Path) -> list[tuple[FrameRef, Transform]]:
     source = open_source(log)
-    if source.truth is None or source.sensor != "lidar":
+    truth = with_rotations(source.truth)
+    if truth is None or source.sensor != "lidar":
         return []
-    poses = dict(source.truth.items())
+    poses = dict(truth.items())
     return [(entry, poses[entry.stamp_ns]) for entry in source.entries_of(poses)]
 
 

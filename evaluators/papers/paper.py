@@ -13,7 +13,7 @@ from typing import Any, Literal, NamedTuple
 
 from mapper.config.build import BuildConfig
 from mapper.core.errors import ConfigError, DataError, SourceError
-from mapper.core.trajectory import Trajectory
+from mapper.core.trajectory import Trajectory, with_rotations
 from mapper.evaluators.papers.model import PaperCell, PaperPath, PaperTable
 from mapper.evaluators.study.engine import digest, versions
 from mapper.evaluators.study.table import Record
@@ -250,9 +250,10 @@ def open_with_truth(log: Path, config: BuildConfig) -> tuple[Log, Trajectory]:
         DataError: It has none.
     """
     source = open_source(log, config.source)
-    if source.truth is None:
+    truth = with_rotations(source.truth)
+    if truth is None:
         raise DataError(f"{log}: has no ground truth, so its error is unknown")
-    return source, source.truth
+    return source, truth
 
 
 def cells_of(table: str, results: Results, printed: Figures) -> tuple[PaperCell, ...]:

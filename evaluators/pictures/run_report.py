@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from mapper.core.errors import MapperError
+from mapper.core.trajectory import with_rotations
 from mapper.evaluators.metrics.agreement import CommonViews, agreement_metrics
 from mapper.evaluators.metrics.evaluate import assess
 from mapper.evaluators.metrics.loops import loop_metrics_of_run
@@ -54,8 +55,8 @@ def report(runs: Sequence[Run], out: AnyPath | None = None, *, overwrite: bool =
 
 def _figures(run: Run) -> list[Figure]:
     metrics = list(assess(run.trajectory, run.truth, frames_ns=run.frames_ns).metrics)
-    if run.truth is not None:
-        metrics += loop_metrics_of_run(run, run.truth)
+    if (truth := with_rotations(run.truth)) is not None:
+        metrics += loop_metrics_of_run(run, truth)
     figures = [Figure(name, value, "Is it right?") for name, value in _correctness(run)]
     figures.append(Figure("disagreement of views, RMS", _agreement(run), "Is it right?"))
     figures += [Figure(name, value, "Is it complete?") for name, value in _completeness(run)]

@@ -11,7 +11,7 @@ import numpy as np
 
 from mapper.config.build import BuildConfig
 from mapper.core.errors import DataError, MapperError
-from mapper.core.trajectory import Trajectory
+from mapper.core.trajectory import Trajectory, with_rotations
 from mapper.evaluators.metrics.odometry import ONE_SECOND, PathErrors, path_errors
 from mapper.evaluators.metrics.segments import lengths_for, segment_errors
 from mapper.evaluators.metrics.trajectory_errors import Matched, align, associate, start_end_offset
@@ -30,7 +30,7 @@ def summary(run: Run) -> dict[str, Value]:
     a second or over stretches of the path where there are none. ``relative_…`` are means over the
     segments of :func:`mapper.evaluators.metrics.segments.lengths_for`, as KITTI's table has them.
     """
-    counts, trajectory, truth = run.manifest.counts, run.trajectory, run.truth
+    counts, trajectory, truth = run.manifest.counts, run.trajectory, with_rotations(run.truth)
     matched = None if truth is None else _aligned(trajectory, truth)
     errors = PathErrors() if matched is None else path_errors(matched, ONE_SECOND)
     relative = _relative(matched, 0.0 if truth is None else truth.path_length_m)

@@ -15,6 +15,7 @@ from mapper.config.build import BuildConfig
 from mapper.config.loading import load_config, load_source_config, read_config
 from mapper.core.config import Config, flattened
 from mapper.core.errors import ConfigError
+from mapper.core.trajectory import with_rotations
 from mapper.evaluators.study.engine import CELLS, digest, run_study, seeded, versions
 from mapper.evaluators.sweep.build_job import BuildJob
 from mapper.loops.config import PlaceLoopsConfig, ScanLoopsConfig, ThesisLoopsConfig
@@ -230,7 +231,7 @@ def _misfit(config: BuildConfig, source: Log) -> str:
         return f"odometry.kind={odometry.kind} needs images"
     if odometry.kind == "wheels" and source.wheels is None:
         return "odometry.kind=wheels needs wheels"
-    has_poses = source.truth is not None or source.device_poses is not None
+    has_poses = with_rotations(source.truth) is not None or source.device_poses is not None
     if odometry.kind == "given" and odometry.path is None and not has_poses:
         return "odometry.kind=given needs truth or device poses"
     sees_scans = source.sensor != "rgbd" or isinstance(odometry, ScanOdometryConfig)

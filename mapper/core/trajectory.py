@@ -1,7 +1,7 @@
 """Trajectory: a body's poses over time."""
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 from os import PathLike
 from pathlib import Path
@@ -73,7 +73,7 @@ class Trajectory:
         if isinstance(index, int | np.integer):
             pose: Transform = self.T_world_body[index]
             return pose
-        return Trajectory(self.stamps_ns[index], self.T_world_body[index])
+        return replace(self, stamps_ns=self.stamps_ns[index], T_world_body=self.T_world_body[index])
 
     def __iter__(self) -> Iterator[Transform]:
         return iter(self.T_world_body)
@@ -156,7 +156,7 @@ class Trajectory:
 
     def moved(self, T_new_world: Transform) -> "Trajectory":
         """Return the same motion in another world frame."""
-        return Trajectory(self.stamps_ns, T_new_world @ self.T_world_body)
+        return replace(self, T_world_body=T_new_world @ self.T_world_body)
 
     def plot(self, axes: "Axes | None" = None) -> "Axes":
         """Draw the path seen from above, with a disc at its start and a square at its end.
@@ -173,6 +173,23 @@ class Trajectory:
         axes.plot(x[:1], y[:1], "o", color=line.get_color())
         axes.plot(x[-1:], y[-1:], "s", color=line.get_color())
         return axes
+
+
+class Positions(Trajectory):
+    """Trajectory of which positions alone are known, as of a total station: its rotations mean nothing."""
+
+    __slots__ = ()
+
+
+def without_idle_rotations(trajectory: Trajectory) -> Trajectory:
+    """Return a trajectory as positions alone if all of its rotations are exactly the identity."""
+    is_idle = len(trajectory) > 2 and (trajectory.T_world_body[:, :3, :3] == np.eye(3)).all()
+    return Positions(trajectory.stamps_ns, trajectory.T_world_body) if is_idle else trajectory
+
+
+def with_rotations(trajectory: Trajectory | None) -> Trajectory | None:
+    """Return a trajectory that has rotations; None of positions alone, and of none."""
+    return None if isinstance(trajectory, Positions) else trajectory
 
 
 def trajectory_from(poses: Iterable[tuple[int, Transform]]) -> Trajectory:

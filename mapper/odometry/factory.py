@@ -84,7 +84,7 @@ def build_odometry(
 
             if poses is None:
                 raise ConfigError(
-                    "odometry.kind=given: the log has neither truth nor device poses; name a file of poses: "
+                    "odometry.kind=given: the log has neither true nor device poses; name a file of poses: "
                     "--set odometry.path=poses.tum"
                 )
             return GivenOdometry(config, poses)

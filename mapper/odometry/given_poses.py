@@ -7,11 +7,11 @@ import numpy as np
 from mapper.core.deskew import Twist
 from mapper.core.errors import ConfigError
 from mapper.core.timebase import NS_PER_S, seconds_text_from_ns
-from mapper.core.trajectory import Trajectory
+from mapper.core.trajectory import Trajectory, with_rotations
 from mapper.odometry.config import GivenOdometryConfig, OdometryConfig
 from mapper.odometry.wheel_odometry import WheelsOdometry
 from mapper.sources.base import Log
-from mapper.sources.trajectory_files import read_tum
+from mapper.sources.trajectory_files import POSE_COLUMNS, read_tum, tum_rows
 
 
 class GivenOdometry(WheelsOdometry):
@@ -41,9 +41,11 @@ def poses_for(config: OdometryConfig, log: Log) -> Trajectory | None:
     if not isinstance(config, GivenOdometryConfig):
         return log.wheels
     if config.path is None:
-        return log.device_poses if log.truth is None else log.truth
+        return log.device_poses if (truth := with_rotations(log.truth)) is None else truth
     path = _found(config.path, log)
     poses = read_tum(path)
+    if len(next(tum_rows(path))[1]) < len(POSE_COLUMNS):
+        raise ConfigError(f"{path}: positions alone; odometry.kind=given needs rotations, qx qy qz qw, too")
     (first_ns, last_ns), (begin_ns, end_ns) = poses.stamps_ns[[0, -1]], log.stamps_ns[[0, -1]]
     if last_ns < begin_ns or first_ns > end_ns:
         given, frames = (

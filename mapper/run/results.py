@@ -1,7 +1,7 @@
 """Results of a run, read together for its MCAP log, a viewer or a report."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -63,7 +63,7 @@ def aligned_truth(truth: Trajectory, trajectory: Trajectory) -> Trajectory | Non
     meanwhile = slice(
         *np.searchsorted(truth.stamps_ns, [first_ns - MAX_TRUTH_GAP_NS, last_ns + MAX_TRUTH_GAP_NS])
     )
-    return Trajectory(truth.stamps_ns[meanwhile], truth.T_world_body[meanwhile]).moved(T_level_truth)
+    return truth[meanwhile].moved(T_level_truth)
 
 
 def with_truth(truth: Trajectory, trajectory: Trajectory) -> tuple[Trajectory, Trajectory] | None:
@@ -72,4 +72,5 @@ def with_truth(truth: Trajectory, trajectory: Trajectory) -> tuple[Trajectory, T
     near = gap_ns <= MAX_TRUTH_GAP_NS
     if near.sum() < 3:
         return None
-    return trajectory[near], Trajectory(trajectory.stamps_ns[near], truth.T_world_body[index[near]])
+    stamps_ns, T_world_body = trajectory.stamps_ns[near], truth.T_world_body[index[near]]
+    return trajectory[near], replace(truth, stamps_ns=stamps_ns, T_world_body=T_world_body)

@@ -173,7 +173,8 @@ class SourceConfig(Config):
     """File with one stamp per line and cloud, seconds or nanoseconds; None looks for stamps in names, then
     for times.txt."""
     truth_file: Path | None = None
-    """Poses of a LiDAR log, in TUM's or KITTI's text; None looks for groundtruth.txt and poses.txt."""
+    """Poses of a LiDAR log, in TUM's, KITTI's or MulRan's text or a table with a header; None looks for
+    groundtruth.txt, poses.txt, and tables of poses or positions that are called truth."""
     cloud_scale: PositiveFloat | None = None
     """Metres per unit of a LiDAR log's points; None is 1, and refuses what looks like millimetres."""
     bin_columns: int | None = Field(default=None, ge=3, le=64)

@@ -9,7 +9,7 @@ import numpy as np
 from mapper.core.frames import RgbdFrame
 from mapper.core.geometry import Array, Transform, angle_between, apply, inverse
 from mapper.core.timebase import NS_PER_S
-from mapper.core.trajectory import Trajectory
+from mapper.core.trajectory import Trajectory, with_rotations
 from mapper.core.units import MM_PER_M
 from mapper.sensing.wheel_kinematics import pose_at
 from mapper.sources.base import Log, read_depth
@@ -250,7 +250,7 @@ def _are_whole_millimetres(log: Log, frames: Collection[RgbdFrame]) -> bool:
 
 def _scale_of_log(log: Log, frames: Mapping[int, RgbdFrame]) -> float | None:
     """Return the factor that depth lacks by several pairs of frames; None where too few agree on one."""
-    motion = log.wheels if log.truth is None else log.truth
+    motion = log.wheels if (truth := with_rotations(log.truth)) is None else truth
     if motion is None:
         return None
     scales = []

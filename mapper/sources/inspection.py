@@ -9,7 +9,7 @@ import numpy as np
 from mapper.core.errors import DataError, DependencyError, FrameError, SourceError
 from mapper.core.frames import Frame, PinholeCamera, RgbdFrame, Scan, Sensor
 from mapper.core.timebase import GAP_INTERVALS, MAX_TRUTH_GAP_NS, NS_PER_S, Stamps, check_stamps, nearest
-from mapper.core.trajectory import Trajectory
+from mapper.core.trajectory import Positions, Trajectory
 from mapper.runtime.ordered_map import ordered_map
 from mapper.sources import RECORDING, format_of, open_source
 from mapper.sources.base import Log
@@ -342,7 +342,8 @@ def _unreadable(log: Log, indices: Iterable[int], images: ImageChecks | None = N
 def _truth_text(truth: Trajectory, stamps_ns: Stamps) -> str:
     _, gap_ns = nearest(truth.stamps_ns, stamps_ns)
     near = int((gap_ns <= MAX_TRUTH_GAP_NS).sum())
+    what = "positions" if isinstance(truth, Positions) else "poses"
     return (
-        f"{len(truth)} poses over {truth.path_length_m:.1f} m, "
+        f"{len(truth)} {what} over {truth.path_length_m:.1f} m, "
         f"within {MAX_TRUTH_GAP_NS / 1e6:g} ms of {near} of {len(stamps_ns)} frames"
     )

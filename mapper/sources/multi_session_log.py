@@ -10,7 +10,7 @@ import numpy as np
 
 from mapper.core.frames import Frame, Scan
 from mapper.core.timebase import NS_PER_S
-from mapper.core.trajectory import Trajectory
+from mapper.core.trajectory import Positions, Trajectory
 from mapper.sensing.gnss import GnssFixes
 from mapper.sensing.gyroscope import Gyroscope
 from mapper.sources.base import Accelerations, FrameRef, ImageFiles, Log, Session, WrappedEntry
@@ -178,4 +178,6 @@ def _joined_truth(logs: Sequence[Log]) -> tuple[Trajectory | None, list[str]]:
         notes.append(f"ground truth of {' and '.join(named)} only")
     if len(named) > 1:
         notes.append(f"the ground truths of {' and '.join(named)} are taken to be in one world")
-    return Trajectory(*map(np.concatenate, zip(*parts, strict=True))), notes
+    kind = Positions if any(isinstance(log.truth, Positions) for log in logs) else Trajectory
+    stamps_ns, T_world_body = map(np.concatenate, zip(*parts, strict=True))
+    return kind(stamps_ns, T_world_body), notes

@@ -12,7 +12,7 @@ from mapper.core.errors import DataError, SourceError
 from mapper.core.geometry import FARTHEST_M, Array, Transform, is_rigid, nearest_rotation, transform
 from mapper.core.rotations import pose_of_row
 from mapper.core.timebase import NS_PER_S, UNITS_PER_S, Stamps, ns_from_date_text, ns_from_seconds_text
-from mapper.core.trajectory import Trajectory
+from mapper.core.trajectory import Positions, Trajectory, without_idle_rotations
 from mapper.runtime.regular_files import read_text
 
 ROUNDING = 0.01
@@ -160,6 +160,15 @@ def pose_from_matrix(matrix: Sequence[Sequence[float]] | Array) -> Transform | N
         return None
     R = nearest_rotation(T[:3, :3])
     return transform(R, T[:3, 3]) if np.abs(R - T[:3, :3]).max() < ROUNDING else None
+
+
+def told_without_rotations(
+    truth: Trajectory | None, notes: list[str], *, what: str
+) -> tuple[Trajectory | None, list[str]]:
+    """Return a truth as one of positions alone where it has no rotations, with a note on that."""
+    if truth is None or not isinstance(truth := without_idle_rotations(truth), Positions):
+        return truth, notes
+    return truth, [*notes, f"{what}: positions without rotations; taken as the body's own"]
 
 
 def truth_from(

@@ -1,8 +1,9 @@
-"""Trajectories as TUM, EuRoC, KITTI and MulRan text."""
+"""Trajectories as TUM, EuRoC, KITTI and MulRan text, and as tables whose header names the columns."""
 
 import math
 import re
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -11,14 +12,26 @@ from mapper.core.errors import DataError
 from mapper.core.geometry import is_rigid, transform
 from mapper.core.rotations import pose_of_row, row_of_pose
 from mapper.core.timebase import Stamps, ns_from_seconds_text, seconds_text_from_ns
-from mapper.core.trajectory import Trajectory
+from mapper.core.trajectory import Positions, Trajectory, without_idle_rotations
 from mapper.runtime.atomic import write_text
 from mapper.runtime.regular_files import read_text
 from mapper.sources.text import ROUNDING, epoch_ns, poses_from_numbers
 
 _EUROC = re.compile(r"\s*\d{16,19}\s*,")
-_W_FIRST = re.compile(r"\bq\w*w\b.*\bq\w*x\b")
+_POSITION = r"(?:.*(?:position|translation)[./_]|p(?:os)?_|p_\w+_|[pt]_?)?{}(?:_m)?"
+_QUATERNION = r"(?:.*(?:orientation|rotation|quaternion|quat)[./_]|q_\w+_|q_?){}"
+_COLUMNS = {
+    "stamp": r"[_#%]*(?:.*stamp.*|u?time.*|gpstime|t|sec(?:s|onds)?)",
+    "nanoseconds": r"n(?:ano)?sec(?:s|onds)?",
+    **{axis: _POSITION.format(axis) for axis in "xyz"},
+    **{f"q{axis}": _QUATERNION.format(axis) for axis in "xyzw"},
+}
+"""Names of the columns of a pose, in lower case and without units, by EuRoC's, ROS's and other tables."""
+_OF_MAPS = {"x": "east(?:ing)?", "y": "north(?:ing)?", "z": "alt(?:itude)?|up|height"}
 _MULRAN_COLUMNS = 13
+POSE_COLUMNS = ("stamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw")
+POSITION_COLUMNS = POSE_COLUMNS[:4]
+_NCLT_COLUMNS = 7
 _LAST_ROW = [0.0, 0.0, 0.0, 1.0]
 _NUMBER = re.compile(r"[-+.]?\d|nan|inf", re.IGNORECASE)
 _DECIMAL_COMMA = re.compile(r"[-+]?\d+(?:,\d+)?(?:e[-+]?\d+)?", re.IGNORECASE)
@@ -28,21 +41,22 @@ def read_tum(path: Path) -> Trajectory:
     """Read ``stamp tx ty tz qx qy qz qw`` lines (Sturm et al. 2012), or EuRoC's (Burri et al. 2016).
 
     EuRoC's have whole nanoseconds, commas, w before x, and velocities and biases after the pose, which are
-    left out. A header above the first pose that names qw before qx sets the order, too. Stamps may be ms, µs
-    or ns since 1970, and semicolons separate columns. Quaternions are normalised.
+    left out. A header above the first pose may name the columns in any order, among others. Lines without a
+    quaternion, ``stamp x y z``, give positions alone; angles, whose order no two programs share, are left
+    out. Stamps may be ms, µs or ns since 1970, and semicolons separate columns. Quaternions are normalised.
 
     Of two poses with the same stamp the first counts: fr2_desk's truth rounds two samples to one stamp.
 
     Raises:
-        DataError: A line that is not eight finite numbers, a zero quaternion, or stamps that decrease.
+        DataError: A line that is not eight or four finite numbers, a zero quaternion, or stamps that
+            decrease.
     """
     stamps_ns: list[int] = []
     numbers: list[list[float]] = []
     places: list[str] = []
     for number, words in tum_rows(path):
         place = f"{path}:{number}"
-        if len(words) != 8:
-            raise DataError(f"{place}: {len(words)} columns, want 8: stamp tx ty tz qx qy qz qw")
+        words = whole_row(words, place=place)
         try:
             stamp_ns, pose = epoch_ns(words[0]), [float(word) for word in words[1:]]
             stamp_ns = ns_from_seconds_text(words[0]) if stamp_ns is None else stamp_ns
@@ -63,13 +77,27 @@ def read_tum(path: Path) -> Trajectory:
         if T is None:
             raise DataError(f"{place}: quaternion {tuple(pose[3:])} has no direction; want a non-zero xyzw")
         poses.append(T)
-    return Trajectory(np.array(stamps_ns, dtype=np.int64), np.array(poses))
+    return without_idle_rotations(Trajectory(np.array(stamps_ns, dtype=np.int64), np.array(poses)))
+
+
+def whole_row(words: list[str], *, place: str) -> list[str]:
+    """Return a line's eight words; of positions alone with a rotation of the identity.
+
+    Raises:
+        DataError: It has another number of columns.
+    """
+    if len(words) == len(POSITION_COLUMNS):
+        return [*words, "0", "0", "0", "1"]
+    if len(words) != len(POSE_COLUMNS):
+        raise DataError(f"{place}: {len(words)} columns, want 8: {' '.join(POSE_COLUMNS)}, or the first 4")
+    return words
 
 
 def write_tum(path: Path, trajectory: Trajectory) -> None:
-    """Write TUM text with exact stamps and every digit of the poses."""
-    lines = ["# timestamp tx ty tz qx qy qz qw"]
-    rows = row_of_pose(trajectory.T_world_body).tolist()
+    """Write TUM text with exact stamps and every digit of the poses, or of the positions."""
+    columns = POSITION_COLUMNS if isinstance(trajectory, Positions) else POSE_COLUMNS
+    lines = [f"# timestamp {' '.join(columns[1:])}"]
+    rows = row_of_pose(trajectory.T_world_body)[:, : len(columns) - 1].tolist()
     for stamp_ns, row in zip(trajectory.stamps_ns.tolist(), rows, strict=True):
         lines.append(" ".join([seconds_text_from_ns(stamp_ns), *map(repr, row)]))
     write_text(path, "\n".join(lines) + "\n")
@@ -116,6 +144,16 @@ def _matrices(path: Path, lines: Iterable[tuple[int, list[str]]], stamps_ns: Sta
     return Trajectory(stamps, pose_of_row(row_of_pose(T)))  # text of few digits is slightly off SO(3)
 
 
+def has_poses(path: Path) -> bool:
+    """Return whether a file's first line is a stamp and a pose or a position."""
+    with suppress(DataError):
+        if is_mulran(path):
+            return True
+        _, words = next(tum_rows(path), (0, []))
+        return len(words) in (len(POSITION_COLUMNS), len(POSE_COLUMNS))
+    return False
+
+
 def is_mulran(path: Path) -> bool:
     """Return whether a file begins as MulRan's ``global_pose.csv``: whole nanoseconds and a 3×4 pose."""
     _, words = next(iter(_rows(path)), (0, []))
@@ -154,21 +192,59 @@ def tum_rows(path: Path) -> Iterator[tuple[int, list[str]]]:
     Raises:
         DataError: The file cannot be read, or a line begins as EuRoC's and has no unit quaternion.
     """
-    is_w_first = has_begun = False
+    header, columns = "", list[int]()
+    has_begun = False
     for number, line in enumerate(read_text(path, may_be_pipe=True).splitlines(), start=1):
         words = _words(line)
-        is_comment = bool(words) and words[0].startswith("#")
+        is_comment = bool(words) and words[0].startswith(("#", "%"))
         if not has_begun and (is_comment or not any(map(_NUMBER.match, words))):
-            is_w_first = is_w_first or _W_FIRST.search(line.lower()) is not None
+            columns, header = (found, line) if (found := _columns_of(line)) else (columns, header)
         elif words and not is_comment:
-            is_euroc = len(words) >= 8 and _EUROC.match(line) is not None
-            if is_euroc:
+            if columns and max(columns) < len(words):
+                words = _picked(words, columns, header)
+            elif _EUROC.match(line) is not None and len(words) >= len(POSE_COLUMNS):
                 _refuse_another_csv(f"{path}:{number}", words)
-                words = [f"{words[0]}e-9", *words[1:8]]
-            if (is_euroc or is_w_first) and len(words) == 8:
-                words = [*words[:4], *words[5:], words[4]]
+                words = [f"{words[0]}e-9", *words[1:4], *words[5:8], words[4]]
+            elif len(words) == _NCLT_COLUMNS and epoch_ns(words[0]) is not None:
+                words = words[: len(POSITION_COLUMNS)]
             yield number, words
         has_begun = has_begun or (bool(words) and not is_comment)
+
+
+def _columns_of(header: str) -> list[int]:
+    """Return the columns of stamp, x y z, and, where they are there, the quaternion and nanoseconds."""
+    separator = next((one for one in ",;\t" if one in header), None)
+    names = [
+        re.sub(r"[\[(].*|\s", "", name.strip(" #%\"'").lower())
+        for name in header.strip().lstrip("#%").strip().split(separator)
+    ]
+    patterns = dict(_COLUMNS)
+    if not any(re.fullmatch(patterns["x"], name) for name in names):
+        patterns |= _OF_MAPS
+    at = {
+        role: next((k for k, name in enumerate(names) if re.fullmatch(pattern, name)), None)
+        for role, pattern in patterns.items()
+    }
+    found = {role: k for role, k in at.items() if k is not None}
+    if not {"stamp", "x", "y", "z"} <= found.keys():
+        return []
+    turns = [found[role] for role in ("qx", "qy", "qz", "qw") if role in found]
+    nanoseconds = [found["nanoseconds"]] if "nanoseconds" in found else []
+    return [
+        *(found[role] for role in ("stamp", "x", "y", "z")),
+        *(turns if len(turns) == 4 else []),
+        *nanoseconds,
+    ]
+
+
+def _picked(words: list[str], columns: list[int], header: str) -> list[str]:
+    """Return stamp, position and perhaps quaternion of a row by the columns that its header names."""
+    stamp, *numbers = (words[k] for k in columns)
+    if len(columns) in (len(POSITION_COLUMNS) + 1, len(POSE_COLUMNS) + 1):
+        stamp = f"{stamp}.{numbers.pop():0>9}"
+    elif re.search(r"stamp\s*\[ns\]", header):
+        stamp = f"{stamp}e-9"
+    return [stamp, *numbers]
 
 
 def _refuse_another_csv(place: str, words: list[str]) -> None:

@@ -89,7 +89,7 @@ def test_lists_out_of_order_are_sorted_and_repeats_dropped(tiny_tum_log):
         ("rgb.txt", "# x\nsoon rgb/a.png\n", r"rgb\.txt:2: stamp 'soon' is not a decimal number"),
         ("rgb.txt", "1.0 rgb/none.png\n", r"rgb\.txt: none of its 1 images exists"),
         ("rgb.txt", b"\xff\xfe\x00", r"rgb\.txt: not a text file"),
-        ("groundtruth.txt", "1.0 0 0 0\n", r"groundtruth\.txt:1: 4 columns, want 8"),
+        ("groundtruth.txt", "1.0 0 0\n", r"groundtruth\.txt:1: 3 columns, want 8"),
         ("groundtruth.txt", "1.0 0 0 x 0 0 0 1\n", r"groundtruth\.txt:1: could not convert string"),
         ("accelerometer.txt", "1.0 0 0\n", r"accelerometer\.txt:1: 3 columns, want 4"),
         ("calibration.toml", "fx_px = 500.0\n", r"calibration\.toml: no number fy_px"),

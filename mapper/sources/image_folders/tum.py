@@ -33,9 +33,10 @@ from mapper.sources.text import (
     read_lines,
     table,
     time_order,
+    told_without_rotations,
     truth_from,
 )
-from mapper.sources.trajectory_files import tum_rows
+from mapper.sources.trajectory_files import tum_rows, whole_row
 
 DEVICE_POSES = "device_poses.txt"
 """File of a phone's own poses in a converted log, as its groundtruth.txt."""
@@ -146,14 +147,17 @@ def read_truth(path: Path) -> tuple[Trajectory | None, list[str]]:
         raise SourceError(f"{error}") from None
     for number, words in lines:
         where = f"{path}:{number}"
-        if len(words) != 8:
-            raise SourceError(f"{where}: {len(words)} columns, want 8: stamp tx ty tz qx qy qz qw")
+        try:
+            words = whole_row(words, place=where)
+        except DataError as error:
+            raise SourceError(f"{error}") from None
         row = parse_numbers(words, where=where)
         has_stamp = math.isfinite(row[0])
         stamps_ns.append(parse_stamp(words[0], where=where) if has_stamp else 0)
         numbers.append(row[1:] if has_stamp else np.full(7, np.nan))
     poses = poses_from_numbers(np.reshape(numbers, (-1, 7)))
-    return truth_from(list(zip(stamps_ns, poses, strict=True)), what=path.name)
+    truth, notes = truth_from(list(zip(stamps_ns, poses, strict=True)), what=path.name)
+    return told_without_rotations(truth, notes, what=path.name)
 
 
 def _read_list(folder: Path, name: str, notes: list[str]) -> ImageList:

@@ -184,6 +184,11 @@ def _pose_stamped(m: Any) -> list[PoseMessage]:
     return [_pose(m.header, getattr(m, "child_frame_id", ""), pose.position, pose.orientation)]
 
 
+def _point_stamped(m: Any) -> list[PoseMessage]:
+    point = m.point.x, m.point.y, m.point.z
+    return [PoseMessage(_ns(m.header.stamp), m.header.frame_id, "", (*point, 0.0, 0.0, 0.0, 1.0))]
+
+
 def _transform_stamped(m: Any) -> list[PoseMessage]:
     return [_pose(m.header, m.child_frame_id, m.transform.translation, m.transform.rotation)]
 
@@ -228,6 +233,7 @@ _READERS: Mapping[str, Callable[[Any], Message]] = {
     "geometry_msgs/msg/PoseStamped": _pose_stamped,
     "geometry_msgs/msg/PoseWithCovarianceStamped": _pose_stamped,
     "nav_msgs/msg/Odometry": _pose_stamped,
+    "geometry_msgs/msg/PointStamped": _point_stamped,
     "geometry_msgs/msg/TransformStamped": _transform_stamped,
     "geometry_msgs/msg/Transform": _transform,
     "tf2_msgs/msg/TFMessage": _transforms,

@@ -219,6 +219,7 @@ FIXES = frozenset({"sensor_msgs/msg/NavSatFix"}) | GPS_FIXES | SENTENCES
 ODOMETRY = frozenset({"nav_msgs/msg/Odometry"})
 POSES = ODOMETRY | frozenset(
     {
+        "geometry_msgs/msg/PointStamped",
         "geometry_msgs/msg/PoseStamped",
         "geometry_msgs/msg/PoseWithCovarianceStamped",
         "geometry_msgs/msg/TransformStamped",

@@ -13,7 +13,7 @@ from mapper.core.frames import Sensor
 from mapper.core.geometry import FARTHEST_M, spread_indices
 from mapper.core.rotations import pose_of_row
 from mapper.core.timebase import NS_PER_S
-from mapper.core.trajectory import Trajectory
+from mapper.core.trajectory import Positions, Trajectory
 from mapper.core.units import GRAVITY_MPS2, unit_of_gravity
 from mapper.sensing.gnss import GnssFixes
 from mapper.sensing.gyroscope import Gyroscope
@@ -37,7 +37,7 @@ from mapper.sources.ros.messages import (
 )
 from mapper.sources.ros.recording import Recording
 from mapper.sources.ros.topic_ranks import shared_namespaces
-from mapper.sources.text import ROUNDING, time_order
+from mapper.sources.text import ROUNDING, time_order, told_without_rotations
 from mapper.sources.wheel_files import mounting
 
 _MAX_TRANSFORMS = 1_000
@@ -89,6 +89,9 @@ class RecordingReader:
         if series is None:
             return None, []
         truth, child, notes = self._poses_of(series)
+        truth, notes = told_without_rotations(truth, notes, what=series.topic.name)
+        if isinstance(truth, Positions):
+            return truth, notes
         if truth is None or child in ("", body):
             return truth, notes
         if self.tree.find(child, body) is None:

@@ -1,5 +1,7 @@
 """Single clouds, and folders of them in any of the formats of ``cloud_files.ENDINGS``."""
 
+import re
+from collections.abc import Sequence
 from pathlib import Path
 
 from mapper.core.errors import SourceError
@@ -14,8 +16,10 @@ from mapper.sources.scan_folders.scan_folder import (
     scan_log,
 )
 from mapper.sources.scan_stamps import stamps_list
+from mapper.sources.trajectory_files import has_poses
 
-TRUTH_FILES = ("groundtruth.txt", "poses.txt")
+_TRUTH_FILES = ("groundtruth.txt", "poses.txt")
+_LIKE_TRUTH = re.compile(r"ground.?truth|(?<![a-z])gt(?![a-z])|global_pose", re.IGNORECASE)
 
 
 def recognise(path: Path) -> bool:
@@ -58,11 +62,20 @@ def read_log(path: Path, config: SourceConfig) -> Log:
         files,
         kind="clouds",
         stamps_file=stamps_list((folder, path)),
-        truth_file=first_of((folder, path), TRUTH_FILES),
+        truth_file=_truth_file((folder, path)),
         config=config,
         notes=[*notes, *refused],
     )
     return log
+
+
+def _truth_file(folders: Sequence[Path]) -> Path | None:
+    """Return the file of true poses: by its usual name, or by its columns where it is called truth."""
+    if (usual := first_of(folders, _TRUTH_FILES)) is not None:
+        return usual
+    named = (path for folder in folders for path in sorted(folder.iterdir()) if _LIKE_TRUTH.search(path.stem))
+    texts = (path for path in named if path.suffix.lower() in (".csv", ".txt", ".tum") and path.is_file())
+    return next(filter(has_poses, texts), None)
 
 
 def _folders(path: Path) -> list[Path]:

@@ -22,8 +22,15 @@ from mapper.sources.listed_files import refuse_links_out
 from mapper.sources.point_times import times_told
 from mapper.sources.scan_folders.scans import read_scan
 from mapper.sources.scan_stamps import in_order, line_of_each, scan_stamps
-from mapper.sources.text import time_order, truth_from
-from mapper.sources.trajectory_files import read_kitti, tum_rows
+from mapper.sources.text import time_order, told_without_rotations, truth_from
+from mapper.sources.trajectory_files import (
+    POSE_COLUMNS,
+    POSITION_COLUMNS,
+    is_mulran,
+    read_kitti,
+    read_mulran,
+    tum_rows,
+)
 
 _TEXT_ENDINGS = (".txt", ".csv")
 _SAMPLED = 5
@@ -223,7 +230,9 @@ def _read_truth(
 ) -> tuple[Trajectory | None, list[str]]:
     if path is None:
         return None, []
-    if len(next(tum_rows(path), (0, []))[1]) == 8:
+    if is_mulran(path):
+        return told_without_rotations(read_mulran(path), [], what=path.name)
+    if len(next(tum_rows(path), (0, []))[1]) in (len(POSE_COLUMNS), len(POSITION_COLUMNS)):
         return read_truth(path)
     T_world_posed = read_kitti(path).T_world_body
     lines = line_of_each(files, len(T_world_posed))
@@ -237,4 +246,4 @@ def _read_truth(
     if T_posed_lidar is not None:  # the world is where the LiDAR began, as it is for KITTI's camera
         T_world_lidar = inverse(T_posed_lidar) @ T_world_posed @ T_posed_lidar
     truth, more = truth_from([(int(stamps_ns[i]), T_world_lidar[line]) for i, line in posed], what=path.name)
-    return truth, [*notes, *more]
+    return told_without_rotations(truth, [*notes, *more], what=path.name)
