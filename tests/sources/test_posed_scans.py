@@ -22,8 +22,8 @@ from tests.support.posed_scans import WRITERS, Shots, shots_of, write_record3d
 
 DEVICE = {"stray-scanner", "record3d", "polycam", "nerfstudio"}
 CONFIDENT = {"stray-scanner", "record3d", "polycam"}
-UNTIMED = {"nerfstudio", "replica", "scannet", "bundlefusion", "redwood"}
-LOSSLESS = {"nerfstudio", "redwood", "openloris"}
+UNTIMED = {"nerfstudio", "replica", "bop", "scannet", "bundlefusion", "redwood"}
+LOSSLESS = {"nerfstudio", "bop", "redwood", "openloris"}
 
 
 @pytest.fixture(scope="module")
@@ -61,6 +61,22 @@ def test_layouts_of_every_way_of_reading_are_mapped(shots, tmp_path, kind):
     run = build(log, load_config(None), tmp_path / "run")
     assert run.manifest.counts.tracked == len(shots.frames)
     assert evaluate(run.trajectory, log.device_poses if kind in DEVICE else log.truth).ate_m < 0.02
+
+
+def test_a_scene_of_bop_without_poses_or_of_other_scales_is_told(shots, tmp_path):
+    path = WRITERS["bop"][0](tmp_path / "000002", shots) / "scene_camera.json"
+    cameras = json.loads(path.read_text())
+    bare = {key: {"cam_K": one["cam_K"], "depth_scale": 0.25} for key, one in cameras.items()}
+    path.write_text(json.dumps(bare))
+    log = open_source(path.parent)
+    assert log.truth is None
+    assert not [note for note in log.notes if "poses" in note]
+    bare["1"]["depth_scale"] = 1.0
+    path.write_text(json.dumps(bare))
+    assert any("depth_scale" in note for note in open_source(path.parent).notes)
+    path.write_text("{}")
+    with pytest.raises(SourceError, match="no camera"):
+        open_source(path.parent)
 
 
 def test_depth_of_early_stray_scanner_exports_is_arrays(shots, tmp_path):

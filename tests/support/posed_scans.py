@@ -181,6 +181,22 @@ def write_replica(folder: Path, shots: Shots) -> Path:
     return scene
 
 
+def write_bop(folder: Path, shots: Shots) -> Path:
+    cameras = {}
+    for i, shot in enumerate(shots.frames):
+        _save(folder / f"rgb/{i:06}.png", shot.rgb)
+        _save(folder / f"depth/{i:06}.png", shot.depth_mm * 4)
+        T = np.linalg.inv(shot.T_world_camera)
+        cameras[str(i)] = {
+            "cam_K": shots.K.ravel().tolist(),
+            "depth_scale": 0.25,
+            "cam_R_w2c": T[:3, :3].ravel().tolist(),
+            "cam_t_w2c": (1000.0 * T[:3, 3]).tolist(),
+        }
+    (folder / "scene_camera.json").write_text(json.dumps(cameras, indent=2))
+    return folder
+
+
 def write_sens(path: Path, shots: Shots) -> Path:
     height, width = shots.frames[0].rgb.shape[:2]
     rows, columns = shots.frames[0].depth_mm.shape
@@ -286,6 +302,7 @@ WRITERS: dict[str, tuple[Callable[[Path, Shots], Path], str]] = {
     "polycam": (write_polycam, "scan"),
     "nerfstudio": (write_nerfstudio, "scan"),
     "replica": (write_replica, "scan"),
+    "bop": (write_bop, "000001"),
     "scannet-sens": (write_sens, "scene0000_00.sens"),
     "scannet": (write_scannet, "scan"),
     "bundlefusion": (write_bundlefusion, "scan"),

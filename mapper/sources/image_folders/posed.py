@@ -82,7 +82,8 @@ def log_of(layout: Layout, path: Path, config: SourceConfig) -> Log:
     frames, notes = _whole(found, path)
     ordered, order_notes = ordered_pairs([pair for pair, _ in frames], config, what=layout.kind, path=path)
     poses = [(pair.stamp_ns, T_world_camera) for pair, T_world_camera in frames]
-    stated, pose_notes = truth_from(poses, what=f"poses of {path.name}")
+    are_stated = any(T_world_camera is not None for _, T_world_camera in poses)
+    stated, pose_notes = truth_from(poses, what=f"poses of {path.name}") if are_stated else (None, [])
     log = rgbd_log(
         ordered,
         found.calibration,

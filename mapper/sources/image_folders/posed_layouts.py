@@ -6,6 +6,7 @@ from mapper.core.errors import SourceError
 from mapper.sources.base import Log
 from mapper.sources.config import SourceConfig
 from mapper.sources.image_folders import (
+    bop,
     nerfstudio,
     polycam,
     record3d,
@@ -20,6 +21,7 @@ LAYOUTS = (
     Layout("record3d", record3d.FILES, record3d.read_frames),
     Layout("polycam", polycam.FILES, polycam.read_frames),
     Layout("nerfstudio", nerfstudio.FILES, nerfstudio.read_frames, holds_too=nerfstudio.has_depth),
+    Layout("bop", bop.FILES, bop.read_frames, are_poses_true=True),
     Layout("replica", replica.FILES, replica.read_frames, are_poses_true=True),
     Layout("scannet", scannet_sens.FILES, scannet_sens.read_frames, are_poses_true=True),
 )
