@@ -63,11 +63,12 @@ _OTHER_FILES = {
         (".lvx", ".lvx2"), "Livox Viewer's own format; convert it to .bag or .las with Livox's tools"
     ),
     ".oni": "OpenNI's own format; play it into a recording with openni2_launch, or export its images",
-    ".klg": "Kintinuous' and ElasticFusion's own format; export its images, with their stamps in the names",
     ".vrs": "Project Aria's own format; it has no depth",
     ".npz": "arrays of NumPy; write each cloud as .npy, or images as .png, into a folder",
 }
 """What files are that are no logs, and what to do, by their ending."""
+_RECORDINGS = (".mcap", ".bag", ".db3", ".klg", ".mkv", ".r3d", ".pcap", ".pcapng")
+"""Endings of logs that are one file each, of which a folder may hold several."""
 
 
 def open_source(path: Path, config: SourceConfig = _DEFAULTS) -> "Log":
@@ -76,7 +77,7 @@ def open_source(path: Path, config: SourceConfig = _DEFAULTS) -> "Log":
     Args:
         path: Folder of a TUM, ICL-NUIM, Poznań, 7-Scenes, Redwood, ScanNet, Replica, EuRoC or KITTI log,
             of an app's export (Stray Scanner, Record3D, Polycam, nerfstudio), of a HoloLens 2 or of clouds;
-            an mbag, .sens, .r3d, .mkv (Azure Kinect), .e57, .pcap or MCAP file, a CARMEN log, or a ROS bag.
+            an mbag, .sens, .klg, .r3d, .mkv (Azure Kinect), .e57, .pcap or MCAP file, CARMEN log or ROS bag.
         config: Selection, pairing, camera, and what the files of a log do not state.
 
     Raises:
@@ -157,7 +158,7 @@ def _inner_hint(path: Path) -> str:
         with suppress(SourceError):  # of a file in it that cannot be read
             if format_of(inner):
                 return f"; {inner.relative_to(path)} in it is one"
-    recordings = sorted(one.name for one in path.glob("*") if one.suffix in (".mcap", ".bag", ".db3"))
+    recordings = sorted(one.name for one in path.glob("*") if one.suffix.lower() in _RECORDINGS)
     if recordings:
         return f"; open one of {listed(recordings)}"
     for names in ("*/*", "*/*/*", "*/*/*/*"):

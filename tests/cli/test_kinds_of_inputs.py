@@ -111,7 +111,7 @@ def test_data_that_are_no_logs_are_named(tmp_path):
     for name in ("a.jpg", "b.jpg"):
         (images / name).write_bytes(b"")
     named = {images: "depth", images / "a.jpg": "one image"}
-    others = [("a.svo2", "ZED"), ("a.lvx", "Livox"), ("a.oni", "OpenNI"), ("a.klg", "Kintinuous")]
+    others = [("a.svo2", "ZED"), ("a.lvx", "Livox"), ("a.oni", "OpenNI")]
     for name, what in (("walk.mp4", "video"), ("log.zip", "archive"), ("log.tar.gz", "archive"), *others):
         (tmp_path / name).write_bytes(b"")
         named[tmp_path / name] = what

@@ -18,7 +18,7 @@ from mapper.sources import open_source
 from mapper.sources.config import CameraConfig, SourceConfig
 from mapper.sources.inspection import inspect_log
 from mapper.sources.writers import write_log
-from tests.support.posed_scans import WRITERS, Shots, shots_of, write_record3d
+from tests.support.posed_scans import WRITERS, Shots, shots_of, write_klg, write_record3d
 
 DEVICE = {"stray-scanner", "record3d", "polycam", "nerfstudio"}
 CONFIDENT = {"stray-scanner", "record3d", "polycam"}
@@ -49,6 +49,9 @@ def test_every_layout_is_read_as_it_was_taken(shots, tmp_path, kind):
         np.testing.assert_allclose(frame.depth_m[::2, ::2] * 1000.0, expected_mm, atol=0.1)
         difference = np.abs(frame.image.astype(int) - shot.rgb.astype(int))
         assert difference.max() == 0 if kind in LOSSLESS else difference.mean() < 6.0
+    if kind == "klg":
+        assert log.truth is log.device_poses is None
+        return
     poses = log.device_poses if kind in DEVICE else log.truth
     assert (log.truth is None) == (kind in DEVICE)
     np.testing.assert_allclose(poses.T_world_body, [shot.T_world_camera for shot in shots.frames], atol=1e-5)
@@ -61,6 +64,23 @@ def test_layouts_of_every_way_of_reading_are_mapped(shots, tmp_path, kind):
     run = build(log, load_config(None), tmp_path / "run")
     assert run.manifest.counts.tracked == len(shots.frames)
     assert evaluate(run.trajectory, log.device_poses if kind in DEVICE else log.truth).ate_m < 0.02
+
+
+def test_a_klg_file_may_be_raw_or_cut_and_needs_a_camera(shots, tmp_path):
+    path = write_klg(tmp_path / "scan.klg", shots, packed=False)
+    frame = open_source(path)[1]
+    np.testing.assert_array_equal(frame.image, shots.frames[1].rgb)
+    np.testing.assert_allclose(frame.depth_m[::2, ::2] * 1000.0, shots.frames[1].depth_mm, atol=0.1)
+    path.write_bytes(path.read_bytes()[:-5])
+    log = open_source(path)
+    assert len(log) == len(shots.frames) - 1
+    assert any(f"it says {len(shots.frames)}" in note for note in log.notes)
+    path.with_name("intrinsics.txt").unlink()
+    with pytest.raises(SourceError, match=r"put a calibration\.toml"):
+        open_source(path)
+    path.write_bytes(b"\x03\0\0\0")
+    with pytest.raises(SourceError, match="no frame in it"):
+        open_source(path)
 
 
 def test_a_scene_of_bop_without_poses_or_of_other_scales_is_told(shots, tmp_path):

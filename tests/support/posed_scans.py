@@ -197,6 +197,23 @@ def write_bop(folder: Path, shots: Shots) -> Path:
     return folder
 
 
+def write_klg(path: Path, shots: Shots, *, packed: bool = True) -> Path:
+    records = [struct.pack("<i", len(shots.frames))]
+    for shot in shots.frames:
+        depth = cv2.resize(
+            shot.depth_mm, shot.rgb.shape[1::-1], interpolation=cv2.INTER_NEAREST_EXACT
+        ).tobytes()
+        image = shot.rgb.tobytes()
+        if packed:
+            depth, image = zlib.compress(depth), cv2.imencode(".jpg", shot.rgb[..., ::-1])[1].tobytes()
+        stamp_us = round(shot.stamp_s * 1e6)
+        records.append(struct.pack("<qii", stamp_us, len(depth), len(image)) + depth + image)
+    path.write_bytes(b"".join(records))
+    K = shots.K
+    path.with_name("intrinsics.txt").write_text(f"{K[0, 0]} {K[1, 1]} {K[0, 2]} {K[1, 2]}\n")
+    return path
+
+
 def write_sens(path: Path, shots: Shots) -> Path:
     height, width = shots.frames[0].rgb.shape[:2]
     rows, columns = shots.frames[0].depth_mm.shape
@@ -303,6 +320,7 @@ WRITERS: dict[str, tuple[Callable[[Path, Shots], Path], str]] = {
     "nerfstudio": (write_nerfstudio, "scan"),
     "replica": (write_replica, "scan"),
     "bop": (write_bop, "000001"),
+    "klg": (write_klg, "scan.klg"),
     "scannet-sens": (write_sens, "scene0000_00.sens"),
     "scannet": (write_scannet, "scan"),
     "bundlefusion": (write_bundlefusion, "scan"),

@@ -7,6 +7,7 @@ from mapper.sources.base import Log
 from mapper.sources.config import SourceConfig
 from mapper.sources.image_folders import (
     bop,
+    klg,
     nerfstudio,
     polycam,
     record3d,
@@ -23,6 +24,7 @@ LAYOUTS = (
     Layout("nerfstudio", nerfstudio.FILES, nerfstudio.read_frames, holds_too=nerfstudio.has_depth),
     Layout("bop", bop.FILES, bop.read_frames, are_poses_true=True),
     Layout("replica", replica.FILES, replica.read_frames, are_poses_true=True),
+    Layout("klg", klg.FILES, klg.read_frames),
     Layout("scannet", scannet_sens.FILES, scannet_sens.read_frames, are_poses_true=True),
 )
 

@@ -108,7 +108,7 @@ def _read(file: BinaryIO, path: Path, config: SourceConfig) -> PosedFrames:
         stamps_us.append(int(record["stamps_us"][0]))
         stamp_ns = 1000 * stamps_us[-1]
         part = FilePart(path, start + colour_bytes, depth_bytes, ".png")
-        decode = partial(_depth_m, part, depth_px, depth_compression == _ZLIB, units_per_m)
+        decode = partial(depth_m_of_part, part, depth_px, depth_compression == _ZLIB, units_per_m)
         colour = FilePart(path, start, colour_bytes, suffix)
         pairs.append(FramePair(stamp_ns, colour, stamp_ns, DecodedDepth(part, decode, units_per_m)))
         poses.append(pose_from_matrix(record["pose"]))
@@ -124,7 +124,14 @@ def _read(file: BinaryIO, path: Path, config: SourceConfig) -> PosedFrames:
     return PosedFrames(pairs, poses, camera, units_per_m, notes)
 
 
-def _depth_m(part: FilePart, size_px: tuple[int, int], is_packed: bool, units_per_m: float) -> DepthImage:
+def depth_m_of_part(
+    part: FilePart, size_px: tuple[int, int], is_packed: bool, units_per_m: float
+) -> DepthImage:
+    """Return (H, W) depth of raw or packed 16-bit units.
+
+    Raises:
+        FrameError: They are not as many pixels, or cannot be read.
+    """
     width_px, height_px = size_px
     try:
         data = part.read_bytes()
