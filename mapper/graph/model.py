@@ -66,6 +66,10 @@ class BetweenFactor:
         except np.linalg.LinAlgError:
             raise GraphError(f"factor {self.i} → {self.j}: information is not positive definite") from None
 
+    def renumbered(self, offset: int) -> "BetweenFactor":
+        """Return the factor with a constant added to its node numbers."""
+        return replace(self, i=self.i + offset, j=self.j + offset)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PositionFactor:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
@@ -78,6 +78,17 @@ class FrameResult:
     is_sharp: bool = True
     doubts: tuple[Doubt, ...] = ()
     covariance: Array | None = None
+
+    def renumbered(self, offset: int) -> FrameResult:
+        """Return the result with a constant added to its node numbers."""
+        if offset == 0:
+            return self
+        return replace(
+            self,
+            node=None if self.node is None else self.node + offset,
+            factors=[factor.renumbered(offset) for factor in self.factors],
+            links=[link.renumbered(offset) for link in self.links],
+        )
 
 
 def lost_frame(

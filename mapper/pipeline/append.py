@@ -12,7 +12,6 @@ from mapper.loops.config import KeyframeLoopsConfig
 from mapper.loops.factory import build_keyframe_loop_detector
 from mapper.odometry.base import FrameResult
 from mapper.odometry.gyroscope_calibration import with_body_rates
-from mapper.odometry.renumbered_nodes import NodeOffset
 from mapper.pipeline.component_loops import joined
 from mapper.pipeline.disconnected_components import component_of
 from mapper.pipeline.fuse import carry_times, fuse_into
@@ -154,8 +153,7 @@ def _after(
     detector = build_keyframe_loop_detector(config.loops, config.graph.solve)
     views = reobserve(first, before.trajectory, set(graph.stamps_ns.values()), config, progress=progress)
     detector.preload(graph, {node: views[stamp_ns] for node, stamp_ns in graph.stamps_ns.items()})
-    odometry = NodeOffset(session_odometry(session, config), first_node=max(graph.T_world_node) + 1)
-    return Start(odometry, detector, graph.without_loops(), before.loops)
+    return Start(session_odometry(session, config), detector, graph.without_loops(), before.loops)
 
 
 def _joined(

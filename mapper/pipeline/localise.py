@@ -31,7 +31,6 @@ from mapper.loops.closure import (
 from mapper.loops.config import SLACK_RAD, GateConfig, PlaceLoopsConfig, ScanLoopsConfig
 from mapper.loops.map_constraints import build_map_constraint_detector
 from mapper.loops.odometry_drift import NodePath, allowed
-from mapper.odometry.renumbered_nodes import NodeOffset
 from mapper.pipeline.disconnected_components import component_of, disconnected
 from mapper.pipeline.known_map import KnownMap, detector_of, loops_between_days
 from mapper.pipeline.solve import solve
@@ -221,8 +220,7 @@ def _start(source: Log, known: KnownMap, config: BuildConfig) -> Start:
     map_node = known.places.map_node
     detector = build_map_constraint_detector(loops_between_days(config.loops, source.sensor), known.places)
     graph = PoseGraph({map_node: np.eye(4)}, {map_node: 0})
-    odometry = NodeOffset(session_odometry(source, config), first_node=map_node + 1)
-    return Start(odometry, detector, graph)
+    return Start(session_odometry(source, config), detector, graph)
 
 
 def _solved_in_map(

@@ -46,7 +46,7 @@ class Start:
     """State that tracking begins with.
 
     Attributes:
-        odometry: Before its first frame.
+        odometry: Before its first frame; its node 0 gets the number after those of ``graph``.
         detector: Loop detector with the places of earlier sessions.
         graph: Graph of earlier sessions, without loops.
         loops: The candidates of earlier sessions.
@@ -58,6 +58,11 @@ class Start:
     graph: PoseGraph
     loops: Sequence[LoopClosure] = ()
     searches: VerificationLog | None = None
+
+    @property
+    def first_node(self) -> int:
+        """Number of the odometry's first node."""
+        return max(self.graph.T_world_node, default=-1) + 1
 
 
 def first_session(
@@ -114,7 +119,7 @@ def track_log(
         ConfigError: The odometry needs wheels or poses and there are none, or the loops need feature counts.
     """
     start = start or first_session(source, config)
-    odometry, checks = start.odometry, ReadingChecks(source)
+    odometry, first_node, checks = start.odometry, start.first_node, ReadingChecks(source)
     read = with_merged_scans(checks.log) if config.source.topics.others == "tracked" else checks.log
     known: Sequence[FrameCheckpoint] = ()
     if checkpoints is not None:
@@ -137,7 +142,7 @@ def track_log(
                 progress.note(f"skipped: {result.reason}")
             else:
                 began = time.perf_counter()
-                result = odometry.track(observed.observation)
+                result = odometry.track(observed.observation).renumbered(first_node)
                 view = partial(odometry.view, observed.observation, result.twist)
                 first_pass.add(result, view)
                 ms = 1e3 * (observed.seconds + time.perf_counter() - began)
@@ -226,7 +231,8 @@ class _FirstPass:
         """Return the result of all frames; nothing is added afterwards."""
         calibration = odometry.gyroscope_calibration() if isinstance(odometry, GyroscopeUser) else None
         gyroscope = None if calibration is None else with_body_rates(checks.log, calibration).gyroscope
-        tracks = _in_hindsight(self.tracks, odometry, checks, gyroscope)
+        last = [factor.renumbered(self._start.first_node) for factor in odometry.finish()]
+        tracks = _in_hindsight(self.tracks, last, checks, gyroscope)
         before = self._start.graph
         graph = PoseGraph(
             dict(before.T_world_node), dict(before.stamps_ns), list(before.factors), fixes=before.fixes
@@ -287,16 +293,16 @@ class _FirstPass:
 
 def _in_hindsight(
     tracks: Sequence[FrameResult],
-    odometry: Odometry[Any],
+    last: Sequence[BetweenFactor],
     checks: ReadingChecks,
     gyroscope: Gyroscope | None,
 ) -> list[FrameResult]:
-    """Return the frames' results with all factors, and with what later frames and the readings add.
+    """Return the frames' results with the ``last`` factors, and with what later frames and readings add.
 
     ``gyroscope`` gives the angular velocities of the body, if they are known.
     """
     if tracks:
-        tracks = [*tracks[:-1], replace(tracks[-1], factors=(*tracks[-1].factors, *odometry.finish()))]
+        tracks = [*tracks[:-1], replace(tracks[-1], factors=(*tracks[-1].factors, *last))]
     tracks, doubts = with_doubtful_spikes(tracks, gyroscope), checks.doubts()
     return [
         replace(track, doubts=track.doubts or tuple(doubts.get(track.stamp_ns, ())))

@@ -11,6 +11,7 @@ from mapper.config.loading import overridden
 from mapper.core.errors import ConfigError, RunError
 from mapper.evaluators.metrics.trajectory_errors import align, associate, ate, ate_rmse_m
 from mapper.octree.map import read_octree
+from mapper.odometry.keyframes.odometry import KeyframeOdometry
 from mapper.pipeline.append import append
 from mapper.pipeline.fuse import fuse
 from mapper.run.folder import moved_log, open_run
@@ -161,6 +162,16 @@ def test_a_third_session_is_appended_to_two(joined, desk_log, tmp_path):
     assert ate(align(matched, "se3").moved(matched)).rmse < 0.02
     assert three.manifest.timing.log_s == pytest.approx(31 / 15 + 11 / 15, abs=0.2)
     fuse(three.open_log(), three, three.config)
+
+
+def test_what_contradicts_the_camera_is_warned_of(first, desk_log, tmp_path, monkeypatch):
+    for check in ("calibration_warnings", "sensor_notes"):
+        monkeypatch.setattr(KeyframeOdometry, check, lambda _: ["wrong"])
+    config = overridden(first.config, ["source.first_frame=16", "source.last_frame=30"])
+
+    run = append(open_source(desk_log, config.source), first, config, tmp_path / "out")
+
+    assert {"camera", "shutter"} <= {warning.kind for warning in run.manifest.warnings}
 
 
 def test_another_place_is_refused_and_the_run_is_untouched(first, elsewhere, tmp_path):

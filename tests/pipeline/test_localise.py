@@ -11,6 +11,7 @@ from mapper.config.loading import load_config, overridden
 from mapper.core.errors import ConfigError, RunError
 from mapper.core.geometry import exp, fit_rigid
 from mapper.core.timebase import nearest
+from mapper.odometry.keyframes.odometry import KeyframeOdometry
 from mapper.pipeline.build import build
 from mapper.pipeline.known_map import load_known_map
 from mapper.pipeline.localise import localise
@@ -57,6 +58,15 @@ def test_every_frame_lies_where_it_was_taken_in_the_map(first, localised, desk_l
     trajectory = read_tum(localised / "trajectory.tum")
     assert len(trajectory) == 15
     assert miss_m(first, desk_log, trajectory).max() < 0.02
+
+
+def test_what_contradicts_the_camera_is_warned_of(first, desk_log, tmp_path, monkeypatch):
+    for check in ("calibration_warnings", "sensor_notes"):
+        monkeypatch.setattr(KeyframeOdometry, check, lambda _: ["wrong"])
+
+    manifest = in_map(first, desk_log, tmp_path / "out")
+
+    assert {"camera", "shutter"} <= {warning.kind for warning in manifest.warnings}
 
 
 def test_the_manifest_tells_the_map_the_stretches_and_a_verdict(first, localised):
