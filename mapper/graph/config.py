@@ -31,7 +31,7 @@ class WheelFactorsConfig(WheelNoiseConfig):
     """Settings of wheel factors beside another odometry."""
 
     use: bool = True
-    """Connect keyframes by wheel odometry, if the log has it."""
+    """Connect keyframes by wheel odometry, and predict 2D scans by it, if the log has it."""
 
 
 class GnssFactorsConfig(Config):

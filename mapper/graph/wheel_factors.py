@@ -124,8 +124,13 @@ def wheel_factor(
         origin: Origin of the factor: "odometry" where wheels are the odometry.
     """
     path_m, turn_rad = odometer.between(i.stamp_ns, j.stamp_ns)
-    sigmas = PoseSigmas(
+    sigmas = wheel_sigmas(noise, path_m, turn_rad)
+    return BetweenFactor(i.node, j.node, inverse(i.T_odom_body) @ j.T_odom_body, sigmas.information, origin)
+
+
+def wheel_sigmas(noise: WheelNoiseConfig, path_m: float, turn_rad: float) -> PoseSigmas:
+    """Return the standard deviations of a motion by the wheels along a path that turns."""
+    return PoseSigmas(
         rotation_rad=noise.least_rad + noise.turn_share * turn_rad + noise.rad_per_m * path_m,
         translation_m=noise.least_m + noise.path_share * path_m,
     )
-    return BetweenFactor(i.node, j.node, inverse(i.T_odom_body) @ j.T_odom_body, sigmas.information, origin)

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any, assert_never
 
 from mapper.core.errors import ConfigError
 from mapper.core.trajectory import Trajectory
+from mapper.graph.config import WheelFactorsConfig, WheelNoiseConfig
 from mapper.odometry.base import FrameOdometry, MotionCheck, Odometry
 from mapper.odometry.config import (
     FrameOdometryConfig,
@@ -31,9 +32,18 @@ if TYPE_CHECKING:
 
 
 def odometry_for(
-    config: OdometryConfig, log: "Log", motion_check: MotionCheck | None = None
+    config: OdometryConfig,
+    log: "Log",
+    motion_check: MotionCheck | None = None,
+    wheels: WheelFactorsConfig | None = None,
 ) -> Odometry[Any]:
     """Return the odometry that the settings choose for a log: with its poses, adapted to its surroundings.
+
+    Args:
+        config: Settings of one method.
+        log: The log.
+        motion_check: Another measurement of the motion, which rules out poses after a gap.
+        wheels: Whether 2D scans are predicted by the log's wheels, and their noise; None is no.
 
     Raises:
         ConfigError: Wheel odometry or known poses are chosen, and the log has none.
@@ -44,9 +54,14 @@ def odometry_for(
 
     if isinstance(config, IsvdOdometryConfig | LocalMapConfig | PnpConfig) and config.depth_noise is None:
         config = config.model_copy(update={"depth_noise": log.depth_noise})
-    wheels = log.wheels if log.sensor == "lidar-2d" else None
+    is_predicted = log.sensor == "lidar-2d" and wheels is not None and wheels.use
     return build_odometry(
-        adapted_to(config, log), poses_for(config, log), motion_check, log.gyroscope, wheels
+        adapted_to(config, log),
+        poses_for(config, log),
+        motion_check,
+        log.gyroscope,
+        log.wheels if is_predicted else None,
+        wheels,
     )
 
 
@@ -56,6 +71,7 @@ def build_odometry(
     motion_check: MotionCheck | None = None,
     gyroscope: "Gyroscope | None" = None,
     wheels: Trajectory | None = None,
+    wheel_noise: WheelNoiseConfig | None = None,
 ) -> Odometry[Any]:
     """Return the odometry that the settings choose, before its first frame; its module is imported only now.
 
@@ -65,6 +81,7 @@ def build_odometry(
         motion_check: Another measurement of the motion, which rules out poses after a gap.
         gyroscope: Angular velocities of the log, if it has any.
         wheels: T_odom_body by which an odometry from scans predicts the motion, if it does.
+        wheel_noise: Errors of most wheels; None is those of the defaults.
 
     Raises:
         ConfigError: Wheel odometry or known poses are chosen, and the log has none; or a caller's own.
@@ -94,7 +111,7 @@ def build_odometry(
                 "choose another kind, or give it to mapper.build(…, odometry=…)"
             )
         case _:
-            return build_frame_odometry(config, motion_check, gyroscope, wheels)
+            return build_frame_odometry(config, motion_check, gyroscope, wheels, wheel_noise)
 
 
 def build_frame_odometry(
@@ -102,12 +119,13 @@ def build_frame_odometry(
     motion_check: MotionCheck | None = None,
     gyroscope: "Gyroscope | None" = None,
     wheels: Trajectory | None = None,
+    wheel_noise: WheelNoiseConfig | None = None,
 ) -> FrameOdometry[Any]:
     """Return the odometry that the settings choose among those that use the frames' images or scans."""
     if isinstance(config, AnyScanOdometryConfig):
         from mapper.odometry.scans.odometry import ScanOdometry
 
-        return ScanOdometry(config, _build_matcher(config), gyroscope, wheels)
+        return ScanOdometry(config, _build_matcher(config), gyroscope, wheels, wheel_noise)
     match config:
         case IsvdOdometryConfig():
             from mapper.odometry.isvd.odometry import IsvdOdometry

@@ -11,6 +11,7 @@ from mapper.core.geometry import Array, Transform, inverse, rotation_log
 from mapper.core.running_median import RunningMedian
 from mapper.core.timebase import NS_PER_S, Stamps
 from mapper.core.trajectory import Trajectory
+from mapper.graph.config import WheelNoiseConfig
 from mapper.odometry.gyroscope_calibration import (
     CERTAIN_RAD,
     DEGREES,
@@ -46,13 +47,20 @@ class MotionPrior:
     shown yet, or whose readings contradict the odometry, is not used.
     """
 
-    def __init__(self, gyroscope: Gyroscope | None, wheels: Trajectory | None = None) -> None:
+    def __init__(
+        self,
+        gyroscope: Gyroscope | None,
+        wheels: Trajectory | None = None,
+        wheel_noise: WheelNoiseConfig | None = None,
+    ) -> None:
         """Begin before the first frame.
 
         Args:
             gyroscope: Angular velocities of the log, if it has any.
             wheels: T_odom_body of its wheel odometry, if that predicts the motion.
+            wheel_noise: Errors of most wheels; None is those of the defaults.
         """
+        self.wheel_noise = wheel_noise or WheelNoiseConfig()
         self._wheels = wheels
         self._wheel_misses = RunningMedian(memory=_ERRORS)
         self._gyroscope = gyroscope

@@ -318,7 +318,8 @@ def session_odometry(source: Log, config: BuildConfig) -> Odometry[Any]:
     Raises:
         ConfigError: It needs wheels or poses and there are none.
     """
-    return odometry_for(config.odometry, source, _wheel_measurements(source, config))
+    check = _wheel_measurements(source, config)
+    return odometry_for(config.odometry, source, check, config.graph.wheels)
 
 
 def why_untrackable(source: Log, config: BuildConfig) -> str | None:

@@ -14,6 +14,8 @@ from mapper.octree.grid import FREE, OCCUPIED, read_grid
 from mapper.pipeline.build import build
 from mapper.pipeline.known_map import load_known_map
 from mapper.pipeline.localise import localise
+from mapper.pipeline.track import track_log
+from mapper.runtime.progress import SILENT
 from mapper.sources import open_source
 from mapper.sources.trajectory_files import read_tum
 from tests.support.planar import at
@@ -128,6 +130,33 @@ def test_walls_alone_place_scans_without_wheels(tmp_path):
 
     assert error_m(run.trajectory, driven) < 0.03
     assert len(run.trajectory) > 0.95 * len(driven.times_s)
+
+
+def tracked(log, *overrides):
+    config = load_config(None, list(overrides), sensor=log.sensor)
+    return track_log(log, config, progress=SILENT)
+
+
+@pytest.fixture(scope="module")
+def bare(tmp_path_factory):
+    """The first scans in a corridor without doors."""
+    driven = drive(corridor(20.0), RPLIDAR, speed_mps=1.6).part(40)
+    return open_source(write_ros(tmp_path_factory.mktemp("bare") / "log.bag", driven))
+
+
+def test_wheels_that_are_not_used_predict_no_scan(bare):
+    unused, without = tracked(bare, "graph.wheels.use=false"), tracked(replace(bare, wheels=None))
+
+    np.testing.assert_array_equal(unused.trajectory().T_world_body, without.trajectory().T_world_body)
+
+
+def test_noise_of_the_wheels_is_that_of_poses_that_no_wall_shows(bare):
+    sure, unsure = (
+        max(1.0 / factor.information[3, 3] for factor in tracked(bare, *overrides).graph.factors)
+        for overrides in ([], ["graph.wheels.path_share=0.5"])
+    )
+
+    assert unsure > 4.0 * sure
 
 
 def test_another_drive_is_localised_in_the_map(rooms, tmp_path):

@@ -14,7 +14,6 @@ _MIN_ELAPSED_S = 0.005  # over less, an error of millimetres becomes a large vel
 _ERRORS, _FEWEST_ERRORS = 50, 5  # of predictions' errors: the newest in the median, and fewest for one
 _MEDIAN_LENGTH = 1.538  # of a vector of three independent normal errors, in standard deviations
 _LEAST_M, _LEAST_RAD, _LEAST_SHARE = 2e-3, 1e-3, 0.02
-_WHEELS_SHARE = 0.05  # of the way and of the turn, as graph.wheels has it
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,9 +140,10 @@ class MotionModel:
         """Return the spread of a motion by the wheels: the errors that they had, and those of most wheels."""
         moved, turned = float(np.linalg.norm(rolled[:3, 3])), angle_between(np.eye(3), rolled[:3, :3])
         rotation, translation = self._of_wheels.sigmas
+        noise = self.prior.wheel_noise
         return Spread(
-            float(np.hypot(rotation, _LEAST_RAD + _WHEELS_SHARE * turned)),
-            float(np.hypot(translation, _LEAST_M + _WHEELS_SHARE * moved)),
+            float(np.hypot(rotation, _LEAST_RAD + noise.turn_share * turned)),
+            float(np.hypot(translation, _LEAST_M + noise.path_share * moved)),
             is_by_wheels=True,
         )
 

@@ -12,6 +12,7 @@ from mapper.core.frames import Frame
 from mapper.core.geometry import Array, Transform, adjoint, inverse
 from mapper.core.trajectory import Trajectory
 from mapper.features.frame_view import ScanView
+from mapper.graph.config import WheelNoiseConfig
 from mapper.graph.measurement_covariance import information_of
 from mapper.graph.model import BetweenFactor
 from mapper.odometry.base import Diagnostics, FrameOdometry, FrameResult, lost_frame
@@ -56,6 +57,7 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
         matcher: ScanMatcher,
         gyroscope: Gyroscope | None = None,
         wheels: Trajectory | None = None,
+        wheel_noise: WheelNoiseConfig | None = None,
     ) -> None:
         """Begin before the first scan.
 
@@ -64,13 +66,14 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
             matcher: Finds poses in the local map.
             gyroscope: Angular velocities of the log; None if it has none.
             wheels: T_odom_body by which the motion is predicted; None if it is not.
+            wheel_noise: Errors of most wheels; None is those of the defaults.
         """
         self._config = config
         self._matcher = matcher
         self._assessment = PoseAssessment(config)
         self._registration = SweepRegistration(config, matcher, PoseSearch(config, matcher, self._assessment))
-        self._noise = ScanNoise()
-        self._prior = MotionPrior(gyroscope, wheels)
+        self._prior = MotionPrior(gyroscope, wheels, wheel_noise)
+        self._noise = ScanNoise(self._prior.wheel_noise)
         self._motion = MotionModel(0, np.eye(4), self._prior)
         self._keyframes: deque[ScanKeyframe] = deque(maxlen=_KEYFRAMES)  # the newest first
         self._doubtful: ScanKeyframe | None = None

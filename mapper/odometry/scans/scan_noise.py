@@ -9,6 +9,7 @@ from mapper.core.doubts import Doubt
 from mapper.core.geometry import Array, Transform, angle_between
 from mapper.core.linear import gram
 from mapper.graph.config import WheelNoiseConfig
+from mapper.graph.wheel_factors import wheel_sigmas
 from mapper.odometry.scans.pose_candidate import Jump
 from mapper.odometry.scans.scan_fit import ScanFit
 
@@ -27,7 +28,6 @@ _TRUSTED_MPS, _TRUSTED_M = 0.1, 0.05
 """A prediction is doubtful when it may be off by more than both: single scans of stairs leave turns open by
 2 cm, and are right."""
 _SHORTEST_S = 0.01
-_WHEELS = WheelNoiseConfig()
 
 
 def surface_covariance(fit: ScanFit) -> Array:
@@ -71,14 +71,12 @@ def _sectors(points: Array) -> NDArray[np.intp]:
     return 2 * around + (points[:, 2] > np.median(points[:, 2]))
 
 
-def _with_wheels(covariance: Array, T_key_scan: Transform) -> Array:
+def _with_wheels(covariance: Array, T_key_scan: Transform, noise: WheelNoiseConfig) -> Array:
     """Return the (6, 6) covariance of a pose that surfaces and wheels measured."""
     turned, moved = angle_between(np.eye(3), T_key_scan[:3, :3]), float(np.linalg.norm(T_key_scan[:3, 3]))
-    sigmas = [_WHEELS.least_rad + _WHEELS.turn_share * turned + _WHEELS.rad_per_m * moved] * 3
-    sigmas += [_WHEELS.least_m + _WHEELS.path_share * moved] * 3
-    reduced: Array = covariance - covariance @ np.linalg.solve(
-        covariance + np.diag(np.square(sigmas)), covariance
-    )
+    sigmas = wheel_sigmas(noise, moved, turned)
+    variances = np.square([sigmas.rotation_rad] * 3 + [sigmas.translation_m] * 3)
+    reduced: Array = covariance - covariance @ np.linalg.solve(covariance + np.diag(variances), covariance)
     return 0.5 * (reduced + reduced.T)
 
 
@@ -100,7 +98,8 @@ class PoseNoise:
 class ScanNoise:
     """Noise of poses relative to the last keyframe, with what was predicted since then."""
 
-    def __init__(self) -> None:
+    def __init__(self, wheels: WheelNoiseConfig) -> None:
+        self._wheels = wheels
         self._unseen = 0.0  # scans in a row that left a motion open, each by the probability that it did
         self._steps = 0.0  # their sums since the keyframe
 
@@ -131,7 +130,7 @@ class ScanNoise:
         """
         covariance = surface_covariance(fit)
         if is_by_wheels:
-            covariance = _with_wheels(covariance, T_key_scan)
+            covariance = _with_wheels(covariance, T_key_scan, self._wheels)
         off_m, moved_m = float(np.median(np.abs(fit.residuals_m))), float(np.linalg.norm(T_key_scan[:3, 3]))
         least_rad = _LEAST_RAD + _MODEL_RAD_M * off_m
         least_m = np.hypot(_LEAST_M + _MODEL_M_M * off_m, _MODEL_SHARE_M * off_m * moved_m)

@@ -7,6 +7,7 @@ import pytest
 
 from mapper.core.frames import Scan
 from mapper.core.geometry import angle_between, exp, inverse, log
+from mapper.graph.config import WheelNoiseConfig
 from mapper.odometry.motion_prior import MotionPrior
 from mapper.odometry.scans.config import GicpOdometryConfig
 from mapper.odometry.scans.gicp_matcher import GicpMatcher
@@ -313,7 +314,7 @@ def noise_of(T_key_scan, *, noise_m):
     key = keyframe(room_scan(0, seed=1, noise_m=noise_m))
     scan = keyframe(room_scan(1, T_key_scan, seed=2, noise_m=noise_m)).deskewed
     fit = fit_of(key, scan, T_key_scan, max_pair_distance_m=0.5)
-    noise = ScanNoise().of(fit, np.zeros(6), T_key_scan, 0.1, np.zeros((6, 6)))
+    noise = ScanNoise(WheelNoiseConfig()).of(fit, np.zeros(6), T_key_scan, 0.1, np.zeros((6, 6)))
     return np.sqrt(np.diag(noise.covariance))
 
 
@@ -335,7 +336,7 @@ def test_a_motion_that_two_scans_leave_open_is_no_doubt():
     key, scan = keyframe(room_scan(0, seed=1)), keyframe(room_scan(1, OFF, seed=2)).deskewed
     fit = fit_of(key, scan, OFF, max_pair_distance_m=0.5)
     fit = replace(fit, observability=np.array([0.0, 1.0, 1.0, 1.0, 1.0, 1.0]))
-    noise, open_m = ScanNoise(), np.array([0.012, 0.0, 0.0, 0.0, 0.0, 0.0])
+    noise, open_m = ScanNoise(WheelNoiseConfig()), np.array([0.012, 0.0, 0.0, 0.0, 0.0, 0.0])
 
     doubts = [noise.of(fit, open_m, OFF, 0.1, np.zeros((6, 6))).doubts for _ in range(4)]
 
