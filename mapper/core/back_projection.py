@@ -37,7 +37,7 @@ def back_project(
 
 
 @njit(cache=True, nogil=True)
-def _back_project(depth_m, rays, T, stride_px, max_depth_m, points_body):  # type: ignore[no-untyped-def]
+def _back_project(depth_m, rays, T, stride_px, max_depth_m, points_body):
     is_camera = np.array_equal(T, np.eye(4))  # as of nearly all logs, and four times as fast
     found = 0
     for row in range(0, depth_m.shape[0], stride_px):

@@ -123,7 +123,7 @@ def deskewed(scan: Scan, motion: Motion) -> Scan:
 
 
 @njit(cache=True, nogil=True)
-def _moved(points, times_s, rotation_radps, translation_mps):  # type: ignore[no-untyped-def]
+def _moved(points, times_s, rotation_radps, translation_mps):
     """Return exp(τ·twist) applied to every point: R = I + a·[ω]× + b·[ω]×², t = τ·v + b·ω×v + c·ω×(ω×v)."""
     moved = np.empty_like(points)
     wx, wy, wz = rotation_radps
@@ -151,14 +151,14 @@ def _moved(points, times_s, rotation_radps, translation_mps):  # type: ignore[no
 
 
 @njit(cache=True, nogil=True)
-def _rotation_at(times_s, R, rates_radps, time_s):  # type: ignore[no-untyped-def]
+def _rotation_at(times_s, R, rates_radps, time_s):
     """Return the (3, 3) rotation at a time; the angular velocity is constant between two samples."""
     k = min(max(np.searchsorted(times_s, time_s, side="right") - 1, 0), len(rates_radps) - 1)
     return R[k] @ rotation_of(rates_radps[k] * (time_s - times_s[k]))
 
 
 @njit(cache=True, nogil=True)
-def _moved_by_samples(points, point_times_s, times_s, R, rates_radps, translation_mps):  # type: ignore[no-untyped-def]
+def _moved_by_samples(points, point_times_s, times_s, R, rates_radps, translation_mps):
     """Return R(τ)·p + τ·v of every point, R(τ) = R[k] · exp((τ − t_k)·ω_k) from the sample k before τ on."""
     moved = np.empty_like(points)
     k, last = 0, len(rates_radps) - 1

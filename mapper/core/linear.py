@@ -24,6 +24,15 @@ def turned(A, v):
 
 
 @njit(cache=True, nogil=True)
+def between(T_a_w, T_b_w):
+    """Return T_a_b of two poses (4, 4) of the world."""
+    T = np.eye(4)
+    T[:3, :3] = product(T_a_w, T_b_w[:3, :3].T.copy())
+    T[:3, 3] = T_a_w[:3, 3] - turned(T, T_b_w[:3, 3])
+    return T
+
+
+@njit(cache=True, nogil=True)
 def gram(A, B):
     """Return the (K, L) product AᵀB of (N, K) and (N, L), summed in the same order with any BLAS."""
     rows, columns = A.shape[1], B.shape[1]

@@ -63,7 +63,7 @@ def voxel_numbers(points: Points | Points32, voxel_m: float) -> tuple[NDArray[np
 
 
 @njit(cache=True, nogil=True)
-def _voxels(points, voxels_per_m, index):  # type: ignore[no-untyped-def]
+def _voxels(points, voxels_per_m, index):
     voxel_of, firsts = np.empty(len(points), np.int64), np.empty(len(points), np.int64)
     count = 0
     for i in range(len(points)):
@@ -77,7 +77,7 @@ def _voxels(points, voxels_per_m, index):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _in_range(points, origin, min_range, max_range, voxel, index):  # type: ignore[no-untyped-def]
+def _in_range(points, origin, min_range, max_range, voxel, index):
     kept, ranges = np.empty(len(points), np.int64), np.empty(len(points), np.float32)
     voxels_per_m, count = 1.0 / voxel if voxel > 0.0 else 0.0, 0
     for i in range(len(points)):
@@ -97,7 +97,7 @@ def _in_range(points, origin, min_range, max_range, voxel, index):  # type: igno
 
 
 @njit(cache=True, nogil=True)
-def _means(points, voxel_of, count):  # type: ignore[no-untyped-def]
+def _means(points, voxel_of, count):
     sums, counts = np.zeros((count, 3)), np.zeros(count)
     for index in range(len(points)):
         voxel = voxel_of[index]

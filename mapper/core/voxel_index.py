@@ -45,7 +45,7 @@ def voxel_index(capacity: int, keys: NDArray[np.int64] | None = None) -> VoxelIn
 
 
 @njit(cache=True, nogil=True)
-def cell_key(x, y, z):  # type: ignore[no-untyped-def]
+def cell_key(x, y, z):
     """Return the key of the cell around a point whose coordinates are counted in cells."""
     mask = (1 << AXIS_BITS) - 1
     return (
@@ -56,7 +56,7 @@ def cell_key(x, y, z):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def cell_of(key):  # type: ignore[no-untyped-def]
+def cell_of(key):
     """Return the three coordinates of a cell, counted in cells, by its key."""
     upper = 64 - AXIS_BITS
     return (
@@ -67,7 +67,7 @@ def cell_of(key):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _slot_of(index, key):  # type: ignore[no-untyped-def]
+def _slot_of(index, key):
     """Return the number of the table's entry with a key's row, or of the vacant one where it belongs."""
     mask = len(index.rows) - 1
     # Folded, since the product's middle bits do not depend on the key's highest ones.
@@ -78,13 +78,13 @@ def _slot_of(index, key):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def row_of(index, key):  # type: ignore[no-untyped-def]
+def row_of(index, key):
     """Return the row of a key, or −1."""
     return np.int64(index.rows[_slot_of(index, key)])
 
 
 @njit(cache=True, nogil=True)
-def claim_row(index, key, count):  # type: ignore[no-untyped-def]
+def claim_row(index, key, count):
     """Return the row of a key; an absent key is added with the row ``count``, the number of keys so far."""
     slot = _slot_of(index, key)
     if index.rows[slot] == VACANT:
@@ -93,6 +93,6 @@ def claim_row(index, key, count):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _add(index, keys):  # type: ignore[no-untyped-def]
+def _add(index, keys):
     for row in range(len(keys)):
         claim_row(index, keys[row], row)

@@ -46,7 +46,7 @@ class Linearised(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
-def points_in_world(points_node, nodes, poses):  # type: ignore[no-untyped-def]
+def points_in_world(points_node, nodes, poses):
     """Return (N, 3) points, each of one node, in the world."""
     points = np.empty_like(points_node)
     for index in range(len(points)):
@@ -58,7 +58,7 @@ def points_in_world(points_node, nodes, poses):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def cluster_moments(points, cluster_of, count):  # type: ignore[no-untyped-def]
+def cluster_moments(points, cluster_of, count):
     """Return (count, 4, 4) sums of p pᵀ over (N, 3) points as (x, y, z, 1); −1 is no cluster."""
     moments = np.zeros((count, 4, 4))
     p = np.ones(4)
@@ -73,7 +73,7 @@ def cluster_moments(points, cluster_of, count):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def linearise(surfaces, poses, floor_m, enough):  # type: ignore[no-untyped-def]
+def linearise(surfaces, poses, floor_m, enough):
     """Return the cost, its gradient and its Gauss–Newton Hessian; see ``Linearised``.
 
     Args:
@@ -134,7 +134,7 @@ def linearise(surfaces, poses, floor_m, enough):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _add_product(A, B, factor, total):  # type: ignore[no-untyped-def]
+def _add_product(A, B, factor, total):
     """Add factor · A · B to a matrix."""
     for i in range(A.shape[0]):
         for j in range(B.shape[1]):
@@ -145,7 +145,7 @@ def _add_product(A, B, factor, total):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _pose_about(T_world_node, origin_world, T):  # type: ignore[no-untyped-def]
+def _pose_about(T_world_node, origin_world, T):
     """Write the pose relative to an origin to T."""
     T[:] = T_world_node
     for i in range(3):
@@ -153,7 +153,7 @@ def _pose_about(T_world_node, origin_world, T):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def times_eliminated(surfaces, linearised, x):  # type: ignore[no-untyped-def]
+def times_eliminated(surfaces, linearised, x):
     """Return Σ across · planes · acrossᵀ times (K, 6): what free planes take away from the Hessian."""
     starts, nodes = surfaces.starts, surfaces.nodes
     across, planes = linearised.across, linearised.planes

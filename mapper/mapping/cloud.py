@@ -132,9 +132,7 @@ class CloudBuilder:
 
 
 @njit(cache=True, nogil=True)
-def _fold(  # type: ignore[no-untyped-def]
-    points, colors, has_color, intensities, voxels_per_m, index, offsets, counts, intensity_sums, size
-):
+def _fold(points, colors, has_color, intensities, voxels_per_m, index, offsets, counts, intensity_sums, size):
     """Add each point to its voxel's sums; return the number of voxels."""
     last_key, voxel = np.int64(-1), np.int64(-1)
     for i in range(len(points)):
@@ -159,7 +157,7 @@ def _fold(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _fill_means(keys, offsets, counts, voxel_m, points, colors):  # type: ignore[no-untyped-def]
+def _fill_means(keys, offsets, counts, voxel_m, points, colors):
     """Fill in the mean position and colour of each voxel."""
     for row in range(len(points)):
         count, colored = float(counts[row, 3]), float(counts[row, 4])

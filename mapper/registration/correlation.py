@@ -66,7 +66,7 @@ def correlate(
 
 
 @njit(cache=True, nogil=True)
-def _occupied(points, width, cell_m):  # type: ignore[no-untyped-def]
+def _occupied(points, width, cell_m):
     """Return a (width, width) grid about the origin: 2 in the cells of points, 1 next to them."""
     grid = np.zeros((width, width), np.uint8)
     for n in range(len(points)):
@@ -79,7 +79,7 @@ def _occupied(points, width, cell_m):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _pooled(grid):  # type: ignore[no-untyped-def]
+def _pooled(grid):
     """Return the largest value in the square of cells that begins at each."""
     width = len(grid)
     pooled = np.zeros_like(grid)
@@ -94,7 +94,7 @@ def _pooled(grid):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _turned(source, turn, turns, width, cell_m):  # type: ignore[no-untyped-def]
+def _turned(source, turn, turns, width, cell_m):
     """Return the (M, 2) cells of the source's points at a heading."""
     cosine, sine = np.cos(2.0 * np.pi * turn / turns), np.sin(2.0 * np.pi * turn / turns)
     cells = np.empty((len(source), 2), np.int64)
@@ -106,7 +106,7 @@ def _turned(source, turn, turns, width, cell_m):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _support(grid, cells, i, j):  # type: ignore[no-untyped-def]
+def _support(grid, cells, i, j):
     support = 0
     for n in range(len(cells)):
         support += grid[cells[n, 0] + i, cells[n, 1] + j]
@@ -114,7 +114,7 @@ def _support(grid, cells, i, j):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _coarse_supports(coarse, source, turns, steps, cell_m):  # type: ignore[no-untyped-def]
+def _coarse_supports(coarse, source, turns, steps, cell_m):
     """Return (turns, C, C): the most support that a motion in each square of cells can have."""
     count = 2 * steps // _COARSE
     supports = np.zeros((turns, count, count), np.int64)
@@ -127,7 +127,7 @@ def _coarse_supports(coarse, source, turns, steps, cell_m):  # type: ignore[no-u
 
 
 @njit(cache=True, nogil=True)
-def _best_motion(fine, source, supports, order, turns, steps, cell_m, kept, apart_m, apart_rad):  # type: ignore[no-untyped-def]
+def _best_motion(fine, source, supports, order, turns, steps, cell_m, kept, apart_m, apart_rad):
     """Return the support, x, y and heading of the best motion that differs from those kept; 0 without any."""
     best, count = np.zeros(4), supports.shape[1]
     last_turn, cells = -1, np.empty((0, 2), np.int64)
@@ -200,7 +200,7 @@ class LikelihoodField:
 
 
 @njit(cache=True, nogil=True)
-def _smeared(points, corner, width, cell_m):  # type: ignore[no-untyped-def]
+def _smeared(points, corner, width, cell_m):
     values = np.zeros((width, width), np.float32)
     for n in range(len(points)):
         x, y = int((points[n, 0] - corner[0]) / cell_m), int((points[n, 1] - corner[1]) / cell_m)
@@ -214,7 +214,7 @@ def _smeared(points, corner, width, cell_m):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _most_likely(values, source, at, yaw_rad, reach, turns, step_rad, cell_m):  # type: ignore[no-untyped-def]
+def _most_likely(values, source, at, yaw_rad, reach, turns, step_rad, cell_m):
     """Return the cells along x and y, and the turn's steps, by which the best motion differs from a guess."""
     width, best, found = len(values), -1.0, (0, 0, 0)
     x, y = np.empty(len(source), np.int64), np.empty(len(source), np.int64)

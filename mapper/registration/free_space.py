@@ -140,7 +140,7 @@ class FreeSpaceCheck:
 
 
 @njit(cache=True, nogil=True)
-def range_image(points, origin, direction_rad):  # type: ignore[no-untyped-def]
+def range_image(points, origin, direction_rad):
     """Return (elevations, azimuths) float32: the least range of the points in each direction from the origin.
 
     Directions without a point hold +inf. Rows begin straight down, columns behind.
@@ -160,7 +160,7 @@ def range_image(points, origin, direction_rad):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _pixel_of(x, y, z, shape, direction_rad):  # type: ignore[no-untyped-def]
+def _pixel_of(x, y, z, shape, direction_rad):
     """Return the row and column of a point relative to a range image's origin, and the point's range."""
     across = np.sqrt(x * x + y * y)
     row = min(int64((np.arctan2(z, across) + 0.5 * np.pi) / direction_rad), shape[0] - 1)
@@ -169,7 +169,7 @@ def _pixel_of(x, y, z, shape, direction_rad):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _classify(ranges, origin, points, T, direction_rad, margin_m):  # type: ignore[no-untyped-def]
+def _classify(ranges, origin, points, T, direction_rad, margin_m):
     """Return how many points, moved by T, agree with a range image, and how many contradict it."""
     rows, columns = ranges.shape
     agreeing = contradicting = 0

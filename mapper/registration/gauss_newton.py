@@ -21,7 +21,7 @@ _DAMPING = 1e-6
 
 
 @njit(cache=True, nogil=True)
-def descend_on_points(  # type: ignore[no-untyped-def]
+def descend_on_points(
     points, axes, cuts, normals, source_points, source_normals, T, kind, max_distance, iterations, steps
 ):
     """Return T_target_source after Gauss–Newton on the pairs that are nearest at each step.
@@ -45,14 +45,14 @@ def descend_on_points(  # type: ignore[no-untyped-def]
     for _ in range(iterations):
         sums, pairs = np.zeros(27), 0
         for i in range(len(source_points)):
-            moved(T, source_points[i], p)
+            move(T, source_points[i], p)
             squared[0] = max_distance * max_distance
             search(points, axes, cuts, p, index, squared, branches, offsets)
             if squared[0] == max_distance * max_distance:
                 continue
             pairs += 1
             partner = index[0]
-            turned(T, source_normals[i], m)
+            turn(T, source_normals[i], m)
             for k in range(3):
                 n[k] = normals[partner, k]
             if kind == POINT:
@@ -78,21 +78,21 @@ def descend_on_points(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def moved(T, point, out):  # type: ignore[no-untyped-def]
-    """Fill in T · point."""
+def move(T, point, out):
+    """Write T · point."""
     for k in range(3):
         out[k] = T[k, 0] * point[0] + T[k, 1] * point[1] + T[k, 2] * point[2] + T[k, 3]
 
 
 @njit(cache=True, nogil=True)
-def turned(T, direction, out):  # type: ignore[no-untyped-def]
-    """Fill in R · direction."""
+def turn(T, direction, out):
+    """Write R · direction."""
     for k in range(3):
         out[k] = T[k, 0] * direction[0] + T[k, 1] * direction[1] + T[k, 2] * direction[2]
 
 
 @njit(cache=True, nogil=True)
-def inverse_of(xx, xy, xz, yy, yz, zz):  # type: ignore[no-untyped-def]
+def inverse_of(xx, xy, xz, yy, yz, zz):
     """Return the inverse of a symmetric positive definite matrix by its cofactors."""
     a, b, c = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy
     scale = 1.0 / (xx * a + xy * b + xz * c)
@@ -107,7 +107,7 @@ def inverse_of(xx, xy, xz, yy, yz, zz):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def add_pair(sums, T, p, x, y, z, weight):  # type: ignore[no-untyped-def]
+def add_pair(sums, T, p, x, y, z, weight):
     """Add a pair's JᵀWJ (upper triangle, row by row) and JᵀWr to 27 sums.
 
     The residual r is (x, y, z), from p to its partner. With u from the source's origin to p, it changes by
@@ -149,7 +149,7 @@ def add_pair(sums, T, p, x, y, z, weight):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def gauss_newton_step(sums, pairs, T, steps):  # type: ignore[no-untyped-def]
+def gauss_newton_step(sums, pairs, T, steps):
     """Return T after one step of Gauss–Newton, and whether the step was short enough to be the last."""
     H, g = np.empty((6, 6)), np.empty(6)
     k = 0
@@ -164,6 +164,6 @@ def gauss_newton_step(sums, pairs, T, steps):  # type: ignore[no-untyped-def]
     about_source[:3, 3] = 0.0
     moved = twist_exp(step, about_source)
     moved[:3, 3] += T[:3, 3]
-    turn = np.sqrt(step[0] ** 2 + step[1] ** 2 + step[2] ** 2)
-    shift = np.sqrt(step[3] ** 2 + step[4] ** 2 + step[5] ** 2)
-    return moved, turn < steps[0] and shift < steps[1]
+    turned = np.sqrt(step[0] ** 2 + step[1] ** 2 + step[2] ** 2)
+    shifted = np.sqrt(step[3] ** 2 + step[4] ** 2 + step[5] ** 2)
+    return moved, turned < steps[0] and shifted < steps[1]

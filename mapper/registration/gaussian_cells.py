@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from mapper.core.geometry import Array, Transform, is_rigid
 from mapper.core.voxel_index import VoxelIndex, cell_key, claim_row, row_of, voxel_index
-from mapper.registration.gauss_newton import FLATNESS, add_pair, gauss_newton_step, inverse_of, moved, turned
+from mapper.registration.gauss_newton import FLATNESS, add_pair, gauss_newton_step, inverse_of, move, turn
 from mapper.registration.surfaces import Prepared
 
 _CLEAR_CYCLE = 10
@@ -116,14 +116,12 @@ def _room_for(capacity: int, keys: NDArray[np.int64] | None = None) -> _Cells:
 
 
 @njit(cache=True, nogil=True)
-def _insert(  # type: ignore[no-untyped-def]
-    numbers, sums, gaussians, touched, count, cloud, cell_m, points, normals, T
-):
+def _insert(numbers, sums, gaussians, touched, count, cloud, cell_m, points, normals, T):
     """Add points and their surfaces' covariances to their cells; return the number of cells."""
     p, m = np.empty(3), np.empty(3)
     for i in range(len(points)):
-        moved(T, points[i], p)
-        turned(T, normals[i], m)
+        move(T, points[i], p)
+        turn(T, normals[i], m)
         cell, k = claim_row(numbers, cell_key(p[0] / cell_m, p[1] / cell_m, p[2] / cell_m), count), 3
         count += cell == count
         for row in range(3):
@@ -139,9 +137,7 @@ def _insert(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _descend(  # type: ignore[no-untyped-def]
-    numbers, gaussians, cell_m, points, normals, T, iterations, steps
-):
+def _descend(numbers, gaussians, cell_m, points, normals, T, iterations, steps):
     """Return T_world_source after Gauss–Newton on points and their cells' Gaussians, and the number of pairs.
 
     Points farther from the mean of their cell than its edge are left out.
@@ -150,7 +146,7 @@ def _descend(  # type: ignore[no-untyped-def]
     for _ in range(iterations):
         sums, pairs = np.zeros(27), 0
         for i in range(len(points)):
-            moved(T, points[i], p)
+            move(T, points[i], p)
             cell = row_of(numbers, cell_key(p[0] / cell_m, p[1] / cell_m, p[2] / cell_m))
             if cell < 0:
                 continue
@@ -161,7 +157,7 @@ def _descend(  # type: ignore[no-untyped-def]
             if x * x + y * y + z * z > cell_m * cell_m:
                 continue
             pairs += 1
-            turned(T, normals[i], m)
+            turn(T, normals[i], m)
             weight = inverse_of(
                 mean_and_covariance[3] + 1.0 - FLATNESS * m[0] * m[0],
                 mean_and_covariance[4] - FLATNESS * m[0] * m[1],

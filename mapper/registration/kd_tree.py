@@ -66,7 +66,7 @@ def kd_tree(points: Points | Points32) -> KdTree:
 
 
 @njit(cache=True, nogil=True)
-def _grow(points, axes, cuts):  # type: ignore[no-untyped-def]
+def _grow(points, axes, cuts):
     """Order the points, and fill in the inner nodes level by level."""
     inner = len(axes)
     begins, ends = np.zeros(2 * inner, np.int64), np.zeros(2 * inner, np.int64)
@@ -82,7 +82,7 @@ def _grow(points, axes, cuts):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _widest_axis(points, begin, end):  # type: ignore[no-untyped-def]
+def _widest_axis(points, begin, end):
     widest, extent = 0, -1.0
     for axis in range(3):
         low = high = points[begin, axis]
@@ -94,7 +94,7 @@ def _widest_axis(points, begin, end):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _part(points, axis, begin, end, middle):  # type: ignore[no-untyped-def]
+def _part(points, axis, begin, end, middle):
     """Move what is smaller than the ``middle``-th along an axis before it, the rest behind (Hoare 1961)."""
     low, high = begin, end - 1
     while low < high:
@@ -120,7 +120,7 @@ def _part(points, axis, begin, end, middle):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def neighbours_of(points, axes, cuts, queries, count):  # type: ignore[no-untyped-def]
+def neighbours_of(points, axes, cuts, queries, count):
     """Return (Q, count) indices and squared distances, ascending, of the points nearest to the queries."""
     indices = np.zeros((len(queries), count), np.int64)
     squared = np.full((len(queries), count), np.inf)
@@ -134,7 +134,7 @@ def neighbours_of(points, axes, cuts, queries, count):  # type: ignore[no-untype
 
 
 @njit(cache=True, nogil=True)
-def search(points, axes, cuts, query, indices, squared, branches, offsets):  # type: ignore[no-untyped-def]
+def search(points, axes, cuts, query, indices, squared, branches, offsets):
     """Fill in the points nearest to a query, ascending, of those nearer than the initial ``squared``.
 
     The distance of a branch is updated from its distances along each axis (Arya & Mount 1993).

@@ -15,6 +15,9 @@ CHI2_2DOF, CHI2_3DOF = 5.991, 7.815
 HUBER_2DOF, HUBER_3DOF = np.sqrt(CHI2_2DOF), np.sqrt(CHI2_3DOF)
 """Residual lengths at which Huber's kernel becomes linear."""
 
+NEAREST_M = 0.05
+"""Distance before the camera from which on a point can be seen."""
+
 VIRTUAL_BASELINE_PX_M = 40.0
 """bf where no setting has it: depth z counts as the disparity bf / z (Mur-Artal & Tardós 2017)."""
 _CONFIDENCE = 0.999
@@ -104,30 +107,40 @@ def pose_jacobian(x, y, z, J, J_pose):
 
 
 @njit(cache=True, nogil=True)
-def _linearise(T, points, measured, weights, intrinsics, inlier, robust, H, g):
-    """Write the normal equations and return the robust cost (Huber 1964)."""
+def huber(e, has_depth):
+    """Return the weight of a residual of squared length ``e``, and its cost (Huber 1964)."""
+    k = HUBER_3DOF if has_depth else HUBER_2DOF
+    if e <= k * k:
+        return 1.0, e
+    root = np.sqrt(e)
+    return k / root, 2.0 * k * root - k * k
+
+
+@njit(cache=True, nogil=True)
+def linearise(T, point, measured, intrinsics, r, J, J_pose):
+    """Write ``residual``, ``projection_jacobian`` and ``pose_jacobian``; return whether there is depth."""
+    x, y, z = residual(T, point, measured, intrinsics, r)
+    has_depth = not np.isnan(measured[2])
+    projection_jacobian(x, y, z, intrinsics, has_depth, J)
+    pose_jacobian(x, y, z, J, J_pose)
+    return has_depth
+
+
+@njit(cache=True, nogil=True)
+def _normal_equations(T, points, measured, weights, intrinsics, inlier, robust, H, g):
+    """Write the normal equations and return the robust cost."""
     H[:, :] = 0.0
     g[:] = 0.0
-    r = np.empty(3)
-    J = np.empty((3, 3))
-    J_pose = np.empty((3, 6))
-    cost = 0.0
+    r, J, J_pose = np.empty(3), np.empty((3, 3)), np.empty((3, 6))
+    total = 0.0
     for n in range(len(points)):
         if not inlier[n]:
             continue
-        x, y, z = residual(T, points[n], measured[n], intrinsics, r)
-        has_depth = not np.isnan(measured[n, 2])
-        e = chi2(r, weights[n])
-        k = HUBER_3DOF if has_depth else HUBER_2DOF
-        scale = 1.0
-        if robust and e > k * k:
-            root = np.sqrt(e)
-            scale = k / root
-            cost += 2.0 * k * root - k * k
-        else:
-            cost += e
-        projection_jacobian(x, y, z, intrinsics, has_depth, J)
-        pose_jacobian(x, y, z, J, J_pose)
+        has_depth = linearise(T, points[n], measured[n], intrinsics, r, J, J_pose)
+        scale, cost = 1.0, chi2(r, weights[n])
+        if robust:
+            scale, cost = huber(cost, has_depth)
+        total += cost
         for i in range(3):
             w = scale * weights[n, i]
             for a in range(6):
@@ -138,7 +151,7 @@ def _linearise(T, points, measured, weights, intrinsics, inlier, robust, H, g):
     for a in range(6):
         for b in range(a):
             H[a, b] = H[b, a]
-    return cost
+    return total
 
 
 @njit(cache=True, nogil=True)
@@ -146,7 +159,7 @@ def normal_matrix(T_camera_world, points, measured, weights, intrinsics):
     """Return the (6, 6) robust normal matrix of exp(δ) · T_camera_world; arguments as for ``refine_pose``."""
     H, g = np.zeros((6, 6)), np.zeros(6)
     inlier = np.ones(len(points), np.bool_)
-    _linearise(T_camera_world, points, measured, weights, intrinsics, inlier, True, H, g)
+    _normal_equations(T_camera_world, points, measured, weights, intrinsics, inlier, True, H, g)
     return H
 
 
@@ -157,13 +170,9 @@ def scores(T_camera_world, points, measured, weights, intrinsics):
     Arguments as for ``refine_pose``.
     """
     gradients, squares = np.zeros((len(points), 6)), np.empty(len(points))
-    r = np.empty(3)
-    J = np.empty((3, 3))
-    J_pose = np.empty((3, 6))
+    r, J, J_pose = np.empty(3), np.empty((3, 3)), np.empty((3, 6))
     for n in range(len(points)):
-        x, y, z = residual(T_camera_world, points[n], measured[n], intrinsics, r)
-        projection_jacobian(x, y, z, intrinsics, not np.isnan(measured[n, 2]), J)
-        pose_jacobian(x, y, z, J, J_pose)
+        linearise(T_camera_world, points[n], measured[n], intrinsics, r, J, J_pose)
         squares[n] = chi2(r, weights[n])
         for i in range(3):
             for a in range(6):
@@ -172,14 +181,20 @@ def scores(T_camera_world, points, measured, weights, intrinsics):
 
 
 @njit(cache=True, nogil=True)
+def is_inlier(T, point, measured, weights, intrinsics, r):
+    """Return whether a point is before the camera and its χ² passes the 95 % test; write its residual."""
+    _, _, z = residual(T, point, measured, intrinsics, r)
+    limit = CHI2_2DOF if np.isnan(measured[2]) else CHI2_3DOF
+    return z > NEAREST_M and chi2(r, weights) <= limit
+
+
+@njit(cache=True, nogil=True)
 def classify(T, points, measured, weights, intrinsics, inlier):
-    """Mark as inliers the points in front of the camera whose χ² passes the 95 % test; return how many."""
+    """Mark the inliers; return how many."""
     r = np.empty(3)
     count = 0
     for n in range(len(points)):
-        _, _, z = residual(T, points[n], measured[n], intrinsics, r)
-        limit = CHI2_2DOF if np.isnan(measured[n, 2]) else CHI2_3DOF
-        inlier[n] = z > 0.05 and chi2(r, weights[n]) <= limit
+        inlier[n] = is_inlier(T, points[n], measured[n], weights[n], intrinsics, r)
         count += inlier[n]
     return count
 
@@ -207,14 +222,14 @@ def refine_pose(T_camera_world, points, measured, weights, intrinsics, rounds, i
     for k in range(rounds):
         robust = k < rounds - 1
         damping = 1e-4
-        cost = _linearise(T, points, measured, weights, intrinsics, inlier, robust, H, g)
+        cost = _normal_equations(T, points, measured, weights, intrinsics, inlier, robust, H, g)
         for _ in range(iterations):
             A = H.copy()
             for a in range(6):
                 A[a, a] += damping * H[a, a] + 1e-9
             delta = solve_positive(A, g)
             trial = twist_exp(delta, T)
-            trial_cost = _linearise(
+            trial_cost = _normal_equations(
                 trial, points, measured, weights, intrinsics, inlier, robust, trial_H, trial_g
             )
             if trial_cost <= cost:

@@ -96,7 +96,7 @@ def _normals(tree: KdTree, neighbours: int, is_planar: bool) -> Array:
 
 
 @njit(cache=True, nogil=True)
-def _fit_normals(points, about, normals, is_planar):  # type: ignore[no-untyped-def]
+def _fit_normals(points, about, normals, is_planar):
     """Fill in the normals, towards the origin, of the planes that fit the points about each point best.
 
     Of points in a plane they are the lines' in it, as if these were walls as high as they are long; where the
@@ -123,7 +123,7 @@ def _fit_normals(points, about, normals, is_planar):  # type: ignore[no-untyped-
 
 
 @njit(cache=True, nogil=True)
-def _least_axis(xx, xy, xz, yy, yz, zz):  # type: ignore[no-untyped-def]
+def _least_axis(xx, xy, xz, yy, yz, zz):
     """Return the unit eigenvector of a symmetric matrix's least eigenvalue (Smith 1961); 0 if it has none.
 
     The rows of the matrix less that eigenvalue span a plane: the eigenvector is normal to it, and the longest

@@ -156,7 +156,7 @@ class DepthLimit:
 
 
 @njit(cache=True, nogil=True)
-def _free_ends(points, origin, noise, limit_m):  # type: ignore[no-untyped-def]
+def _free_ends(points, origin, noise, limit_m):
     """Return where the rays of returns beyond a depth stop to free space; some free none."""
     a, b, c = noise
     ends = np.empty((len(points), 3), np.float32)

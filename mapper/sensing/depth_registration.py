@@ -94,7 +94,7 @@ class DepthRegistration:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _project(depth_m, rays, t, optics, max_tangent2, projected):  # type: ignore[no-untyped-def]
+def _project(depth_m, rays, t, optics, max_tangent2, projected):
     """Write column, row and depth of each pixel in the other camera; depth 0 where it is not seen there.
 
     Nothing is less than half as far from a camera beside the other: that would cover all of the image.
@@ -118,7 +118,7 @@ def _project(depth_m, rays, t, optics, max_tangent2, projected):  # type: ignore
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _cover(depth_m, projected, spacing_px, max_stretch, registered_m):  # type: ignore[no-untyped-def]
+def _cover(depth_m, projected, spacing_px, max_stretch, registered_m):
     """Give each pixel of the other camera the least depth of the rectangles over its centre."""
     columns, rows, depths = projected[0], projected[1], projected[2]
     height, width = depth_m.shape
@@ -162,7 +162,7 @@ def _cover(depth_m, projected, spacing_px, max_stretch, registered_m):  # type: 
 
 
 @njit(inline="always")
-def _first_after(position, last):  # type: ignore[no-untyped-def]
+def _first_after(position, last):
     """Return the first pixel whose centre lies after a position, at most one after the last pixel."""
     position = position if position > np.float32(-1.0) else np.float32(-1.0)
     position = position if position < last else last

@@ -7,7 +7,7 @@ from mapper.core.linear import rotation_of
 
 
 @njit(cache=True, nogil=True)
-def integrate(stamps_ns, rates, begins_ns, ends_ns, bias, scale, gap_ns):  # type: ignore[no-untyped-def]
+def integrate(stamps_ns, rates, begins_ns, ends_ns, bias, scale, gap_ns):
     """Return the rotation over each interval, and whether readings cover it."""
     R_begin_end = np.empty((len(begins_ns), 3, 3))
     known = np.zeros(len(begins_ns), np.bool_)
@@ -41,7 +41,7 @@ def integrate(stamps_ns, rates, begins_ns, ends_ns, bias, scale, gap_ns):  # typ
 
 
 @njit(cache=True, nogil=True)
-def rotation_vectors(R):  # type: ignore[no-untyped-def]
+def rotation_vectors(R):
     """Return the (M, 3) rotation vectors, at most π long, of (M, 3, 3) rotations, by their quaternions."""
     vectors = np.empty((len(R), 3))
     for m in range(len(R)):

@@ -42,7 +42,7 @@ def valid_returns(points: NDArray[np.float32]) -> ValidReturns:
 
 
 @njit(cache=True, nogil=True)
-def _gather(points, farthest_m2, kept_points, rows):  # type: ignore[no-untyped-def]
+def _gather(points, farthest_m2, kept_points, rows):
     """Copy the valid points to the front; return their number and that of the far; NaN compares false."""
     count, far = 0, 0
     for row in range(len(points)):

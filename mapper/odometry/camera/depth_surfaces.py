@@ -126,7 +126,7 @@ def _rays_of(camera: PinholeCamera, cell_px: int) -> Array:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _average(depth_m, cell_px, sample_px, max_ratio, inverse_depth):  # type: ignore[no-untyped-def]
+def _average(depth_m, cell_px, sample_px, max_ratio, inverse_depth):
     """Fill in the mean inverse depth of the cells that are measured for the most part, and not on an edge."""
     rows, columns = inverse_depth.shape
     samples = len(range(0, cell_px, sample_px)) ** 2
@@ -145,9 +145,7 @@ def _average(depth_m, cell_px, sample_px, max_ratio, inverse_depth):  # type: ig
 
 
 @njit(cache=True, nogil=True)
-def _fit_planes(  # type: ignore[no-untyped-def]
-    inverse_depth, rays, reach, min_cells, same_surface, planes, variances
-):
+def _fit_planes(inverse_depth, rays, reach, min_cells, same_surface, planes, variances):
     """Fill in the planes 1 / z = a · x/z + b · y/z + c about each cell, with their variances."""
     rows, columns = inverse_depth.shape
     for row in range(reach, rows - reach):

@@ -7,7 +7,7 @@ from mapper.core.geometry import Array
 
 
 @njit(cache=True, nogil=True)
-def pixel_velocity(pixels, depth_m, intrinsics, twist_camera):  # type: ignore[no-untyped-def]
+def pixel_velocity(pixels, depth_m, intrinsics, twist_camera):
     """Return the (N, 2) velocity of still points' pixels, px/s (Longuet-Higgins & Prazdny 1980, eq. 2.9).
 
     Args:
@@ -28,7 +28,7 @@ def pixel_velocity(pixels, depth_m, intrinsics, twist_camera):  # type: ignore[n
 
 
 @njit(cache=True, nogil=True)
-def depth_velocity(pixels, depth_m, intrinsics, twist_camera):  # type: ignore[no-untyped-def]
+def depth_velocity(pixels, depth_m, intrinsics, twist_camera):
     """Return the (N,) velocity of still points' depths, m/s; arguments as for ``pixel_velocity``."""
     wx, wy, vz = twist_camera[0], twist_camera[1], twist_camera[5]
     velocity = np.empty(len(pixels))

@@ -3,13 +3,11 @@
 import numpy as np
 from numba import njit
 
-from mapper.core.linear import product, solve_positive, turned, twist_exp
+from mapper.core.linear import between, product, solve_positive, turned, twist_exp
 from mapper.registration.reprojection import (
-    CHI2_2DOF,
-    CHI2_3DOF,
-    HUBER_2DOF,
-    HUBER_3DOF,
     chi2,
+    huber,
+    is_inlier,
     pose_jacobian,
     projection_jacobian,
     residual,
@@ -19,9 +17,7 @@ from mapper.registration.reprojection import (
 @njit(cache=True, nogil=True)
 def _link_error(T_measured, T_to, T_from, e):
     """Write the (6,) twist by which a relative pose misses its measurement; small-angle in the rotation."""
-    T = np.eye(4)
-    T[:3, :3] = product(T_to, T_from[:3, :3].T.copy())
-    T[:3, 3] = T_to[:3, 3] - turned(T, T_from[:3, 3])
+    T = between(T_to, T_from)
     R = product(T_measured, T[:3, :3].T.copy())
     for a in range(3):
         e[3 + a] = T_measured[a, 3] - R[a, 0] * T[0, 3] - R[a, 1] * T[1, 3] - R[a, 2] * T[2, 3]
@@ -80,12 +76,10 @@ def _cost(poses, points, edges, measured, weights, intrinsics, active, robust):
         if not active[e]:
             continue
         residual(poses[edges[e, 0]], points[edges[e, 1]], measured[e], intrinsics, r)
-        value = chi2(r, weights[e])
-        k = HUBER_2DOF if np.isnan(measured[e, 2]) else HUBER_3DOF
-        if robust and value > k * k:
-            total += 2.0 * k * np.sqrt(value) - k * k
-        else:
-            total += value
+        cost = chi2(r, weights[e])
+        if robust:
+            _, cost = huber(cost, not np.isnan(measured[e, 2]))
+        total += cost
     return total
 
 
@@ -108,9 +102,9 @@ def _linearise(poses, free, points, edges, measured, weights, intrinsics, active
         T = poses[c]
         x, y, z = residual(T, points[p], measured[e], intrinsics, r)
         has_depth = not np.isnan(measured[e, 2])
-        value = chi2(r, weights[e])
-        k = HUBER_3DOF if has_depth else HUBER_2DOF
-        scale = k / np.sqrt(value) if robust and value > k * k else 1.0
+        scale = 1.0
+        if robust:
+            scale, _ = huber(chi2(r, weights[e]), has_depth)
         projection_jacobian(x, y, z, intrinsics, has_depth, J)
         for i in range(3):
             for j in range(3):
@@ -283,9 +277,8 @@ def adjust(poses, free, points, first_edge, edges, measured, weights, intrinsics
                 if damping > 1e3:
                     break
         for e in range(len(edges)):
-            _, _, z = residual(poses[edges[e, 0]], points[edges[e, 1]], measured[e], intrinsics, r)
-            limit = CHI2_2DOF if np.isnan(measured[e, 2]) else CHI2_3DOF
-            active[e] = z > 0.05 and chi2(r, weights[e]) <= limit
+            T, point = poses[edges[e, 0]], points[edges[e, 1]]
+            active[e] = is_inlier(T, point, measured[e], weights[e], intrinsics, r)
     return poses, points, active
 
 

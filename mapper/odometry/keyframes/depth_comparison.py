@@ -11,10 +11,11 @@ from numba import njit
 from numpy.typing import NDArray
 
 from mapper.core.geometry import Array, Points, Transform
+from mapper.core.linear import between
 from mapper.core.timebase import NS_PER_S
 from mapper.odometry.camera.depth_surfaces import DepthCells
 from mapper.odometry.camera.image_observation import ImageObservation
-from mapper.odometry.keyframes.depth_kernels import between, cell_of, place_in_cells
+from mapper.odometry.keyframes.depth_kernels import cell_of, place_in_cells
 from mapper.odometry.keyframes.landmarks import LandmarkMap
 from mapper.sensing.config import KINECT_NOISE, DepthNoiseConfig
 
@@ -147,9 +148,7 @@ def _optics(cells: DepthCells) -> Array:
 
 
 @njit(cache=True, nogil=True)
-def _in_free_space(  # type: ignore[no-untyped-def]
-    points, T_camera_world, inverse_depth, T_keyframes_world, optics, cell_px, noise
-):
+def _in_free_space(points, T_camera_world, inverse_depth, T_keyframes_world, optics, cell_px, noise):
     """Return (N,) which points lie in front of all nine cells about the one that a keyframe sees them in."""
     moved = np.zeros(len(points), np.bool_)
     shape = inverse_depth.shape[1:]
@@ -174,9 +173,7 @@ def _in_free_space(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _apart(  # type: ignore[no-untyped-def]
-    points, T_camera_world, inverse_depth, T_keyframe_world, optics, cell_px, noise
-):
+def _apart(points, T_camera_world, inverse_depth, T_keyframe_world, optics, cell_px, noise):
     """Return how many points lie on a keyframe's surfaces, how many beside them, and the latter's distances.
 
     The inverse depth of a plane is linear in the image, so it is interpolated between the cells' middles.

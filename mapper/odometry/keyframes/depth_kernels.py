@@ -3,17 +3,8 @@
 import numpy as np
 from numba import njit
 
-from mapper.core.linear import product, solve_positive, turned, twist_exp
-from mapper.registration.reprojection import (
-    CHI2_2DOF,
-    CHI2_3DOF,
-    HUBER_2DOF,
-    HUBER_3DOF,
-    chi2,
-    pose_jacobian,
-    projection_jacobian,
-    residual,
-)
+from mapper.core.linear import between, solve_positive, twist_exp
+from mapper.registration.reprojection import chi2, classify, huber, linearise
 
 _MIN_DEPTH_M = 0.1
 _WIDEST = 4.0
@@ -27,16 +18,7 @@ _INDEPENDENT = 0.25
 
 
 @njit(cache=True, nogil=True)
-def between(T_a_w, T_b_w):  # type: ignore[no-untyped-def]
-    """Return T_a_b of two poses of the world."""
-    T = np.eye(4)
-    T[:3, :3] = product(T_a_w, T_b_w[:3, :3].T.copy())
-    T[:3, 3] = T_a_w[:3, 3] - turned(T, T_b_w[:3, 3])
-    return T
-
-
-@njit(cache=True, nogil=True)
-def place_in_cells(T, p, optics, cell_px):  # type: ignore[no-untyped-def]
+def place_in_cells(T, p, optics, cell_px):
     """Return where a point is seen, in rows and columns of cells from their corner, and its depth, metres.
 
     Row and column are −1 for a point that is not before the camera.
@@ -59,7 +41,7 @@ def place_in_cells(T, p, optics, cell_px):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def cell_of(T, p, optics, cell_px, shape):  # type: ignore[no-untyped-def]
+def cell_of(T, p, optics, cell_px, shape):
     """Return row and column of the cell that a point is seen in, −1 for none, and its depth, metres."""
     down, across, z = place_in_cells(T, p, optics, cell_px)
     line, column = int(np.floor(down)), int(np.floor(across))
@@ -69,7 +51,7 @@ def cell_of(T, p, optics, cell_px, shape):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _plane_row(planes, optics, cell_px, T, p, row):  # type: ignore[no-untyped-def]
+def _plane_row(planes, optics, cell_px, T, p, row):
     """Write the Jacobian of a point's distance from the plane that it projects to, and return that distance.
 
     Args:
@@ -101,26 +83,21 @@ def _plane_row(planes, optics, cell_px, T, p, row):  # type: ignore[no-untyped-d
 
 
 @njit(cache=True, nogil=True)
-def _sigma_m(row, p, sigmas):  # type: ignore[no-untyped-def]
+def _sigma_m(row, p, sigmas):
     """Return the standard deviation of a point's distance from a plane: of its depth, and across its ray."""
     along = (row[3] * p[0] + row[4] * p[1] + row[5] * p[2]) / p[2] * sigmas[0]
     return np.sqrt(along * along + sigmas[1] * sigmas[1])
 
 
 @njit(cache=True, nogil=True)
-def _add_landmarks(T, points, measured, weights, intrinsics, active, H, g):  # type: ignore[no-untyped-def]
+def _add_landmarks(T, points, measured, weights, intrinsics, active, H, g):
     """Add the normal equations of landmarks with Huber's kernel."""
     r, J, J_pose = np.empty(3), np.empty((3, 3)), np.empty((3, 6))
     for n in range(len(points)):
         if not active[n]:
             continue
-        x, y, z = residual(T, points[n], measured[n], intrinsics, r)
-        has_depth = not np.isnan(measured[n, 2])
-        e = chi2(r, weights[n])
-        k = HUBER_3DOF if has_depth else HUBER_2DOF
-        scale = k / np.sqrt(e) if e > k * k else 1.0
-        projection_jacobian(x, y, z, intrinsics, has_depth, J)
-        pose_jacobian(x, y, z, J, J_pose)
+        has_depth = linearise(T, points[n], measured[n], intrinsics, r, J, J_pose)
+        scale, _ = huber(chi2(r, weights[n]), has_depth)
         for i in range(3):
             w = scale * weights[n, i]
             for a in range(6):
@@ -130,7 +107,7 @@ def _add_landmarks(T, points, measured, weights, intrinsics, active, H, g):  # t
 
 
 @njit(cache=True, nogil=True)
-def _projected(kept, H, g):  # type: ignore[no-untyped-def]
+def _projected(kept, H, g):
     """Return keptᵀ · H · kept and keptᵀ · g."""
     H_kept, g_kept = np.zeros((6, 6)), np.zeros(6)
     for a in range(6):
@@ -143,7 +120,7 @@ def _projected(kept, H, g):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def descend(  # type: ignore[no-untyped-def]
+def descend(
     T_camera_world,
     T_prior,
     prior,
@@ -185,7 +162,7 @@ def descend(  # type: ignore[no-untyped-def]
     """
     T = T_camera_world.copy()
     active = np.ones(len(landmarks), np.bool_)
-    row, r = np.empty(6), np.empty(3)
+    row = np.empty(6)
     shared = _INDEPENDENT / (len(planes) + 1.0)
     for gate_m, stride in zip(gates_m, every):  # noqa: B905 – numba
         for _ in range(iterations):
@@ -221,15 +198,12 @@ def descend(  # type: ignore[no-untyped-def]
             T = twist_exp(step, T)
             if np.abs(step).max() < _STEP:
                 break
-        for n in range(len(landmarks)):
-            _, _, z = residual(T, landmarks[n], measured[n], intrinsics, r)
-            limit = CHI2_2DOF if np.isnan(measured[n, 2]) else CHI2_3DOF
-            active[n] = z > 0.05 and chi2(r, weights[n]) <= limit
+        classify(T, landmarks, measured, weights, intrinsics, active)
     return T, active
 
 
 @njit(cache=True, nogil=True)
-def compare(T_camera_world, points, sigmas, planes, T_keyframes_world, optics, cell_px):  # type: ignore[no-untyped-def]
+def compare(T_camera_world, points, sigmas, planes, T_keyframes_world, optics, cell_px):
     """Return how a depth image fits keyframes' planes; arguments as for ``descend``.
 
     Returns:
@@ -283,9 +257,7 @@ def compare(T_camera_world, points, sigmas, planes, T_keyframes_world, optics, c
 
 
 @njit(cache=True, nogil=True)
-def seen_through(  # type: ignore[no-untyped-def]
-    T_camera_world, inverse_depth, planes, rays, T_keyframes_world, optics, cell_px, noise
-):
+def seen_through(T_camera_world, inverse_depth, planes, rays, T_keyframes_world, optics, cell_px, noise):
     """Return how many cells of keyframes a depth image sees through, and how many it sees at all.
 
     Args:

@@ -12,7 +12,7 @@ from mapper.core.geometry import Array, Points, Transform, apply, exp, inverse, 
 from mapper.odometry.camera.image_observation import ImageObservation
 from mapper.odometry.keyframes.depth_alignment import DepthAlignment
 from mapper.odometry.keyframes.landmarks import Ids
-from mapper.registration.reprojection import refine_pose
+from mapper.registration.reprojection import NEAREST_M, refine_pose
 
 MAX_HAMMING = 64
 """Descriptors that differ in more of their 256 bits do not match."""
@@ -119,7 +119,7 @@ def predict_by_turn(last: TrackedPose, T_by_velocity: Transform | None, R_last_b
 def project(T_camera_world: Transform, points_world: Points, intrinsics: Array) -> Array:
     """Return the pixels of world points; those behind the camera are far outside the image."""
     points_camera = apply(T_camera_world, points_world)
-    z = np.where(points_camera[:, 2] > 0.05, points_camera[:, 2], np.nan)
+    z = np.where(points_camera[:, 2] > NEAREST_M, points_camera[:, 2], np.nan)
     pixels = points_camera[:, :2] / z[:, None] * intrinsics[:2] + intrinsics[2:4]
     return np.nan_to_num(pixels, nan=-1e6)
 

@@ -13,7 +13,7 @@ from mapper.odometry.camera.image_observation import ImageObservation
 from mapper.odometry.camera.pixel_motion import line_phase
 from mapper.odometry.camera.readout_time import ReadoutTime
 from mapper.odometry.keyframes.pose_tracker import TrackedPose
-from mapper.registration.reprojection import pose_jacobian, projection_jacobian, residual
+from mapper.registration.reprojection import linearise
 
 _ITERATIONS = 2
 _MIN_LANDMARKS = 50
@@ -98,7 +98,7 @@ class RollingShutter:
 
 
 @njit(cache=True, nogil=True)
-def _refine(T_camera_world, expected_sweep, information, points, measured, weights, intrinsics, phases):  # type: ignore[no-untyped-def]
+def _refine(T_camera_world, expected_sweep, information, points, measured, weights, intrinsics, phases):
     """Return T_camera_world when the middle line was read, and the camera's motion over all lines (6,).
 
     Gauss–Newton on both; ``measured`` is as it was read, and the motion has a normal prior.
@@ -114,9 +114,7 @@ def _refine(T_camera_world, expected_sweep, information, points, measured, weigh
             H[6 + a, 6 + a] = information[a]
             g[6 + a] = information[a] * (expected_sweep[a] - sweep[a])
         for n in range(len(points)):
-            x, y, z = residual(T, points[n], measured[n], intrinsics, r)
-            projection_jacobian(x, y, z, intrinsics, not np.isnan(measured[n, 2]), J)
-            pose_jacobian(x, y, z, J, J_pose)
+            linearise(T, points[n], measured[n], intrinsics, r, J, J_pose)
             for i in range(3):
                 for a in range(6):
                     J_both[i, a] = J_pose[i, a]

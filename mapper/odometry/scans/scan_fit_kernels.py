@@ -5,7 +5,7 @@ from numba import njit
 
 
 @njit(cache=True, nogil=True)
-def pair_rows(  # type: ignore[no-untyped-def]
+def pair_rows(
     near, partners, points, points_key, normals, near_normals, elsewhere, key_points, key_normals, R
 ):
     """Return the Jacobians of M pairs' distances from surfaces by the scan's tangent, and the distances.
@@ -49,7 +49,7 @@ def pair_rows(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def count_showing(motions, points, rows, own_rows, agree, facing):  # type: ignore[no-untyped-def]
+def count_showing(motions, points, rows, own_rows, agree, facing):
     """Return (K,) numbers of pairs that show motions, or the sums of what each shows, whichever is more.
 
     Args:
@@ -82,11 +82,11 @@ def count_showing(motions, points, rows, own_rows, agree, facing):  # type: igno
 
 
 @njit(cache=True, nogil=True)
-def _dot(a, b):  # type: ignore[no-untyped-def]
+def _dot(a, b):
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @njit(cache=True, nogil=True)
-def _fill_row(p, n, row):  # type: ignore[no-untyped-def]
+def _fill_row(p, n, row):
     row[0], row[1], row[2] = p[1] * n[2] - p[2] * n[1], p[2] * n[0] - p[0] * n[2], p[0] * n[1] - p[1] * n[0]
     row[3], row[4], row[5] = n[0], n[1], n[2]

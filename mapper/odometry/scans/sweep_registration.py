@@ -154,7 +154,7 @@ class SweepRegistration:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SweepMotion:
+class FittedMotion:
     """Motion of the body during one sweep.
 
     Attributes:
@@ -177,7 +177,7 @@ def fit_sweep_motion(
     *,
     start: Twist,
     max_pair_distance_m: float,
-) -> SweepMotion | None:
+) -> FittedMotion | None:
     """Return the pose and the velocity under which a sweep fits the keyframes' surfaces; None with few pairs.
 
     Twelve unknowns, two poses as in CT-ICP (Dellenbach et al. 2022): the pose in the middle and the
@@ -237,4 +237,4 @@ def fit_sweep_motion(
         if round_ >= _WIDE_ROUNDS and moved_m < _FITTED * voxel_m:
             break
     covariance: Array = np.linalg.inv(information)[6:, 6:].astype(np.float64)
-    return SweepMotion(Twist.of(velocity), covariance, T_world_scan)
+    return FittedMotion(Twist.of(velocity), covariance, T_world_scan)
