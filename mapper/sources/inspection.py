@@ -250,22 +250,23 @@ def _unwritable(source: Log) -> str | None:
 
 def _first_frame(source: Log) -> tuple[Frame | None, str]:
     """Return the first frame that can be read, else None and the reason."""
-    reason = "there is none"
+    reason = ""
     for entry in source.entries():
         try:
             frame = entry.load()
         except FrameError as error:
-            reason = str(error)
+            reason = reason or str(error)
             continue
         if not isinstance(frame, Scan) or len(frame.points_body):
             return frame, ""
-        reason = "it has no returns"
-        if frame.far_returns:
-            reason = (
+        if not frame.far_returns:
+            reason = reason or "it has no returns"
+        else:
+            reason = reason or (
                 f"all {frame.far_returns} returns are farther than {FARTHEST_M:g} m from the origin of their "
                 "frame; are they in coordinates of a map (UTM) and not around the sensor?"
             )
-    return None, f"no frame can be read: {reason}"
+    return None, f"no frame can be read: {reason or 'there is none'}"
 
 
 def _times_text(scan: Scan, timing: Timing) -> str | None:

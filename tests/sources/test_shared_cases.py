@@ -144,6 +144,7 @@ def test_headers_that_all_have_stamp_0_leave_the_times_of_recording():
     log = open_source(case("11_header_stamps_zero/bag"), SourceConfig())
     np.testing.assert_allclose(np.diff(log.stamps_ns), 1e8, atol=2e7)
     assert [scan.stamp_ns for scan in log] == log.stamps_ns.tolist()
+    assert not [sentence for sentence in log.sentences if "clock of" in sentence and "own" in sentence]
 
 
 def test_float_depth_in_millimetres_is_refused_and_the_setting_reads_it():

@@ -170,7 +170,13 @@ def scan_from(
         raise FrameError(f"{where}: points of {', '.join(names) or 'no fields'}; want x, y and z")
     coordinates = _coordinates(points) if scale is None else _coordinates(points) * np.float32(scale)
     points_body, rows, far = valid_returns(coordinates)
-    check_range(points_body, where=where, is_scaled=scale is not None)
+    try:
+        check_range(points_body, where=where, is_scaled=scale is not None)
+    except FrameError:  # of millimetres, what is left may be what lies to one side
+        check_range(
+            coordinates[np.isfinite(coordinates).all(axis=1)], where=where, is_scaled=scale is not None
+        )
+        raise
     if far > len(points_body) > 0:
         raise FrameError(
             f"{where}: {far} of {far + len(points_body)} returns are farther than {FARTHEST_M:g} m, which no "

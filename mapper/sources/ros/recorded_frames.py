@@ -161,8 +161,10 @@ def lidar_frames(reader: RecordingReader, clouds: Series, config: SourceConfig) 
     first = _first_of(reader, clouds)
     assert isinstance(first, CloudMessage)
     notes += [f"{clouds.topic.name}: {note}" for note in first.notes]
+    has_stamp = first.stamp_ns in clouds.stamps_ns  # else the time of recording is taken
+    stamp_ns = first.stamp_ns if has_stamp else int(clouds.stamps_ns[0])
     choices, time_notes = times_told(
-        first.points.dtype.names or (), partial(values_of_returns, first.points), first.stamp_ns
+        first.points.dtype.names or (), partial(values_of_returns, first.points), stamp_ns
     )
     notes += [f"{clouds.topic.name}: {note}" for note in time_notes]
     frame, is_planar = _usual_frame(reader, clouds, frame_of(first)), clouds.topic.type in LASERS
