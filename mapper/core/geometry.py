@@ -172,12 +172,17 @@ def interpolate(T_a_b: Transform, T_a_c: Transform, fraction: float) -> Transfor
 
 def angle_between(R_a: Array, R_b: Array) -> float:
     """Return the angle in radians, 0 … π, of the rotation that takes one to the other."""
-    return float(np.linalg.norm(rotation_log(R_a.T @ R_b)))
+    return angle_of(R_a.T @ R_b)
+
+
+def angle_of(R: Array) -> float:
+    """Return the angle of a rotation (3, 3) in radians, 0 … π."""
+    return float(np.linalg.norm(rotation_log(R)))
 
 
 def length_and_angle(T_a_b: Transform) -> tuple[float, float]:
     """Return how far a motion goes, in metres, and how far it turns, in radians, 0 … π."""
-    return float(np.linalg.norm(T_a_b[:3, 3])), float(np.linalg.norm(rotation_log(T_a_b[:3, :3])))
+    return float(np.linalg.norm(T_a_b[:3, 3])), angle_of(T_a_b[:3, :3])
 
 
 def nearest_rotation(M: Array) -> Array:

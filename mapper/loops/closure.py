@@ -117,6 +117,11 @@ def discrepancy(T_i_j: Transform, T_world_i: Transform, T_world_j: Transform) ->
     return Discrepancy(*length_and_angle(inverse(T_i_j) @ inverse(T_world_i) @ T_world_j))
 
 
+def pose_difference(T_a: Transform, T_b: Transform) -> Discrepancy:
+    """Return how far two poses are apart."""
+    return Discrepancy(*length_and_angle(inverse(T_a) @ T_b))
+
+
 def exceeds(miss: Discrepancy, limit: Discrepancy) -> bool:
     """Return whether a discrepancy is larger than a limit in either part."""
     return miss.translation_m > limit.translation_m or miss.rotation_rad > limit.rotation_rad
@@ -124,7 +129,7 @@ def exceeds(miss: Discrepancy, limit: Discrepancy) -> bool:
 
 def has_moved(T_world_last: Transform, T_world_now: Transform, config: KeyframeLoopsConfig) -> bool:
     """Return whether loops are searched at a pose, given that of the last search."""
-    moved = discrepancy(np.eye(4), T_world_last, T_world_now)
+    moved = pose_difference(T_world_last, T_world_now)
     return exceeds(moved, Discrepancy(config.min_motion_m, config.min_motion_rad))
 
 

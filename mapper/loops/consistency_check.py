@@ -2,10 +2,8 @@
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from mapper.core.geometry import inverse
-from mapper.loops.closure import LoopClosure, discrepancy, exceeds
+from mapper.loops.closure import LoopClosure, exceeds, pose_difference
 from mapper.loops.config import GateConfig
 from mapper.loops.odometry_drift import NodePath, OdometryChain, allowed
 from mapper.loops.online_pose_estimator import OnlinePoseEstimator
@@ -83,4 +81,4 @@ class ConsistencyCheck:
         carried = T_i_other @ other.T_i_j @ T_other_j
         paths = near_i[other.i], near_j[other.j]
         both = NodePath(sum(path.path_m for path in paths), sum(path.turned_rad for path in paths))
-        return not exceeds(discrepancy(new.T_i_j, np.eye(4), carried), allowed(self._gate, both))
+        return not exceeds(pose_difference(new.T_i_j, carried), allowed(self._gate, both))

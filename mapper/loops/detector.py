@@ -19,7 +19,7 @@ from mapper.features.frame_view import FrameView
 from mapper.graph.measurement_covariance import Comparison, compare
 from mapper.graph.model import PoseGraph
 from mapper.loops.base import Place, Proposer, Verifier, verify_proposal
-from mapper.loops.closure import MIN_CONFLICTS, Discrepancy, LoopClosure, discrepancy, exceeds
+from mapper.loops.closure import MIN_CONFLICTS, Discrepancy, LoopClosure, exceeds, pose_difference
 from mapper.loops.config import GateConfig, KeyframeLoopsConfig
 from mapper.loops.consistency_check import ConsistencyCheck
 from mapper.loops.nearby_proposer import PoseProposer
@@ -204,7 +204,7 @@ class KeyframeLoopDetector(Generic[Place]):
         path_m = 0.0
         if self._searches:
             last = self._searches[-1]
-            moved = discrepancy(np.eye(4), last.T_world_body, track.T_world_body)
+            moved = pose_difference(last.T_world_body, track.T_world_body)
             if not exceeds(moved, Discrepancy(self._config.min_motion_m, self._config.min_motion_rad)):
                 return None
             path_m = last.path_m + moved.translation_m

@@ -11,7 +11,7 @@ from mapper.core.geometry import Array, Transform, apply, inverse, transform
 from mapper.features.frame_view import FrameView, ScanView
 from mapper.graph.measurement_covariance import inflated
 from mapper.loops.base import Verification
-from mapper.loops.closure import Discrepancy, discrepancy, exceeds
+from mapper.loops.closure import Discrepancy, exceeds, pose_difference
 from mapper.loops.config import ScanVerificationConfig
 from mapper.loops.scan_context_proposer import ScanPlace
 from mapper.registration.base import Alignment
@@ -127,7 +127,7 @@ class ScanVerifier:
         found = replace(self._compared(i, j, T_i_j, self._fine), rmse_m=alignment.inlier_rmse_m)
         if found.reason:
             return found
-        rivals = [score for score, other in guesses if exceeds(discrepancy(other, np.eye(4), T_i_j), _SAME)]
+        rivals = [score for score, other in guesses if exceeds(pose_difference(other, T_i_j), _SAME)]
         lead = _score(self._worse(i, j, T_i_j, self._coarse)) - max(rivals, default=-1.0)
         if lead < config.min_lead:
             reason = f"ambiguous: another motion is {lead:.2f} worse, want {config.min_lead}"

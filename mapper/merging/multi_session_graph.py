@@ -27,6 +27,7 @@ from mapper.loops.closure import (
     apply_solution,
     discrepancy,
     exceeds,
+    pose_difference,
 )
 from mapper.loops.config import SLACK_RAD, GateConfig
 from mapper.loops.inter_session_loops import SharedPlace
@@ -133,7 +134,7 @@ def _agreement(places: Sequence[SharedPlace], gate: GateConfig) -> NDArray[np.bo
 def _are_several(T_world_bodies: Sequence[Transform], gate: GateConfig) -> bool:
     same = Discrepancy(gate.slack_m, SLACK_RAD)
     first = T_world_bodies[0]
-    return any(exceeds(discrepancy(np.eye(4), first, other), same) for other in T_world_bodies[1:])
+    return any(exceeds(pose_difference(first, other), same) for other in T_world_bodies[1:])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -174,7 +175,7 @@ class _SpanningTree:
                 next_m = places_m[np.linalg.norm(places_m - at_m, axis=1).argmin()]
                 path_m, at_m = path_m + float(np.linalg.norm(next_m - at_m)), next_m
             path = NodePath(path_m + float(np.linalg.norm(begin_m - at_m)), 0.0)
-            miss = discrepancy(np.eye(4), T_map_first @ place.T_first_body, T_map_body)
+            miss = pose_difference(T_map_first @ place.T_first_body, T_map_body)
             agreeing += not exceeds(miss, allowed(gate, path))
         return 2 * agreeing > len(ties[pair])
 
@@ -230,8 +231,7 @@ def _measure_residuals(
 ) -> WorldByPlaces:
     """Return the pose of a run's world with the residuals of the places that it shares with any other."""
     misses_m = [
-        discrepancy(
-            np.eye(4),
+        pose_difference(
             T_map_worlds[place.first] @ place.T_first_body,
             T_map_worlds[place.second] @ place.T_second_body,
         ).translation_m

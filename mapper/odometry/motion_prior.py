@@ -2,6 +2,7 @@
 
 import math
 from collections import deque
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -308,3 +309,17 @@ class MotionPrior:
         own = float(np.median(self._errors)) / _MEDIAN_LENGTH
         without = float(np.median(self._errors_without)) / _MEDIAN_LENGTH
         return math.hypot(sigma_rad, own) < without
+
+
+class WithMotionPrior:
+    """Odometry that predicts the motion by ``_prior``: a :class:`mapper.odometry.base.GyroscopeUser`."""
+
+    _prior: MotionPrior
+
+    def gyroscope_notes(self) -> Sequence[str]:
+        """Return how the gyroscope was used, if the log has one."""
+        return self._prior.notes()
+
+    def gyroscope_calibration(self) -> GyroscopeCalibration | None:
+        """Return the gyroscope's calibration, if the log has one that was of use."""
+        return self._prior.calibration

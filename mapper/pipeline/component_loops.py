@@ -21,8 +21,8 @@ from mapper.loops.closure import (
     Discrepancy,
     LoopClosure,
     accepted_loops,
-    discrepancy,
     exceeds,
+    pose_difference,
 )
 from mapper.loops.config import SLACK_RAD, GateConfig, PlaceLoopsConfig
 from mapper.loops.image_verification import verify_wide
@@ -187,7 +187,7 @@ def _agreed(links: Sequence[_Link], graph: PoseGraph, gate: GateConfig) -> LoopC
     agreeing = [
         (T_i_j, information)
         for T_i_j, information in carried
-        if not exceeds(discrepancy(T_i_j, np.eye(4), best.T_i_j), limit)
+        if not exceeds(pose_difference(T_i_j, best.T_i_j), limit)
     ]
     if len(agreeing) < LEAST_AGREEING or 2 * len(agreeing) <= len(links):
         return None

@@ -24,8 +24,8 @@ from mapper.loops.closure import (
     SOLVER,
     Discrepancy,
     accepted_loops,
-    discrepancy,
     exceeds,
+    pose_difference,
     why_none_accepted,
 )
 from mapper.loops.config import SLACK_RAD, GateConfig, PlaceLoopsConfig, ScanLoopsConfig
@@ -99,7 +99,7 @@ def _constrained(tracking: TrackingResult, nodes: Sequence[int]) -> list[_Constr
     }
     found, path_m, turned_rad = [], 0.0, 0.0
     for before, node in zip([nodes[0], *nodes], nodes, strict=False):
-        step = discrepancy(np.eye(4), T_odometry[before], T_odometry[node])
+        step = pose_difference(T_odometry[before], T_odometry[node])
         path_m, turned_rad = path_m + step.translation_m, turned_rad + step.rotation_rad
         if node in T_map_node:
             path = NodePath(path_m, turned_rad)
@@ -128,7 +128,7 @@ def _within(side: Sequence[_Constrained], gate: GateConfig) -> float:
 def _agree(a: _Constrained, b: _Constrained, gate: GateConfig) -> bool:
     T_map_b = a.T_map_node @ inverse(a.T_odometry_node) @ b.T_odometry_node
     path = NodePath(b.path.path_m - a.path.path_m, b.path.turned_rad - a.path.turned_rad)
-    return not exceeds(discrepancy(np.eye(4), T_map_b, b.T_map_node), allowed(gate, path))
+    return not exceeds(pose_difference(T_map_b, b.T_map_node), allowed(gate, path))
 
 
 def _cut(tracking: TrackingResult, last: int, first: int, map_node: int) -> TrackingResult:

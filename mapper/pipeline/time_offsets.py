@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from mapper.config.build import BuildConfig
 from mapper.core.errors import FrameError
 from mapper.core.frames import PinholeCamera
-from mapper.core.geometry import Array, angle_between
+from mapper.core.geometry import Array, angle_of
 from mapper.core.timebase import GAP_INTERVALS, NS_PER_S, Stamps
 from mapper.core.trajectory import Trajectory
 from mapper.odometry.given_poses import poses_for
@@ -155,7 +155,7 @@ def _turn_rad(matcher: Any, one: _Features, other: _Features, camera: PinholeCam
     if essential is None or essential.shape != (3, 3):
         return 0.0
     R_a, R_b, _ = cv2.decomposeEssentialMat(essential)  # one is the other turned by 180° about the way
-    return float(min(angle_between(np.eye(3), R) for R in (R_a, R_b)))
+    return min(angle_of(R_a), angle_of(R_b))
 
 
 def _motions(path: Trajectory) -> tuple[_Motion, _Motion]:

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from mapper.core.geometry import angle_between
+from mapper.core.geometry import angle_between, angle_of
 from mapper.core.timebase import GAP_INTERVALS, NS_PER_S, stretches
 from mapper.core.trajectory import Trajectory
 from mapper.navigation.config import TraversableConfig
@@ -373,7 +373,7 @@ def _turn_errors(estimated: Trajectory, known: Trajectory) -> tuple[float, float
     ends = np.searchsorted(known.stamps_ns, known.stamps_ns + NS_PER_S)
     windows = [(begin, end) for begin, end in enumerate(ends.tolist()) if end < len(known)]
     of_truth = [known.T_world_body[i, :3, :3].T @ known.T_world_body[j, :3, :3] for i, j in windows]
-    turned_rad = np.array([angle_between(np.eye(3), turn) for turn in of_truth])
+    turned_rad = np.array([angle_of(turn) for turn in of_truth])
     if turned_rad.max(initial=0.0) < _NO_TURN_RAD:
         return 0.0, 0.0
     R = estimated.T_world_body[:, :3, :3]

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from mapper.core.errors import SourceError, listed
 from mapper.core.frames import NO_DISTORTION, PinholeCamera
-from mapper.core.geometry import Transform, angle_between
+from mapper.core.geometry import Transform, length_and_angle
 from mapper.core.rotations import pose_of_row
 from mapper.sources.config import CameraConfig
 from mapper.sources.lens import Lens
@@ -154,12 +154,11 @@ class DepthCamera:
     def note(self) -> str:
         """Sentence on the pose."""
         T_color_depth = np.eye(4) if self.T_color_depth is None else self.T_color_depth
-        apart_mm = 1e3 * float(np.linalg.norm(T_color_depth[:3, 3]))
-        turned_deg = np.degrees(angle_between(np.eye(3), T_color_depth[:3, :3]))
+        apart_m, turned_rad = length_and_angle(T_color_depth)
         return (
             f"depth is registered to colour as it is read: its camera, of focal length "
-            f"{self.calibration.fx_px:.1f} px, is {apart_mm:.1f} mm from colour's and turned by "
-            f"{turned_deg:.2f}° ({self.origin})"
+            f"{self.calibration.fx_px:.1f} px, is {1e3 * apart_m:.1f} mm from colour's and turned by "
+            f"{np.degrees(turned_rad):.2f}° ({self.origin})"
         )
 
 

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from mapper.core.frames import RgbdFrame
-from mapper.core.geometry import Array, Transform, angle_between, apply, inverse
+from mapper.core.geometry import Array, Transform, apply, inverse, length_and_angle
 from mapper.core.timebase import NS_PER_S
 from mapper.core.trajectory import Trajectory, with_rotations
 from mapper.core.units import MM_PER_M
@@ -281,8 +281,7 @@ def _pairs(log: Log, motion: Trajectory, anchors: Collection[int]) -> Iterator[t
             if T_world_second is None:
                 continue
             T_first_second = inverse(T_world_first) @ T_world_second
-            distance_m = float(np.linalg.norm(T_first_second[:3, 3]))
-            turn_rad = angle_between(np.eye(3), T_first_second[:3, :3])
+            distance_m, turn_rad = length_and_angle(T_first_second)
             if distance_m >= farthest_m and turn_rad <= _MAX_TURN_RAD:
                 farthest_m, farthest = distance_m, (first, second, T_first_second)
         if farthest is not None:

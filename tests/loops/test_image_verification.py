@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from mapper.core.geometry import exp, inverse, log
-from mapper.loops.closure import discrepancy
+from mapper.loops.closure import discrepancy, pose_difference
 from mapper.loops.config import ImageVerificationConfig
 from mapper.loops.image_verification import ImageVerifier, verify_aligned
 from mapper.odometry.config import MatchConfig
@@ -33,7 +33,7 @@ def test_isvd_can_be_the_measure_too():
     by_pixels = ImageVerifier(ImageVerificationConfig()).verify(*views)
     assert by_isvd.reason == by_pixels.reason == ""
     assert not np.array_equal(by_isvd.T_i_j, by_pixels.T_i_j)
-    assert discrepancy(by_isvd.T_i_j, np.eye(4), by_pixels.T_i_j).translation_m < 0.02
+    assert pose_difference(by_isvd.T_i_j, by_pixels.T_i_j).translation_m < 0.02
 
 
 def test_the_claimed_uncertainty_covers_the_error():
@@ -101,7 +101,7 @@ def test_frames_that_were_aligned_by_hand_are_registered_by_their_surfaces(desk_
     by_hand = T_i_j @ exp(np.array([0.05, -0.08, 0.04]), np.array([0.15, 0.1, -0.12]))
     found = verify_aligned(i.load(), j.load(), by_hand)
     assert found.reason == ""
-    miss = discrepancy(found.T_i_j, np.eye(4), T_i_j)
+    miss = pose_difference(found.T_i_j, T_i_j)
     assert miss.translation_m < 0.02
     assert miss.rotation_rad < 0.01
 

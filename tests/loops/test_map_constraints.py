@@ -9,7 +9,7 @@ from mapper.core.geometry import exp, inverse
 from mapper.core.timebase import NS_PER_S
 from mapper.features.frame_view import ScanView
 from mapper.graph.model import BetweenFactor, PoseSigmas
-from mapper.loops.closure import discrepancy
+from mapper.loops.closure import pose_difference
 from mapper.loops.config import ScanLoopsConfig
 from mapper.loops.map_constraints import KnownPlaces, build_map_constraint_detector
 from mapper.loops.scan_verification import ScanVerifier
@@ -45,7 +45,7 @@ def feed(detector, poses, views, odometry):
         detector.add(first + k, track(first + k, timed.stamp_ns, T, links), lambda timed=timed: timed)
     held = [loop for loop in detector.closures() if loop.verdict == "accepted"]
     for loop in held:
-        miss = discrepancy(loop.T_i_j, np.eye(4), T_MAP_WORLD @ poses[loop.j - first])
+        miss = pose_difference(loop.T_i_j, T_MAP_WORLD @ poses[loop.j - first])
         assert miss.translation_m < 0.15
         assert miss.rotation_rad < 0.02
     return [loop.j - first for loop in held]

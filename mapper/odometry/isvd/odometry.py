@@ -38,9 +38,8 @@ from mapper.odometry.base import (
     lost_frame,
 )
 from mapper.odometry.config import IsvdOdometryConfig, MatchConfig
-from mapper.odometry.gyroscope_calibration import GyroscopeCalibration
 from mapper.odometry.isvd.frame_pairs import IsvdObservation, PairRegistration, RegisterPair, matched_pairs
-from mapper.odometry.motion_prior import MotionPrior
+from mapper.odometry.motion_prior import MotionPrior, WithMotionPrior
 from mapper.odometry.sharpest_keyframe import SharpestKeyframes
 from mapper.registration.base import Alignment
 from mapper.registration.reprojection import (
@@ -109,7 +108,7 @@ class PoseCandidate:
     T_world_body: Transform
 
 
-class IsvdOdometry(FrameOdometry[IsvdObservation]):
+class IsvdOdometry(WithMotionPrior, FrameOdometry[IsvdObservation]):
     """Odometry that registers every frame against MP earlier ones and averages the poses.
 
     Every tracked frame is a node, and every registration that succeeded is a factor. The earlier frames are
@@ -230,14 +229,6 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
         before_px = np.full((len(observation.features), 2), np.nan)
         before_px[now] = earlier.measured[:, :2][then]
         return FeatureMatches(np.isfinite(before_px[:, 0]), before_px)
-
-    def gyroscope_notes(self) -> Sequence[str]:
-        """Return how the gyroscope was used, if the log has one."""
-        return self._prior.notes()
-
-    def gyroscope_calibration(self) -> GyroscopeCalibration | None:
-        """Return the gyroscope's calibration, if the log has one that was of use."""
-        return self._prior.calibration
 
     def _undistorted(self, pixels: NDArray[np.float32], camera: PinholeCamera) -> Array:
         exact: Array = pixels.astype(np.float64)

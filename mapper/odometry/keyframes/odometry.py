@@ -24,7 +24,6 @@ from mapper.odometry.base import (
 from mapper.odometry.camera.image_observation import ImageObservation, observe_image
 from mapper.odometry.camera.readout_time import ReadoutTime
 from mapper.odometry.config import KeyframeOdometryConfig
-from mapper.odometry.gyroscope_calibration import GyroscopeCalibration
 from mapper.odometry.keyframes.depth_comparison import EarlierDepth
 from mapper.odometry.keyframes.frame_doubts import UNDOUBTED, Assessment, FrameDoubts
 from mapper.odometry.keyframes.keyframe_decision import KeyframeDecision
@@ -39,7 +38,7 @@ from mapper.odometry.keyframes.pose_tracker import (
 from mapper.odometry.keyframes.relocalizer import Relocalizer
 from mapper.odometry.keyframes.rolling_shutter import RollingShutter
 from mapper.odometry.keyframes.tracking import Tracking
-from mapper.odometry.motion_prior import MotionPrior
+from mapper.odometry.motion_prior import MotionPrior, WithMotionPrior
 from mapper.places.vocabulary import load_vocabulary
 from mapper.sensing.gyroscope import Gyroscope
 
@@ -49,7 +48,7 @@ _OWN_SHARE = 0.5
 MakePoseTracker = Callable[[LandmarkMap, Relocalizer], PoseTracker]
 
 
-class KeyframeOdometry(FrameOdometry[ImageObservation]):
+class KeyframeOdometry(WithMotionPrior, FrameOdometry[ImageObservation]):
     """Odometry against keyframes' landmarks, both refined by local bundle adjustment.
 
     Keyframes are the graph's nodes, numbered from 0. Their poses keep improving while they are in the window,
@@ -143,14 +142,6 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
                 now, then = now[common >= 0], then[common >= 0]
                 previous_px[now] = observation.pixels[then]
         return FeatureMatches(self._agreeing, previous_px)
-
-    def gyroscope_notes(self) -> Sequence[str]:
-        """Return how the gyroscope was used, if the log has one."""
-        return self._prior.notes()
-
-    def gyroscope_calibration(self) -> GyroscopeCalibration | None:
-        """Return the gyroscope's calibration, if the log has one that was of use."""
-        return self._prior.calibration
 
     def sensor_notes(self) -> Sequence[str]:
         """Return the estimated readout time of the camera's shutter, if it has any."""

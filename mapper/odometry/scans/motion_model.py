@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mapper.core.deskew import STILL, SampledMotion, Twist, twist_between
-from mapper.core.geometry import Array, Transform, angle_between, inverse
+from mapper.core.geometry import Array, Transform, inverse, length_and_angle
 from mapper.core.running_median import RunningMedian
 from mapper.core.timebase import NS_PER_S
 from mapper.odometry.motion_prior import MotionPrior
@@ -36,8 +36,9 @@ class _Errors:
 
     def add(self, error: Transform, time_s2: float = 1.0) -> None:
         """Add that of one prediction, in units of a time squared if it is an acceleration's."""
-        self._turns.add(angle_between(np.eye(3), error[:3, :3]) / time_s2)
-        self._shifts.add(float(np.linalg.norm(error[:3, 3])) / time_s2)
+        shift_m, turn_rad = length_and_angle(error)
+        self._turns.add(turn_rad / time_s2)
+        self._shifts.add(shift_m / time_s2)
 
     @property
     def sigmas(self) -> tuple[float, float]:
@@ -138,7 +139,7 @@ class MotionModel:
 
     def _spread_of_wheels(self, rolled: Transform) -> Spread:
         """Return the spread of a motion by the wheels: the errors that they had, and those of most wheels."""
-        moved, turned = float(np.linalg.norm(rolled[:3, 3])), angle_between(np.eye(3), rolled[:3, :3])
+        moved, turned = length_and_angle(rolled)
         rotation, translation = self._of_wheels.sigmas
         noise = self.prior.wheel_noise
         return Spread(

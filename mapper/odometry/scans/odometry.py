@@ -1,7 +1,6 @@
 """Scan-to-map odometry by any scan matcher, with checks of each pose against the last keyframe."""
 
 from collections import deque
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -16,9 +15,8 @@ from mapper.graph.config import WheelNoiseConfig
 from mapper.graph.measurement_covariance import information_of
 from mapper.graph.model import BetweenFactor
 from mapper.odometry.base import Diagnostics, FrameOdometry, FrameResult, lost_frame
-from mapper.odometry.gyroscope_calibration import GyroscopeCalibration
 from mapper.odometry.keyframe_distance import is_far
-from mapper.odometry.motion_prior import MotionPrior
+from mapper.odometry.motion_prior import MotionPrior, WithMotionPrior
 from mapper.odometry.scans.config import ScanOdometryConfig
 from mapper.odometry.scans.motion_model import MotionModel
 from mapper.odometry.scans.pose_assessment import PoseAssessment
@@ -37,7 +35,7 @@ _DISPLACED = 0.5
 """Displacement of a sweep's outer points, in voxels, from which on its pose is doubtful."""
 
 
-class ScanOdometry(FrameOdometry[ScanObservation]):
+class ScanOdometry(WithMotionPrior, FrameOdometry[ScanObservation]):
     """Odometry by constant-velocity prediction, a scan matcher, and acceptance by this log's medians.
 
     A pose is compared with the last keyframes and the last scan: the share of the points that have a partner
@@ -113,14 +111,6 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
     def view(self, observation: ScanObservation, twist: Motion | None = None, /) -> ScanView:
         """Return the view for place recognition. Pure."""
         return observation.view(twist)
-
-    def gyroscope_notes(self) -> Sequence[str]:
-        """Return how the gyroscope was used, if the log has one."""
-        return self._prior.notes()
-
-    def gyroscope_calibration(self) -> GyroscopeCalibration | None:
-        """Return the gyroscope's calibration, if the log has one that was of use."""
-        return self._prior.calibration
 
     def matches(self) -> None:
         """Return None: the pose is not from features."""

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mapper.core.geometry import Array, Transform, angle_between, exp, inverse, log
+from mapper.core.geometry import Array, Transform, exp, inverse, length_and_angle, log
 from mapper.odometry.base import Diagnostics
 from mapper.odometry.scans.motion_model import Spread
 from mapper.odometry.scans.scan_fit import ScanFit, ScanKeyframe
@@ -72,7 +72,7 @@ def jump_between(T_world_predicted: Transform, T_world_found: Transform, spread:
             max(_JUMP_SPREADS * spread.translation_m, _LEAST_JUMP_M),
             max(_JUMP_SPREADS * spread.rotation_rad, _LEAST_JUMP_RAD),
         )
-    return Jump(float(np.linalg.norm(error[:3, 3])), angle_between(np.eye(3), error[:3, :3]), *limits)
+    return Jump(*length_and_angle(error), *limits)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

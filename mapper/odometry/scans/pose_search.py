@@ -6,7 +6,7 @@ from functools import partial
 
 import numpy as np
 
-from mapper.core.geometry import Transform, angle_between, exp, in_plane, inverse
+from mapper.core.geometry import Transform, exp, in_plane, inverse, length_and_angle
 from mapper.odometry.scans.config import ScanOdometryConfig
 from mapper.odometry.scans.motion_model import MotionModel, Spread
 from mapper.odometry.scans.pose_assessment import PoseAssessment
@@ -198,9 +198,9 @@ class PoseSearch:
         T_world_middle: Transform,
     ) -> ScanFit:
         """Return the fit at the pose that the wheels made of another one, if it is far from that."""
-        moved = inverse(T_world_found) @ T_world_middle
+        moved_m, turned_rad = length_and_angle(inverse(T_world_found) @ T_world_middle)
         farther_m = self._config.max_pair_distance_m
-        if np.linalg.norm(moved[:3, 3]) < farther_m and angle_between(np.eye(3), moved[:3, :3]) < _SAME_RAD:
+        if moved_m < farther_m and turned_rad < _SAME_RAD:
             return fit
         T_key_scan = inverse(keyframe.T_world_middle) @ T_world_middle
         return fit_of(keyframe, scan.deskewed, T_key_scan, max_pair_distance_m=farther_m) or fit
@@ -301,11 +301,8 @@ class Answers:
 
     def _of(self, T_world_body: Transform) -> set[int] | None:
         for other, guesses in self._poses:
-            difference = inverse(other) @ T_world_body
-            if (
-                np.linalg.norm(difference[:3, 3]) < self._near_m
-                and angle_between(np.eye(3), difference[:3, :3]) < _SAME_RAD
-            ):
+            apart_m, turned_rad = length_and_angle(inverse(other) @ T_world_body)
+            if apart_m < self._near_m and turned_rad < _SAME_RAD:
                 return guesses
         return None
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.doubts import Doubt
-from mapper.core.geometry import Array, Transform, angle_between
+from mapper.core.geometry import Array, Transform, length_and_angle
 from mapper.core.linear import gram
 from mapper.graph.config import WheelNoiseConfig
 from mapper.graph.wheel_factors import wheel_sigmas
@@ -73,8 +73,7 @@ def _sectors(points: Array) -> NDArray[np.intp]:
 
 def _with_wheels(covariance: Array, T_key_scan: Transform, noise: WheelNoiseConfig) -> Array:
     """Return the (6, 6) covariance of a pose that surfaces and wheels measured."""
-    turned, moved = angle_between(np.eye(3), T_key_scan[:3, :3]), float(np.linalg.norm(T_key_scan[:3, 3]))
-    sigmas = wheel_sigmas(noise, moved, turned)
+    sigmas = wheel_sigmas(noise, *length_and_angle(T_key_scan))
     variances = np.square([sigmas.rotation_rad] * 3 + [sigmas.translation_m] * 3)
     reduced: Array = covariance - covariance @ np.linalg.solve(covariance + np.diag(variances), covariance)
     return 0.5 * (reduced + reduced.T)
