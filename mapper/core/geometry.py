@@ -88,7 +88,7 @@ def skew(v: Array) -> Array:
 
 def rotation_exp(rotation_rad: Array) -> Array:
     """Return the (3, 3) rotation of a (3,) rotation vector in radians (Rodrigues 1840)."""
-    angle = math.sqrt(rotation_rad @ rotation_rad)
+    angle = math.sqrt(np.dot(rotation_rad, rotation_rad))
     K = skew(rotation_rad)
     if angle < _SMALL_ANGLE_RAD:
         return np.eye(3) + K + 0.5 * K @ K
@@ -135,7 +135,7 @@ def exp(rotation_rad: Array, translation_m: Array) -> Transform:
 def log(T_a_b: Transform) -> tuple[Array, Array]:
     """Return the twist (rotation_rad (3,), translation_m (3,)) with ``exp(*log(T)) == T``."""
     rotation_rad, t = rotation_log(T_a_b[:3, :3]), T_a_b[:3, 3]
-    angle = math.sqrt(rotation_rad @ rotation_rad)
+    angle = math.sqrt(np.dot(rotation_rad, rotation_rad))
     # The inverse left Jacobian in closed form, and its series at small angles (Barfoot 2017, eq. 7.76b).
     b = (1.0 - 0.5 * angle / math.tan(0.5 * angle)) / angle**2 if angle > 1e-4 else 1.0 / 12.0
     K = skew(rotation_rad)
@@ -154,7 +154,7 @@ def adjoint(T_a_b: Transform) -> Array:
 
 
 def _left_jacobian(rotation_rad: Array) -> Array:
-    angle = math.sqrt(rotation_rad @ rotation_rad)
+    angle = math.sqrt(np.dot(rotation_rad, rotation_rad))
     K = skew(rotation_rad)
     if angle < 1e-4:  # series: the closed form loses digits here
         return np.eye(3) + 0.5 * K + K @ K / 6.0

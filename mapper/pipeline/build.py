@@ -204,19 +204,20 @@ class _Steps:
     def save(self, solved: _Solved, poses: Trajectory | None) -> None:
         """Write the solved poses, the graph, the places, and the poses that were given."""
         tracking, level = solved.tracking, solved.level
+        warnings = []
         if level.conflict:
-            self.progress.note(level.conflict)
             weight: Weight = "note" if level.is_decided else "doubt"
-            self.writer.warn([RunWarning(kind="level", sentence=level.conflict, weight=weight)])
+            warnings.append(RunWarning(kind="level", sentence=level.conflict, weight=weight))
         if implausible := _height_warning(self.source, tracking.tracked_trajectory()):
-            self.progress.note(implausible)
-            self.writer.warn([RunWarning(kind="depth", sentence=implausible, weight="doubt")])
-        for sentence in _mounting_warnings(self.source, tracking, self.config):
-            self.progress.note(sentence)
-            self.writer.warn([RunWarning(kind="mounting", sentence=sentence, weight="doubt")])
-        for warning in solved.georeferenced.warnings:
+            warnings.append(RunWarning(kind="depth", sentence=implausible, weight="doubt"))
+        warnings += [
+            RunWarning(kind="mounting", sentence=sentence, weight="doubt")
+            for sentence in _mounting_warnings(self.source, tracking, self.config)
+        ]
+        warnings += solved.georeferenced.warnings
+        for warning in warnings:
             self.progress.note(warning.text)
-        self.writer.warn(solved.georeferenced.warnings)
+        self.writer.warn(warnings)
         with self.writer.clock.stage("solve"):
             save_solved(self.writer, from_tracking(tracking, self.source))
             save_places(self.writer, tracking)

@@ -2,7 +2,7 @@
 
 import os
 import re
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path, PurePath
 
 from mapper.core.errors import SourceError, listed
@@ -39,6 +39,23 @@ def within(folder: Path, name: str, *, where: str) -> Path:
             f"{where}: {name!r} leads out of the log's folder; want the name of a file within it"
         )
     return folder / path
+
+
+def only_one(path: Path, found: Sequence[Path], what: str) -> Path:
+    """Return the only log in a folder.
+
+    Args:
+        path: The folder.
+        found: The logs in it.
+        what: What they are, e.g. "sequences".
+
+    Raises:
+        SourceError: There are several.
+    """
+    if len(found) == 1:
+        return found[0]
+    names = listed([str(one.relative_to(path)) for one in found])
+    raise SourceError(f"{path}: holds {len(found)} {what}; open one of {names}")
 
 
 def present(paths: Iterable[Path]) -> list[bool]:

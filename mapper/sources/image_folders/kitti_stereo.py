@@ -34,6 +34,7 @@ from mapper.sources.kitti_calibration import (
     rectification,
     rigid_motion,
 )
+from mapper.sources.listed_files import only_one
 from mapper.sources.scan_stamps import Wording, in_order, scan_stamps
 from mapper.sources.stereo import StereoCamera, rectified_pair, rectify, refuse_settings
 from mapper.sources.text import time_order, truth_from
@@ -78,9 +79,7 @@ def read_log(path: Path, config: SourceConfig) -> Log:
     """
     refuse_settings(config.camera)
     sequences = _sequences(path)
-    if len(sequences) != 1:
-        names = ", ".join(f"{one.sequence.relative_to(path)}" for one in sequences)
-        raise SourceError(f"{path}: holds {len(sequences)} sequences; open one of {names}")
+    only_one(path, [one.sequence for one in sequences], "sequences")
     pairs = sequences[0]
     left_ns, notes = _stamps(pairs, pairs.left, config)
     right_ns = left_ns

@@ -27,6 +27,7 @@ from mapper.sources.image_files import png
 from mapper.sources.image_folders.pairing import ordered_pairs
 from mapper.sources.image_folders.rgbd import FramePair, assumed_camera_note, find_calibration, rgbd_log
 from mapper.sources.image_folders.tum import read_truth
+from mapper.sources.listed_files import only_one
 from mapper.sources.scan_stamps import (
     Wording,
     line_of_each,
@@ -101,10 +102,7 @@ def read_log(path: Path, config: SourceConfig) -> Log:
     """
     opened = path
     if sequences := _sequences(path):
-        if len(sequences) > 1:
-            names = ", ".join(folder.name for folder in sequences)
-            raise SourceError(f"{path}: holds {len(sequences)} sequences; open one of {names}")
-        path = sequences[0]
+        path = only_one(path, sequences, "sequences")
     images = find_images(path)
     if images is None:
         raise SourceError(f"{path}: no colour and depth images with the same numbers; want {LOOKED_FOR}")

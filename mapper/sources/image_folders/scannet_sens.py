@@ -23,7 +23,7 @@ from mapper.sources.image_files.reading import depth_m_from
 from mapper.sources.image_folders.numbered import RATE_HZ
 from mapper.sources.image_folders.posed import PosedFrames, camera_of
 from mapper.sources.image_folders.rgbd import FramePair
-from mapper.sources.listed_files import refuse_links_out
+from mapper.sources.listed_files import only_one, refuse_links_out
 from mapper.sources.scan_stamps import stamp_at
 from mapper.sources.text import pose_from_matrix
 
@@ -53,10 +53,8 @@ def read_frames(path: Path, config: SourceConfig) -> PosedFrames:
     """
     if path.is_dir():
         files = sorted(filter(Path.is_file, path.glob("*.sens")))
-        if len(files) > 1:
-            raise SourceError(f"{path}: holds {len(files)} .sens files; open one of them")
         refuse_links_out(files, log=path)
-        path = files[0]
+        path = only_one(path, files, ".sens files")
     try:
         with path.open("rb") as file:
             return _read(file, path, config)

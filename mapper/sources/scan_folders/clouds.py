@@ -8,6 +8,7 @@ from mapper.core.errors import SourceError
 from mapper.sources.base import Log
 from mapper.sources.cloud_files.pcd import viewpoint_note
 from mapper.sources.config import SourceConfig
+from mapper.sources.listed_files import only_one
 from mapper.sources.scan_folders.scan_folder import (
     clouds_in,
     first_of,
@@ -49,9 +50,7 @@ def read_log(path: Path, config: SourceConfig) -> Log:
             refused.append(str(error))
     if not readable:
         raise SourceError(refused[0])
-    if len(readable) > 1:
-        names = ", ".join(folder.name for folder, _, _ in readable)
-        raise SourceError(f"{path}: holds {len(readable)} folders of clouds; open one of {names}")
+    only_one(path, [folder for folder, _, _ in readable], "folders of clouds")
     folder, files, notes = readable[0]
     if not files:
         raise SourceError(f"{folder}: no cloud matches source.pattern={config.pattern}")

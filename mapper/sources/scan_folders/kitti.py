@@ -31,7 +31,7 @@ from mapper.sources.kitti_calibration import (
     rectification,
     rigid_motion,
 )
-from mapper.sources.listed_files import refuse_links_out
+from mapper.sources.listed_files import only_one, refuse_links_out
 from mapper.sources.scan_folders.scan_folder import clouds_in, first_of, most_clouds, scan_log
 from mapper.sources.scan_stamps import stamps_list
 
@@ -55,11 +55,7 @@ def read_log(path: Path, config: SourceConfig) -> Log:
         SourceError: There are several sequences, no scan matches the pattern, or a text file is malformed.
         DataError: A line of poses is malformed.
     """
-    sequences = _sequences(path)
-    if len(sequences) != 1:
-        names = ", ".join(str(folder.relative_to(path)) for folder in sequences)
-        raise SourceError(f"{path}: holds {len(sequences)} sequences; open one of {names}")
-    sequence = sequences[0]
+    sequence = only_one(path, _sequences(path), "sequences")
     folder = _scans(sequence)
     files, notes = clouds_in(folder, config.pattern)
     if not files:
