@@ -21,6 +21,8 @@ _FIXED_FRAMES = frozenset(
 )
 """Last words of frames that do not move with the robot: REP 105's, odom_combined of robot_pose_ekf,
 camera_init of LOAM (Zhang & Singh 2014), local_origin of mavros, odom_frame of a T265."""
+ESTIMATED = re.compile("map|laser|lidar|icp|rf2o|visual|camera|gps|gnss|truth|amcl|slam")
+"""Words in names of odometry that is not of wheels, or not of them alone."""
 _MAX_GAP_NS = NS_PER_S
 """Longer than any publisher of a moving frame pauses; tf2 keeps 10 s and interpolates over any gap."""
 _SAME_POSE = 1e-6
@@ -30,6 +32,12 @@ def is_fixed(frame: str) -> bool:
     """Return whether a frame's name says that it does not move with the robot."""
     words = re.findall("[a-z]+", frame.lower())
     return bool(words) and words[-2 if words[-1] == "frame" and words[1:] else -1] in _FIXED_FRAMES
+
+
+def is_of_wheels(frame: str) -> bool:
+    """Return whether a frame's name says that the wheels' odometry is given in it: odom, odom_combined."""
+    words = re.findall("[a-z]+", frame.lower())
+    return not {"odom", "odometry"}.isdisjoint(words) and not ESTIMATED.search(frame.lower())
 
 
 class FrameTree:

@@ -23,7 +23,7 @@ from mapper.sources.imu_files import saturation_notes
 from mapper.sources.nmea import fixes_from_sentences
 from mapper.sources.ros.decode import decode
 from mapper.sources.ros.entries import Located
-from mapper.sources.ros.frame_tree import BY_TF, FrameTree
+from mapper.sources.ros.frame_tree import BY_TF, FrameTree, is_of_wheels
 from mapper.sources.ros.message_index import Series, first_messages, index_of
 from mapper.sources.ros.message_order import ordered
 from mapper.sources.ros.messages import (
@@ -142,7 +142,7 @@ class RecordingReader:
 
         Where tf does not tie the two the base is taken as for a topic.
         """
-        odom = next((frame for frame in self.tree.frames if frame.split("/")[-1] == "odom"), None)
+        odom = next((frame for frame in self.tree.frames if is_of_wheels(frame)), None)
         if odom is None:
             return None, []
         wheels = self.whole_tree.path_in(odom, body)

@@ -12,7 +12,7 @@ from mapper.sources.base import BASES, CameraImages, Log, MountedSensor
 from mapper.sources.config import SourceConfig
 from mapper.sources.laser_scan import rolling
 from mapper.sources.ros.cameras import images_beside
-from mapper.sources.ros.frame_tree import BY_TF, is_fixed
+from mapper.sources.ros.frame_tree import BY_TF, is_fixed, is_of_wheels
 from mapper.sources.ros.message_index import Series, why_unread
 from mapper.sources.ros.messages import READ, frame_of
 from mapper.sources.ros.reader import SAME_CLOCK_NS, RecordingReader
@@ -150,7 +150,7 @@ def _offered_truth(reader: RecordingReader, body: str) -> list[str]:
     base = reader.base_of(body)
     if base in frames:  # a camera that pans on a robot
         frames = frames[frames.index(base) + 1 :]
-    frames = [one for one in frames if one.rpartition("/")[2] not in ("odom", *BASES)]
+    frames = [one for one in frames if one.rpartition("/")[2] not in BASES and not is_of_wheels(one)]
     if not frames:
         return []
     return [

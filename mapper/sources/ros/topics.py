@@ -8,7 +8,7 @@ from pathlib import Path
 
 from mapper.core.errors import SourceError
 from mapper.sources.config import TopicsConfig
-from mapper.sources.ros.frame_tree import BY_TF, is_fixed
+from mapper.sources.ros.frame_tree import BY_TF, ESTIMATED, is_fixed
 from mapper.sources.ros.message_index import Series
 from mapper.sources.ros.messages import (
     CAMERAS,
@@ -49,8 +49,6 @@ from mapper.sources.ros.unused_topics import (
 
 TRUTH, WHEELS = "/ground_truth", "/wheel_odometry"
 
-_ESTIMATED = re.compile("map|laser|lidar|icp|rf2o|visual|camera|gps|gnss|truth|amcl|slam")
-"""Names of odometry that is not of wheels, or not of them alone."""
 _OWN_TYPES = "mapper/msg/"
 _SIDES = re.compile(r"left|infra1|Infrared_1|cam0|camera0", re.IGNORECASE)
 _OTHER_SIDE = {
@@ -194,7 +192,7 @@ def choose(
     wheels = pick.one("wheels", config.wheels, POSES, plain_rank, where=lambda name: name == WHEELS)
     if wheels is None and points is not None and points.topic.type in LASERS:
         driven = [
-            one for one in pick.all(ODOMETRY) if one is not truth and not _ESTIMATED.search(one.topic.name)
+            one for one in pick.all(ODOMETRY) if one is not truth and not ESTIMATED.search(one.topic.name)
         ]
         wheels = _best(driven, plain_rank)
     pick.refuse_own_runs()

@@ -1,10 +1,11 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from mapper.core.geometry import Transform, exp, inverse
 from mapper.core.rotations import quaternion_from_rotation
-from mapper.sources.ros.frame_tree import FrameTree
+from mapper.sources.ros.frame_tree import FrameTree, is_of_wheels
 from mapper.sources.ros.messages import PoseMessage
 
 T_BASE_MAST = exp(np.array([0.1, 0.2, 0.3]), np.array([1.0, 2.0, 3.0]))
@@ -74,3 +75,18 @@ def test_a_circle_ends():
     circle = FrameTree([told("a", "b", np.eye(4)), told("b", "a", np.eye(4))])
     assert circle.find("a", "c") is None
     assert list(circle.frames) == ["a", "b"]
+
+
+@pytest.mark.parametrize(
+    ("frame", "is_wheels"),
+    [
+        ("odom", True),
+        ("odom_combined", True),
+        ("robot1/odom", True),
+        ("camera_odom_frame", False),
+        ("laser_odom", False),
+        ("odometer_link", False),
+    ],
+)
+def test_frames_of_wheel_odometry_are_known_by_their_words(frame, is_wheels):
+    assert is_of_wheels(frame) == is_wheels
