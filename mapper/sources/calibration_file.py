@@ -68,6 +68,9 @@ _FILE_NAMES = (
 """Globs in a log's folder, the first that is there counts."""
 
 _BY_CONTENT = (".yaml", ".yml", ".json", ".xml")
+_LIKE_CALIBRATION = re.compile(
+    "calib|intrinsic|cam(?:era)?(?![a-z]|.*(?:pose|extrinsic|traj))", re.IGNORECASE
+)
 
 
 def calibration_files(folder: Path) -> tuple[list[Path], bool]:
@@ -79,9 +82,14 @@ def calibration_files(folder: Path) -> tuple[list[Path], bool]:
     found = [path for path in named if not path.name.endswith(_MAY_BE_OTHER) or _has_camera(path)]
     if found:
         return list(dict.fromkeys(found)), True
-    others = [path for path in sorted(folder.glob("*")) if path.suffix in _BY_CONTENT and path.is_file()]
+    others = [path for path in sorted(folder.glob("*")) if _may_have_camera(path) and path.is_file()]
     found = [path for path in others if "depth" not in path.name.lower() and _has_camera(path)]
     return found, len(found) == 1
+
+
+def _may_have_camera(path: Path) -> bool:
+    """Return whether a file is looked into for intrinsics: text only where its name says that it has some."""
+    return path.suffix in _BY_CONTENT or (path.suffix == ".txt" and bool(_LIKE_CALIBRATION.search(path.stem)))
 
 
 def read_calibration(path: Path) -> Calibration:
@@ -281,6 +289,8 @@ def _toml_numbers(table: Mapping[str, Any]) -> dict[str, Sequence[float]]:
 
 
 _ANY_LINE = re.IGNORECASE | re.MULTILINE
+_BARE_NUMBERS, _BARE_COUNTS = re.compile(r"[-+\d.eE\s,;]+"), (4, 9, 16)
+"""Text of numbers alone, and how many there are in fx fy cx cy and in matrices of 3×3 and 4×4."""
 _MAY_BE_OTHER = ("info.txt", "cameras.txt", "metadata.json", "transforms.json")
 _POLYNOMIAL_LENS = re.compile(r"radtan|plumb_bob|rational_polynomial", re.IGNORECASE)
 _OTHER_LENS = re.compile(
@@ -386,5 +396,7 @@ def _is_numeric(value: Any) -> bool:
 def _has_camera(path: Path) -> bool:
     with suppress(OSError), path.open("rb") as file:
         head = file.read(HEAD_BYTES).decode(errors="replace")
+        if path.suffix == ".txt" and _BARE_NUMBERS.fullmatch(head):
+            return len(re.findall(r"[^\s,;]+", head)) in _BARE_COUNTS
         return any(found.search(head) for found in (_KEY_AND_NUMBER, COLMAP, re.compile(INFO_KEY)))
     return False

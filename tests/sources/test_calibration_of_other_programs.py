@@ -1,5 +1,7 @@
 """Intrinsics in the files that other programs and data sets put beside their images."""
 
+from contextlib import nullcontext
+
 import cv2
 import numpy as np
 import pytest
@@ -314,6 +316,25 @@ def test_a_file_of_another_name_is_read_if_it_alone_has_intrinsics(tiny_tum_log)
     (folder / "TUM2.yaml").write_text("Camera.fx: 61.0\n")
     with pytest.raises(SourceError, match="intrinsics unknown"):
         open_source(folder)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "is_read"),
+    [
+        ("calib.txt", "60, 60 32 24", True),
+        ("my_camera.txt", "60 0 32\n0 60 24\n0 0 1\n", True),
+        ("rgb_intrinsics_left.txt", "fx: 60\nfy: 60\ncx: 32\ncy: 24\n", True),
+        ("cam_pose.txt", "1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n", False),
+        ("notes.txt", "60 60 32 24", False),
+        ("calib.txt", "P0: 718 0 607 0 0 718 185 0 0 0 1 0\n", False),
+    ],
+)
+def test_text_that_is_called_calibration_is_read_by_its_numbers(tiny_tum_log, name, text, is_read):
+    folder = tiny_tum_log()
+    (folder / "calibration.toml").unlink()
+    (folder / name).write_text(text)
+    with nullcontext() if is_read else pytest.raises(SourceError, match="intrinsics unknown"):
+        assert next(iter(open_source(folder))).camera.fx_px == 60.0
 
 
 @pytest.mark.parametrize("scale", [0.0002, 5000])

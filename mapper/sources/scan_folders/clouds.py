@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from mapper.core.errors import SourceError
+from mapper.runtime.atomic import MANIFEST_NAME
 from mapper.sources.base import Log
 from mapper.sources.cloud_files.pcd import viewpoint_note
 from mapper.sources.config import SourceConfig
@@ -84,4 +85,6 @@ def _folders(path: Path) -> list[Path]:
 
 
 def _has_two(folder: Path) -> bool:
-    return most_clouds(folder) >= 2
+    return (
+        most_clouds(folder) >= 2 and not (folder / MANIFEST_NAME).is_file()
+    )  # of a run, whose clouds are maps
