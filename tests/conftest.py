@@ -76,14 +76,14 @@ def pictures_drawn(*, drawn: bool) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         for draw in (write_summary, write_cloud_views):
             instead = draw if drawn else lambda path, *_, **__: path.write_bytes(pixel)
-            patch.setattr(f"mapper.pipeline.fuse.{draw.__name__}", instead)
+            patch.setattr(f"mapper.pipeline.write_maps.{draw.__name__}", instead)
         yield
 
 
 @pytest.fixture(scope="session", autouse=True)
 def undrawn_builds() -> Iterator[None]:
     """Spare builds their pictures, a third of a small one's time; tests of small things load no builds."""
-    if "mapper.pipeline.fuse" not in sys.modules:
+    if "mapper.pipeline.write_maps" not in sys.modules:
         yield
         return
     with pictures_drawn(drawn=False):

@@ -19,7 +19,7 @@ from mapper.runtime.atomic import atomic_file
 from mapper.sources.base import Log
 
 if TYPE_CHECKING:  # a build begins without what its end needs
-    from mapper.mapping.fusion import Maps
+    from mapper.mapping.map_building import Maps
     from mapper.run.folder import Run
     from mapper.run.results import RunResults
 

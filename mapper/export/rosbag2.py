@@ -12,7 +12,7 @@ from mapper.export.mcap_messages import MAP, OCCUPANCY_GRID, encode_occupancy_gr
 from mapper.export.run_maps import maps_of, snapshots_of
 from mapper.export.transforms import Transforms, transforms_of
 from mapper.mapping.cloud import MOST_TO_VIEW
-from mapper.mapping.fusion import Snapshot
+from mapper.mapping.map_building import Snapshot
 from mapper.octree.grid import OccupancyGrid
 from mapper.octree.octomap_file import bt_words
 from mapper.run.folder import Run

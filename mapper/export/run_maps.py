@@ -13,7 +13,7 @@ from mapper.export.part_of_run import part_of_cloud
 from mapper.export.transforms import CAMERA
 from mapper.mapping.config import edits_of
 from mapper.mapping.edits import MapEditor
-from mapper.mapping.fusion import Maps, Snapshot
+from mapper.mapping.map_building import Maps, Snapshot
 from mapper.navigation.reachable_floor import reachable_floor
 from mapper.navigation.traversable_grid import TraversableFloor, traversable
 from mapper.octree.grid import OccupancyGrid, stored_grid_if_any

@@ -8,7 +8,7 @@ import numpy as np
 
 from mapper.core.geometry import Transform
 from mapper.export.mcap_messages import MAP
-from mapper.mapping.fusion import Snapshot
+from mapper.mapping.map_building import Snapshot
 from mapper.run.folder import Run
 from mapper.run.manifest_logs import RobotFrames
 from mapper.run.stored_tracking import base_in_body

@@ -75,7 +75,7 @@ def sensor_paths(source: Log, trajectory: Trajectory) -> list[tuple[Log, Traject
     return paths
 
 
-def fused_frames(paths: Iterable[tuple[Log, Trajectory]]) -> Iterator[PlacedFrame]:
+def frames_in_order(paths: Iterable[tuple[Log, Trajectory]]) -> Iterator[PlacedFrame]:
     """Yield the frames that have a pose, of every sensor of ``sensor_paths``, in the order of time."""
     frames = [placed_frames(log, path) for log, path in paths]
     return heapq.merge(*frames, key=lambda frame: frame.entry.stamp_ns)

@@ -21,7 +21,7 @@ from mapper.core.config import Config
 from mapper.core.geometry import Transform, inverse
 from mapper.core.trajectory import Trajectory
 from mapper.mapping.config import edits_of
-from mapper.mapping.fusion import fuse_octree
+from mapper.mapping.map_building import build_octree
 from mapper.merging.merged_map import TILES, Tiling
 from mapper.octree.attributes import UNSET
 from mapper.octree.color_tree import COLOR_NODE, color_nodes, parent_color
@@ -168,7 +168,7 @@ def fuse_run(workspace: Workspace, run: int, path: Path, trajectory: Trajectory,
         open_scan_updates(before) if before is not None else nullcontext() as known,
         ScanUpdateWriter(written, near) as updates,
     ):
-        fused = fuse_octree(
+        fused = build_octree(
             built.open_log(),
             trajectory,
             config,

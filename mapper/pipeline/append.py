@@ -14,13 +14,14 @@ from mapper.odometry.base import FrameResult
 from mapper.odometry.gyroscope_calibration import with_body_rates
 from mapper.pipeline.component_loops import joined
 from mapper.pipeline.disconnected_components import component_of
-from mapper.pipeline.fuse import carry_times, fuse_into
+from mapper.pipeline.fuse import carry_times
 from mapper.pipeline.inertial_bridging import bridge
 from mapper.pipeline.lidar_adjustment import adjust_stored
 from mapper.pipeline.reobserve import reobserve
 from mapper.pipeline.solve import solve
 from mapper.pipeline.track import Start, noted_log_warnings, session_odometry, track_log
 from mapper.pipeline.tracking_result import TrackingResult, from_tracking, refuse_a_fragment, save_places
+from mapper.pipeline.write_maps import write_maps
 from mapper.run.edits_file import edits_text, parse_edits, write_edits
 from mapper.run.folder import Run, open_run
 from mapper.run.manifest import Manifest, Timing, library_versions, now_text
@@ -108,7 +109,9 @@ def append(
         save_solved(writer, both)
         writer.update(solve=report)
         write_edits(writer.folder, edits)
-        fuse_into(writer, source, whole, progress, observer=observer, cached=run.scan_updates(), edits=wanted)
+        write_maps(
+            writer, source, whole, progress, observer=observer, cached=run.scan_updates(), edits=wanted
+        )
     return open_run(out)
 
 

@@ -233,9 +233,9 @@ class _Steps:
 
     def fuse(self) -> None:
         """Fuse every frame at its final pose."""
-        from mapper.pipeline.fuse import fuse_into  # takes long to load: the first frame does not wait
+        from mapper.pipeline.write_maps import write_maps  # takes long to load: the first frame does not wait
 
-        fuse_into(
+        write_maps(
             self.writer,
             self.source,
             self.config,

@@ -17,7 +17,7 @@ from mapper.loops.factory import build_verifier, keyframe_loops
 from mapper.loops.image_verification import verify_aligned
 from mapper.loops.scan_verification import ScanVerifier
 from mapper.mapping.config import EditKind, Region
-from mapper.pipeline.fuse import fuse_changed
+from mapper.pipeline.fuse import fuse_again
 from mapper.pipeline.lidar_adjustment import adjust_stored
 from mapper.pipeline.reobserve import reobserve
 from mapper.pipeline.solve import solve
@@ -78,7 +78,7 @@ def edit_loops(
             the solver rejects a loop that was added.
     """
     changed, report = _solve_edited(source, run, dict.fromkeys(add, _Alignment()), remove, progress=progress)
-    return fuse_changed(source, run, changed, solve=report, progress=progress)
+    return fuse_again(source, run, changed, solve=report, progress=progress)
 
 
 def apply_edits(source: Log, run: Run, edits: EditsFile, *, progress: Progress = SILENT) -> Run:
@@ -106,7 +106,7 @@ def apply_edits(source: Log, run: Run, edits: EditsFile, *, progress: Progress =
         rejected = [loop.nodes for loop in edits.reject]
         changed, report = _solve_edited(source, run, aligned, rejected, edits.drop, progress=progress)
     regions = text if len(edits) else None
-    return fuse_changed(source, run, changed, solve=report, edits=regions, progress=progress)
+    return fuse_again(source, run, changed, solve=report, edits=regions, progress=progress)
 
 
 def _solve_edited(
@@ -258,7 +258,7 @@ def add_region(source: Log, run: Run, kind: EditKind, region: Region, *, progres
         RunError: The log is not the one that the run was built from.
     """
     text = with_region(edits_text(run.path), run.path, kind, region)
-    return fuse_changed(source, run, edits=text, progress=progress)
+    return fuse_again(source, run, edits=text, progress=progress)
 
 
 def undo_region(source: Log, run: Run, *, progress: Progress = SILENT) -> Run:
@@ -268,4 +268,4 @@ def undo_region(source: Log, run: Run, *, progress: Progress = SILENT) -> Run:
         ConfigError: There is none, or the run's edits are not valid.
         RunError: The log is not the one that the run was built from.
     """
-    return fuse_changed(source, run, edits=without_last(edits_text(run.path), run.path), progress=progress)
+    return fuse_again(source, run, edits=without_last(edits_text(run.path), run.path), progress=progress)

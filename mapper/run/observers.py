@@ -8,7 +8,7 @@ if TYPE_CHECKING:  # a command line that only helps loads none of it
     from mapper.core.geometry import Transform
     from mapper.features.frame_view import FrameView
     from mapper.loops.detector import LoopDetector
-    from mapper.mapping.fusion import Maps
+    from mapper.mapping.map_building import Maps
     from mapper.odometry.base import FeatureMatches, FrameResult
     from mapper.run.folder import Run
     from mapper.run.results import RunResults

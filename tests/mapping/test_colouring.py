@@ -9,7 +9,7 @@ from mapper.core.errors import FrameError
 from mapper.core.frames import PinholeCamera
 from mapper.core.geometry import exp, inverse, transform
 from mapper.core.trajectory import Trajectory
-from mapper.mapping.cloud_fusion import ScanColouring
+from mapper.mapping.cloud_building import ScanColouring
 from mapper.sources.base import CameraImages
 
 CAMERA = PinholeCamera(160, 120, 100.0, 100.0, 79.5, 59.5, (-0.2, 0.05, 0.001, -0.001, 0.0))

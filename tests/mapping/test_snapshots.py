@@ -7,7 +7,7 @@ from mapper.config.loading import overridden
 from mapper.core.frames import Scan
 from mapper.core.trajectory import Trajectory
 from mapper.mapping.config import Edits
-from mapper.mapping.fusion import fuse_log
+from mapper.mapping.map_building import build_maps
 from mapper.octree.scan_updates import ScanUpdateWriter
 from mapper.runtime.progress import SILENT
 from mapper.simulation import CameraSimulator
@@ -20,7 +20,7 @@ def snapshots(log, trajectory, tmp_path, *settings):
     config = overridden(BuildConfig(), ["workers=0", "mcap.image_stride=1", "octree.moving=kept", *settings])
     seen = []
     with ScanUpdateWriter(tmp_path / "updates.bin", config.octree) as updates:
-        fuse_log(
+        build_maps(
             log,
             trajectory,
             config,

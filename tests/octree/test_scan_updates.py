@@ -12,7 +12,7 @@ from mapper.core.frames import Scan
 from mapper.core.geometry import exp
 from mapper.core.trajectory import Trajectory
 from mapper.mapping.config import Edits
-from mapper.mapping.fusion import fuse_log
+from mapper.mapping.map_building import build_maps
 from mapper.octree.config import OctreeConfig
 from mapper.octree.map import OctreeMap
 from mapper.octree.ray_casting import Caster
@@ -70,7 +70,7 @@ def first(source, tmp_path_factory):
 
 def fused(source, trajectory, path, *, before=None, config=CONFIG):
     with ScanUpdateWriter(path, config.octree) as after:
-        maps = fuse_log(
+        maps = build_maps(
             source,
             trajectory,
             config,

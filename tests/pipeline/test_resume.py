@@ -100,7 +100,8 @@ def test_a_solve_is_not_made_twice(short_log, short_run, tmp_path, monkeypatch):
         stopped(short_log, out)
     with monkeypatch.context() as patched:
         patched.setattr("mapper.pipeline.build.track_log", None)
-        patched.setattr("mapper.pipeline.fuse.fuse_into", lambda *_, **__: (_ for _ in ()).throw(Stopped()))
+        writing = "mapper.pipeline.write_maps.write_maps"
+        patched.setattr(writing, lambda *_, **__: (_ for _ in ()).throw(Stopped()))
         stopped(short_log, out)
         patched.setattr("mapper.pipeline.build.solve", None)
         stopped(short_log, out)

@@ -16,7 +16,7 @@ from mapper.export.figures import MARGIN_M
 from mapper.export.report.data import Chapter, data_uri, four_digits
 from mapper.export.report.packing import Plane, pack_layers, pack_points
 from mapper.export.run_maps import snapshots_of
-from mapper.mapping.fusion import Snapshot
+from mapper.mapping.map_building import Snapshot
 from mapper.mapping.thumbnails import encode_jpeg
 from mapper.octree.keys import BLOCK_BITS, BLOCK_VOXELS, KEY_BITS, codes_of, codes_of_keys, keys_of
 from mapper.octree.map import OctreeMap

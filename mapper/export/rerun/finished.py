@@ -13,7 +13,7 @@ from mapper.export.rerun.recording import LINE_PX, RerunLog, new_recording, reco
 from mapper.export.rerun.target import streaming
 from mapper.export.run_maps import maps_of, snapshots_of
 from mapper.mapping.cloud import thinned_to_view
-from mapper.mapping.fusion import Maps
+from mapper.mapping.map_building import Maps
 from mapper.run.folder import Run
 from mapper.run.results import RunResults
 

@@ -19,7 +19,7 @@ from mapper.export.figures import ACCEPTED, ESTIMATE, FACTORS, REJECTED, START, 
 from mapper.export.rerun.finished import about_text, extent, log_run
 from mapper.export.rerun.recording import THIN_PX, RerunLog, recorded, transform_of
 from mapper.features.frame_view import ImageView
-from mapper.mapping.fusion import Maps
+from mapper.mapping.map_building import Maps
 from mapper.mapping.thumbnails import encode_jpeg, shrunk_camera
 from mapper.odometry.base import FeatureMatches, FrameResult
 from mapper.run.folder import Run

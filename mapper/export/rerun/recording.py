@@ -45,7 +45,7 @@ from mapper.export.rerun.target import streaming
 from mapper.graph.model import PoseGraph
 from mapper.loops.closure import LoopClosure, Verdict
 from mapper.mapping.cloud import height_colors
-from mapper.mapping.fusion import Snapshot
+from mapper.mapping.map_building import Snapshot
 from mapper.octree.grid import OccupancyGrid
 from mapper.octree.keys import KEY_ZERO
 from mapper.octree.map import OctreeMap

@@ -11,10 +11,10 @@ from mapper.core.frames import Cloud, Frame, PinholeCamera, Points32, RgbdFrame,
 from mapper.core.geometry import Transform
 from mapper.core.trajectory import Trajectory
 from mapper.core.voxel_grid import thin
-from mapper.mapping.cloud_fusion import fuse_clouds
+from mapper.mapping.cloud_building import build_clouds
 from mapper.mapping.config import AppliedEdit, Edits, FuseSettings, McapConfig
 from mapper.mapping.edits import MapEditor
-from mapper.mapping.placed_frames import PlacedFrame, fused_frames, sensor_paths, within_reach
+from mapper.mapping.placed_frames import PlacedFrame, frames_in_order, sensor_paths, within_reach
 from mapper.mapping.thumbnails import encode_jpeg, shrunk_camera
 from mapper.navigation.reachable_floor import driven_ground, reachable_floor
 from mapper.navigation.traversable_grid import traversable
@@ -135,7 +135,7 @@ class _Prepared:
     unreached: int = 0
 
 
-def fuse_log(
+def build_maps(
     source: Log,
     trajectory: Trajectory,
     config: FuseSettings,
@@ -166,10 +166,10 @@ def fuse_log(
     Raises:
         DataError: The edits leave nothing of the map, or nothing in the height of the slice.
     """
-    octree, objects = _fuse_scans(
+    octree, objects = _insert_scans(
         source, trajectory, config, progress, on_snapshot=on_snapshot, cached=cached, updates=updates
     )
-    cloud, dynamic = fuse_clouds(source, trajectory, config, objects, progress=progress)
+    cloud, dynamic = build_clouds(source, trajectory, config, objects, progress=progress)
     if objects is not None:
         progress.note(f"moving objects: {len(dynamic)} of {len(cloud) + len(dynamic)} points of the clouds")
     editor = MapEditor(edits, trajectory.positions_world, config.traversable.head_room_m)
@@ -204,7 +204,7 @@ def fuse_log(
     )
 
 
-def fuse_octree(
+def build_octree(
     source: Log,
     trajectory: Trajectory,
     config: FuseSettings,
@@ -214,10 +214,10 @@ def fuse_octree(
     updates: ScanUpdateWriter,
     edits: Edits,
 ) -> OctreeMap:
-    """Return the octree of ``fuse_log`` alone; frames whose cached update still holds are not read.
+    """Return the octree of ``build_maps`` alone; frames whose cached update still holds are not read.
 
     Args:
-        source: As for ``fuse_log``, as are all others.
+        source: As for ``build_maps``, as are all others.
         trajectory: Final body poses in the levelled world.
         config: Settings of the maps.
         progress: Receives progress and notes.
@@ -228,7 +228,7 @@ def fuse_octree(
     Raises:
         DataError: The edits leave nothing of the map.
     """
-    octree, _ = _fuse_scans(source, trajectory, config, progress, cached=cached, updates=updates)
+    octree, _ = _insert_scans(source, trajectory, config, progress, cached=cached, updates=updates)
     editor = MapEditor(edits, trajectory.positions_world, config.traversable.head_room_m)
     editor.erase(octree)
     editor.crop(octree)
@@ -236,7 +236,7 @@ def fuse_octree(
     return octree
 
 
-def _fuse_scans(
+def _insert_scans(
     source: Log,
     trajectory: Trajectory,
     config: FuseSettings,
@@ -320,7 +320,7 @@ def _jobs(
     log_stride: int,
 ) -> Iterator[_Job]:
     tracked = paths[0][0].sensor
-    for frame in fused_frames(paths):
+    for frame in frames_in_order(paths):
         update, rays = None, _rays_of(config.octree, frame.sensor, tracked)
         if cached is not None and (frame.sensor == "rgbd" or _neighbours_hold(cached, frame, rays)):
             update = cached.lookup(frame.entry.stamp_ns, frame.T_world_body, config=rays)

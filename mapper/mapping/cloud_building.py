@@ -17,7 +17,13 @@ from mapper.core.timebase import NS_PER_S, nearest
 from mapper.core.trajectory import Trajectory
 from mapper.mapping.cloud import CloudBuilder, height_colors
 from mapper.mapping.config import FuseSettings
-from mapper.mapping.placed_frames import MOST_APART_NS, PlacedFrame, fused_frames, sensor_paths, within_reach
+from mapper.mapping.placed_frames import (
+    MOST_APART_NS,
+    PlacedFrame,
+    frames_in_order,
+    sensor_paths,
+    within_reach,
+)
 from mapper.octree.moving_objects import MovingObjects
 from mapper.octree.ray_casting import depth_limit_of
 from mapper.runtime.ordered_map import ordered_map
@@ -34,7 +40,7 @@ _SIDES = _LEFT, _LEFT[:, ::-1].copy(), _LEFT.T.copy(), _LEFT.T[::-1].copy()
 """Cells on each side of a point's own whose nearest points may cover it."""
 
 
-def fuse_clouds(
+def build_clouds(
     source: Log,
     trajectory: Trajectory,
     config: FuseSettings,
@@ -56,7 +62,7 @@ def fuse_clouds(
     still, moving = CloudBuilder(config.cloud.voxel_m), CloudBuilder(config.cloud.voxel_m)
     stride = config.cloud.frame_stride
     paths = sensor_paths(source, trajectory)
-    frames = [frame for frame in fused_frames(paths) if frame.index % stride == 0]
+    frames = [frame for frame in frames_in_order(paths) if frame.index % stride == 0]
     depth_limit, begin_ns = depth_limit_of(config.octree), int(trajectory.stamps_ns[0])
 
     colouring = ScanColouring(source.images, trajectory) if source.images else None
