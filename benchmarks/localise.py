@@ -29,7 +29,7 @@ from mapper.pipeline.known_map import load_known_map
 from mapper.pipeline.localise import localise
 from mapper.run import files
 from mapper.run.folder import Run, open_run
-from mapper.run.frame_outcomes import read_records
+from mapper.run.frame_records import read_records
 from mapper.run.pose_covariances import read_poses
 from mapper.simulation import write_tum_log
 from mapper.simulation.config import LIDAR_SCENES, SynthConfig

@@ -19,7 +19,7 @@ from mapper.evaluators.metrics.trajectory_errors import ate_rmse_m
 from mapper.pipeline.disconnected_components import largest_component
 from mapper.pipeline.solve import solve
 from mapper.pipeline.track import track_log
-from mapper.run.frame_outcomes import records_of
+from mapper.run.frame_records import records_of
 from mapper.runtime.progress import SILENT
 from mapper.sources import open_source
 

@@ -35,7 +35,7 @@ def inspect(
 
     from mapper.api.logs import inspect as inspect_log
     from mapper.config.loading import load_config
-    from mapper.sources.selection import too_few_text
+    from mapper.sources.frame_selection import too_few_text
 
     settings = settings_of({}, set_)
     found = inspect_log(log, settings=settings, time_offset=time_offset, progress=output.progress())

@@ -25,7 +25,7 @@ from mapper.evaluators.metrics.evaluate import (
 from mapper.evaluators.metrics.metric import Metric, records_of
 from mapper.loops.closure import LoopClosure, accepted_loops, rejections
 from mapper.run.folder import Run
-from mapper.run.frame_outcomes import FrameRecord
+from mapper.run.frame_records import FrameRecord
 from mapper.run.manifest import Counts, Timing
 
 _SHOWN_NOTES = frozenset({"gap", "lost", "doubtful", "skipped", "levelling", "shutter"})

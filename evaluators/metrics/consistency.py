@@ -11,7 +11,7 @@ from mapper.core.trajectory import Trajectory
 from mapper.evaluators.metrics.metric import Metric
 from mapper.graph.marginals import marginals_of
 from mapper.graph.model import BetweenFactor, PoseGraph
-from mapper.run.frame_outcomes import FrameRecord, stamps_of
+from mapper.run.frame_records import FrameRecord, stamps_of
 from mapper.run.pose_covariances import UncertainPoses
 from mapper.sensing.wheel_kinematics import pose_at
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from mapper.core.geometry import Array, adjoint, inverse, log
 from mapper.core.timebase import MAX_TRUTH_GAP_NS, NS_PER_S, nearest
 from mapper.core.trajectory import Trajectory
-from mapper.run.frame_outcomes import FrameRecord, stamps_of
+from mapper.run.frame_records import FrameRecord, stamps_of
 
 WRONG_M, WRONG_RAD, WRONG_SIGMAS = 0.2, float(np.deg2rad(5.0)), 5.0
 """A relative pose is wrong if it is farther off than either, and than this many sigmas."""

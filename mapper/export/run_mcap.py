@@ -13,7 +13,7 @@ from mapper.export.transforms import Transforms
 from mapper.loops.closure import Discrepancy, LoopClosure
 from mapper.mapping.cloud import height_colors, thinned_to_view
 from mapper.mapping.map_building import Maps, ScanSnapshot, Snapshot
-from mapper.run.frame_outcomes import FrameRecord
+from mapper.run.frame_records import FrameRecord
 from mapper.run.results import RunResults
 
 

@@ -12,7 +12,7 @@ from mapper.graph.model import BetweenFactor, PoseGraph
 from mapper.loops.closure import LoopClosure
 from mapper.odometry.base import Diagnostics, FrameResult
 from mapper.pipeline.tracking_result import TrackingResult
-from mapper.run.frame_outcomes import DISCONNECTED
+from mapper.run.frame_records import DISCONNECTED
 from mapper.runtime.progress import Progress
 
 

@@ -11,7 +11,7 @@ from mapper.pipeline.write_maps import write_maps
 from mapper.run import files
 from mapper.run.edits_file import edits_text, parse_edits, write_edits
 from mapper.run.folder import Run, moved_log, open_run
-from mapper.run.frame_outcomes import FrameRecord
+from mapper.run.frame_records import FrameRecord
 from mapper.run.input_logs import paths_of, refuse_another_log
 from mapper.run.manifest import Solve, Status, Timing
 from mapper.run.stored_tracking import StoredTracking, load_tracking, save_solved

@@ -37,7 +37,7 @@ from mapper.pipeline.solve import solve
 from mapper.pipeline.track import Start, noted_log_warnings, session_odometry, track_log
 from mapper.pipeline.tracking_result import TrackingResult, from_tracking
 from mapper.run import files
-from mapper.run.frame_outcomes import FrameRecord
+from mapper.run.frame_records import FrameRecord
 from mapper.run.manifest import LocalisedManifest, Solve, Stretch, StretchState
 from mapper.run.pose_covariances import UncertainPoses, uncertain_poses, write_poses
 from mapper.run.results import RunResults

@@ -14,12 +14,12 @@ from mapper.odometry.base import FrameResult, see_more
 from mapper.odometry.gyroscope_calibration import GyroscopeCalibration
 from mapper.run import files
 from mapper.run.doubtful_frames import placed_by_neighbours
-from mapper.run.frame_outcomes import records_of
+from mapper.run.frame_records import records_of
 from mapper.run.manifest import RunWarning
 from mapper.run.stored_tracking import StoredTracking
 from mapper.run.writer import RunWriter
 from mapper.sources.base import Log, Skipped
-from mapper.sources.selection import too_few_text
+from mapper.sources.frame_selection import too_few_text
 
 BY_POSES = ("wheels", "given")
 """Kinds of odometry without tracking: frames have the poses of wheels, or known ones."""

@@ -11,7 +11,7 @@ from mapper.core.rotations import pose_of_row
 from mapper.core.timebase import NS_PER_S
 from mapper.core.trajectory import Trajectory
 from mapper.graph.model import PoseGraph
-from mapper.run.frame_outcomes import FrameRecord
+from mapper.run.frame_records import FrameRecord
 
 MAX_GAP_NS = 2 * NS_PER_S
 """Where tracked frames are farther apart, a frame keeps its own pose, unless its image is a repeated one."""

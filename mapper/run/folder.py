@@ -21,7 +21,7 @@ from mapper.odometry.config import GivenOdometryConfig
 from mapper.run import files
 from mapper.run.digests import changing, checked, regular
 from mapper.run.doubtful_frames import without_doubtful
-from mapper.run.frame_outcomes import FrameRecord, read_frame_ms, read_records, stamps_of
+from mapper.run.frame_records import FrameRecord, read_frame_ms, read_records, stamps_of
 from mapper.run.gnss_file import read_fixes
 from mapper.run.input_logs import open_inputs
 from mapper.run.manifest import Manifest, Verdict, is_localised_log, is_merged_map, read_manifest

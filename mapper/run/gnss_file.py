@@ -7,7 +7,7 @@ import numpy as np
 
 from mapper.core.geometry import Array
 from mapper.graph.model import PositionFactor
-from mapper.run.frame_outcomes import read_csv, write_csv
+from mapper.runtime.csv_file import read_csv, write_csv
 
 _UPPER = np.triu_indices(3)
 _AXES = ("x", "y", "z")

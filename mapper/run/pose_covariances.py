@@ -15,7 +15,8 @@ from mapper.core.trajectory import Trajectory
 from mapper.graph.marginals import marginals_of
 from mapper.graph.model import PoseGraph
 from mapper.run.doubtful_frames import estimates_of_doubtful
-from mapper.run.frame_outcomes import FrameRecord, read_csv, write_csv
+from mapper.run.frame_records import FrameRecord
+from mapper.runtime.csv_file import read_csv, write_csv
 
 _AXES = ("roll", "pitch", "yaw", "x", "y", "z")
 _UPPER = np.triu_indices(6)

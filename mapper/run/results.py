@@ -11,7 +11,7 @@ from mapper.core.trajectory import Trajectory
 from mapper.graph.model import PoseGraph
 from mapper.loops.closure import LoopClosure
 from mapper.run.doubtful_frames import without_doubtful
-from mapper.run.frame_outcomes import FrameRecord
+from mapper.run.frame_records import FrameRecord
 from mapper.run.pose_covariances import UncertainPoses
 
 

@@ -14,7 +14,7 @@ from mapper.loops.closure import LoopClosure, accepted_loops, write_closures
 from mapper.run import files
 from mapper.run.doubtful_frames import placed_by_neighbours
 from mapper.run.folder import Run
-from mapper.run.frame_outcomes import FrameRecord, write_frame_ms, write_records
+from mapper.run.frame_records import FrameRecord, write_frame_ms, write_records
 from mapper.run.gnss_file import write_fixes
 from mapper.run.manifest import SkippedFrame
 from mapper.run.manifest_logs import RobotFrames

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mapper.core.timebase import NS_PER_S, Stamps
-from mapper.run.frame_outcomes import stamps_of
+from mapper.run.frame_records import stamps_of
 from mapper.run.manifest import Manifest
 from mapper.run.results import RunResults
 

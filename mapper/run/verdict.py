@@ -11,7 +11,7 @@ from mapper.core.trajectory import Trajectory
 from mapper.navigation.config import TraversableConfig
 from mapper.odometry.base import see_more
 from mapper.run.doubtful_frames import MAX_GAP_NS
-from mapper.run.frame_outcomes import DISCONNECTED, FrameRecord
+from mapper.run.frame_records import DISCONNECTED, FrameRecord
 from mapper.run.graph_warnings import (
     HARMLESS_M,
     MAX_DRIFT_SHARE,

@@ -85,10 +85,10 @@ def open_source(path: Path, config: SourceConfig = _DEFAULTS) -> "Log":
             has no frame such as is to be its body.
         DependencyError: A library that decodes it is not installed.
     """
+    from mapper.sources.frame_selection import selected
     from mapper.sources.listed_files import unused_note
     from mapper.sources.readings_beside import with_readings
     from mapper.sources.scan_folders.scan_folder import most_clouds
-    from mapper.sources.selection import selected
 
     if not path.exists():
         if address := _ADDRESS.match(f"{path}"):  # of whose two slashes a path keeps one

@@ -15,7 +15,7 @@ from mapper.core.errors import DataError, FrameError, SourceError
 from mapper.core.frames import NO_DISTORTION, PinholeCamera
 from mapper.runtime.regular_files import HEAD_BYTES, parse_toml, read_text
 from mapper.sources.calibration import Calibration, DepthCamera, Distortion
-from mapper.sources.calibration_formats import (
+from mapper.sources.calibration_parsers import (
     COLMAP,
     INFO_KEY,
     Numbers,

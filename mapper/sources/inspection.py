@@ -16,6 +16,7 @@ from mapper.sources.base import Log
 from mapper.sources.config import SourceConfig
 from mapper.sources.depth_outlines import outline_warnings
 from mapper.sources.depth_scale import depth_warnings, read_spread, why_no_depth
+from mapper.sources.frame_selection import selected
 from mapper.sources.image_order import time_warnings
 from mapper.sources.image_quality import ImageChecks, ImageQuality
 from mapper.sources.reading_checks import ReadingChecks
@@ -24,7 +25,6 @@ from mapper.sources.ros.message_index import Series
 from mapper.sources.ros.reader import RecordingReader
 from mapper.sources.ros.source import recording_log
 from mapper.sources.scan_frame import scan_frame_warnings
-from mapper.sources.selection import selected
 from mapper.sources.time_offsets import TimeOffset
 from mapper.sources.valid_returns import FARTHEST_M
 from mapper.sources.vehicle import Box, vehicle_box

@@ -9,7 +9,7 @@ from mapper.loops.closure import LoopClosure
 from mapper.loops.config import GateConfig
 from mapper.pipeline.localise import without_jumps
 from mapper.pipeline.tracking_result import TrackingResult
-from mapper.run.frame_outcomes import DISCONNECTED
+from mapper.run.frame_records import DISCONNECTED
 from mapper.runtime.progress import SILENT
 from tests.support.feature_room import track
 from tests.support.planar import at

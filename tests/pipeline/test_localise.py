@@ -17,7 +17,7 @@ from mapper.pipeline.known_map import load_known_map
 from mapper.pipeline.localise import localise
 from mapper.run.file_checks import check_run
 from mapper.run.folder import Run, open_run
-from mapper.run.frame_outcomes import read_records
+from mapper.run.frame_records import read_records
 from mapper.run.pose_covariances import read_poses
 from mapper.simulation.config import STREET, LidarSensorConfig
 from mapper.simulation.lidar import write_lidar_log

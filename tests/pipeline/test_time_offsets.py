@@ -20,7 +20,7 @@ from mapper.sources import open_source
 from mapper.sources.base import CameraImages, SensorBeside
 from mapper.sources.config import SourceConfig
 from mapper.sources.depth_time import depth_time_offset
-from mapper.sources.selection import selected
+from mapper.sources.frame_selection import selected
 from mapper.sources.time_offsets import time_offset
 from mapper.sources.trajectory_files import write_tum
 from tests.support.command_line import mapper

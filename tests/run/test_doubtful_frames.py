@@ -11,7 +11,7 @@ from mapper.core.trajectory import Trajectory
 from mapper.graph.model import PoseGraph
 from mapper.odometry.base import Diagnostics, FrameResult
 from mapper.run.doubtful_frames import placed_by_neighbours, without_doubtful
-from mapper.run.frame_outcomes import read_records, records_of, write_records
+from mapper.run.frame_records import read_records, records_of, write_records
 from mapper.run.stored_tracking import StoredTracking
 
 STEP_NS = 50_000_000

@@ -12,7 +12,7 @@ from mapper.core.trajectory import trajectory_from
 from mapper.graph.marginals import marginals_of
 from mapper.graph.model import BetweenFactor, PoseGraph, PoseSigmas
 from mapper.odometry.base import Diagnostics
-from mapper.run.frame_outcomes import FrameRecord
+from mapper.run.frame_records import FrameRecord
 from mapper.run.pose_covariances import read_poses, uncertain_poses, write_poses
 
 DIAGNOSTICS = Diagnostics(100, 50, 40, 0.01, "m", "map")

@@ -13,7 +13,7 @@ from mapper.odometry.base import Diagnostics
 from mapper.run.cloud import read_cloud
 from mapper.run.files import RUN
 from mapper.run.folder import open_run
-from mapper.run.frame_outcomes import FrameRecord, read_frame_ms, read_records, write_frame_ms, write_records
+from mapper.run.frame_records import FrameRecord, read_frame_ms, read_records, write_frame_ms, write_records
 from mapper.run.input_logs import fingerprint
 from mapper.run.manifest import Manifest, is_merged_map, read_manifest
 from mapper.run.manifest_logs import Input

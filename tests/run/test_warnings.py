@@ -11,7 +11,7 @@ from mapper.core.geometry import exp, inverse
 from mapper.core.trajectory import Trajectory
 from mapper.graph.model import BetweenFactor, PoseSigmas
 from mapper.loops.closure import Discrepancy
-from mapper.run.frame_outcomes import DISCONNECTED
+from mapper.run.frame_records import DISCONNECTED
 from mapper.run.manifest import Levelling, RunWarning, SkippedFrame
 from mapper.run.manifest_logs import AppendedLog
 from mapper.run.pose_covariances import uncertain_poses

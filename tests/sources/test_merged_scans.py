@@ -16,9 +16,9 @@ from mapper.simulation.config import LidarSensorConfig, LidarSynthConfig
 from mapper.simulation.lidar import LidarSimulator
 from mapper.sources.base import SensorBeside, WrappedEntry
 from mapper.sources.config import SourceConfig
+from mapper.sources.frame_selection import selected
 from mapper.sources.merged_scans import with_merged_scans, with_whole_turns
 from mapper.sources.reading_checks import ReadingChecks
-from mapper.sources.selection import selected
 from tests.support.logs import MemoryEntry, log_in_memory
 
 MS = 1_000_000

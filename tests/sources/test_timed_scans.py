@@ -5,8 +5,8 @@ import pytest
 
 from mapper.core.frames import Scan
 from mapper.sources.config import SourceConfig
+from mapper.sources.frame_selection import selected
 from mapper.sources.point_times import azimuth_times_s
-from mapper.sources.selection import selected
 from tests.support.logs import MemoryEntry, log_in_memory
 
 COLUMNS, RINGS, SWEEP_S = 360, 4, 0.1

@@ -10,7 +10,7 @@ from mapper.core.frames import PinholeCamera, RgbdFrame, Scan
 from mapper.core.geometry import apply, exp, inverse
 from mapper.sources.base import SensorBeside
 from mapper.sources.config import BodyConfig, SourceConfig
-from mapper.sources.selection import selected
+from mapper.sources.frame_selection import selected
 from tests.support.logs import MemoryEntry, log_in_memory
 
 BOX = (-2.0, -1.0, -1.5, 0.5, 1.0, -0.3)

@@ -11,7 +11,7 @@ from mapper.navigation.config import TraversableConfig
 from mapper.octree.config import SliceConfig
 from mapper.octree.map_file import write_map
 from mapper.run.folder import open_run
-from mapper.run.frame_outcomes import write_records
+from mapper.run.frame_records import write_records
 from mapper.run.manifest import Manifest
 from mapper.run.manifest_logs import Input
 from mapper.run.writer import write_run

@@ -11,7 +11,7 @@ from mapper.core.geometry import exp
 from mapper.core.trajectory import Trajectory, trajectory_from
 from mapper.graph.model import BetweenFactor, PoseGraph, PoseSigmas
 from mapper.odometry.base import Diagnostics
-from mapper.run.frame_outcomes import FrameRecord
+from mapper.run.frame_records import FrameRecord
 from mapper.run.manifest import Levelling, Manifest
 from mapper.run.manifest_logs import Input
 from mapper.run.pose_covariances import uncertain_poses

@@ -24,7 +24,7 @@ from mapper.octree.queries import Leaves
 from mapper.octree.ray_casting_kernels import FREE, OCCUPIED
 from mapper.octree.scan_updates import open_scan_updates
 from mapper.run.folder import Run
-from mapper.run.frame_outcomes import stamps_of
+from mapper.run.frame_records import stamps_of
 
 NEVER_NS = np.iinfo(np.int64).max
 

@@ -49,7 +49,7 @@ from mapper.mapping.map_building import Snapshot
 from mapper.octree.grid import OccupancyGrid
 from mapper.octree.keys import KEY_ZERO
 from mapper.octree.map import OctreeMap
-from mapper.run.frame_outcomes import FrameRecord, stamps_of
+from mapper.run.frame_records import FrameRecord, stamps_of
 
 _DIRECTION = np.array([-0.6, -1.0, 0.9])  # from what is looked at to the eye
 _DISTANCE = 0.85  # in diagonals of what is looked at

@@ -8,7 +8,7 @@ from mapper.core.trajectory import Trajectory
 from mapper.evaluators.metrics.consistency import drift_metrics, factor_nees, window_nees
 from mapper.graph.model import BetweenFactor, PoseGraph, PoseSigmas
 from mapper.odometry.base import Diagnostics
-from mapper.run.frame_outcomes import FrameRecord
+from mapper.run.frame_records import FrameRecord
 from mapper.run.pose_covariances import UncertainPoses
 
 NODES, STEP_NS = 120, 250_000_000

@@ -8,7 +8,7 @@ from mapper.core.timebase import NS_PER_S
 from mapper.core.trajectory import Trajectory
 from mapper.evaluators.metrics.silent_failures import check_doubts
 from mapper.odometry.base import Diagnostics
-from mapper.run.frame_outcomes import FrameRecord
+from mapper.run.frame_records import FrameRecord
 
 FRAMES, RATE_HZ = 50, 10
 STAMPS_NS = np.arange(FRAMES) * NS_PER_S // RATE_HZ

@@ -1,50 +1,18 @@
 """Frame records: the outcome of every frame of a log, and the time it took; the CSV files of a run."""
 
-import csv
-import io
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, TypeVar, get_args
+from typing import Literal, get_args
 
 import numpy as np
 
 from mapper.core.doubts import Doubt, doubts_of, doubts_text, kinds_text
-from mapper.core.errors import DataError, RunError
 from mapper.core.rotations import row_of_pose
 from mapper.core.timebase import Stamps
 from mapper.odometry.base import Diagnostics, FrameResult
-from mapper.runtime.atomic import write_text
-from mapper.runtime.regular_files import read_text
+from mapper.runtime.csv_file import read_csv, write_csv
 from mapper.sources.base import Skipped
-
-Read = TypeVar("Read")
-
-
-def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Iterable[object]]) -> None:
-    """Write rows below the names of their columns."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(columns)
-    writer.writerows(rows)
-    write_text(path, text.getvalue())
-
-
-def read_csv(
-    path: Path, columns: Sequence[str], read: Callable[[Iterable[Mapping[str, str]]], Read], *, of: str
-) -> Read:
-    """Return what a function makes of the rows, each a text by its column's name.
-
-    Raises:
-        RunError: The file cannot be read.
-        DataError: It lists something else: a KeyError, ValueError, TypeError or DataError was raised.
-    """
-    text = read_text(path, error=RunError)
-    try:
-        return read(csv.DictReader(io.StringIO(text)))
-    except (KeyError, ValueError, TypeError, csv.Error, DataError) as error:
-        raise DataError(f"{path}: not a list of {of} with columns {', '.join(columns)}: {error}") from None
-
 
 Outcome = Literal["tracked", "doubtful", "lost", "skipped"]
 _OUTCOMES: Mapping[str, Outcome] = {outcome: outcome for outcome in get_args(Outcome)}
