@@ -1,6 +1,6 @@
 """Tracking by depth where an image has little texture: the second leg of the local map's odometry."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -40,6 +40,21 @@ _MIN_KEPT_RATIO = 0.5
 """When fewer of a pose's landmarks agree once the depth image takes part, one of both is wrong."""
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Surfaces:
+    """Surfaces that a depth image is aligned to: of the latest keyframes, then perhaps of the last frame.
+
+    Attributes:
+        keyframes: Their numbers.
+        surfaces: As many surfaces as keyframes, or one more.
+        T_camera_world: (4, 4) each.
+    """
+
+    keyframes: list[int]
+    surfaces: list[DepthSurface]
+    T_camera_world: list[Transform]
+
+
 class DepthTracker:
     """Pose of frames of few landmarks by their depth image, against the surfaces of the last keyframes."""
 
@@ -49,7 +64,6 @@ class DepthTracker:
         self._search = LocalSearch(config, landmark_map)
         self._earlier_depth = EarlierDepth(landmark_map, config.depth_noise)
         self._surfaces: dict[int, DepthSurface] = {}  # of the frames last used, by stamp
-        self._keyframes: list[int] = []  # those among them
         self._observed_ns = 0  # when every motion was last observed
         self._is_confirmed = False  # the sub-map, by a frame of many landmarks
 
@@ -91,9 +105,10 @@ class DepthTracker:
         if T_predicted is None:
             T_predicted = last.T_camera_world
             gap_s = (observation.stamp_ns - last.observation.stamp_ns) / NS_PER_S
+        near = self._near_surfaces(observation, last)
         starts = [T_predicted] if found is None else [found.T_camera_world, T_predicted]
         for T_camera_world in starts:
-            alignment = self._aligned(observation, T_camera_world, T_predicted, last, found)
+            alignment = self._aligned(observation, T_camera_world, T_predicted, last, found, near)
             if alignment is not None and _agrees(alignment):
                 break
         else:
@@ -102,7 +117,7 @@ class DepthTracker:
             return found
         if found is not None:
             return self._by_both(observation, alignment, found)
-        reference = self._keyframes[int(np.argmax(alignment.agreeing))]
+        reference = near.keyframes[int(np.argmax(alignment.agreeing))]
         found = self._search.refine(
             observation,
             alignment.T_camera_world,
@@ -119,9 +134,9 @@ class DepthTracker:
         T_predicted: Transform,
         last: TrackedPose,
         found: TrackedPose | None,
+        near: _Surfaces,
     ) -> DepthAlignment | None:
-        surfaces, T_surfaces_world = self._models(observation, last)
-        if observation.depth_cells is None or not surfaces:
+        if observation.depth_cells is None or not near.surfaces:
             return None
         unsure_s = max(self._unobserved_s(observation), _LEAST_ELAPSED_S)
         ids = unmatched(observation) if found is None else found.landmark_of_feature
@@ -131,9 +146,9 @@ class DepthTracker:
         return align_depth(
             observation.depth_cells,
             points[~moved],
-            surfaces,
-            T_surfaces_world,
-            keyframes=len(self._keyframes),
+            near.surfaces,
+            near.T_camera_world,
+            keyframes=len(near.keyframes),
             T_camera_world=T_camera_world,
             T_prior=T_predicted,
             prior=np.eye(6) / (_SPEED_SIGMA * unsure_s) ** 2,
@@ -146,18 +161,16 @@ class DepthTracker:
             noise=self._config.depth_noise,
         )
 
-    def _models(
-        self, observation: ImageObservation, last: TrackedPose
-    ) -> tuple[list[DepthSurface], list[Transform]]:
-        """Return the surfaces of the latest keyframes and of the last frame, and their T_camera_world."""
+    def _near_surfaces(self, observation: ImageObservation, last: TrackedPose) -> _Surfaces:
+        """Return the surfaces of the latest keyframes and of the last frame."""
         keyframes, cells = self._map.keyframes, observation.depth_cells
         origin = keyframes[last.reference].origin
-        self._keyframes = [
+        latest = [
             k
             for k in self._map.latest(last.reference)
             if keyframes[k].origin == origin and _alike(self._map.observation(k).depth_cells, cells)
         ]
-        models = [(self._map.observation(k), keyframes[k].T_camera_world, k) for k in self._keyframes]
+        models = [(self._map.observation(k), keyframes[k].T_camera_world, k) for k in latest]
         blind = last.doubts or (last.depth is not None and last.depth.unobservable)
         if not blind and all(earlier.stamp_ns != last.observation.stamp_ns for earlier, _, _ in models):
             models.append((last.observation, last.T_camera_world, last.reference))
@@ -166,7 +179,8 @@ class DepthTracker:
             earlier.stamp_ns: self._surfaces.get(earlier.stamp_ns) or self._still_surface(earlier, T, k)
             for earlier, T, k in models
         }
-        return [self._surfaces[earlier.stamp_ns] for earlier, _, _ in models], [T for _, T, _ in models]
+        surfaces = [self._surfaces[earlier.stamp_ns] for earlier, _, _ in models]
+        return _Surfaces(latest, surfaces, [T for _, T, _ in models])
 
     def _still_surface(
         self, observation: ImageObservation, T_camera_world: Transform, reference: int
