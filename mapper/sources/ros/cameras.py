@@ -20,7 +20,7 @@ from mapper.sources.calibration_file import calibration_files, read_calibration
 from mapper.sources.config import CameraConfig
 from mapper.sources.image_files.image_sizes import Size, is_same_view, recorded_camera
 from mapper.sources.lens import FISHEYE_MODELS, POLYNOMIAL_MODELS, Lens, lens_model
-from mapper.sources.ros.image_messages import image_of, size_of
+from mapper.sources.ros.image_messages import image_of, size_of, unused_bits
 from mapper.sources.ros.message_index import Series
 from mapper.sources.ros.message_order import ordered
 from mapper.sources.ros.messages import CAMERAS, EXTRINSICS, CameraMessage, ImageMessage, Window, frame_of
@@ -116,7 +116,7 @@ def images_beside(reader: RecordingReader, topics: ImageTopics, *, body: str) ->
     if not isinstance(first, ImageMessage) or info is None or T_body_camera is None:
         return f"{name}: colours no points, as tf does not say where {frame_of(first)} is on {body}"
     try:
-        size_px = size_of(first, where=name)
+        size_px, shift = size_of(first, where=name), unused_bits(first, where=name)
         calibration = calibration_of(
             info, size_px, is_rectified=is_called_rectified(name), name=topics.info.topic.name
         )
@@ -127,7 +127,9 @@ def images_beside(reader: RecordingReader, topics: ImageTopics, *, body: str) ->
 
     def image_at(index: int) -> Image:
         located = reader.located(images, int(order[index]))
-        return recorded.image(image_of(located.image(), colour=True, where=f"{located}"), f"{located}")
+        return recorded.image(
+            image_of(located.image(), colour=True, shift=shift, where=f"{located}"), f"{located}"
+        )
 
     return CameraImages(name, images.stamps_ns[order], recorded.camera, T_body_camera, image_at)
 

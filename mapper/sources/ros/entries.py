@@ -90,13 +90,15 @@ def rgbd_entry(
             where=f"{depth}",
         )
 
-    def image(in_colour: bool) -> Image:
-        return image_of(colour.image(), colour=in_colour, shift=shift, where=f"{colour}")
-
     return RgbdEntry(
         colour.stamp_ns,
         ImageFiles(
-            DecodedColour(colour, image, lambda: _file_of(colour.image()), colour_suffix),
+            DecodedColour(
+                colour,
+                partial(read_image, colour, shift=shift),
+                lambda: _file_of(colour.image()),
+                colour_suffix,
+            ),
             DecodedDepth(depth, depth_m, units_per_m, lambda: depth_file_of(depth.image())),
             depth.stamp_ns,
             units_per_m,
@@ -108,7 +110,9 @@ def rgbd_entry(
     )
 
 
-def stereo_entry(left: Located, right: Located, camera: StereoCamera, recorded: RecordedCamera) -> RgbdEntry:
+def stereo_entry(
+    left: Located, right: Located, camera: StereoCamera, recorded: RecordedCamera, *, shift: int
+) -> RgbdEntry:
     """Return the entry of a left and a right image, whose body is the rectified left camera.
 
     Args:
@@ -116,8 +120,9 @@ def stereo_entry(left: Located, right: Located, camera: StereoCamera, recorded: 
         right: Right image.
         camera: Rectifies and matches them.
         recorded: Camera of the frame, and the size of both images.
+        shift: Bits below those that are used of grey images of 16.
     """
-    read_left, read_right = (partial(read_image, one) for one in (left, right))
+    read_left, read_right = (partial(read_image, one, shift=shift) for one in (left, right))
     depth = camera.depth_of(read_left, read_right, left)
     images = ImageFiles(
         camera.image_of(read_left, left),
@@ -130,9 +135,9 @@ def stereo_entry(left: Located, right: Located, camera: StereoCamera, recorded: 
     return RgbdEntry(left.stamp_ns, images, recorded)
 
 
-def read_image(image: Located, in_colour: bool) -> Image:
-    """Read an image in colour or grey."""
-    return image_of(image.image(), colour=in_colour, where=f"{image}")
+def read_image(image: Located, in_colour: bool, *, shift: int) -> Image:
+    """Read an image in colour or grey; ``shift`` as of :func:`image_of`."""
+    return image_of(image.image(), colour=in_colour, shift=shift, where=f"{image}")
 
 
 def _file_of(message: ImageMessage) -> bytes | None:

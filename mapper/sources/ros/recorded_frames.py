@@ -79,6 +79,7 @@ def stereo_frames(reader: RecordingReader, topics: StereoTopics, config: SourceC
     i, j, notes = paired(left, right, max_gap_s=config.max_pair_gap_s, where=where)
     first = _first_image(reader, left)
     size_px = size_of(first, where=f"{where}: {left.topic.name}")
+    shift = unused_bits(first, where=f"{where}: {left.topic.name}")
     camera = stereo_camera(reader, topics, size_px=size_px)
     recorded = recorded_camera(camera.calibration, colour_px=size_px, depth_px=size_px, where=where)
 
@@ -86,10 +87,12 @@ def stereo_frames(reader: RecordingReader, topics: StereoTopics, config: SourceC
         return reader.located(left, int(i[index])), reader.located(right, int(j[index]))
 
     def entry_at(index: int) -> FrameRef:
-        return stereo_entry(*located(index), camera, recorded)
+        return stereo_entry(*located(index), camera, recorded, shift=shift)
 
     camera.refuse_exchanged(
-        lambda k: [partial(read_image, one) for one in located(k)], len(i), f"{where}: {left.topic.name}"
+        lambda k: [partial(read_image, one, shift=shift) for one in located(k)],
+        len(i),
+        f"{where}: {left.topic.name}",
     )
     notes.append(camera.note)
     return RecordedFrames("rgbd", frame_of(first), left.stamps_ns[i], entry_at, notes, camera.noise)

@@ -8,7 +8,9 @@ from mapper.core.errors import SourceError
 from mapper.sources import open_source
 from mapper.sources.config import SourceConfig, TopicsConfig
 from mapper.sources.ros.encode_ros import compressed_image_message
+from mapper.sources.ros.typestore import typestore
 from tests.support.recordings import COLOR, DEPTH, camera_info, image, shots, write
+from tests.support.stereo_rig import RECTIFIED, SIZE_PX, projections, recorded
 from tests.support.tum_logs import FIRST_NS, PERIOD_NS, picture
 
 
@@ -61,3 +63,21 @@ def test_which_of_two_alike_images_of_16_bits_is_depth_has_to_be_said(tmp_path):
         opened(tmp_path / "a.mcap", messages)
     topics = TopicsConfig(color="/cam/a/image", depth="/cam/b/image")
     assert open_source(tmp_path / "a.mcap", SourceConfig(topics=topics)).entry_at(0).load().gray.any()
+
+
+def test_stereo_pairs_of_12_bits_are_as_bright_as_of_8(tmp_path):
+    topics = "/ir/left/image_rect", "/ir/right/image_rect"
+    eight = recorded(RECTIFIED, topics, projections=projections(0.12))
+    twelve = []
+    for message in eight:
+        if message.type.endswith("/Image"):
+            data = typestore("cdr").deserialize_cdr(message.cdr, message.type).data
+            pixels = data.reshape(SIZE_PX[::-1]).astype(np.uint16) << 4
+            message = image(message.stamp_ns, message.topic, pixels, "mono16", frame="optical")
+        twelve.append(message)
+    of_8, of_12 = (
+        opened(tmp_path / f"{name}.mcap", messages).entry_at(0).load()
+        for name, messages in (("a", eight), ("b", twelve))
+    )
+    np.testing.assert_array_equal(of_8.gray, of_12.gray)
+    np.testing.assert_array_equal(of_8.depth_m, of_12.depth_m)
