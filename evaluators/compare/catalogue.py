@@ -3,14 +3,15 @@
 import atexit
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from importlib.util import find_spec
-from typing import Any, get_args
+from typing import Any, cast, get_args
 
 import numpy as np
 
+from mapper.config.loading import load_config
 from mapper.core.config import AnyConfig, scale_length, with_changes
 from mapper.core.errors import ConfigError
 from mapper.core.frames import Scan, Sensor
@@ -19,10 +20,19 @@ from mapper.core.rotations import rotation_from_quaternion
 from mapper.core.timebase import NS_PER_S
 from mapper.core.trajectory import Trajectory, trajectory_from
 from mapper.evaluators.compare.config import CompareConfig
-from mapper.evaluators.compare.methods import AnyRegistration, Method, odometry_method, registration_method
+from mapper.evaluators.compare.methods import (
+    AnyRegistration,
+    Method,
+    OdometryTracker,
+    Tracker,
+    odometry_method,
+    registration_method,
+)
+from mapper.odometry.base import FrameOdometry
 from mapper.odometry.config import IsvdOdometryConfig, LocalMapConfig, PnpConfig
 from mapper.odometry.factory import build_frame_odometry
 from mapper.odometry.scans.config import KissOdometryConfig
+from mapper.pipeline.track import session_odometry
 from mapper.registration.config import NEED_NO_GUESS, VOXEL_M, RegistrationConfig
 from mapper.registration.factory import build_registration
 from mapper.registration.hough.config import HoughConfig
@@ -30,6 +40,8 @@ from mapper.runtime.extras import extra, install_line, require
 from mapper.sources.base import Log
 
 RKO_LIO = "rko-lio"
+SCAN_TO_MAP = "scan-to-map"
+"""The odometry of LiDAR logs in `mapper build`, with the times of points, the gyroscope and the wheels."""
 _LIBRARIES = {
     "rgbd": "open3d",
     "ndt": "open3d",
@@ -97,7 +109,7 @@ def _image_methods(max_depth_m: float) -> list[Method]:
 
 
 def _scan_methods(source: Log) -> list[Method]:
-    """Return the registrations of scans, first those that need a guess, KISS-ICP, and with an IMU RKO-LIO."""
+    """Return the registrations of scans, first those that need a guess, and the odometries of scans."""
     sensor = source.sensor
     registrations = [
         registration_method(
@@ -110,19 +122,23 @@ def _scan_methods(source: Log) -> list[Method]:
         *sorted(registrations, key=lambda method: not method.uses_guess),
         odometry_method(kiss.kind, partial(build_frame_odometry, kiss), sees_images=False),
     ]
+    if sensor != "rgbd":
+        methods.append(_follower(SCAN_TO_MAP, partial(_default_tracker, source)))
     if sensor == "lidar" and source.gyroscope is not None and source.accelerations is not None:
-        tracker = partial(RkoLioTracker, source)
-        methods.append(
-            Method(
-                RKO_LIO,
-                sees_images=False,
-                uses_guess=False,
-                tracker=tracker,
-                registration=None,
-                sees_times=True,
-            )
-        )
+        methods.append(_follower(RKO_LIO, partial(RkoLioTracker, source)))
     return methods
+
+
+def _follower(name: str, tracker: Callable[[], Tracker]) -> Method:
+    """Return a method that follows whole logs alone, and gets the times of points."""
+    return Method(
+        name, sees_images=False, uses_guess=False, tracker=tracker, registration=None, sees_times=True
+    )
+
+
+def _default_tracker(source: Log) -> Tracker:
+    odometry = session_odometry(source, load_config(None, sensor=source.sensor))
+    return OdometryTracker(cast(FrameOdometry[Any], odometry))
 
 
 def registrations_for(sensor: Sensor) -> list[Any]:

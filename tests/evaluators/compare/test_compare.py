@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
+from mapper.config.loading import load_config
 from mapper.core.errors import ConfigError, DataError, FrameError
 from mapper.evaluators.compare import comparison as compare_module
 from mapper.evaluators.compare.catalogue import methods_for
@@ -20,6 +21,8 @@ from mapper.evaluators.compare.files import tables_of, tables_text, write_compar
 from mapper.evaluators.compare.methods import registration_method
 from mapper.evaluators.compare.pairwise import registration_records
 from mapper.evaluators.metrics.odometry import PathErrors
+from mapper.pipeline.track import track_log
+from mapper.runtime.progress import SILENT
 from mapper.simulation.config import STREET, LidarSensorConfig, SynthImuConfig
 from mapper.simulation.lidar import LidarSimulator
 from mapper.sources import open_source
@@ -107,6 +110,23 @@ def test_rko_lio_follows_scans_with_inertial_readings(street, tmp_path, capfd):
     assert theirs.errors.rpe_rad < 0.005
     assert {trial["method"] for trial in comparison.trials} == {ours.method}
     assert capfd.readouterr().out == ""
+
+
+def test_the_odometry_of_builds_is_compared_on_lidar_logs(desk, tmp_path):
+    sensor = LidarSensorConfig(rings=32, azimuth_steps=450)
+    log = LidarSimulator(STREET.model_copy(update={"duration_s": 1.0, "sensor": sensor})).log()
+    assert "scan-to-map" not in {method.name for method in methods_for(desk, CompareConfig())[0]}
+
+    comparison = compare(log, CompareConfig(methods=("gicp", "scan-to-map"), pairs=2), tmp_path)
+
+    by_scans, by_map = comparison.runs
+    assert (by_map.failures, by_map.coverage) == (0, 1.0)
+    assert by_map.errors.ate_m < 0.5 * by_scans.errors.ate_m  # which has no times to deskew by
+    tracked = track_log(
+        log, load_config(None, ["loops.kind=none"], sensor="lidar"), progress=SILENT
+    ).trajectory()
+    np.testing.assert_allclose(by_map.trajectory.T_world_body, tracked.T_world_body, atol=1e-9)
+    assert {trial["method"] for trial in comparison.trials} == {"gicp"}
 
 
 def odometry_records(comparison):
