@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from mapper.core.frames import Scan, Sensor
     from mapper.evaluators.compare.registration import Registered
 
-_CLOUD = "A cloud (.bin .pcd .ply .xyz .npy .las .laz), or LOG@N: the n-th frame of a log, from 0."
+_CLOUD = "A cloud (.bin .pcd .ply .npy .las .laz, text as .xyz), or LOG@N: the n-th frame of a log, from 0."
 
 
 def register(
