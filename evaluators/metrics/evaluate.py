@@ -10,7 +10,7 @@ import numpy as np
 
 from mapper.core.errors import DataError, SourceError
 from mapper.core.timebase import Stamps
-from mapper.core.trajectory import Positions, Trajectory, with_rotations
+from mapper.core.trajectory import Trajectory, with_rotations, without_idle_rotations
 from mapper.evaluators.metrics.clock_offset import clock_offset
 from mapper.evaluators.metrics.coverage import frame_coverage, time_coverage
 from mapper.evaluators.metrics.metric import Metric, shown, text_table
@@ -207,7 +207,7 @@ def assess(
     matched = associate(estimate, truth, max_gap_s=max_gap_s, names=names)
     similarity = align(matched, alignment)
     aligned = similarity.moved(matched)
-    if isinstance(truth, Positions):
+    if with_rotations(truth) is None or with_rotations(estimate) is None:
         errors = [*_position_errors(aligned, alignment), *_lever_metrics(matched, alignment)]
         return Assessment((*errors, *_clock_metrics(estimate, truth, alignment), *own), aligned)
     lengths = segment_errors(aligned, lengths_for(truth.path_length_m) if lengths_m is None else lengths_m)
@@ -312,7 +312,9 @@ def estimate_and_truth(
         raise DataError(f"{times}: --times is for poses in KITTI text, which neither file is")
     if times is None and len(untimed) == 1 and truth is not None:
         raise DataError(f"{untimed[0]}: KITTI text has no stamps to pair poses by; give them with --times")
-    known = truth if isinstance(truth, Trajectory) or truth is None else _poses(truth, times)
+    known = truth
+    if not (isinstance(known, Trajectory) or known is None):
+        known = without_idle_rotations(_poses(known, times))
     if isinstance(estimate, Trajectory):
         return None, estimate, known
     if isinstance(estimate, str | os.PathLike):

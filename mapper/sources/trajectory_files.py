@@ -12,7 +12,7 @@ from mapper.core.errors import DataError
 from mapper.core.geometry import is_rigid, transform
 from mapper.core.rotations import pose_of_row, row_of_pose
 from mapper.core.timebase import Stamps, ns_from_seconds_text, seconds_text_from_ns
-from mapper.core.trajectory import Positions, Trajectory, without_idle_rotations
+from mapper.core.trajectory import Positions, Trajectory
 from mapper.runtime.atomic import write_text
 from mapper.runtime.regular_files import read_text
 from mapper.sources.text import ROUNDING, epoch_ns, poses_from_numbers
@@ -27,6 +27,8 @@ _COLUMNS = {
     **{f"q{axis}": _QUATERNION.format(axis) for axis in "xyzw"},
 }
 """Names of the columns of a pose, in lower case and without units, by EuRoC's, ROS's and other tables."""
+_STAMP_UNIT = re.compile(r"(?:stamp|time)\s*[\[(_]([mun])s\b")
+_DIGITS = {"m": 3, "u": 6, "n": 9}
 _OF_MAPS = {"x": "east(?:ing)?", "y": "north(?:ing)?", "z": "alt(?:itude)?|up|height"}
 _MULRAN_COLUMNS = 13
 POSE_COLUMNS = ("stamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw")
@@ -54,8 +56,10 @@ def read_tum(path: Path) -> Trajectory:
     stamps_ns: list[int] = []
     numbers: list[list[float]] = []
     places: list[str] = []
+    kind: type[Trajectory] = Trajectory
     for number, words in tum_rows(path):
         place = f"{path}:{number}"
+        kind = Positions if len(words) == len(POSITION_COLUMNS) else kind
         words = whole_row(words, place=place)
         try:
             stamp_ns, pose = epoch_ns(words[0]), [float(word) for word in words[1:]]
@@ -77,7 +81,7 @@ def read_tum(path: Path) -> Trajectory:
         if T is None:
             raise DataError(f"{place}: quaternion {tuple(pose[3:])} has no direction; want a non-zero xyzw")
         poses.append(T)
-    return without_idle_rotations(Trajectory(np.array(stamps_ns, dtype=np.int64), np.array(poses)))
+    return kind(np.array(stamps_ns, dtype=np.int64), np.array(poses))
 
 
 def whole_row(words: list[str], *, place: str) -> list[str]:
@@ -242,8 +246,8 @@ def _picked(words: list[str], columns: list[int], header: str) -> list[str]:
     stamp, *numbers = (words[k] for k in columns)
     if len(columns) in (len(POSITION_COLUMNS) + 1, len(POSE_COLUMNS) + 1):
         stamp = f"{stamp}.{numbers.pop():0>9}"
-    elif re.search(r"stamp\s*\[ns\]", header):
-        stamp = f"{stamp}e-9"
+    elif (unit := _STAMP_UNIT.search(header)) and epoch_ns(stamp) is None:
+        stamp = f"{stamp}e-{_DIGITS[unit[1]]}"
     return [stamp, *numbers]
 
 

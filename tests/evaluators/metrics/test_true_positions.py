@@ -51,7 +51,6 @@ POSITIONS = {
         ",",
     ),
     "NCLT": ("", WALK.stamps_ns // 1000, np.hstack([PRISM, ANGLES]), ","),
-    "no rotation": ("", SECONDS, np.hstack([PRISM, np.tile([0.0, 0.0, 0.0, 1.0], (len(WALK), 1))]), " "),
     "semicolons": ("time;x;y;z", SECONDS, PRISM, ";"),
 }
 
@@ -100,6 +99,20 @@ def test_positions_are_compared_without_rotations_and_with_a_lever_arm(tmp_path)
     assert found.metrics[names.index("lever arm of the true positions")].value == pytest.approx(
         np.linalg.norm(LEVER), abs=1e-3
     )
+
+
+def test_poses_that_never_turn_are_positions_where_they_are_the_truth(tmp_path):
+    unturned = np.hstack([PRISM, np.tile([0.0, 0.0, 0.0, 1.0], (len(WALK), 1))])
+    path = table(tmp_path / "a.txt", "", SECONDS, unturned, " ")
+    assert not isinstance(read_tum(path), Positions)
+    found = evaluate(WALK, path)
+    assert found["lever arm of the true positions: ATE RMSE"] < 1e-5
+    assert found.ate_m == pytest.approx(evaluate(read_tum(path), WALK).ate_m, rel=0.1)
+
+
+def test_units_of_stamps_may_stand_in_the_header(tmp_path):
+    path = table(tmp_path / "a.csv", "time [ms],x,y,z", np.arange(len(WALK)) * 100, PRISM)
+    assert np.diff(read_tum(path).stamps_ns).tolist() == [100_000_000] * (len(WALK) - 1)
 
 
 def test_a_log_may_have_true_positions(tmp_path):
