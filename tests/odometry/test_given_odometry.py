@@ -143,7 +143,7 @@ def test_a_path_starts_here_or_in_the_log_s_folder(flat, tmp_path, monkeypatch):
 
 
 def test_mistakes_are_named_with_the_remedy(flat, tmp_path):
-    with pytest.raises(ConfigError, match=r"neither truth nor device poses; .*odometry\.path=poses\.tum"):
+    with pytest.raises(ConfigError, match=r"neither true nor device poses; .*odometry\.path=poses\.tum"):
         track_log(replace(flat, truth=None), given(), progress=SILENT)
     with pytest.raises(ConfigError, match=r"loops\.kind=thesis looks .*odometry\.kind=given counts none"):
         track_log(flat, given("loops.kind=thesis"), progress=SILENT)
