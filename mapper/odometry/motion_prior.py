@@ -27,7 +27,7 @@ from mapper.sensing.wheel_kinematics import pose_at
 
 _FIRST_FIT, _FITS_GROW, _MOST_BETWEEN_FITS = 8, 1.5, 100
 _KEPT = 400  # intervals that a fit uses: bias drifts over minutes
-_ERRORS, _FEWEST_ERRORS = 30, 5
+_ERRORS, _FEWEST_ERRORS, _MOST_REJECTED_FRAMES = 30, 5, 15
 _MEDIAN_LENGTH = 1.538  # of a vector of three independent normal errors, in standard deviations
 _LONGEST_TURN_RAD = 2.8
 _SLIPPED, _STANDING_M = 0.5, 0.05
@@ -74,7 +74,7 @@ class MotionPrior:
         self._measured = 0
         self._next_fit = _FIRST_FIT
         self._used = self._uncovered = 0
-        self._rejected: tuple[int, float] | None = None
+        self._rejected_frames, self._last_rejected_ns = 0, -1
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the state without what is made again when it is needed."""
@@ -189,26 +189,21 @@ class MotionPrior:
     def reject(self, begin_ns: int, end_ns: int, R_begin_end: Array) -> bool:
         """Return whether the gyroscope rules out a rotation (3, 3) of the body between two times.
 
-        Each frame of which a pose is rejected and none accepted counts as an error of the gyroscope, so that
-        one that has become wrong soon rejects nothing.
+        One that rules out all poses of many frames in a row has become wrong itself, and rejects nothing
+        until a pose agrees with it again.
         """
-        if self._rejected is not None and self._rejected[0] != end_ns:
-            self._errors.append(self._rejected[1])
-            self._rejected = None
         found = self._turn(begin_ns, end_ns)
         if found is None or len(self._errors) < _FEWEST_ERRORS or not self._is_better(*found):
             return False
         sigma_rad = math.hypot(found[1], float(np.median(self._errors)) / _MEDIAN_LENGTH)
         off_rad = float(np.linalg.norm(rotation_log(found[0].T @ R_begin_end)))
         if off_rad <= max(_CONTRADICTION_RAD, _CONTRADICTION_SIGMAS * sigma_rad):
+            self._rejected_frames = 0
             return False
-        self._rejected = self._rejected or (end_ns, off_rad)
-        return True
-
-    def accept(self, end_ns: int) -> None:
-        """Take over that a frame has a pose that was not rejected, whatever was rejected before."""
-        if self._rejected is not None and self._rejected[0] == end_ns:
-            self._rejected = None
+        if end_ns != self._last_rejected_ns:
+            self._last_rejected_ns = end_ns
+            self._rejected_frames += 1
+        return self._rejected_frames <= _MOST_REJECTED_FRAMES
 
     @property
     def calibration(self) -> GyroscopeCalibration | None:

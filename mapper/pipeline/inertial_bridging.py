@@ -24,6 +24,7 @@ from mapper.odometry.gyroscope_calibration import (
 )
 from mapper.pipeline.disconnected_components import largest_component
 from mapper.pipeline.tracking_result import TrackingResult
+from mapper.run.graph_warnings import MAX_STEP_M, MAX_STEP_RAD
 from mapper.run.manifest import RunWarning
 from mapper.runtime.progress import SILENT, Progress
 from mapper.sensing.inertial import InertialReadings
@@ -161,11 +162,24 @@ def with_body_readings(source: Log, tracking: TrackingResult) -> Log:
 
 
 def _is_weak(track: FrameResult) -> bool:
-    return track.node is None or bool(track.diagnostics.unobservable) or _is_open(track)
+    return (
+        track.node is None
+        or bool(track.diagnostics.unobservable)
+        or _is_open(track)
+        or _is_uncertain(track.covariance)
+    )
 
 
 def _is_open(track: FrameResult) -> bool:
     return any(doubt.kind == "unobservable" for doubt in track.doubts)
+
+
+def _is_uncertain(covariance: Array | None) -> bool:
+    """Return whether the verdict would doubt a motion of this (6, 6) covariance, rad² and m²."""
+    if covariance is None:
+        return False
+    variance_rad2, variance_m2 = np.trace(covariance[:3, :3]), np.trace(covariance[3:, 3:])
+    return bool(variance_rad2 > MAX_STEP_RAD**2 or variance_m2 > MAX_STEP_M**2)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

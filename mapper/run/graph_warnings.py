@@ -19,7 +19,7 @@ _MAX_LOOP_M, _MAX_LOOP_RAD = 0.3, np.radians(10.0)
 _MAX_REFUSED_SHARE = 0.5
 _MAX_WHEEL_CHI2, _LEAST_WHEEL_FACTORS = 9.0, 5
 _MAX_SIGMA_SHARE, _BROKEN_SIGMA_SHARE = 0.1, 0.3
-_MAX_STEP_M, _MAX_STEP_RAD = 0.2, np.radians(5.0)
+MAX_STEP_M, MAX_STEP_RAD = 0.2, np.radians(5.0)
 
 _LOOK_AT_LOOPS = "mapper loops RUN lists them; mapper loops RUN --remove I J takes a wrong one back"
 
@@ -120,7 +120,7 @@ def step_warnings(results: RunResults, timeline: TimeLine, suggestion: str) -> I
         nodes: np.sqrt([covariance[part, part].trace() for part in (slice(3, 6), slice(0, 3))])
         for nodes, covariance in relative.items()
     }
-    wide = [nodes for nodes, (m, rad) in sigmas.items() if m > _MAX_STEP_M or rad > _MAX_STEP_RAD]
+    wide = [nodes for nodes, (m, rad) in sigmas.items() if m > MAX_STEP_M or rad > MAX_STEP_RAD]
     if not wide:
         return
     worst = max(wide, key=lambda nodes: float(sigmas[nodes][0]))
@@ -130,8 +130,8 @@ def step_warnings(results: RunResults, timeline: TimeLine, suggestion: str) -> I
     steps = counted(_stretches(wide, results.graph), "step")
     yield RunWarning(
         kind="uncertainty",
-        sentence=f"{steps} between keyframes known to {_MAX_STEP_M:g} m or "
-        f"{np.degrees(_MAX_STEP_RAD):.0f}° at best (1 σ), the worst to {worst_m:.2g} m and "
+        sentence=f"{steps} between keyframes known to {MAX_STEP_M:g} m or "
+        f"{np.degrees(MAX_STEP_RAD):.0f}° at best (1 σ), the worst to {worst_m:.2g} m and "
         f"{np.degrees(worst_rad):.2g}°: the parts before and after may not fit",
         where=timeline.place(first, last),
         suggestion=suggestion,

@@ -54,11 +54,12 @@ class InertialReadings:
         return max(self._density(self.accelerations_mps2), _LEAST_ACCELERATION_DENSITY)
 
     def covers(self, begin_ns: int, end_ns: int) -> bool:
-        """Return whether readings cover the time between two times, without a gap."""
-        first = int(np.searchsorted(self.stamps_ns, begin_ns, side="right")) - 1
-        last = int(np.searchsorted(self.stamps_ns, end_ns))
-        if first < 0 or last >= len(self.stamps_ns):
+        """Return whether readings cover the time between two times, without a gap: half of one at an end."""
+        reach_ns = self.gap_ns // 2
+        if begin_ns < self.stamps_ns[0] - reach_ns or end_ns > self.stamps_ns[-1] + reach_ns:
             return False
+        first = max(int(np.searchsorted(self.stamps_ns, begin_ns, side="right")) - 1, 0)
+        last = int(np.searchsorted(self.stamps_ns, end_ns))
         return bool((np.diff(self.stamps_ns[first : last + 1]) <= self.gap_ns).all())
 
     def between(self, begin_ns: int, end_ns: int) -> tuple[Array, Array, Array]:
@@ -205,7 +206,7 @@ class InertialReadings:
     def _at(self, values: Array, stamp_ns: int) -> Array:
         after = min(max(int(np.searchsorted(self.stamps_ns, stamp_ns)), 1), len(values) - 1)
         begin_ns, end_ns = self.stamps_ns[after - 1 : after + 1].tolist()
-        share = (stamp_ns - begin_ns) / (end_ns - begin_ns)
+        share = min(max((stamp_ns - begin_ns) / (end_ns - begin_ns), 0.0), 1.0)
         interpolated: Array = (1.0 - share) * values[after - 1] + share * values[after]
         return interpolated
 

@@ -175,6 +175,21 @@ def test_a_gyroscope_that_has_become_wrong_soon_rejects_nothing():
     assert sum(rejected) < 20
 
 
+def test_frames_that_are_lost_do_not_take_away_the_calibration():
+    times_s, rates, R = swinging(17)
+    stamps_ns, noisy = frames(times_s, R)
+    _, _, prior = predictions(readings(times_s, rates), stamps_ns, noisy)
+    turned = rotation_exp(np.array([0.0, 0.0, 0.5]))
+    steps = [(int(stamps_ns[k]), int(stamps_ns[k + 1]), noisy[k].T @ noisy[k + 1]) for k in range(32)]
+    for begin_ns, end_ns, R_begin_end in steps[:30]:
+        prior.reject(begin_ns, end_ns, R_begin_end @ turned)
+    assert prior.calibration is not None
+    assert prior.turn(*steps[0][:2]) is not None
+    assert not prior.reject(*steps[30])
+    begin_ns, end_ns, R_begin_end = steps[31]
+    assert prior.reject(begin_ns, end_ns, R_begin_end @ turned)
+
+
 def test_a_gyroscope_of_another_clock_is_named():
     times_s, rates, R = swinging(14)
     _, used, prior = predictions(readings(times_s, rates, offset_s=1000.0), *frames(times_s, R))

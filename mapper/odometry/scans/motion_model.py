@@ -206,7 +206,6 @@ class MotionModel:
         """
         elapsed_s = self.elapsed_s(time_ns)
         self._placed += 1
-        self.prior.accept(time_ns)
         if elapsed_s >= _MIN_ELAPSED_S:
             if is_certain and self._placed > 1:  # the first is predicted without a velocity
                 constant = self.twist.over(elapsed_s)
