@@ -108,7 +108,7 @@ def holds_other_numbers(name: str) -> bool:
 
 def why_no_depths(firsts: Mapping[str, Message], depths: set[str], greys: set[str]) -> Iterator[str]:
     """Yield why images that are called depth or disparity are none, and how to tell depth from grey."""
-    if len(both := sorted(depths | greys)) > 1:
+    if len(both := sorted(depths | greys)) > 1 or greys:
         yield f"of 16 bits are {listed(both)}: source.topics.color=… and .depth=… say which is which"
     for name, first in firsts.items():
         if not isinstance(first, ImageMessage) or name in depths:
