@@ -44,7 +44,8 @@ from mapper.run.folder import Run, open_run
 from mapper.run.manifest import Levelling, RunWarning, Solve, Weight
 from mapper.run.observers import NULL_OBSERVER, Observer
 from mapper.run.stored_tracking import save_solved, save_tracking
-from mapper.run.verdict import DEPTH_TIME, MAX_SHARE
+from mapper.run.timeline import MAX_SHARE
+from mapper.run.verdict import DEPTH_TIME
 from mapper.run.writer import RunWriter, first_manifest, write_run
 from mapper.runtime.progress import SILENT, Progress
 from mapper.sensing.sweep_motion import motion_during

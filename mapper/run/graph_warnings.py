@@ -111,7 +111,10 @@ def uncertainty_warnings(results: RunResults, suggestion: str) -> Iterator[RunWa
 
 
 def step_warnings(results: RunResults, timeline: TimeLine, suggestion: str) -> Iterator[RunWarning]:
-    """Yield a warning, with what to try, if uncertain steps connect two parts of the path."""
+    """Yield a warning, with what to try, if uncertain steps connect two parts of the path.
+
+    The first or last few frames are no such part.
+    """
     try:
         relative = marginals_of(results.graph).relative
     except GraphError:
@@ -120,20 +123,23 @@ def step_warnings(results: RunResults, timeline: TimeLine, suggestion: str) -> I
         nodes: np.sqrt([covariance[part, part].trace() for part in (slice(3, 6), slice(0, 3))])
         for nodes, covariance in relative.items()
     }
-    wide = [nodes for nodes, (m, rad) in sigmas.items() if m > MAX_STEP_M or rad > MAX_STEP_RAD]
+    wide = {
+        nodes: timeline.span(*(results.graph.stamps_ns[node] for node in nodes))
+        for nodes, (m, rad) in sigmas.items()
+        if m > MAX_STEP_M or rad > MAX_STEP_RAD
+    }
+    wide = {nodes: span for nodes, span in wide.items() if not timeline.is_at_an_end(*span)}
     if not wide:
         return
     worst = max(wide, key=lambda nodes: float(sigmas[nodes][0]))
-    stamps_ns = sorted(results.graph.stamps_ns[node] for node in worst)
-    first, last = (int(index) for index in np.searchsorted(timeline.stamps_ns, stamps_ns))
     worst_m, worst_rad = sigmas[worst]
-    steps = counted(_stretches(wide, results.graph), "step")
+    steps = counted(_stretches([*wide], results.graph), "step")
     yield RunWarning(
         kind="uncertainty",
         sentence=f"{steps} between keyframes known to {MAX_STEP_M:g} m or "
         f"{np.degrees(MAX_STEP_RAD):.0f}° at best (1 σ), the worst to {worst_m:.2g} m and "
         f"{np.degrees(worst_rad):.2g}°: the parts before and after may not fit",
-        where=timeline.place(first, last),
+        where=timeline.place(*wide[worst]),
         suggestion=suggestion,
         weight="doubt",
     )

@@ -23,7 +23,7 @@ from mapper.run.graph_warnings import (
 )
 from mapper.run.manifest import Manifest, RunWarning, Verdict, Weight
 from mapper.run.results import RunResults, with_truth
-from mapper.run.timeline import TimeLine, counted
+from mapper.run.timeline import MAX_SHARE, TimeLine, counted
 
 FLOOR, DEPTH_TIME = "floor", "depth time"
 """Kinds that are found each time a run is fused; the second after tracking, too."""
@@ -51,9 +51,7 @@ INPUT_KINDS = frozenset(
 
 _ORDER: tuple[Weight, ...] = ("break", "doubt", "note")
 _LEAST_GAP_S = 0.5
-MAX_SHARE, _BROKEN_SHARE, _FEW_FRAMES = 0.05, 0.25, 2
-"""Frames that may be without a sure pose: those around them hold the path where they are single ones. Good
-logs have up to 5 %; paths that were wrong had 8 % and more."""
+_BROKEN_SHARE, _FEW_FRAMES = 0.25, 2
 _LONG_FRAMES = 3
 _MIN_COUNTED_DEPTH = 0.5
 _LEAST_AGREEMENT, _LEAST_SHARED_VOXELS = 0.15, 1000

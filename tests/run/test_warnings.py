@@ -233,6 +233,12 @@ def test_a_step_that_nothing_else_holds():
     assert found(replace(results, poses=poses), kind="uncertainty") == []
 
 
+@pytest.mark.parametrize(("step", "count"), [(1, 0), (2, 0), (39, 0), (5, 1), (38, 1)])
+def test_a_step_to_the_first_or_last_few_frames_is_none_between_parts(step, count):
+    results = results_of(wide_steps={step: PoseSigmas(0.01, 0.3)})
+    assert len(found(results, kind="uncertainty")) == count
+
+
 def test_what_was_found_while_reading_stays_and_old_notes_count():
     manifest = MANIFEST.model_copy(
         update={
