@@ -54,7 +54,7 @@ _OTHER_FILES = {
     **dict.fromkeys(_ARCHIVES, "an archive; unpack it, and open the folder"),
     **dict.fromkeys(_VIDEOS, "a video, which has no depth; open the folder of its log"),
     **dict.fromkeys((*_IMAGES, ".exr"), "one image; open the folder of its log"),
-    ".osf": "an Ouster's own format; with pip install ouster-sdk: ouster-cli source X.osf save X.pcap",
+    ".osf": "an Ouster's format; with ouster-sdk in a venv of its own: ouster-cli source X.osf save X.pcap",
     **dict.fromkeys(
         (".svo", ".svo2"),
         "a ZED's own format; export images and depth with its SDK, or record zed-ros2-wrapper's topics",
