@@ -39,6 +39,11 @@ from mapper.sources.base import Log
 _IMU = SynthImuConfig()
 _SMALL = {"width_px": 320, "height_px": 240, "texture_px_per_m": 128, "imu": _IMU}
 _RINGS = LidarSensorConfig(rings=16, lowest_ring_rad=-0.26, highest_ring_rad=0.26, azimuth_steps=450)
+_BY_HAND = {
+    "duration_s": 20.0, "speed_mps": 1.3, "mount_height_m": 1.3, "tilt_rad": 0.15, "yaw_swing_rad": 0.6,
+    "imu": _IMU,
+}  # fmt: skip
+_NEAR = {"min_range_m": 0.5, "max_range_m": 70.0}
 SCENES: Mapping[str, SynthConfig | LidarSynthConfig] = {
     "images, 180°/s, 5 Hz": SynthConfig(
         **_SMALL, frame_rate_hz=5.0, duration_s=20.0, max_yaw_rate_rad_s=3.14
@@ -65,6 +70,16 @@ SCENES: Mapping[str, SynthConfig | LidarSynthConfig] = {
         }
     ),
     "scans, stairs": LIDAR_SCENES["staircase"].model_copy(update={"duration_s": 40.0, "imu": _IMU}),
+    "scans of a zigzag, yard": LidarSynthConfig(
+        scene="courtyard", pedestrians=3, **_BY_HAND,
+        sensor=LidarSensorConfig(
+            pattern="zigzag", rings=4, azimuth_steps=5000, lowest_ring_rad=-0.12, highest_ring_rad=0.9, **_NEAR
+        ),
+    ),
+    "scans of a rosette, rooms": LidarSynthConfig(
+        scene="flat", **_BY_HAND,
+        sensor=LidarSensorConfig(pattern="rosette", rings=6, azimuth_steps=4000, **_NEAR),
+    ),
 }  # fmt: skip
 
 

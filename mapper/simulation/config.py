@@ -229,8 +229,12 @@ UNCALIBRATED: Mapping[str, float] = {
 
 
 class LidarSensorConfig(Config):
-    """A spinning multi-beam LiDAR; by default the rings of a Velodyne HDL-64E."""
+    """A multi-beam LiDAR; by default the rings of a Velodyne HDL-64E."""
 
+    pattern: Literal["rings", "rosette", "zigzag"] = "rings"
+    """"rosette": two rotating prisms swing the beams within 70° ahead, along curves that never repeat (Livox
+    Avia: 6 rings, 4000 azimuth steps); "zigzag": the beams turn, and go up and down (Livox Mid-360: 4 rings,
+    5000 azimuth steps, -0.1 to 0.9 rad)."""
     rings: PositiveInt = 64
     lowest_ring_rad: Annotated[float, Field(gt=-1.5, lt=1.5)] = -0.4346
     highest_ring_rad: Annotated[float, Field(gt=-1.5, lt=1.5)] = 0.0349

@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from mapper.core.errors import SourceError
 from mapper.core.geometry import angle_between, apply, inverse
@@ -20,6 +21,7 @@ from mapper.simulation.lidar import (
     write_lidar_log,
 )
 from mapper.simulation.lidar.solids import Shape
+from mapper.simulation.lidar.source import ray_directions
 from mapper.simulation.path import seconds_of
 from mapper.sources import open_source
 from tests.support.ideal_sensors import IDEAL_LIDAR
@@ -132,6 +134,23 @@ def test_rings_columns_and_times_are_as_configured():
     turned = (np.pi - azimuth) / (2.0 * np.pi)  # clockwise from looking back
     np.testing.assert_allclose(turned - scan.times_s / EXACT.sweep_s, 0.5 / 180, atol=1e-5)
     assert len(source.log()) == 11
+
+
+@pytest.mark.parametrize(
+    ("pattern", "lowest_rad", "highest_rad", "widest_rad"),
+    [("rosette", -0.64, 0.64, 0.615), ("zigzag", -0.37, 0.27, np.pi)],
+)
+def test_patterns_that_do_not_repeat(pattern, lowest_rad, highest_rad, widest_rad):
+    sensor = EXACT.model_copy(update={"pattern": pattern, "azimuth_steps": 4000})
+    sweeps = np.stack([ray_directions(sensor, start_s) for start_s in (0.0, 0.1)])
+    assert np.linalg.norm(sweeps, axis=-1) == pytest.approx(1.0)
+    azimuth_rad = np.abs(np.arctan2(sweeps[..., 1], sweeps[..., 0]))
+    elevation_rad = np.arcsin(sweeps[..., 2])
+    assert azimuth_rad.max() == pytest.approx(widest_rad, abs=0.01)
+    assert elevation_rad.min() == pytest.approx(lowest_rad, abs=0.02)
+    assert elevation_rad.max() == pytest.approx(highest_rad, abs=0.02)
+    first, second = sweeps[0].reshape(-1, 3), cKDTree(sweeps[1].reshape(-1, 3))
+    assert np.median(second.query(first)[0]) > 1e-3  # rings of two sweeps are the same directions
 
 
 def test_noise_dropout_and_range_are_as_configured():
