@@ -73,7 +73,8 @@ SCENES: Mapping[str, SynthConfig | LidarSynthConfig] = {
     "scans of a zigzag, yard": LidarSynthConfig(
         scene="courtyard", pedestrians=3, **_BY_HAND,
         sensor=LidarSensorConfig(
-            pattern="zigzag", rings=4, azimuth_steps=5000, lowest_ring_rad=-0.12, highest_ring_rad=0.9, **_NEAR
+            pattern="zigzag", rings=4, azimuth_steps=5000, lowest_ring_rad=-0.12, highest_ring_rad=0.9,
+            **_NEAR,
         ),
     ),
     "scans of a rosette, rooms": LidarSynthConfig(

@@ -247,7 +247,8 @@ class MotionPrior:
                 f"{name}: no readings at the times of {self._uncovered} of "
                 f"{self._uncovered + self._measured} frames; has it another clock?"
             )
-        offset_s = offset_by_speeds(gyroscope, *self._turns_measured()) if self._intervals else None
+        is_wrong = bool(self._intervals) and self.calibration is None
+        offset_s = offset_by_speeds(gyroscope, *self._turns_measured()) if is_wrong else None
         if offset_s is not None and abs(offset_s - found.offset_s) > _ANOTHER_CLOCK_S:
             late = f"{abs(offset_s):.2f} s {'late' if offset_s > 0.0 else 'early'}"
             notes.append(

@@ -1,7 +1,7 @@
 """Stretches of a log whose frames show no motion, or not all of it, bridged by inertial readings."""
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from mapper.core.doubts import Doubt
 from mapper.core.errors import GraphError
 from mapper.core.geometry import Array, Transform, adjoint, inverse
+from mapper.core.timebase import NS_PER_S
 from mapper.core.units import OTHER_UNIT
 from mapper.graph.components import component_numbers
 from mapper.graph.inertial_smoothing import SmoothedPath, smooth_path
@@ -24,7 +25,7 @@ from mapper.odometry.gyroscope_calibration import (
 )
 from mapper.pipeline.disconnected_components import largest_component
 from mapper.pipeline.tracking_result import TrackingResult
-from mapper.run.graph_warnings import MAX_STEP_M, MAX_STEP_RAD
+from mapper.run.graph_warnings import MAX_STEP_RAD
 from mapper.run.manifest import RunWarning
 from mapper.runtime.progress import SILENT, Progress
 from mapper.sensing.inertial import InertialReadings
@@ -36,6 +37,10 @@ _CONTRADICTION = 25.0
 """Variance factor from which on residuals are not noise but wrong readings: 5 standard deviations."""
 METHOD = "inertial"
 _CERTAIN = 5.0  # standard deviations
+_FAR_LESS, _LEAST_UNKNOWN_MPS = 4.0, 0.2
+"""Times the path's standard deviation of the velocity, and least one, from which on it replaces that of
+surfaces; below, poses keep what surfaces say of them."""
+_PARTS = slice(0, 3), slice(3, 6)  # rotation and translation of a covariance
 
 
 def bridge(source: Log, tracking: TrackingResult, *, progress: Progress) -> TrackingResult:
@@ -162,24 +167,11 @@ def with_body_readings(source: Log, tracking: TrackingResult) -> Log:
 
 
 def _is_weak(track: FrameResult) -> bool:
-    return (
-        track.node is None
-        or bool(track.diagnostics.unobservable)
-        or _is_open(track)
-        or _is_uncertain(track.covariance)
-    )
+    return track.node is None or bool(track.diagnostics.unobservable) or _is_open(track)
 
 
 def _is_open(track: FrameResult) -> bool:
     return any(doubt.kind == "unobservable" for doubt in track.doubts)
-
-
-def _is_uncertain(covariance: Array | None) -> bool:
-    """Return whether the verdict would doubt a motion of this (6, 6) covariance, rad² and m²."""
-    if covariance is None:
-        return False
-    variance_rad2, variance_m2 = np.trace(covariance[:3, :3]), np.trace(covariance[3:, 3:])
-    return bool(variance_rad2 > MAX_STEP_RAD**2 or variance_m2 > MAX_STEP_M**2)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -255,6 +247,7 @@ def _bridge_window(
         later = max(factor.i, factor.j)
         if later < len(tracks) and path.contradicts(factor):
             weak[later] = True
+    weak |= _know_less(tracks, path, inside.values())
     changed = _place_frames(tracks, weak, path, inside)
     replaced = _replace_factors(graph, weak, path, inside)
     connected = _connect_parts(replaced, part_of_node, path, inside)
@@ -273,6 +266,20 @@ def _bridge_window(
         tracks=(*tracking.tracks[:first], *changed, *tracking.tracks[last + 1 :]),
         graph=connected,
     )
+
+
+def _know_less(tracks: Sequence[FrameResult], path: SmoothedPath, nodes: Container[int]) -> NDArray[np.bool_]:
+    """Return the (N,) frames whose motion since a node surfaces know far less than the smoothed path does."""
+    less, last_node = np.zeros(len(tracks), np.bool_), -1
+    for k, track in enumerate(tracks):
+        if track.covariance is not None and last_node >= 0:
+            elapsed_s = (track.stamp_ns - tracks[last_node].stamp_ns) / NS_PER_S
+            sigma_mps = max(_FAR_LESS * path.velocity_sigmas_mps[k], _LEAST_UNKNOWN_MPS)
+            variance_rad2, variance_m2 = (np.trace(track.covariance[part, part]) for part in _PARTS)
+            less[k] = variance_rad2 > MAX_STEP_RAD**2 or variance_m2 > (sigma_mps * elapsed_s) ** 2
+        if k in nodes:
+            last_node = k
+    return less
 
 
 def _with_note(tracking: TrackingResult, sentence: str) -> TrackingResult:

@@ -42,7 +42,7 @@ _ROAMING_M = (1.5, 4.0)
 _LEAST_GAP_M = 12.0
 _CAR_MPS, _CYCLIST_MPS, _PEDESTRIAN_MPS = (4.0, 9.0), (3.0, 6.0), (0.7, 1.6)
 _PRISM_RAD, _PRISMS_HZ, _BEAMS_RAD = 0.307, np.array([121.57, -77.73]), 0.02
-"""Deflection of each prism, turns of both (7294 and -4664 a minute, Livox' Mid-40), half the beams' spread."""
+"""Deflection of each prism, turns of both (7294, -4664 a minute: Livox Mid-40), half of the beams' spread."""
 _TURNS_HZ, _ZIGZAGS_HZ = 10.37, 187.3
 
 
