@@ -106,7 +106,7 @@ def pose_jacobian(x, y, z, J, J_pose):
         J_pose[i, 5] = c
 
 
-@njit(cache=True, nogil=True)
+@njit(inline="always", cache=True, nogil=True)
 def huber(e, has_depth):
     """Return the weight of a residual of squared length ``e``, and its cost (Huber 1964)."""
     k = HUBER_3DOF if has_depth else HUBER_2DOF
@@ -116,7 +116,7 @@ def huber(e, has_depth):
     return k / root, 2.0 * k * root - k * k
 
 
-@njit(cache=True, nogil=True)
+@njit(inline="always", cache=True, nogil=True)
 def linearise(T, point, measured, intrinsics, r, J, J_pose):
     """Write ``residual``, ``projection_jacobian`` and ``pose_jacobian``; return whether there is depth."""
     x, y, z = residual(T, point, measured, intrinsics, r)
@@ -180,7 +180,7 @@ def scores(T_camera_world, points, measured, weights, intrinsics):
     return gradients, squares
 
 
-@njit(cache=True, nogil=True)
+@njit(inline="always", cache=True, nogil=True)
 def is_inlier(T, point, measured, weights, intrinsics, r):
     """Return whether a point is before the camera and its χ² passes the 95 % test; write its residual."""
     _, _, z = residual(T, point, measured, intrinsics, r)
