@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mapper.core.geometry import Array, Transform, inverse, log, rotation_log
+from mapper.core.geometry import Array, Transform, inverse, length_and_angle, log
 
 MEDIAN_CHI2 = 5.348
 """Median of χ² with six degrees of freedom."""
@@ -91,8 +91,7 @@ def with_model_error(information: Array, T_i_j: Transform) -> Array:
         information: (6, 6) of j's tangent (rotation, translation) from the features alone.
         T_i_j: (4, 4) the measurement.
     """
-    angle_rad = float(np.linalg.norm(rotation_log(T_i_j[:3, :3])))
-    distance_m = float(np.linalg.norm(T_i_j[:3, 3]))
+    distance_m, angle_rad = length_and_angle(T_i_j)
     return inflated(
         information,
         sigma_rad=_LEAST + MODEL_SHARE * angle_rad,

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.core.geometry import Array, adjoint, inverse, rotation_log
+from mapper.core.geometry import Array, adjoint, inverse, length_and_angle
 from mapper.graph.model import BetweenFactor
 from mapper.loops.closure import Discrepancy
 from mapper.loops.config import SLACK_RAD, GateConfig
@@ -165,8 +165,7 @@ def _edge(factor: BetweenFactor) -> _Edge:
     least = np.diag([_MAX_STEP_RAD**-2.0] * 3 + [_MAX_STEP_M**-2.0] * 3)
     information = factor.information + least if factor.origin == "odometry" else factor.information
     covariance = np.asarray(np.linalg.inv(information), np.float64)
-    path_m = float(np.linalg.norm(factor.T_i_j[:3, 3]))
-    turned_rad = float(np.linalg.norm(rotation_log(factor.T_i_j[:3, :3])))
+    path_m, turned_rad = length_and_angle(factor.T_i_j)
     sigma_rad, sigma_m = (float(np.trace(block)) ** 0.5 for block in (covariance[:3, :3], covariance[3:, 3:]))
     return _Edge(factor, covariance, path_m, turned_rad, path_m + turned_rad + sigma_m + sigma_rad)
 

@@ -11,7 +11,7 @@ from mapper.core.trajectory import Trajectory, with_rotations
 from mapper.odometry.config import GivenOdometryConfig, OdometryConfig
 from mapper.odometry.wheel_odometry import WheelsOdometry
 from mapper.sources.base import Log
-from mapper.sources.trajectory_files import POSE_COLUMNS, read_tum, tum_rows
+from mapper.sources.trajectory_files import read_tum
 
 
 class GivenOdometry(WheelsOdometry):
@@ -44,7 +44,7 @@ def poses_for(config: OdometryConfig, log: Log) -> Trajectory | None:
         return log.device_poses if (truth := with_rotations(log.truth)) is None else truth
     path = _found(config.path, log)
     poses = read_tum(path)
-    if len(next(tum_rows(path))[1]) < len(POSE_COLUMNS):
+    if with_rotations(poses) is None:
         raise ConfigError(f"{path}: positions alone; odometry.kind=given needs rotations, qx qy qz qw, too")
     (first_ns, last_ns), (begin_ns, end_ns) = poses.stamps_ns[[0, -1]], log.stamps_ns[[0, -1]]
     if last_ns < begin_ns or first_ns > end_ns:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from mapper.core.deskew import SampledMotion, Twist
-from mapper.core.geometry import Array, Transform, inverse, rotation_log
+from mapper.core.geometry import Array, Transform, angle_between, angle_of, inverse
 from mapper.core.running_median import RunningMedian
 from mapper.core.timebase import NS_PER_S, Stamps
 from mapper.core.trajectory import Trajectory
@@ -27,7 +27,9 @@ from mapper.sensing.wheel_kinematics import pose_at
 
 _FIRST_FIT, _FITS_GROW, _MOST_BETWEEN_FITS = 8, 1.5, 100
 _KEPT = 400  # intervals that a fit uses: bias drifts over minutes
-_ERRORS, _FEWEST_ERRORS, _MOST_REJECTED_FRAMES = 30, 5, 15
+_ERRORS, _FEWEST_ERRORS = 30, 5
+_MOST_REJECTED_FRAMES = 15
+"""In a row: as many as images, and more than scans, are lost before a new sub-map begins."""
 _MEDIAN_LENGTH = 1.538  # of a vector of three independent normal errors, in standard deviations
 _LONGEST_TURN_RAD = 2.8
 _SLIPPED, _STANDING_M = 0.5, 0.05
@@ -169,7 +171,7 @@ class MotionPrior:
             R_constant: (3, 3) by constant velocity.
         """
         gyroscope = self._gyroscope
-        if gyroscope is None or np.linalg.norm(rotation_log(R_begin_end)) > _LONGEST_TURN_RAD:
+        if gyroscope is None or angle_of(R_begin_end) > _LONGEST_TURN_RAD:
             return
         found = self._turn(begin_ns, end_ns)
         self._turns.clear()
@@ -177,8 +179,8 @@ class MotionPrior:
             self._uncovered += 1
             return
         self._used += self._is_better(*found)
-        self._errors.append(float(np.linalg.norm(rotation_log(found[0].T @ R_begin_end))))
-        self._errors_without.append(float(np.linalg.norm(rotation_log(R_constant.T @ R_begin_end))))
+        self._errors.append(angle_between(found[0], R_begin_end))
+        self._errors_without.append(angle_between(R_constant, R_begin_end))
         self._intervals.append((begin_ns, end_ns, R_begin_end))
         self._measured += 1
         if self._measured >= self._next_fit:
@@ -196,7 +198,7 @@ class MotionPrior:
         if found is None or len(self._errors) < _FEWEST_ERRORS or not self._is_better(*found):
             return False
         sigma_rad = math.hypot(found[1], float(np.median(self._errors)) / _MEDIAN_LENGTH)
-        off_rad = float(np.linalg.norm(rotation_log(found[0].T @ R_begin_end)))
+        off_rad = angle_between(found[0], R_begin_end)
         if off_rad <= max(_CONTRADICTION_RAD, _CONTRADICTION_SIGMAS * sigma_rad):
             self._rejected_frames = 0
             return False
@@ -234,7 +236,7 @@ class MotionPrior:
         stated = gyroscope.R_body_imu
         origin = "found from the log"
         if stated is not None:
-            off = float(np.linalg.norm(rotation_log(stated @ found.R_body_imu.T)))
+            off = angle_between(stated.T, found.R_body_imu.T)
             origin = "from tf"
             if off > _ANOTHER_RAD and sigmas[:3].max() < CERTAIN_RAD:
                 notes.append(
@@ -247,8 +249,8 @@ class MotionPrior:
                 f"{name}: no readings at the times of {self._uncovered} of "
                 f"{self._uncovered + self._measured} frames; has it another clock?"
             )
-        is_wrong = bool(self._intervals) and self.calibration is None
-        offset_s = offset_by_speeds(gyroscope, *self._turns_measured()) if is_wrong else None
+        is_unused = bool(self._intervals) and self.calibration is None
+        offset_s = offset_by_speeds(gyroscope, *self._turns_measured()) if is_unused else None
         if offset_s is not None and abs(offset_s - found.offset_s) > _ANOTHER_CLOCK_S:
             late = f"{abs(offset_s):.2f} s {'late' if offset_s > 0.0 else 'early'}"
             notes.append(
@@ -277,7 +279,7 @@ class MotionPrior:
         R_turned, _, _ = self._calibration.turns(gyroscope, begins_ns[-count:], ends_ns[-count:])
         self._errors.clear()
         self._errors.extend(
-            float(np.linalg.norm(rotation_log(turned.T @ measured)))
+            angle_between(turned, measured)
             for turned, measured in zip(R_turned, R_begin_end[-count:], strict=True)
         )
 
@@ -301,7 +303,7 @@ class MotionPrior:
     def _is_better(self, R: Array, sigma_rad: float) -> bool:
         """Return whether a rotation of the gyroscope is more certain than constant velocity."""
         if len(self._errors_without) < _FEWEST_ERRORS:  # it may just have begun to turn
-            return sigma_rad < float(np.linalg.norm(rotation_log(R))) / math.sqrt(3.0)
+            return sigma_rad < angle_of(R) / math.sqrt(3.0)
         own = float(np.median(self._errors)) / _MEDIAN_LENGTH
         without = float(np.median(self._errors_without)) / _MEDIAN_LENGTH
         return math.hypot(sigma_rad, own) < without

@@ -151,11 +151,18 @@ def _matrices(path: Path, lines: Iterable[tuple[int, list[str]]], stamps_ns: Sta
 def has_poses(path: Path) -> bool:
     """Return whether a file's first line is a stamp and a pose or a position."""
     with suppress(DataError):
-        if is_mulran(path):
-            return True
-        _, words = next(tum_rows(path), (0, []))
-        return len(words) in (len(POSITION_COLUMNS), len(POSE_COLUMNS))
+        return is_mulran(path) or is_tum(path)
     return False
+
+
+def is_tum(path: Path) -> bool:
+    """Return whether a file's first line is what `read_tum` reads.
+
+    Raises:
+        DataError: The file cannot be read.
+    """
+    _, words = next(tum_rows(path), (0, []))
+    return len(words) in (len(POSITION_COLUMNS), len(POSE_COLUMNS))
 
 
 def is_mulran(path: Path) -> bool:
@@ -196,16 +203,17 @@ def tum_rows(path: Path) -> Iterator[tuple[int, list[str]]]:
     Raises:
         DataError: The file cannot be read, or a line begins as EuRoC's and has no unit quaternion.
     """
-    header, columns = "", list[int]()
+    columns, unit = list[int](), ""
     has_begun = False
     for number, line in enumerate(read_text(path, may_be_pipe=True).splitlines(), start=1):
         words = _words(line)
         is_comment = bool(words) and words[0].startswith(("#", "%"))
         if not has_begun and (is_comment or not any(map(_NUMBER.match, words))):
-            columns, header = (found, line) if (found := _columns_of(line)) else (columns, header)
+            if found := _columns_of(line):
+                columns, unit = found, _stamp_unit(line)
         elif words and not is_comment:
             if columns and max(columns) < len(words):
-                words = _picked(words, columns, header)
+                words = _picked(words, columns, unit)
             elif _EUROC.match(line) is not None and len(words) >= len(POSE_COLUMNS):
                 _refuse_another_csv(f"{path}:{number}", words)
                 words = [f"{words[0]}e-9", *words[1:4], *words[5:8], words[4]]
@@ -241,13 +249,18 @@ def _columns_of(header: str) -> list[int]:
     ]
 
 
-def _picked(words: list[str], columns: list[int], header: str) -> list[str]:
-    """Return stamp, position and perhaps quaternion of a row by the columns that its header names."""
+def _stamp_unit(header: str) -> str:
+    unit = _STAMP_UNIT.search(header)
+    return "" if unit is None else unit[1]
+
+
+def _picked(words: list[str], columns: list[int], unit: str) -> list[str]:
+    """Return stamp, position and perhaps quaternion of a row by the header's columns and unit of stamps."""
     stamp, *numbers = (words[k] for k in columns)
     if len(columns) in (len(POSITION_COLUMNS) + 1, len(POSE_COLUMNS) + 1):
         stamp = f"{stamp}.{numbers.pop():0>9}"
-    elif (unit := _STAMP_UNIT.search(header)) and epoch_ns(stamp) is None:
-        stamp = f"{stamp}e-{_DIGITS[unit[1]]}"
+    elif unit and epoch_ns(stamp) is None:
+        stamp = f"{stamp}e-{_DIGITS[unit]}"
     return [stamp, *numbers]
 
 

@@ -43,7 +43,7 @@ _LEAST_GAP_M = 12.0
 _CAR_MPS, _CYCLIST_MPS, _PEDESTRIAN_MPS = (4.0, 9.0), (3.0, 6.0), (0.7, 1.6)
 _PRISM_RAD, _PRISMS_HZ, _BEAMS_RAD = 0.307, np.array([121.57, -77.73]), 0.02
 """Deflection of each prism, turns of both (7294, -4664 a minute: Livox Mid-40), half of the beams' spread."""
-_TURNS_HZ, _ZIGZAGS_HZ = 10.37, 187.3
+_TURNS_HZ, _ZIGZAGS_HZ = 10.37, 187.3  # of no common period, so that sweeps differ
 
 
 def firing_times_s(sensor: LidarSensorConfig) -> Array:
@@ -72,9 +72,9 @@ def ray_directions(sensor: LidarSensorConfig, start_s: float = 0.0) -> Array:
         azimuth = np.pi - 2.0 * np.pi * _TURNS_HZ * times_s + _BEAMS_RAD * across
         height = np.abs(2.0 * (_ZIGZAGS_HZ * times_s % 1.0) - 1.0)
         elevation = lowest_rad + (highest_rad - lowest_rad) * height + _BEAMS_RAD * across
-    azimuth, elevation = np.broadcast_arrays(azimuth, elevation)
-    flat = np.cos(elevation)
-    return np.stack([np.cos(azimuth) * flat, np.sin(azimuth) * flat, np.sin(elevation)], axis=2)
+    flat, up = np.cos(elevation), np.sin(elevation)
+    directions = np.broadcast_arrays(np.cos(azimuth) * flat, np.sin(azimuth) * flat, up)
+    return np.stack(directions, axis=2)
 
 
 def measure(

@@ -23,14 +23,7 @@ from mapper.sources.point_times import times_told
 from mapper.sources.scan_folders.scans import read_scan
 from mapper.sources.scan_stamps import in_order, line_of_each, scan_stamps
 from mapper.sources.text import time_order, told_without_rotations, truth_from
-from mapper.sources.trajectory_files import (
-    POSE_COLUMNS,
-    POSITION_COLUMNS,
-    is_mulran,
-    read_kitti,
-    read_mulran,
-    tum_rows,
-)
+from mapper.sources.trajectory_files import is_mulran, is_tum, read_kitti, read_mulran
 
 _TEXT_ENDINGS = (".txt", ".csv")
 _SAMPLED = 5
@@ -232,7 +225,7 @@ def _read_truth(
         return None, []
     if is_mulran(path):
         return told_without_rotations(read_mulran(path), [], what=path.name)
-    if len(next(tum_rows(path), (0, []))[1]) in (len(POSE_COLUMNS), len(POSITION_COLUMNS)):
+    if is_tum(path):
         return read_truth(path)
     T_world_posed = read_kitti(path).T_world_body
     lines = line_of_each(files, len(T_world_posed))
