@@ -1,5 +1,6 @@
 """Result of the first pass over a log: every frame's result, and the graph before it is solved."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -97,7 +98,7 @@ def refuse_a_fragment(
         TrackingError: Fewer frames were tracked, without a doubt, than the configuration requires.
     """
     read, tracked = len(tracking.tracks), len(tracking.tracked)
-    enough = max(config.min_tracked_frames, config.min_tracked_ratio * read)
+    enough = max(config.min_tracked_frames, math.ceil(round(config.min_tracked_ratio * read, 6)))
     if tracked >= enough:
         return
     if read == 0 and tracking.skipped:
@@ -122,7 +123,7 @@ def refuse_a_fragment(
         found = f"{found} ({unseen[-1].doubts[-1].text})"
         hint = see_more(has_wheels=tracking.graph.has_wheels)
     raise TrackingError(
-        f"{found}, want at least {enough:.0f}; {hint} "
+        f"{found}, want at least {enough}; {hint} "
         f"(min_tracked_frames and min_tracked_ratio set the limit){unread}"
     )
 

@@ -62,12 +62,12 @@ def selected(log: Log, config: SourceConfig) -> Log:
     return replace(log.subset(used), beside=beside, notes=notes)
 
 
-def too_few_text(frames: int, least: float, notes: Iterable[str]) -> str:
+def too_few_text(frames: int, least: int, notes: Iterable[str]) -> str:
     """Return that a log has too few frames for a map, with what was left out of it by its notes."""
     left_out = next((note for note in notes if "left out" in note or "frozen" in note), None)
     read = f"only {frames} {'frame was' if frames == 1 else 'frames were'} read"
     remedy = "record longer, or lower that limit" if left_out is None else left_out
-    return f"{read}, want at least {least:.0f} (min_tracked_frames); {remedy}"
+    return f"{read}, want at least {least} (min_tracked_frames); {remedy}"
 
 
 def _has_truth(log: Log, *, max_gap_s: float) -> NDArray[np.bool_]:
