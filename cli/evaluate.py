@@ -39,6 +39,12 @@ def evaluate(
     truth: Annotated[
         Path | None, typer.Option(help="TUM, KITTI or EuRoC trajectory of the truth; omit for the run's own.")
     ] = None,
+    relations: Annotated[
+        Path | None,
+        typer.Option(
+            help="Known relative poses, as of the Intel lab: lines of time1 time2 x y z roll pitch yaw."
+        ),
+    ] = None,
     times: Annotated[
         Path | None,
         typer.Option(
@@ -127,6 +133,7 @@ def evaluate(
     mapper eval runs/flat --map logs/flat --sharpness
     """
     from mapper.evaluators.metrics.evaluate import estimate_and_truth, run_metrics
+    from mapper.evaluators.metrics.relations import read_relations, relation_metrics
     from mapper.run.manifest import is_merged_map
 
     of_log = {"--sharpness": sharpness, "--agreement": agreement, "--against": against}
@@ -135,6 +142,7 @@ def evaluate(
     if is_merged:
         only_of_runs = {
             "--truth": truth,
+            "--relations": relations,
             "--times": times,
             "--log": log,
             "--lengths": lengths,
@@ -161,6 +169,8 @@ def evaluate(
         names=(str(estimate), str(truth) if truth else "its truth"),
     )
     metrics = list(found.metrics)
+    if relations is not None:
+        metrics += relation_metrics(trajectory, read_relations(relations))
     if run is not None:
         metrics += run_metrics(run, known)
     else:
