@@ -26,7 +26,7 @@ from mapper.sources.ros.encode_ros import (
     path_message,
     transforms_message,
 )
-from mapper.sources.ros.message_writers import rosbag2_writer
+from mapper.sources.ros.message_writers import write_rosbag2
 
 _NAME = "results"
 
@@ -41,19 +41,15 @@ def rosbag2(run: Run, path: Path, _progress: Progress) -> None:
     """
     images, transforms = snapshots_of(run), transforms_of(run)
     first = next(images, None)
-    with (
-        export_folder(run, path, "rosbag2", files=("metadata.yaml", f"{_NAME}.mcap")) as folder,
-        rosbag2_writer(folder, name=_NAME) as writer,
-    ):
-        for message in _latched_messages(run, transforms, first):
-            writer.write(message._replace(is_latched=True))
-        timed = (
-            _image_messages(image, transforms.camera_of(image))
-            for image in chain([first] if first else [], images)
-        )
-        poses = (transforms_message(stamp_ns, "/tf", links) for stamp_ns, links in transforms.moving)
-        for message in heapq.merge(poses, chain.from_iterable(timed), key=lambda message: message.stamp_ns):
-            writer.write(message)
+    latched = (one._replace(is_latched=True) for one in _latched_messages(run, transforms, first))
+    timed = (
+        _image_messages(image, transforms.camera_of(image))
+        for image in chain([first] if first else [], images)
+    )
+    poses = (transforms_message(stamp_ns, "/tf", links) for stamp_ns, links in transforms.moving)
+    moving = heapq.merge(poses, chain.from_iterable(timed), key=lambda message: message.stamp_ns)
+    with export_folder(run, path, "rosbag2", files=("metadata.yaml", f"{_NAME}.mcap")) as folder:
+        write_rosbag2(folder, chain(latched, moving), name=_NAME)
 
 
 def _latched_messages(

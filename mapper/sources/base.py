@@ -134,6 +134,17 @@ class WrappedEntry:
         return self.entry.scan()
 
 
+@dataclass(frozen=True, slots=True)
+class _ChangedEntry(WrappedEntry):
+    change: Callable[[Frame], Frame]
+
+    def load(self, *, colour: bool = True) -> Frame:
+        return self.change(self.entry.load(colour=colour))
+
+    def scan(self) -> Scan:
+        return self.change(self.entry.scan()).scan()
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Accelerations:
     """Accelerometer readings of a log.
@@ -349,6 +360,13 @@ class Log:
     def spread_entries(self, most: int) -> Iterator[FrameRef]:
         """Yield the entries of at most ``most`` frames, evenly spread over the log."""
         return map(self.entry_at, self.spread_indices(most))
+
+    def with_frames(self, change: Callable[[Frame], Frame]) -> "Log":
+        """Return the log with what a function makes of each frame or scan that is read.
+
+        Encoded images stay as they were recorded. The function raises ``FrameError`` where nothing is left.
+        """
+        return replace(self, entry_at=lambda index: _ChangedEntry(self.entry_at(index), change))
 
     def subset(self, indices: NDArray[np.intp]) -> "Log":
         """Return the log with only the frames of some increasing indices; all else stays as it is."""

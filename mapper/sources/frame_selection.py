@@ -4,7 +4,7 @@ Times of a LiDAR's points are as the user says they are: scaled, ignored, or by 
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from mapper.core.errors import SourceError
 from mapper.core.frames import Frame, Scan
 from mapper.core.timebase import NS_PER_S, nearest
-from mapper.sources.base import Log, WrappedEntry
+from mapper.sources.base import Log
 from mapper.sources.config import SourceConfig
 from mapper.sources.merged_scans import with_whole_turns
 from mapper.sources.point_times import azimuth_times_s
@@ -87,39 +87,17 @@ def with_point_times(log: Log, *, time_scale: float, sweep_s: float | None) -> L
         time_scale: Factor on the times of the points; 0 leaves them out.
         sweep_s: Duration of a turn of scans without times, which get some by azimuth; None leaves them.
     """
-    return replace(log, entry_at=lambda index: _TimedEntry(log.entry_at(index), time_scale, sweep_s))
 
+    def timed(frame: Frame) -> Frame:
+        if not isinstance(frame, Scan):
+            return frame
+        if frame.times_s is not None:
+            return replace(frame, times_s=_scaled(frame.times_s, time_scale))
+        if sweep_s is None:
+            return frame
+        return replace(frame, times_s=azimuth_times_s(frame.points_body, frame.origin_body, sweep_s))
 
-@dataclass(frozen=True, slots=True)
-class _TimedEntry(WrappedEntry):
-    """Scan of another log with other times; its files have those that were recorded."""
-
-    time_scale: float
-    sweep_s: float | None
-
-    def load(self, *, colour: bool = True) -> Frame:
-        """Read the scan.
-
-        Raises:
-            FrameError: As the recorded scan.
-        """
-        frame = self.entry.load(colour=colour)
-        return self._timed(frame) if isinstance(frame, Scan) else frame
-
-    def scan(self) -> Scan:
-        """Read the scan.
-
-        Raises:
-            FrameError: As the recorded scan.
-        """
-        return self._timed(self.entry.scan())
-
-    def _timed(self, scan: Scan) -> Scan:
-        if scan.times_s is not None:
-            return replace(scan, times_s=_scaled(scan.times_s, self.time_scale))
-        if self.sweep_s is None:
-            return scan
-        return replace(scan, times_s=azimuth_times_s(scan.points_body, scan.origin_body, self.sweep_s))
+    return log.with_frames(timed)
 
 
 def _scaled(times_s: NDArray[np.float32], scale: float) -> NDArray[np.float32] | None:

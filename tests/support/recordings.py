@@ -18,7 +18,7 @@ from mapper.sources.ros.encode_ros import (
     image_message,
     transforms_message,
 )
-from mapper.sources.ros.message_writers import message_writer
+from mapper.sources.ros.message_writers import write_recording_file
 from mapper.sources.ros.typestore import serialize, typestore
 from tests.support.tum_logs import FIRST_NS, PERIOD_NS, picture
 
@@ -62,9 +62,7 @@ def transforms(
 def write(path: Path, messages: Iterable[SerializedMessage]) -> Path:
     """Write messages in the order given, into whatever the path is named as."""
     if path.suffix in (".mcap", ".bag"):
-        with message_writer(path, kind=path.suffix[1:]) as writer:
-            for message in messages:
-                writer.write(message)
+        write_recording_file(path, messages, kind=path.suffix[1:])
     else:
         write_folder(Writer(path, version=9, storage_plugin=StoragePlugin.SQLITE3), messages)
     return path

@@ -26,7 +26,7 @@ from mapper.sources.ros.encode_ros import (
     transforms_message,
 )
 from mapper.sources.ros.image_messages import DEPTH_HEADER
-from mapper.sources.ros.message_writers import RecordingKind, message_writer
+from mapper.sources.ros.message_writers import RecordingKind, write_recording_file
 from mapper.sources.ros.topics import TRUTH, WHEELS
 
 COLOR, DEPTH = "/camera/color", "/camera/aligned_depth_to_color"
@@ -65,17 +65,10 @@ def write_recording(
         raise SourceError(f"{out}: already there; give a file that does not exist yet")
     skipped: list[Skipped] = []
     first = _first_frame(source)
-    with message_writer(out, kind=kind) as writer:
-        frames = _frames(source, first, skipped, on_progress)
-        for message in heapq.merge(
-            frames,
-            _truth(source),
-            _wheels(source),
-            _imu(source),
-            _fixes(source),
-            key=lambda message: message.stamp_ns,
-        ):
-            writer.write(message)
+    frames = _frames(source, first, skipped, on_progress)
+    readings = _truth(source), _wheels(source), _imu(source), _fixes(source)
+    messages = heapq.merge(frames, *readings, key=lambda message: message.stamp_ns)
+    write_recording_file(out, messages, kind=kind)
     return skipped
 
 

@@ -1,14 +1,14 @@
-"""Recordings written one message at a time: MCAP files (ROS 2), ROS 1 bags and ROS 2 bags."""
+"""Messages written as recordings: MCAP files (ROS 2), ROS 1 bags and ROS 2 bags."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable
+from functools import cache
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 from mcap.writer import CompressionType
-from mcap.writer import Writer as McapFileWriter
+from mcap.writer import Writer as McapWriter
 from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
-from rosbags.rosbag1 import Writer as BagFileWriter
+from rosbags.rosbag1 import Writer as BagWriter
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Bag2Writer
 
@@ -21,104 +21,63 @@ RecordingKind = Literal["mcap", "bag"]
 _DEPTH = 100  # messages that wait for a slow subscriber: tf2's own
 
 
-class MessageWriter(Protocol):
-    """An open file of messages."""
-
-    def write(self, message: SerializedMessage) -> None:
-        """Append a message; its log time is its stamp."""
-        ...
-
-
-@contextmanager
-def message_writer(path: Path, *, kind: RecordingKind) -> Iterator[MessageWriter]:
-    """Yield a writer of a file, compressed by LZ4, that appears whole or not at all."""
+def write_recording_file(path: Path, messages: Iterable[SerializedMessage], *, kind: RecordingKind) -> None:
+    """Write messages, whose log times are their stamps, into a file that appears whole or not at all."""
     with atomic_file(path) as part:
-        if kind == "bag":
-            part.unlink()  # the writer of bags makes the file itself
-            bag = BagFileWriter(part)
-            bag.set_compression(BagFileWriter.CompressionFormat.LZ4)
-            with bag:
-                yield _BagWriter(bag)
-        else:
-            with part.open("wb") as file:
-                mcap = McapFileWriter(file, compression=CompressionType.LZ4, enable_data_crcs=True)
-                mcap.start(profile="ros2", library="mapper")
-                yield _McapWriter(mcap)
-                mcap.finish()
+        (_write_mcap if kind == "mcap" else _write_bag)(part, messages)
 
 
-@contextmanager
-def rosbag2_writer(folder: Path, *, name: str) -> Iterator[MessageWriter]:
-    """Yield a writer of a ROS 2 bag in a folder: NAME.mcap, and ``metadata.yaml`` when it is whole.
+def _write_mcap(path: Path, messages: Iterable[SerializedMessage]) -> None:
+    with path.open("wb") as file:
+        mcap = McapWriter(file, compression=CompressionType.LZ4, enable_data_crcs=True)
+
+        @cache
+        def schema(type_: str) -> Any:
+            return mcap.register_schema(type_, "ros2msg", definition(type_).encode())
+
+        @cache
+        def channel(topic: str, type_: str) -> Any:
+            return mcap.register_channel(topic, "cdr", schema(type_))
+
+        mcap.start(profile="ros2", library="mapper")
+        for stamp_ns, topic, type_, cdr, _ in messages:
+            mcap.add_message(channel(topic, type_), log_time=stamp_ns, data=cdr, publish_time=stamp_ns)
+        mcap.finish()
+
+
+def _write_bag(path: Path, messages: Iterable[SerializedMessage]) -> None:
+    path.unlink()  # its writer makes the file itself
+    bag = BagWriter(path)
+    bag.set_compression(BagWriter.CompressionFormat.LZ4)
+
+    @cache
+    def connection(topic: str, type_: str) -> Any:
+        return bag.add_connection(topic, type_, typestore=typestore("ros1"))
+
+    with bag:
+        for stamp_ns, topic, type_, cdr, _ in messages:
+            bag.write(connection(topic, type_), stamp_ns, typestore("cdr").cdr_to_ros1(cdr, type_))
+
+
+def write_rosbag2(folder: Path, messages: Iterable[SerializedMessage], *, name: str) -> None:
+    """Write messages as a ROS 2 bag in a folder: NAME.mcap, and ``metadata.yaml`` when it is whole.
 
     The metadata is of version 8, the last that ROS 2 Humble reads too.
     """
     bag = Bag2Writer(folder / name, version=8, storage_plugin=StoragePlugin.MCAP)  # names its file so, too
     bag.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+
+    @cache
+    def connection(topic: str, type_: str, is_latched: bool) -> Any:
+        quality = _quality(is_latched=is_latched)
+        return bag.add_connection(topic, type_, typestore=typestore("cdr"), offered_qos_profiles=[quality])
+
     with bag:
-        yield _Bag2Writer(bag)
+        for stamp_ns, topic, type_, cdr, is_latched in messages:
+            bag.write(connection(topic, type_, is_latched), stamp_ns, cdr)
     for file in list(bag.path.iterdir()):
         file.replace(folder / file.name)
     bag.path.rmdir()
-
-
-class _McapWriter:
-    """Writer of an MCAP file; see :class:`MessageWriter`."""
-
-    def __init__(self, writer: McapFileWriter) -> None:
-        self._writer = writer
-        self._schemas: dict[str, int] = {}
-        self._channels: dict[str, int] = {}
-
-    def write(self, message: SerializedMessage) -> None:
-        if message.topic not in self._channels:
-            self._channels[message.topic] = self._register(message.topic, message.type)
-        self._writer.add_message(
-            self._channels[message.topic],
-            log_time=message.stamp_ns,
-            data=message.cdr,
-            publish_time=message.stamp_ns,
-        )
-
-    def _register(self, topic: str, type_: str) -> int:
-        if type_ not in self._schemas:
-            text = definition(type_).encode()
-            self._schemas[type_] = self._writer.register_schema(type_, "ros2msg", text)
-        return int(self._writer.register_channel(topic, "cdr", self._schemas[type_]))
-
-
-class _BagWriter:
-    """Writer of a ROS 1 bag; see :class:`MessageWriter`."""
-
-    def __init__(self, writer: BagFileWriter) -> None:
-        self._writer = writer
-        self._connections: dict[str, Any] = {}
-
-    def write(self, message: SerializedMessage) -> None:
-        if message.topic not in self._connections:
-            self._connections[message.topic] = self._writer.add_connection(
-                message.topic, message.type, typestore=typestore("ros1")
-            )
-        data = typestore("cdr").cdr_to_ros1(message.cdr, message.type)
-        self._writer.write(self._connections[message.topic], message.stamp_ns, data)
-
-
-class _Bag2Writer:
-    """Writer of a ROS 2 bag; see :class:`MessageWriter`."""
-
-    def __init__(self, writer: Bag2Writer) -> None:
-        self._writer = writer
-        self._connections: dict[str, Any] = {}
-
-    def write(self, message: SerializedMessage) -> None:
-        if message.topic not in self._connections:
-            self._connections[message.topic] = self._writer.add_connection(
-                message.topic,
-                message.type,
-                typestore=typestore("cdr"),
-                offered_qos_profiles=[_quality(is_latched=message.is_latched)],
-            )
-        self._writer.write(self._connections[message.topic], message.stamp_ns, message.cdr)
 
 
 def _quality(*, is_latched: bool) -> Qos:
