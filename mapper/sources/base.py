@@ -168,6 +168,11 @@ Readings = TypeVar("Readings", Trajectory, Gyroscope, Accelerations, GnssFixes)
 """What a log has at stamps of its own, in ``stamps_ns``."""
 
 
+def later(readings: Readings | None, shift_ns: int) -> Readings | None:
+    """Return readings whose stamps are raised."""
+    return readings and replace(readings, stamps_ns=readings.stamps_ns + shift_ns)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraImages:
     """Images of a camera beside the sensor that is mapped.

@@ -1,7 +1,6 @@
 """Inertial readings beside a log: ``imu.csv`` as of EuRoC, or angular velocities in ``gyroscope.txt``."""
 
 import re
-from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
@@ -10,18 +9,17 @@ import numpy as np
 from mapper.core.errors import SourceError
 from mapper.core.geometry import Array
 from mapper.core.timebase import Stamps, seconds_text_from_ns
-from mapper.core.units import unit_of_gravity
+from mapper.core.units import GRAVITY_MPS2, unit_of_gravity
 from mapper.sensing.gyroscope import Gyroscope, range_end
 from mapper.sources.base import Accelerations
-from mapper.sources.text import parse_numbers, parse_stamp, read_lines, rows, table, time_order
+from mapper.sources.text import parse_numbers, parse_stamp, read_lines, rows, stamped_numbers, time_order
 
 BOTH, RATES = "imu.csv", "gyroscope.txt"
 _COLUMNS = np.dtype([("stamp_ns", "<i8"), ("rates", "<f8", 3), ("accelerations", "<f8", 3)])
 _NAMES = (BOTH, "imu.txt", "IMU.csv", "imu_data.csv", "imu_data.txt")
 _BETWEEN = r"\s*[,;]\s*|\s+"
-_RATES, _ACCELERATIONS = "(?:w|g(?!rav)|ang(?!le)|omega|rot(?!ation_?[xyz]$))", "(?:a(?!ng|lpha)|lin)"
+_RATES, _ACCELERATIONS = "(?:w|g(?!rav)|alpha|ang(?!le)|omega|rot(?!ation_?[xyz]$))", "(?:a(?!ng|lpha)|lin)"
 """Beginnings of the names of columns."""
-_STRAY_COLUMNS = ("timestamp", "a_x", "a_y", "a_z", "alpha_x", "alpha_y", "alpha_z")
 _SHAKEN = 1.2
 """The end of a range is beyond this many times gravity: of those at rest many are the largest."""
 BOTH_HEADER = (
@@ -38,31 +36,32 @@ def read_imu(folder: Path) -> tuple[Gyroscope | None, Accelerations | None, list
 
     Args:
         folder: Folder that may hold ``imu.csv`` (``stamp_ns,wx,wy,wz,ax,ay,az``, its first line EuRoC's, or
-            Stray Scanner's, of which the angular velocities are read, or one that names the columns) or
+            one that names the columns, as Stray Scanner's, of which the angular velocities are read) or
             ``gyroscope.txt`` (``stamp wx wy wz``); rad/s and m/s², in the unit's own axes.
 
     Raises:
         SourceError: A file is malformed.
     """
-    if (folder / RATES).is_file():
-        path = folder / RATES
-        stamps_ns, rates = [], []
-        for where, words in table(path, "stamp", "wx", "wy", "wz"):
-            stamps_ns.append(parse_stamp(words[0], where=where))
-            rates.append(parse_numbers(words[1:], where=where))
-        stamps = np.array(stamps_ns, np.int64)
-        gyroscope, notes = gyroscope_of(path.name, stamps, np.array(rates, np.float64).reshape(-1, 3))
+    if (path := folder / RATES).is_file():
+        gyroscope, notes = gyroscope_of(path.name, *stamped_numbers(path, "stamp", "wx", "wy", "wz"))
         return gyroscope, None, notes
     named = [one for name in _NAMES if (one := folder / name).is_file()]
     if not named:
         return None, None, []
-    path = named[0]
-    lines = read_lines(path)
-    if lines and all(name in lines[0] for name in _STRAY_COLUMNS):
-        return _stray_rates(path, lines)
-    if lines and "w_RS_S_x" in lines[0]:
-        return _readings(path, lines)
-    return _by_columns(path)
+    is_eurocs = "w_RS_S_x" in "".join(read_lines(named[0])[:1])
+    return read_euroc_imu(named[0]) if is_eurocs else _by_columns(named[0])
+
+
+def read_accelerometer(folder: Path) -> tuple[Accelerations | None, list[str]]:
+    """Return the readings of ``accelerometer.txt`` (lines of ``stamp ax ay az``), if the folder has one.
+
+    Raises:
+        SourceError: A line is not four numbers.
+    """
+    path = folder / "accelerometer.txt"
+    if not path.is_file():
+        return None, []
+    return accelerations_of(path.name, *stamped_numbers(path, "stamp", "ax", "ay", "az"))
 
 
 def read_euroc_imu(path: Path) -> tuple[Gyroscope | None, Accelerations | None, list[str]]:
@@ -71,19 +70,21 @@ def read_euroc_imu(path: Path) -> tuple[Gyroscope | None, Accelerations | None, 
     Raises:
         SourceError: The file is malformed.
     """
-    return _readings(path, read_lines(path))
-
-
-def _readings(path: Path, lines: Sequence[str]) -> tuple[Gyroscope | None, Accelerations | None, list[str]]:
     try:
-        readings = np.loadtxt(lines, _COLUMNS, delimiter=",", ndmin=1)
+        readings = np.loadtxt(read_lines(path), _COLUMNS, delimiter=",", ndmin=1)
     except ValueError as error:
         lengths = ((number, len(words)) for number, words in rows(path, separator=","))
         wrong = (f"line {number} has {n} columns between commas" for number, n in lengths if n != 7)
         raise SourceError(f"{path}: {next(wrong, error)}; want stamp_ns,wx,wy,wz,ax,ay,az") from None
-    gyroscope, notes = gyroscope_of(path.name, readings["stamp_ns"], readings["rates"])
-    accelerations, more = accelerations_of(path.name, readings["stamp_ns"], readings["accelerations"])
-    return gyroscope, accelerations, list(dict.fromkeys([*notes, *more]))
+    return _both(path.name, readings["stamp_ns"], readings["rates"], readings["accelerations"])
+
+
+def _both(
+    name: str, stamps_ns: Stamps, rates_radps: Array, accelerations: Array
+) -> tuple[Gyroscope | None, Accelerations | None, list[str]]:
+    gyroscope, notes = gyroscope_of(name, stamps_ns, rates_radps)
+    felt, more = accelerations_of(name, stamps_ns, accelerations) if accelerations.size else (None, [])
+    return gyroscope, felt, list(dict.fromkeys([*notes, *more]))
 
 
 def _by_columns(path: Path) -> tuple[Gyroscope | None, Accelerations | None, list[str]]:
@@ -109,15 +110,14 @@ def _by_columns(path: Path) -> tuple[Gyroscope | None, Accelerations | None, lis
         first, second = second, first
     if re.search("deg|°", header):
         first = np.radians(first)
-    if second.size and _feels_gravity(second):
-        second = second * (unit_of_gravity(_usual_length(second)) or 1.0)
-    gyroscope, notes = gyroscope_of(path.name, stamps_ns, first)
-    accelerations, more = accelerations_of(path.name, stamps_ns, second) if second.size else (None, [])
-    return gyroscope, accelerations, list(dict.fromkeys([*notes, *more]))
+    return _both(path.name, stamps_ns, first, second)
 
 
 def _columns_of(header: str, width: int) -> list[int]:
-    """Return the columns of the stamp, of the angular velocities, and of the accelerations where named."""
+    """Return the columns of the stamp, of the angular velocities, and of the accelerations where named.
+
+    Those of Stray Scanner point down at rest in some versions, and in others lack gravity: they are left out.
+    """
     words = re.sub(r"[\[(][^\])]*[\])]", "", header).strip("# \t").lower()
     separator = next((one for one in ",;\t" if one in words), None)
     names = [word.strip().strip('"') for word in words.split(separator)]
@@ -128,7 +128,8 @@ def _columns_of(header: str, width: int) -> list[int]:
     stamps = [k for k, name in enumerate(names) if re.match("time|stamp|t$|sec", name)]
     if len(names) != width or not stamps or len(of["rates"]) != 3:
         return []
-    return [stamps[0], *of["rates"], *(of["accelerations"] if len(of["accelerations"]) == 3 else [])]
+    is_sound = len(of["accelerations"]) == 3 and "alpha_x" not in names
+    return [stamps[0], *of["rates"], *(of["accelerations"] if is_sound else [])]
 
 
 def _is_number(word: str) -> bool:
@@ -138,11 +139,12 @@ def _is_number(word: str) -> bool:
 
 
 def _feels_gravity(readings: Array) -> bool:
-    return unit_of_gravity(_usual_length(readings)) is not None
+    return _unit_of(np.clip(readings, -_MOST_READING, _MOST_READING)) is not None
 
 
-def _usual_length(readings: Array) -> float:
-    return float(np.median(np.linalg.norm(np.clip(readings, -_MOST_READING, _MOST_READING), axis=1)))
+def _unit_of(accelerations: Array) -> float | None:
+    """Return the unit of readings that feel gravity, m/s²; None of others."""
+    return unit_of_gravity(float(np.median(np.linalg.norm(accelerations, axis=1))))
 
 
 def write_gyroscope(folder: Path, gyroscope: Gyroscope) -> None:
@@ -166,24 +168,6 @@ def write_imu(folder: Path, gyroscope: Gyroscope, accelerations: Accelerations) 
     (folder / BOTH).write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-def _stray_rates(path: Path, lines: Sequence[str]) -> tuple[Gyroscope | None, None, list[str]]:
-    """Return the angular velocities of Stray Scanner's imu.csv, whose stamps are seconds.
-
-    Its accelerations point down at rest in some versions, and in others lack gravity.
-    """
-    at = [[word.strip() for word in lines[0].split(",")].index(name) for name in _STRAY_COLUMNS]
-    stamps_ns, rates = [], []
-    for number, line in enumerate(lines[1:], start=2):
-        words, where = line.split(","), f"{path}:{number}"
-        if len(words) <= max(at):
-            raise SourceError(f"{where}: {len(words)} columns, want {', '.join(_STRAY_COLUMNS)}")
-        stamps_ns.append(parse_stamp(words[at[0]].strip(), where=where))
-        rates.append(parse_numbers([words[i] for i in at[4:]], where=where))
-    stamps = np.array(stamps_ns, np.int64)
-    gyroscope, notes = gyroscope_of(path.name, stamps, np.array(rates, np.float64).reshape(-1, 3))
-    return gyroscope, None, notes
-
-
 def gyroscope_of(name: str, stamps_ns: Stamps, rates_radps: Array) -> tuple[Gyroscope | None, list[str]]:
     """Return the finite readings in time order within the unit's range, None without any, and notes.
 
@@ -198,16 +182,27 @@ def gyroscope_of(name: str, stamps_ns: Stamps, rates_radps: Array) -> tuple[Gyro
 
 
 def accelerations_of(
-    name: str, stamps_ns: Stamps, acceleration_mps2: Array
+    name: str, stamps_ns: Stamps, accelerations: Array
 ) -> tuple[Accelerations | None, list[str]]:
-    """Return the finite readings in time order, None without any, and notes; arguments as above."""
-    stamps_ns, acceleration_mps2, notes = _finite(name, stamps_ns, acceleration_mps2, what="accelerations")
+    """Return the finite readings in time order in m/s², None without any, and notes.
+
+    Args:
+        name: Topic or file.
+        stamps_ns: (N,) int64 nanoseconds, in any order.
+        accelerations: (N, 3) in the unit's own axes; m/s², or g or mg, as their usual length tells.
+    """
+    stamps_ns, accelerations, notes = _finite(name, stamps_ns, accelerations, what="accelerations")
     if not len(stamps_ns):
         return None, [*notes, f"{name}: no accelerations"]
-    return Accelerations(stamps_ns, acceleration_mps2), [*notes, *saturation_notes(name, acceleration_mps2)]
+    unit = _unit_of(accelerations) or 1.0
+    if unit != 1.0:
+        accelerations = accelerations * unit
+        called = "g" if unit == GRAVITY_MPS2 else "mg"
+        notes.append(f"{name}: accelerations are about {GRAVITY_MPS2 / unit:g} at rest: taken as {called}")
+    return Accelerations(stamps_ns, accelerations), [*notes, *_saturation_notes(name, accelerations)]
 
 
-def saturation_notes(name: str, accelerations: Array) -> list[str]:
+def _saturation_notes(name: str, accelerations: Array) -> list[str]:
     """Return a sentence on the (N, 3) accelerations at the end of the unit's range, if there are any."""
     at_rest = float(np.median(np.linalg.norm(accelerations, axis=1)))
     if (found := range_end(accelerations, beyond=_SHAKEN * at_rest)) is None:

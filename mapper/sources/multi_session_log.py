@@ -4,18 +4,14 @@ from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import accumulate, pairwise
-from typing import TypeVar
 
 import numpy as np
 
 from mapper.core.frames import Frame, Scan
 from mapper.core.timebase import NS_PER_S
 from mapper.core.trajectory import Positions, Trajectory
-from mapper.sensing.gnss import GnssFixes
 from mapper.sensing.gyroscope import Gyroscope
-from mapper.sources.base import Accelerations, FrameRef, ImageFiles, Log, Session, WrappedEntry
-
-_Stamped = TypeVar("_Stamped", Trajectory, Accelerations, Gyroscope, GnssFixes)
+from mapper.sources.base import FrameRef, ImageFiles, Log, Session, WrappedEntry, later
 
 _PAUSE_NS = NS_PER_S
 """Time between two logs whose own stamps are not in order."""
@@ -119,20 +115,16 @@ def shifted(log: Log, shift_ns: int) -> Log:
         log,
         stamps_ns=log.stamps_ns + shift_ns,
         entry_at=lambda index: _ShiftedEntry(log.entry_at(index), shift_ns),
-        truth=_later(log.truth, shift_ns),
-        device_poses=_later(log.device_poses, shift_ns),
+        truth=later(log.truth, shift_ns),
+        device_poses=later(log.device_poses, shift_ns),
         T_body_base=replace(log.T_body_base, stamps_ns=log.T_body_base.stamps_ns + shift_ns),
-        wheels=_later(log.wheels, shift_ns),
-        accelerations=_later(log.accelerations, shift_ns),
-        gyroscope=_later(log.gyroscope, shift_ns),
-        gnss=_later(log.gnss, shift_ns),
+        wheels=later(log.wheels, shift_ns),
+        accelerations=later(log.accelerations, shift_ns),
+        gyroscope=later(log.gyroscope, shift_ns),
+        gnss=later(log.gnss, shift_ns),
         images=[replace(one, stamps_ns=one.stamps_ns + shift_ns) for one in log.images],
         beside=[replace(one, log=shifted(one.log, shift_ns)) for one in log.beside],
     )
-
-
-def _later(stamped: _Stamped | None, shift_ns: int) -> _Stamped | None:
-    return stamped and replace(stamped, stamps_ns=stamped.stamps_ns + shift_ns)
 
 
 def _joined_gyroscope(logs: Sequence[Log]) -> Gyroscope | None:

@@ -62,6 +62,19 @@ def table(path: Path, *columns: str) -> Iterator[tuple[str, list[str]]]:
         yield where, words
 
 
+def stamped_numbers(path: Path, *columns: str) -> tuple[Stamps, Array]:
+    """Return the stamps of a file that has these columns, the first a stamp, and its (N, K) other numbers.
+
+    Raises:
+        SourceError: As :func:`table`, or a word is no number.
+    """
+    stamps_ns, numbers = [], []
+    for where, words in table(path, *columns):
+        stamps_ns.append(parse_stamp(words[0], where=where))
+        numbers.append(parse_numbers(words[1:], where=where))
+    return np.array(stamps_ns, np.int64), np.array(numbers, np.float64).reshape(-1, len(columns) - 1)
+
+
 def epoch_ns(text: str) -> int | None:
     """Return s, ms, µs or ns since 1970, told apart by the digits before the point, as nanoseconds."""
     whole, _, fraction = text.partition(".")

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from mapper.core.geometry import Array
 from mapper.core.timebase import NS_PER_S
-from mapper.sources.base import Log, Readings
+from mapper.sources.base import Log, later
 from mapper.sources.config import SourceConfig
 
 FEWEST_ESTIMATES, _MOST_SIGMA_S = 3, 0.02
@@ -91,23 +91,20 @@ def peak_of(at_s: NDArray[np.floating], score: NDArray[np.floating]) -> float:
 
 def with_time_offsets(log: Log, config: SourceConfig) -> Log:
     """Return a log whose readings and poses have the settings' offsets added to their stamps."""
-    offsets_s = (config.truth_offset_s, config.wheels_offset_s, config.imu_offset_s, config.images_offset_s)
-    if not any(offsets_s):
-        return log
-
-    def moved(readings: Readings | None, offset_s: float) -> Readings | None:
-        if readings is None:
-            return None
-        return replace(readings, stamps_ns=readings.stamps_ns + round(offset_s * NS_PER_S))
-
+    truth_ns, wheels_ns, imu_ns, images_ns = (
+        round(offset_s * NS_PER_S)
+        for offset_s in (
+            config.truth_offset_s,
+            config.wheels_offset_s,
+            config.imu_offset_s,
+            config.images_offset_s,
+        )
+    )
     return replace(
         log,
-        truth=moved(log.truth, config.truth_offset_s),
-        wheels=moved(log.wheels, config.wheels_offset_s),
-        gyroscope=moved(log.gyroscope, config.imu_offset_s),
-        accelerations=moved(log.accelerations, config.imu_offset_s),
-        images=[
-            replace(one, stamps_ns=one.stamps_ns + round(config.images_offset_s * NS_PER_S))
-            for one in log.images
-        ],
+        truth=later(log.truth, truth_ns),
+        wheels=later(log.wheels, wheels_ns),
+        gyroscope=later(log.gyroscope, imu_ns),
+        accelerations=later(log.accelerations, imu_ns),
+        images=[replace(one, stamps_ns=one.stamps_ns + images_ns) for one in log.images],
     )

@@ -12,7 +12,7 @@ from mapper.core.errors import FrameError, SourceError, listed
 from mapper.core.frames import DepthImage, Image, RgbdFrame, Scan
 from mapper.core.timebase import NS_PER_S
 from mapper.core.trajectory import Trajectory
-from mapper.sources.base import Accelerations, ImageFile, ImageFiles, Log
+from mapper.sources.base import ImageFile, ImageFiles, Log
 from mapper.sources.calibration import (
     PRIMESENSE,
     Calibration,
@@ -36,9 +36,8 @@ from mapper.sources.image_files.reading import (
     read_depth_m,
     read_grey,
 )
-from mapper.sources.imu_files import accelerations_of
+from mapper.sources.imu_files import read_accelerometer
 from mapper.sources.listed_files import refuse_links_out
-from mapper.sources.text import parse_numbers, parse_stamp, table
 
 _MIRROR_Y = np.diag([1.0, -1.0, 1.0, 1.0])
 
@@ -162,7 +161,7 @@ def rgbd_log(
         exr.require_decoder()
     recorded_units_per_m = (float_units_per_m if has_floats(array) else units_per_m) if array else None
     pairs = [_with_array(pair, units_per_m, float_units_per_m) for pair in pairs]
-    accelerations, acceleration_notes = read_accelerations(folder)
+    accelerations, acceleration_notes = read_accelerometer(folder)
 
     def entry_of(camera: RecordedCamera, index: int) -> RgbdEntry:
         pair = pairs[index]
@@ -307,26 +306,3 @@ def unpaired_note(
     return [
         f"{alone} of {total} {one} images have no {other} image within {max_gap_s * 1e3:g} ms; {left_out}"
     ]
-
-
-def read_accelerations(folder: Path) -> tuple[Accelerations | None, list[str]]:
-    """Return the readings of ``accelerometer.txt`` (lines of ``stamp ax ay az``), if the folder has one.
-
-    Raises:
-        SourceError: A line is not four numbers.
-    """
-    path = folder / "accelerometer.txt"
-    if not path.is_file():
-        return None, []
-    stamps_ns, readings, dropped = [], [], 0
-    for where, words in table(path, "stamp", "ax", "ay", "az"):
-        numbers = parse_numbers(words, where=where)
-        if np.isfinite(numbers).all():
-            stamps_ns.append(parse_stamp(words[0], where=where))
-            readings.append(numbers[1:])
-        else:
-            dropped += 1
-    notes = [f"{path.name}: {dropped} readings are not finite; dropped"] if dropped else []
-    stamps = np.array(stamps_ns, np.int64)
-    accelerations, more = accelerations_of(path.name, stamps, np.array(readings).reshape(-1, 3))
-    return accelerations, [*notes, *more]

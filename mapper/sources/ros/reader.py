@@ -14,12 +14,11 @@ from mapper.core.geometry import FARTHEST_M, spread_indices
 from mapper.core.rotations import pose_of_row
 from mapper.core.timebase import NS_PER_S
 from mapper.core.trajectory import Positions, Trajectory
-from mapper.core.units import GRAVITY_MPS2, unit_of_gravity
 from mapper.sensing.gnss import GnssFixes
 from mapper.sensing.gyroscope import Gyroscope
 from mapper.sources.base import BASES, FOOTPRINT, Accelerations
 from mapper.sources.config import WheelsConfig
-from mapper.sources.imu_files import saturation_notes
+from mapper.sources.imu_files import accelerations_of, gyroscope_of
 from mapper.sources.nmea import fixes_from_sentences
 from mapper.sources.ros.decode import decode
 from mapper.sources.ros.entries import Located
@@ -159,42 +158,32 @@ class RecordingReader:
         """Return the readings of a topic, in the body's axes where tf ties the two, and notes."""
         if series is None:
             return None, []
-        order, notes = _finite(series, series.imu[:, 3:], what="accelerations")
-        if not len(order):
-            return None, [*notes, f"{series.topic.name}: no readings"]
-        stamps_ns, acceleration_imu = series.stamps_ns[order], series.imu[order, 3:]
-        unit = unit_of_gravity(float(np.median(np.linalg.norm(acceleration_imu, axis=1))))
-        if unit not in (None, 1.0):
-            acceleration_imu *= unit
-            name = "g" if unit == GRAVITY_MPS2 else "mg"
-            at_rest = GRAVITY_MPS2 / unit
-            notes.append(f"{series.topic.name}: accelerations are about {at_rest:g} at rest: taken as {name}")
-        notes += saturation_notes(series.topic.name, acceleration_imu)
+        order, notes = ordered(series)
+        felt, more = accelerations_of(series.topic.name, series.stamps_ns[order], series.imu[order, 3:])
+        notes = [*notes, *more]
+        if felt is None:
+            return None, notes
         imu = frame_of(self.firsts.get(series.topic.name))
         tree = self.tree_of(body, imu)
-        known, T_body_imu = tree.find_each(body, imu, stamps_ns)
+        known, T_body_imu = tree.find_each(body, imu, felt.stamps_ns)
         if not known.any():
-            return Accelerations(stamps_ns, acceleration_imu), notes
-        acceleration_body = np.einsum("nij,nj->ni", T_body_imu[:, :3, :3], acceleration_imu[known])
+            return felt, notes
+        acceleration_body = np.einsum("nij,nj->ni", T_body_imu[:, :3, :3], felt.acceleration_mps2[known])
         place_body = None if tree.moves(body, imu) else T_body_imu[0, :3, 3]
-        return Accelerations(stamps_ns[known], acceleration_body, True, place_body), notes
+        return Accelerations(felt.stamps_ns[known], acceleration_body, True, place_body), notes
 
     def gyroscope(self, series: Series | None, *, body: str) -> tuple[Gyroscope | None, list[str]]:
         """Return the angular velocities of a topic, with the mounting if tf has one that stays, and notes."""
         if series is None:
             return None, []
-        order, notes = _finite(series, series.imu[:, :3], what="angular velocities")
+        order, notes = ordered(series)
+        found, more = gyroscope_of(series.topic.name, series.stamps_ns[order], series.imu[order, :3])
         imu = frame_of(self.firsts.get(series.topic.name))
         tree = self.tree_of(body, imu)
         T_body_imu = None if tree.moves(body, imu) else tree.find(body, imu)
-        gyroscope = Gyroscope(
-            series.topic.name,
-            series.stamps_ns[order],
-            series.imu[order, :3],
-            None if T_body_imu is None else T_body_imu[:3, :3],
-        )
-        sound, more = gyroscope.without_faults()
-        return sound, [*notes, *more]
+        if found is not None and T_body_imu is not None:
+            found = replace(found, R_body_imu=T_body_imu[:3, :3])
+        return found, [*notes, *more]
 
     def gnss(self, series: Series | None, *, body: str) -> tuple[GnssFixes | None, list[str]]:
         """Return the fixes of a topic, with the antenna's place if tf has one that stays, and notes."""
@@ -285,17 +274,6 @@ class RecordingReader:
             with suppress(FrameError, DataError):
                 data = series.kept.get(i) or self.recording.read(series.place(i))
                 yield int(series.stamps_ns[i]), decode(series.topic, memoryview(data))
-
-
-def _finite(series: Series, values: NDArray[np.float64], *, what: str) -> tuple[NDArray[np.intp], list[str]]:
-    """Return the indices of the messages whose values are finite, in time order, and notes."""
-    order, notes = ordered(series)
-    are_finite = np.isfinite(values[order]).all(axis=1)
-    if not are_finite.all():
-        notes.append(
-            f"{series.topic.name}: {(~are_finite).sum()} of {len(order)} {what} are not finite; left out"
-        )
-    return order[are_finite], notes
 
 
 def _spread(indices: NDArray[np.intp], *, most: int) -> NDArray[np.intp]:
