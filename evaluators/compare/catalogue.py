@@ -21,7 +21,6 @@ from mapper.core.timebase import NS_PER_S
 from mapper.core.trajectory import Trajectory, trajectory_from
 from mapper.evaluators.compare.config import CompareConfig
 from mapper.evaluators.compare.methods import (
-    AnyRegistration,
     Method,
     OdometryTracker,
     Tracker,
@@ -94,7 +93,7 @@ def _image_methods(max_depth_m: float) -> list[Method]:
         PnpConfig(max_depth_m=max_depth_m),
     )
 
-    def hybrid() -> AnyRegistration:
+    def hybrid() -> Any:
         from mapper.registration.rgbd import HybridRgbd  # Open3D takes seconds to load
 
         return HybridRgbd(max_depth_m=max_depth_m)

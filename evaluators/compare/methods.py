@@ -9,7 +9,7 @@ import numpy as np
 
 from mapper.core.errors import FrameError
 from mapper.core.frames import Frame, RgbdFrame, Scan
-from mapper.core.geometry import Transform, apply, interpolate, inverse, nearest_rotation, transform
+from mapper.core.geometry import Transform, interpolate, inverse, nearest_rotation, transform
 from mapper.core.trajectory import Trajectory, trajectory_from
 from mapper.evaluators.compare.config import RgbdCompareConfig
 from mapper.graph.model import PoseGraph
@@ -88,20 +88,10 @@ class FrameReader:
         )
 
 
-class AnyAligner(Protocol):
-    """A method bound to one target, of frames or of scans."""
-
-    def align(self, source: Any, T_target_source: Transform, /) -> Alignment:
-        """Return the motion, refined from a guess if the method has use for one."""
-        ...
-
-
-class AnyRegistration(Protocol):
-    """A method of registering pairs of frames, or of scans."""
-
-    def prepare(self, target: Any, /) -> AnyAligner:
-        """Return the method bound to a target."""
-        ...
+Align = Callable[[Any, Transform], Alignment]
+"""Registers a source, of frames or of scans, to one target, from a guess if the method has use for one."""
+Prepare = Callable[[Any], Align]
+"""Takes a target."""
 
 
 class Tracker(Protocol):
@@ -133,7 +123,7 @@ class Method:
     sees_images: bool
     uses_guess: bool
     tracker: Callable[[], Tracker]
-    registration: Callable[[], AnyRegistration] | None
+    registration: Callable[[], Prepare] | None
     sees_times: bool = False
 
     def view(self, frame: PreparedFrame) -> Frame:
@@ -148,20 +138,25 @@ def odometry_method(name: str, build: Callable[[], FrameOdometry[Any]], *, sees_
         sees_images=sees_images,
         uses_guess=not sees_images,
         tracker=lambda: OdometryTracker(build()),
-        registration=lambda: OdometryPairs(build),
+        registration=lambda: lambda target: _aligned_by(build(), target),
     )
 
 
 def registration_method(
-    name: str, build: Callable[[], AnyRegistration], *, uses_guess: bool, sees_images: bool = False
+    name: str, build: Callable[[], Any], *, uses_guess: bool, sees_images: bool = False
 ) -> Method:
     """Return a registration as a method; as an odometry it registers each frame to the one before it."""
+
+    def registration() -> Prepare:
+        made = build()
+        return lambda target: made.prepare(target).align
+
     return Method(
         name,
         sees_images=sees_images,
         uses_guess=uses_guess,
-        tracker=lambda: FrameToFrame(build()),
-        registration=build,
+        tracker=lambda: FrameToFrame(registration()),
+        registration=registration,
     )
 
 
@@ -199,51 +194,34 @@ class OdometryTracker:
         return largest_component(tracking, progress=SILENT).trajectory()
 
 
-class OdometryPairs:
-    """Registration by an odometry, which is given the target, then the source, and nothing else.
+def _aligned_by(odometry: FrameOdometry[Any], target: Frame) -> Align:
+    """Return the registration by an odometry, which is given the target, then the source, and nothing else.
 
     An odometry takes no guess. A scan is moved by the guess before the odometry gets it, which is equivalent;
-    an image cannot be moved, so there the guess is not used.
+    an image cannot be moved, so there the guess is not used. It is good for one alignment, as an odometry
+    keeps every frame.
     """
+    before = odometry.track(odometry.observe(target))
 
-    def __init__(self, build: Callable[[], FrameOdometry[Any]]) -> None:
-        self._build = build
-
-    def prepare(self, target: Frame) -> "OdometryPair":
-        """Return an odometry that has seen the target."""
-        return OdometryPair(self._build(), target)
-
-
-class OdometryPair:
-    """An odometry that has been given the target; good for one alignment, since it keeps every frame."""
-
-    def __init__(self, odometry: FrameOdometry[Any], target: Frame) -> None:
-        self._odometry = odometry
-        self._target = odometry.track(odometry.observe(target))
-
-    def align(self, source: Frame, T_target_source: Transform) -> Alignment:
-        """Return the motion by the pose that the odometry gives the source."""
-        if self._target.node is None:
+    def align(source: Frame, T_target_source: Transform) -> Alignment:
+        if before.node is None:
             return failed("the target alone was lost")
-        guess = T_target_source if isinstance(source, Scan) else np.eye(4)
-        track = self._odometry.track(self._odometry.observe(_seen_from(guess, source)))
+        if isinstance(source, Scan):
+            source, guess = source.moved(T_target_source), T_target_source
+        else:
+            guess = np.eye(4)
+        track = odometry.track(odometry.observe(source))
         if track.node is None:
             return failed("the source was lost")
         return Alignment(
-            inverse(self._target.T_world_body) @ track.T_world_body @ guess,
+            inverse(before.T_world_body) @ track.T_world_body @ guess,
             converged=True,
             inlier_ratio=track.diagnostics.inliers / max(track.diagnostics.matches, 1),
             inlier_rmse_m=track.diagnostics.residual if track.diagnostics.residual_unit == "m" else np.nan,
             pairs=track.diagnostics.inliers,
         )
 
-
-def _seen_from(T_target_source: Transform, source: Frame) -> Frame:
-    if isinstance(source, RgbdFrame):
-        return source
-    points = apply(T_target_source, source.points_body.astype(np.float64)).astype(np.float32)
-    origin = T_target_source[:3, :3] @ source.origin_body + T_target_source[:3, 3]
-    return Scan(source.stamp_ns, points, origin, times_s=source.times_s)
+    return align
 
 
 class FrameToFrame:
@@ -252,27 +230,27 @@ class FrameToFrame:
     Where that does not converge, the motion before is repeated: every frame has a pose.
     """
 
-    def __init__(self, registration: AnyRegistration) -> None:
-        self._registration = registration
-        self._aligner: AnyAligner | None = None
+    def __init__(self, prepare: Prepare) -> None:
+        self._prepare = prepare
+        self._align: Align | None = None
         self._poses: list[tuple[int, Transform]] = []
         self._T_before_last = np.eye(4)
         self._before_ns = 0  # from the frame before the last to the last
 
     def add(self, frame: Frame) -> bool:
         """Register the frame to the last one, and make it the next one's target."""
-        if self._aligner is None:
-            self._aligner = self._registration.prepare(frame)
+        if self._align is None:
+            self._align = self._prepare(frame)
             self._poses.append((frame.stamp_ns, np.eye(4)))
             return True
         last_ns, T_world_last = self._poses[-1]
         guess = self._guess(frame.stamp_ns - last_ns)
-        alignment = self._aligner.align(frame, guess)
+        alignment = self._align(frame, guess)
         T_last_this = alignment.T_target_source if alignment.converged else guess
         T = T_world_last @ T_last_this
         self._poses.append((frame.stamp_ns, transform(nearest_rotation(T[:3, :3]), T[:3, 3])))
         self._T_before_last, self._before_ns = T_last_this, frame.stamp_ns - last_ns
-        self._aligner = self._registration.prepare(frame)
+        self._align = self._prepare(frame)
         return alignment.converged
 
     def trajectory(self) -> Trajectory:

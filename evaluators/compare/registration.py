@@ -11,7 +11,7 @@ import numpy as np
 
 from mapper.config.register import RegisterConfig
 from mapper.core.frames import Frame, Scan, Sensor
-from mapper.core.geometry import Transform, apply
+from mapper.core.geometry import Transform
 from mapper.evaluators.metrics.map_quality import CloudDistance, DistanceTo
 from mapper.evaluators.pictures.registration import write_before_and_after, write_registration_log
 from mapper.export.figures import ESTIMATE
@@ -190,7 +190,7 @@ def write_registration(
         config: Its settings.
     """
     last = registered.stages[-1]
-    points_target = apply(last.T_target_source, source.points_body.astype(np.float64)).astype(np.float32)
+    points_target = source.moved(last.T_target_source).points_body
     colors = source.colors
     if colors is None:
         colors = np.broadcast_to(np.array(ESTIMATE, np.uint8), points_target.shape)

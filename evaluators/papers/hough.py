@@ -97,12 +97,10 @@ class HoughTrial:
         # By the pair and the seed alone, so that both methods get the same.
         rng = np.random.default_rng([self.seed, zlib.crc32(f"{self.pair.name} {self.pair.sensor}".encode())])
         if clouds.T_target_source is None:
-            source, _ = perturbed(clouds.source, np.eye(4), np.eye(4), rng, offset_m=0.0)
-            return Clouds(clouds.target, source, None)
-        source, T_target_source = perturbed(
-            clouds.source, clouds.T_target_source, np.eye(4), rng, offset_m=OFFSET_M
+            return Clouds(clouds.target, perturbed(clouds.source, np.eye(4), rng, offset_m=0.0)[0], None)
+        return Clouds(
+            clouds.target, *perturbed(clouds.source, clouds.T_target_source, rng, offset_m=OFFSET_M)
         )
-        return Clouds(clouds.target, source, T_target_source)
 
     def _against_truth(
         self, clouds: Clouds, final: Transform | None, *, is_trusted: bool

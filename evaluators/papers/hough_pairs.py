@@ -14,7 +14,7 @@ from mapper.config.loading import read_config
 from mapper.core.config import Config
 from mapper.core.errors import MapperError, SourceError
 from mapper.core.frames import Scan
-from mapper.core.geometry import Transform, apply, inverse, transform
+from mapper.core.geometry import Transform, inverse, transform
 from mapper.core.rotations import rotation_from_euler, rotation_from_quaternion
 from mapper.core.trajectory import with_rotations
 from mapper.core.voxel_grid import thin
@@ -109,7 +109,7 @@ class GivenPair:
             return Clouds(target, source, None)
         T_map_scan = np.array(self.T_map_scan)
         T_map_here = transform(np.eye(3), T_map_scan[:3, 3])
-        here = moved(target, inverse(T_map_here))
+        here = target.moved(inverse(T_map_here))
         return Clouds(Scan(0, here.points_body), source, inverse(T_map_here) @ T_map_scan)
 
 
@@ -301,31 +301,17 @@ def _read(path: Path) -> Scan:
     return read_scan(path)
 
 
-def moved(scan: Scan, T_new_body: Transform) -> Scan:
-    """Return a scan in the coordinates of another frame."""
-    return Scan(
-        stamp_ns=scan.stamp_ns,
-        points_body=apply(T_new_body, scan.points_body.astype(np.float64)).astype(np.float32),
-        origin_body=apply(T_new_body, scan.origin_body[np.newaxis])[0],
-    )
-
-
 def perturbed(
-    scan: Scan,
-    T_world_body: Transform,
-    T_world_target: Transform,
-    rng: np.random.Generator,
-    *,
-    offset_m: float,
+    scan: Scan, T_target_source: Transform, rng: np.random.Generator, *, offset_m: float
 ) -> tuple[Scan, Transform]:
-    """Return a scan in a frame of any yaw, at most a distance from the target, and that frame's pose."""
+    """Return a scan in a frame of any yaw, at most a distance from the target's, and that frame's pose."""
     yaw, bearing = rng.uniform(-np.pi, np.pi, 2)
     reach_m = offset_m * np.sqrt(rng.random())
     c, s = np.cos(yaw), np.sin(yaw)
-    R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ T_world_body[:3, :3]
-    x, y = T_world_target[:2, 3] + reach_m * np.array([np.cos(bearing), np.sin(bearing)])
-    T_world_new = transform(R, np.array([x, y, T_world_body[2, 3]]))
-    return moved(scan, inverse(T_world_new) @ T_world_body), T_world_new
+    R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ T_target_source[:3, :3]
+    x, y = reach_m * np.array([np.cos(bearing), np.sin(bearing)])
+    T_target_new = transform(R, np.array([x, y, T_target_source[2, 3]]))
+    return scan.moved(inverse(T_target_new) @ T_target_source), T_target_new
 
 
 def fewer_rings(scan: Scan) -> Scan:
@@ -339,10 +325,5 @@ def fewer_rings(scan: Scan) -> Scan:
 
 def merged(scans: Sequence[Scan], T_map_body: Sequence[Transform], *, voxel_m: float) -> Scan:
     """Return a map of scans, one point per voxel, as if it had been seen from its origin."""
-    points = np.concatenate(
-        [
-            apply(T, scan.points_body.astype(np.float64)).astype(np.float32)
-            for scan, T in zip(scans, T_map_body, strict=True)
-        ]
-    )
+    points = np.concatenate([scan.moved(T).points_body for scan, T in zip(scans, T_map_body, strict=True)])
     return Scan(stamp_ns=0, points_body=points[thin(points, voxel_m)])

@@ -9,7 +9,7 @@ from isal import isal_zlib
 from numpy.typing import NDArray
 
 from mapper.core.errors import DataError
-from mapper.core.geometry import Array, Points, Transform, is_rigid
+from mapper.core.geometry import Array, Points, Transform, apply, is_rigid
 from mapper.core.timebase import NS_PER_S
 
 Image = NDArray[np.uint8]
@@ -200,6 +200,16 @@ class Scan:
             colors=some(self.colors),
             times_s=some(self.times_s),
             intensities=some(self.intensities),
+        )
+
+    def moved(self, T_new_body: Transform) -> "Scan":
+        """Return the scan in the coordinates of another frame."""
+        points, origin = self.points_body.astype(np.float64), self.origin_body[np.newaxis]
+        return replace(
+            self,
+            points_body=apply(T_new_body, points).astype(np.float32),
+            origin_body=apply(T_new_body, origin)[0],
+            is_planar=False,
         )
 
     @property

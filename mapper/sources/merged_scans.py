@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mapper.core.errors import FrameError
 from mapper.core.frames import Frame, Scan
-from mapper.core.geometry import Transform, apply, stride_for
+from mapper.core.geometry import Transform, stride_for
 from mapper.core.timebase import NS_PER_S, nearest
 from mapper.sources.base import FrameRef, Log, WrappedEntry
 
@@ -40,9 +40,7 @@ class _MergedEntry(WrappedEntry):
                 scans.append(entry.load(colour=colour).scan())
                 continue
             with suppress(FrameError):  # fusing reports it
-                scan = entry.load(colour=colour).scan()
-                points_body = apply(T_body_other, scan.points_body.astype(np.float64)).astype(np.float32)
-                scans.append(replace(scan, points_body=points_body))
+                scans.append(entry.load(colour=colour).scan().moved(T_body_other))
         return _merged(scans)
 
     def scan(self) -> Scan:
