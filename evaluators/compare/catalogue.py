@@ -7,14 +7,14 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from importlib.util import find_spec
-from typing import Any, cast, get_args
+from typing import TYPE_CHECKING, Any, cast, get_args
 
 import numpy as np
 
 from mapper.config.loading import load_config
 from mapper.core.config import AnyConfig, scale_length, with_changes
 from mapper.core.errors import ConfigError
-from mapper.core.frames import Scan, Sensor
+from mapper.core.frames import RgbdFrame, Scan, Sensor
 from mapper.core.geometry import Array, interpolate, transform
 from mapper.core.rotations import rotation_from_quaternion
 from mapper.core.timebase import NS_PER_S
@@ -33,10 +33,13 @@ from mapper.odometry.factory import build_frame_odometry
 from mapper.odometry.scans.config import KissOdometryConfig
 from mapper.pipeline.track import session_odometry
 from mapper.registration.config import NEED_NO_GUESS, VOXEL_M, RegistrationConfig
-from mapper.registration.factory import build_registration
+from mapper.registration.factory import aligner_to
 from mapper.registration.hough.config import HoughConfig
 from mapper.runtime.extras import extra, install_line, require
 from mapper.sources.base import Log
+
+if TYPE_CHECKING:
+    from mapper.registration.rgbd import HybridRgbd
 
 RKO_LIO = "rko-lio"
 SCAN_TO_MAP = "scan-to-map"
@@ -93,10 +96,10 @@ def _image_methods(max_depth_m: float) -> list[Method]:
         PnpConfig(max_depth_m=max_depth_m),
     )
 
-    def hybrid() -> Any:
+    def hybrid(target: RgbdFrame) -> "HybridRgbd":
         from mapper.registration.rgbd import HybridRgbd  # Open3D takes seconds to load
 
-        return HybridRgbd(max_depth_m=max_depth_m)
+        return HybridRgbd(target, max_depth_m=max_depth_m)
 
     return [
         *(
@@ -112,7 +115,7 @@ def _scan_methods(source: Log) -> list[Method]:
     sensor = source.sensor
     registrations = [
         registration_method(
-            one.kind, partial(build_registration, one), uses_guess=one.kind not in NEED_NO_GUESS
+            one.kind, partial(aligner_to, config=one), uses_guess=one.kind not in NEED_NO_GUESS
         )
         for one in registrations_for(sensor)
     ]

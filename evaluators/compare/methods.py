@@ -90,8 +90,6 @@ class FrameReader:
 
 Align = Callable[[Any, Transform], Alignment]
 """Registers a source, of frames or of scans, to one target, from a guess if the method has use for one."""
-Prepare = Callable[[Any], Align]
-"""Takes a target."""
 
 
 class Tracker(Protocol):
@@ -115,7 +113,7 @@ class Method:
         sees_images: It gets the log's frames; otherwise the scans that are the same for all.
         uses_guess: Its registration begins at a guess.
         tracker: Makes one for a log.
-        registration: Makes one for pairs; None if it only follows whole logs.
+        registration: Binds one for pairs to a target; None if it only follows whole logs.
         sees_times: It gets the log's scans with the times of their points.
     """
 
@@ -123,7 +121,7 @@ class Method:
     sees_images: bool
     uses_guess: bool
     tracker: Callable[[], Tracker]
-    registration: Callable[[], Prepare] | None
+    registration: Callable[[Any], Align] | None
     sees_times: bool = False
 
     def view(self, frame: PreparedFrame) -> Frame:
@@ -138,25 +136,25 @@ def odometry_method(name: str, build: Callable[[], FrameOdometry[Any]], *, sees_
         sees_images=sees_images,
         uses_guess=not sees_images,
         tracker=lambda: OdometryTracker(build()),
-        registration=lambda: lambda target: _aligned_by(build(), target),
+        registration=lambda target: _aligned_by(build(), target),
     )
 
 
 def registration_method(
-    name: str, build: Callable[[], Any], *, uses_guess: bool, sees_images: bool = False
+    name: str, aligner_to: Callable[[Any], Any], *, uses_guess: bool, sees_images: bool = False
 ) -> Method:
     """Return a registration as a method; as an odometry it registers each frame to the one before it."""
 
-    def registration() -> Prepare:
-        made = build()
-        return lambda target: made.prepare(target).align
+    def bind(target: Frame) -> Align:
+        align: Align = aligner_to(target).align
+        return align
 
     return Method(
         name,
         sees_images=sees_images,
         uses_guess=uses_guess,
-        tracker=lambda: FrameToFrame(registration()),
-        registration=registration,
+        tracker=lambda: FrameToFrame(bind),
+        registration=bind,
     )
 
 
@@ -230,8 +228,8 @@ class FrameToFrame:
     Where that does not converge, the motion before is repeated: every frame has a pose.
     """
 
-    def __init__(self, prepare: Prepare) -> None:
-        self._prepare = prepare
+    def __init__(self, bind: Callable[[Any], Align]) -> None:
+        self._bind = bind
         self._align: Align | None = None
         self._poses: list[tuple[int, Transform]] = []
         self._T_before_last = np.eye(4)
@@ -240,7 +238,7 @@ class FrameToFrame:
     def add(self, frame: Frame) -> bool:
         """Register the frame to the last one, and make it the next one's target."""
         if self._align is None:
-            self._align = self._prepare(frame)
+            self._align = self._bind(frame)
             self._poses.append((frame.stamp_ns, np.eye(4)))
             return True
         last_ns, T_world_last = self._poses[-1]
@@ -250,7 +248,7 @@ class FrameToFrame:
         T = T_world_last @ T_last_this
         self._poses.append((frame.stamp_ns, transform(nearest_rotation(T[:3, :3]), T[:3, 3])))
         self._T_before_last, self._before_ns = T_last_this, frame.stamp_ns - last_ns
-        self._align = self._prepare(frame)
+        self._align = self._bind(frame)
         return alignment.converged
 
     def trajectory(self) -> Trajectory:

@@ -123,7 +123,7 @@ def _trial(
         T_guess, T_true = target.upright(T_guess), target.upright(T_true)
     began = prepared = time.process_time()
     try:
-        align = method.registration()(method.view(target))
+        align = method.registration(method.view(target))
         prepared = time.process_time()
         alignment = align(method.view(source), T_guess)
     except Exception as error:  # a library's breakdown is a result, and the other methods go on

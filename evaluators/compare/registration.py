@@ -19,7 +19,7 @@ from mapper.export.mesh_files import write_ply
 from mapper.odometry.config import IsvdOdometryConfig
 from mapper.registration.base import Alignment
 from mapper.registration.config import AnyRegistration
-from mapper.registration.factory import build_registration
+from mapper.registration.factory import aligner_to
 from mapper.registration.hough.config import HoughGicpConfig, HoughNdtConfig
 from mapper.runtime.atomic import MANIFEST_NAME, FolderKind, write_json
 
@@ -115,12 +115,12 @@ def _by_scans(
     if isinstance(config, HoughGicpConfig | HoughNdtConfig):
         from mapper.registration.hough.aligner import Hough
 
-        voter = Hough(config).prepare(target)
+        voter = Hough(target, config)
         prepared = time.perf_counter()
         course = voter.stages(source)
         hough = None if course.hough is None else course.hough.T_target_source
         return course.alignment, hough, {"prepare": prepared - began, **course.seconds}
-    aligner = build_registration(config).prepare(target)
+    aligner = aligner_to(target, config)
     prepared = time.perf_counter()
     alignment = aligner.align(source, T_target_source)
     return alignment, None, {"prepare": prepared - began, "align": time.perf_counter() - prepared}

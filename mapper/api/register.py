@@ -16,7 +16,7 @@ from mapper.core.geometry import Transform, is_rigid, point_rows, transform
 from mapper.core.rotations import pose_of_row, rotation_from_euler
 from mapper.odometry.config import IsvdOdometryConfig
 from mapper.registration.base import Alignment
-from mapper.registration.factory import build_registration
+from mapper.registration.factory import aligner_to
 from mapper.runtime.regular_files import AnyPath
 from mapper.sources.config import SourceConfig
 
@@ -120,7 +120,7 @@ def register(
         from mapper.odometry.isvd.odometry import align_images
 
         return align_images(target_frame, source_frame, config)[0]
-    return build_registration(config).prepare(target_frame.scan()).align(source_frame.scan(), T_target_source)
+    return aligner_to(target_frame.scan(), config).align(source_frame.scan(), T_target_source)
 
 
 def _frame(cloud: Registrable, name: str, config: SourceConfig) -> tuple[Frame, Sensor]:

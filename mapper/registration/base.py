@@ -47,7 +47,7 @@ def failed(reason: str) -> Alignment:
 
 
 class Aligner(Protocol):
-    """A method bound to one target, so that its search index is built once."""
+    """A method of registering scans, made with one target, so that its search index is built once."""
 
     def align(self, source: Scan, T_target_source: Transform) -> Alignment:
         """Return the motion refined from a guess. Pure: the same inputs give the same answer.
@@ -56,12 +56,4 @@ class Aligner(Protocol):
             source: Its points are aligned to the target's.
             T_target_source: (4, 4) guess. A global method does not use it.
         """
-        ...
-
-
-class Registration(Protocol):
-    """A method of registering scans."""
-
-    def prepare(self, target: Scan) -> Aligner:
-        """Return the method bound to a target."""
         ...

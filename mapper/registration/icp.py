@@ -15,21 +15,10 @@ COARSE_TO_FINE_VOXELS = (7.0, 3.5)
 
 
 class Icp:
-    """ICP and its variants: scans are registered by their nearest pairs."""
+    """ICP and its variants: scans are registered to a target by their nearest pairs."""
 
-    def __init__(self, config: AnyIcp) -> None:
-        self._config = config
-
-    def prepare(self, target: Scan) -> "IcpAligner":
-        """Return the method bound to a target."""
-        return IcpAligner(cloud_of(target, self._config), self._config)
-
-
-class IcpAligner:
-    """ICP bound to a target's cloud."""
-
-    def __init__(self, target: Prepared, config: AnyIcp) -> None:
-        self._target = target
+    def __init__(self, target: Scan, config: AnyIcp) -> None:
+        self._target = cloud_of(target, config)
         self._config = config
 
     def align(self, source: Scan, T_target_source: Transform) -> Alignment:

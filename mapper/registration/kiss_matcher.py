@@ -25,21 +25,10 @@ _MAX_NOISE_M = 1.0  # the library accepts no more, and prints that
 
 
 class KissMatcher:
-    """KISS-Matcher: scans are registered by their features."""
+    """KISS-Matcher: scans are registered by their features; those of the target are found in every call."""
 
-    def __init__(self, config: KissMatcherConfig) -> None:
-        self._config = config
-
-    def prepare(self, target: Scan) -> "KissMatcherAligner":
-        """Return the method bound to a target. The library computes the target's features in every call."""
-        return KissMatcherAligner(cloud_of(target, self._config), self._config)
-
-
-class KissMatcherAligner:
-    """KISS-Matcher bound to a target's cloud, which serves the features and the refinement."""
-
-    def __init__(self, target: Prepared, config: KissMatcherConfig) -> None:
-        self._target = target
+    def __init__(self, target: Scan, config: KissMatcherConfig) -> None:
+        self._target = cloud_of(target, config)
         self._config = config
 
     def align(self, source: Scan, T_target_source: Transform) -> Alignment:  # noqa: ARG002

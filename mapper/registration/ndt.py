@@ -11,7 +11,7 @@ from mapper.registration.acceptance import assess
 from mapper.registration.base import Alignment, failed
 from mapper.registration.config import NdtConfig
 from mapper.registration.icp import COARSE_TO_FINE_VOXELS
-from mapper.registration.surfaces import Prepared, prepared
+from mapper.registration.surfaces import prepared
 from mapper.runtime.extras import extra
 
 _MIN_POINTS = 6
@@ -19,24 +19,11 @@ _MIN_POINTS = 6
 
 
 class Ndt:
-    """NDT: scans are registered by the Gaussians of the target's cells."""
+    """NDT: scans are registered by the Gaussians of a target's cells, which Open3D builds in every call."""
 
-    def __init__(self, config: NdtConfig) -> None:
-        self._config = config
-
-    def prepare(self, target: Scan) -> "NdtAligner":
-        """Return the method bound to a target. Open3D builds its cells in every call anew."""
-        config = self._config
-        cloud = prepared(target.points_body, voxel_m=config.voxel_m, neighbours=config.neighbours)
-        return NdtAligner(target.points_body.astype(np.float64), cloud, config)
-
-
-class NdtAligner:
-    """NDT bound to a target: its points, and its surfaces for the assessment."""
-
-    def __init__(self, points_target: Points, target: Prepared, config: NdtConfig) -> None:
-        self._points_target = points_target
-        self._target = target
+    def __init__(self, target: Scan, config: NdtConfig) -> None:
+        self._points_target = target.points_body.astype(np.float64)
+        self._target = prepared(target.points_body, voxel_m=config.voxel_m, neighbours=config.neighbours)
         self._config = config
 
     def align(self, source: Scan, T_target_source: Transform) -> Alignment:

@@ -24,25 +24,15 @@ class HybridRgbd:
     Open3D's own iterations and thresholds are kept. It has no lens model, so images are undistorted first.
     """
 
-    def __init__(self, *, max_depth_m: float = 4.0) -> None:
-        """Set the options.
+    def __init__(self, target: RgbdFrame, *, max_depth_m: float = 4.0) -> None:
+        """Bind the method to a target.
 
         Args:
+            target: Frame that stays.
             max_depth_m: Deeper measurements are dropped.
         """
-        self._option = _O3D.pipelines.odometry.OdometryOption(depth_max=max_depth_m)
-
-    def prepare(self, target: RgbdFrame) -> "HybridRgbdAligner":
-        """Return the method bound to a target."""
-        return HybridRgbdAligner(target, self._option)
-
-
-class HybridRgbdAligner:
-    """The method bound to one target; see :class:`mapper.registration.base.Aligner`."""
-
-    def __init__(self, target: RgbdFrame, option: Any) -> None:
         self._target = _image(target)
-        self._option = option
+        self._option = _O3D.pipelines.odometry.OdometryOption(depth_max=max_depth_m)
         self._jacobian = _O3D.pipelines.odometry.RGBDOdometryJacobianFromHybridTerm()
 
     def align(self, source: RgbdFrame, T_target_source: Transform) -> Alignment:

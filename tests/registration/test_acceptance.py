@@ -82,7 +82,7 @@ def test_ndt_says_so_where_open3d_only_warns():
 
 def test_ndt_prints_nothing(capfd):
     target = Scan(0, yard(np.random.default_rng(3), points=20_000).astype(np.float32))
-    Ndt(NdtConfig()).prepare(target).align(target, exp(np.zeros(3), np.array([300.0, 0.0, 0.0])))
+    Ndt(target, NdtConfig()).align(target, exp(np.zeros(3), np.array([300.0, 0.0, 0.0])))
     assert capfd.readouterr() == ("", "")
 
 
@@ -91,7 +91,7 @@ def test_clouds_without_features_do_not_crash_kiss_matcher():
     crowd = Scan(0, yard(rng, points=20_000).astype(np.float32))
     scattered = Scan(0, rng.uniform(-200.0, 200.0, (500, 3)).astype(np.float32))
     for target, source in ((crowd, scattered), (scattered, crowd)):
-        found = KissMatcher(KissMatcherConfig()).prepare(target).align(source, np.eye(4))
+        found = KissMatcher(target, KissMatcherConfig()).align(source, np.eye(4))
         assert not found.converged
         assert "to have features" in found.reason
 
@@ -105,6 +105,6 @@ def test_a_dense_cloud_of_many_matches_is_the_same_every_time():
     ).astype(np.float32)
     T_turned = exp(np.array([0.0, 0.0, 0.4]), np.array([2.0, 1.0, 0.0]))
     source = Scan(0, apply(T_turned, bumpy.astype(np.float64)).astype(np.float32))
-    aligner = KissMatcher(KissMatcherConfig(feature_voxels=1.0)).prepare(Scan(0, bumpy))
+    aligner = KissMatcher(Scan(0, bumpy), KissMatcherConfig(feature_voxels=1.0))
     answers = {aligner.align(source, np.eye(4)).T_target_source.tobytes() for _ in range(2)}
     assert len(answers) == 1

@@ -3,8 +3,7 @@ import pytest
 
 from mapper.core.frames import Scan
 from mapper.core.geometry import inverse, length_and_angle, rotation_exp, transform
-from mapper.evaluators.papers.hough_pairs import moved
-from mapper.registration.factory import build_registration
+from mapper.registration.factory import aligner_to
 from mapper.registration.hough.aligner import Hough
 from mapper.registration.hough.config import HoughAcceptanceConfig, HoughGicpConfig, HoughNdtConfig
 from mapper.simulation.config import COURTYARD, STREET
@@ -22,7 +21,7 @@ def pair_of(log, i, j, *, yaw_rad, shift_m):
     """Return two scans, the second in a frame turned and set off, and the motion between them."""
     T_source_new = transform(rotation_exp(yaw_rad * UP), np.array(shift_m))
     T_i_j = inverse(log.truth.T_world_body[i]) @ log.truth.T_world_body[j]
-    return log.observe(i), moved(log.observe(j), inverse(T_source_new)), T_i_j @ T_source_new
+    return log.observe(i), log.observe(j).moved(inverse(T_source_new)), T_i_j @ T_source_new
 
 
 @pytest.fixture(scope="module")
@@ -41,9 +40,8 @@ def courtyard():
 @pytest.mark.parametrize("config", [HoughGicpConfig(), HoughNdtConfig()], ids=lambda c: c.kind)
 def test_recovers_any_yaw_both_ways_without_a_guess(street, config):
     target, source, T_target_source = street
-    method = build_registration(config)
     for a, b, T_a_b in ((target, source, T_target_source), (source, target, inverse(T_target_source))):
-        found = method.prepare(a).align(b, np.eye(4))
+        found = aligner_to(a, config).align(b, np.eye(4))
 
         miss_m, miss_rad = length_and_angle(inverse(T_a_b) @ found.T_target_source)
         assert found.converged, found.reason
@@ -56,7 +54,7 @@ def test_recovers_any_yaw_both_ways_without_a_guess(street, config):
 def test_recovers_motion_between_tilted_scans(courtyard):
     target, source, T_target_source = courtyard
 
-    found = build_registration(HoughGicpConfig()).prepare(target).align(source, np.eye(4))
+    found = aligner_to(target, HoughGicpConfig()).align(source, np.eye(4))
 
     miss_m, miss_rad = length_and_angle(inverse(T_target_source) @ found.T_target_source)
     assert found.converged, found.reason
@@ -70,7 +68,7 @@ def test_recovers_a_sparse_scan_in_a_dense_one(street, kept_ratio):
     keep = np.random.default_rng(0).random(len(source.points_body)) < kept_ratio
     sparse = Scan(stamp_ns=0, points_body=source.points_body[keep], origin_body=source.origin_body)
 
-    found = build_registration(HoughGicpConfig()).prepare(target).align(sparse, np.eye(4))
+    found = aligner_to(target, HoughGicpConfig()).align(sparse, np.eye(4))
 
     assert found.converged, found.reason
     assert length_and_angle(inverse(T_target_source) @ found.T_target_source)[0] < 0.1
@@ -78,7 +76,7 @@ def test_recovers_a_sparse_scan_in_a_dense_one(street, kept_ratio):
 
 def test_returns_its_stages(street):
     target, source, T_target_source = street
-    stages = Hough(HoughGicpConfig()).prepare(target).stages(source)
+    stages = Hough(target, HoughGicpConfig()).stages(source)
 
     gap = inverse(T_target_source) @ stages.hough.T_target_source
     assert np.linalg.norm(gap[:3, 3]) < 0.5
@@ -94,7 +92,7 @@ def test_returns_its_stages(street):
 def test_scans_of_different_places_are_refused(config, seeds):
     a, b = (source_of(config, seed).observe(4) for seed in seeds)
 
-    found = build_registration(HoughGicpConfig()).prepare(a).align(b, np.eye(4))
+    found = aligner_to(a, HoughGicpConfig()).align(b, np.eye(4))
 
     assert not found.converged
     assert found.reason
@@ -104,7 +102,7 @@ def test_an_answer_beyond_the_range_is_refused():
     log = source_of(STREET, 3)
     target, source, _ = pair_of(log, 0, 0, yaw_rad=1.0, shift_m=(25.0, 0.0, 0.0))
 
-    assert not build_registration(HoughGicpConfig()).prepare(target).align(source, np.eye(4)).converged
+    assert not aligner_to(target, HoughGicpConfig()).align(source, np.eye(4)).converged
 
 
 def test_two_motions_as_good_as_each_other_are_none():
@@ -127,7 +125,7 @@ def test_two_motions_as_good_as_each_other_are_none():
         )
     scan = Scan(stamp_ns=0, points_body=np.concatenate([field, *posts]).astype(np.float32))
 
-    found = build_registration(HoughGicpConfig()).prepare(scan).align(scan, np.eye(4))
+    found = aligner_to(scan, HoughGicpConfig()).align(scan, np.eye(4))
 
     assert not found.converged
     assert "ambiguous" in found.reason
@@ -162,10 +160,9 @@ def far_away(rng):
 @pytest.mark.parametrize("config", [HoughGicpConfig(), HoughNdtConfig()], ids=lambda c: c.kind)
 def test_bad_scans_are_refused_with_a_reason(street, make, config):
     bad = Scan(stamp_ns=0, points_body=make(np.random.default_rng(0)).astype(np.float32))
-    method = build_registration(config)
 
     for target, source in ((street[0], bad), (bad, street[0]), (bad, bad)):
-        found = method.prepare(target).align(source, np.eye(4))
+        found = aligner_to(target, config).align(source, np.eye(4))
         assert not found.converged
         assert found.reason
 
@@ -174,7 +171,7 @@ def test_stricter_acceptance_refuses(street):
     target, source, _ = street
     config = HoughGicpConfig(acceptance=HoughAcceptanceConfig(min_agreeing_ratio=0.99))
 
-    found = Hough(config).prepare(target).align(source, np.eye(4))
+    found = Hough(target, config).align(source, np.eye(4))
 
     assert not found.converged
     assert "overlap" in found.reason
@@ -193,7 +190,7 @@ def test_a_corridor_is_refused():
         points = np.concatenate([np.column_stack([x, y, np.full(30_000, -1.7)]), *walls])
         return Scan(stamp_ns=0, points_body=(points + rng.normal(0.0, 0.01, points.shape)).astype(np.float32))
 
-    found = build_registration(HoughGicpConfig()).prepare(corridor(0)).align(corridor(1), np.eye(4))
+    found = aligner_to(corridor(0), HoughGicpConfig()).align(corridor(1), np.eye(4))
 
     assert not found.converged
     assert found.reason

@@ -11,10 +11,10 @@ import ctypes
 import numpy as np
 from mapper.core.frames import Scan
 from mapper.registration.config import KissMatcherConfig
-from mapper.registration.factory import build_registration
+from mapper.registration.factory import aligner_to
 points = np.random.default_rng(0).uniform(-3.0, 3.0, (3000, 3)).astype(np.float32)
 scan = Scan(0, points, np.zeros(3))
-build_registration(KissMatcherConfig()).prepare(scan).align(scan, np.eye(4))
+aligner_to(scan, KissMatcherConfig()).align(scan, np.eye(4))
 with open("/proc/self/maps") as maps:
     openmp = next(line.split()[-1] for line in maps if "kiss_matcher.libs/libgomp" in line)
 print(ctypes.CDLL(openmp).omp_get_max_threads())

@@ -57,13 +57,13 @@ def kiss_matcher():
 
     module._library.cache_clear()
     scan = _scan()
-    module.KissMatcher(KissMatcherConfig()).prepare(scan).align(scan, np.eye(4))
+    module.KissMatcher(scan, KissMatcherConfig()).align(scan, np.eye(4))
 
 
 def ndt():
     from mapper.registration.ndt import Ndt
 
-    Ndt(NdtConfig()).prepare(_scan()).align(_scan(), np.eye(4))
+    Ndt(_scan(), NdtConfig()).align(_scan(), np.eye(4))
 
 
 def sweep():

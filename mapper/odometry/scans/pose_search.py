@@ -14,7 +14,7 @@ from mapper.odometry.scans.pose_candidate import PoseCandidate, Shares, fuse_wit
 from mapper.odometry.scans.scan_fit import ScanFit, ScanKeyframe, contradiction, described, fit_of, shares_on
 from mapper.odometry.scans.scan_matcher import DeskewedScan, ScanMatcher
 from mapper.registration.base import Aligner
-from mapper.registration.factory import build_registration
+from mapper.registration.factory import aligner_to
 from mapper.registration.free_space import ScanDescription
 from mapper.registration.pair_refinement import refined_motion
 
@@ -86,7 +86,7 @@ class PoseSearch:
         self._matcher = matcher
         self._assessment = assessment
         self._believes_all = config.usual_ratio == 0.0
-        self._rescue = build_registration(config.rescue) if config.rescue is not None else None
+        self._rescue = config.rescue
         self._rescuer: tuple[DeskewedScan, Aligner] | None = None
 
     def find(
@@ -258,7 +258,7 @@ class PoseSearch:
             return
         for keyframe in _ends(path):
             if self._rescuer is None or self._rescuer[0] is not keyframe.deskewed:
-                self._rescuer = keyframe.deskewed, self._rescue.prepare(keyframe.deskewed.scan)
+                self._rescuer = keyframe.deskewed, aligner_to(keyframe.deskewed.scan, self._rescue)
             found = self._rescuer[1].align(scan.deskewed.scan, np.eye(4))
             if found.converged:
                 T_world_found = keyframe.T_world_middle @ found.T_target_source

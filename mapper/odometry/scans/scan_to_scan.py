@@ -4,7 +4,7 @@ from mapper.core.geometry import Transform
 from mapper.odometry.scans.config import HoughOdometryConfig
 from mapper.odometry.scans.scan_matcher import DeskewedScan, Reach
 from mapper.registration.base import Aligner
-from mapper.registration.factory import build_registration
+from mapper.registration.factory import aligner_to
 
 
 class ScanToScanMatcher:
@@ -13,7 +13,7 @@ class ScanToScanMatcher:
     uses_guess = False
 
     def __init__(self, config: HoughOdometryConfig) -> None:
-        self._registration = build_registration(config.registration)
+        self._config = config.registration
         self.clear()
 
     def match(self, deskewed: DeskewedScan, T_world_body: Transform, *, reach: Reach) -> Transform | None:
@@ -29,7 +29,7 @@ class ScanToScanMatcher:
 
     def add(self, deskewed: DeskewedScan, T_world_body: Transform, *, is_keyframe: bool) -> None:  # noqa: ARG002
         """Replace the last scan."""
-        self._last: tuple[Aligner, Transform] | None = self._registration.prepare(deskewed.scan), T_world_body
+        self._last: tuple[Aligner, Transform] | None = (aligner_to(deskewed.scan, self._config), T_world_body)
 
     def clear(self) -> None:
         """Drop the last scan."""

@@ -152,18 +152,7 @@ class Stages:
 
 
 class Hough:
-    """Hough registration: scans are aligned by the centres of what stands around them."""
-
-    def __init__(self, config: HoughConfig) -> None:
-        self._config = config
-
-    def prepare(self, target: Scan) -> "HoughAligner":
-        """Return the method bound to a target."""
-        return HoughAligner(target, self._config)
-
-
-class HoughAligner:
-    """Hough registration bound to a target: its description and its cloud."""
+    """Hough registration: scans are aligned to a target by the centres of what stands around them."""
 
     def __init__(self, target: Scan, config: HoughConfig) -> None:
         self._config = config
