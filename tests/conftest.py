@@ -1,12 +1,9 @@
-"""Fixtures for all tests: tiny recorded logs, a built run of one, a Dask scheduler."""
+"""Fixtures for all tests: tiny recorded logs, a built run of one."""
 
 import fcntl
-import json
 import os
 import shutil
-import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,7 +14,6 @@ import pytest
 
 from mapper.runtime.kernels import drop_stale_kernels
 from tests.support.files import digest_of
-from tests.support.paths import ROOT
 from tests.support.tum_logs import write_tiny_log
 
 if TYPE_CHECKING:
@@ -128,43 +124,3 @@ def desk_run(desk_log: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterat
 
     with shared_folder(tmp_path_factory, "runs/desk", fill) as run:
         yield open_run(run)
-
-
-@pytest.fixture(scope="session")
-def dask_scheduler(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """The address of a Dask scheduler with two workers, which gives up a job whose worker has died once."""
-    folder = tmp_path_factory.mktemp("dask")
-    contact = folder / "scheduler.json"
-    settings = os.environ | {
-        "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "0",
-        "DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED": "False",  # it watches what takes long: our imports
-        # By default five idle processes take 7 % of a core; the session's other tests run meanwhile.
-        "DASK_DISTRIBUTED__ADMIN__TICK__INTERVAL": "1s",
-        "DASK_DISTRIBUTED__ADMIN__SYSTEM_MONITOR__INTERVAL": "10s",
-        "DASK_DISTRIBUTED__WORKER__MEMORY__MONITOR_INTERVAL": "10s",
-        "PYTHONPATH": str(ROOT),
-    }
-    roles = {
-        "scheduler": ["--port", "0"],
-        "worker": ["--nworkers", "2", "--nthreads", "1", "--local-directory", str(folder)],
-    }
-    common = ["--scheduler-file", str(contact), "--no-dashboard", "--host", "127.0.0.1"]
-    processes = [
-        subprocess.Popen(
-            [sys.executable, "-m", f"distributed.cli.dask_{role}", *options, *common],
-            env=settings,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-        )
-        for role, options in roles.items()
-    ]
-    try:
-        for _ in range(600):
-            if contact.exists() and contact.stat().st_size:
-                break
-            time.sleep(0.1)
-        yield json.loads(contact.read_text())["address"]
-    finally:
-        for process in reversed(processes):
-            process.terminate()
-            process.wait()

@@ -1,7 +1,5 @@
 import re
 import shutil
-import subprocess
-import sys
 
 import pytest
 
@@ -9,7 +7,6 @@ from tests.support.command_line import mapper
 from tests.support.files import digest_of
 from tests.support.full_disk import largest_file
 
-MAPPER = [sys.executable, "-c", "from mapper.cli.main import main; main()"]
 WRITERS = {
     "fuse": ["fuse", "RUN", "--quiet"],
     "export costmap": ["export", "RUN", "--as", "costmap"],
@@ -54,13 +51,8 @@ def test_every_verb_tells_the_file_in_one_line_and_leaves_no_half(verb, desk_run
 
 def test_a_full_disk_leaves_no_file_and_one_line(desk_log, tmp_path):
     with largest_file(3000):
-        build = subprocess.run(
-            [*MAPPER, "build", desk_log, "--out", tmp_path / "run", "--quiet"],
-            capture_output=True,
-            check=False,
-        )
-    assert build.returncode == 1
-    assert build.stderr.count(b"\n") == 1, build.stderr
-    assert b"File too large; raise the limit (ulimit -f)" in build.stderr
+        build = mapper("build", desk_log, "--out", tmp_path / "run", "--quiet", status=1)
+    assert build.stderr.count("\n") == 1
+    assert "File too large; raise the limit (ulimit -f)" in build.stderr
     assert not (tmp_path / "run").exists()
     assert [path.name for path in (tmp_path / "run.partial").glob(".*")] in ([], [".mapper.part"])

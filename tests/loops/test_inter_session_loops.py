@@ -8,7 +8,7 @@ from mapper.loops.config import ScanLoopsConfig
 from mapper.loops.factory import build_verifier
 from mapper.loops.inter_session_loops import find_shared_places
 from mapper.loops.map_constraints import KnownPlaces
-from mapper.runtime.executor import Workers
+from tests.support.counted_jobs import run_elsewhere
 from tests.support.street_scans import on_street, street, view
 
 CONFIG = ScanLoopsConfig()
@@ -42,9 +42,11 @@ def test_the_way_back_has_the_same_places(first):
         assert np.linalg.norm((inverse(place.T_first_place) @ place.T_first_body)[:3, 3]) < 30.0
 
 
-def test_other_processes_measure_the_same(first):
+def test_other_processes_measure_the_same(first, monkeypatch):
     runs = [first, drive(1, 14, 54), drive(1, 4, 30, back=True)]
-    here, elsewhere = (find_shared_places(runs, CONFIG, workers=Workers(count)) for count in (1, 2))
+    here = find_shared_places(runs, CONFIG)
+    monkeypatch.setattr("mapper.loops.inter_session_loops.run_jobs", run_elsewhere)
+    elsewhere = find_shared_places(runs, CONFIG)
     assert {(place.first, place.second) for place in here} == {(0, 1), (0, 2), (1, 2)}
     assert [(place.first, place.second, place.loop.i, place.loop.j) for place in here] == [
         (place.first, place.second, place.loop.i, place.loop.j) for place in elsewhere

@@ -159,6 +159,7 @@ def test_noise_of_the_wheels_is_that_of_poses_that_no_wall_shows(bare):
     assert unsure > 4.0 * sure
 
 
+@pytest.mark.parametrize("rooms", ["360° at 8 Hz, ROS 2"], indirect=True)
 def test_another_drive_is_localised_in_the_map(rooms, tmp_path):
     driven, run = rooms
     again = drive(flat(), driven.laser, speed_mps=1.0, seed=5)

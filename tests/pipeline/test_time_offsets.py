@@ -81,11 +81,11 @@ def test_a_late_gyroscope_is_found_whatever_its_mounting_and_unit(tmp_path, offs
     assert found.late_s == pytest.approx(offset_s, abs=0.003)
 
 
-@pytest.mark.parametrize("offset_s", [0.0, 0.08, -0.3])
+@pytest.mark.parametrize("offset_s", [0.08, -0.3])
 def test_late_images_beside_a_lidar_are_found_by_their_turns(tmp_path, offset_s):
     """The camera, with x right, y down and z forward, sees what is far away."""
     world = cv2.blur(np.random.default_rng(1).integers(0, 255, (500, 6000), np.uint8), (5, 5))
-    seen, camera = path_at(np.arange(0.0, 30.0, 0.07)), PinholeCamera(320, 240, 250.0, 250.0, 159.5, 119.5)
+    seen, camera = path_at(np.arange(0.0, 12.0, 0.07)), PinholeCamera(320, 240, 250.0, 250.0, 159.5, 119.5)
     rows, columns = np.mgrid[:240, :320].astype(np.float32)
     rays = np.stack([(columns - 159.5) / 250.0, (rows - 119.5) / 250.0, np.ones_like(rows)], axis=-1)
     R_body_camera = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
@@ -98,15 +98,14 @@ def test_late_images_beside_a_lidar_are_found_by_their_turns(tmp_path, offset_s)
     T_body_camera = np.eye(4)
     T_body_camera[:3, :3] = R_body_camera
     images = CameraImages("/image", late(seen, offset_s).stamps_ns, camera, T_body_camera, image_at)
-    log_, config = walk(tmp_path, images=[images])
+    log_, config = walk(tmp_path, seconds=12.0, images=[images])
     other = SensorBeside(replace(log_, name="/rear", images=[]), np.eye(4))
     found, rear = measure_time_offsets(replace(log_, beside=[other]), config)
     assert (found.sensor, found.late_s) == ("/image", pytest.approx(offset_s, abs=0.01))
     assert (rear.sensor, rear.late_s, rear.is_measured) == ("/rear", None, False)
-    if offset_s:
-        setting = float(re.search(r"--set source.images_offset_s=(\S+)", found.remedy)[1])
-        moved = selected(log_, SourceConfig(images_offset_s=setting))
-        assert moved.images[0].stamps_ns[0] == pytest.approx(seen.stamps_ns[0], abs=1e7)
+    setting = float(re.search(r"--set source.images_offset_s=(\S+)", found.remedy)[1])
+    moved = selected(log_, SourceConfig(images_offset_s=setting))
+    assert moved.images[0].stamps_ns[0] == pytest.approx(seen.stamps_ns[0], abs=1e7)
 
 
 @pytest.mark.parametrize("facts", ["another walk", "too short", "at rest"])

@@ -1,3 +1,5 @@
+import json
+import os
 import signal
 import subprocess
 import sys
@@ -9,6 +11,39 @@ from mapper.runtime import executor as workers
 from mapper.runtime.executor import Failure, Workers, make_executor, run_jobs
 from tests.support.counted_jobs import Work, alive, told, until
 from tests.support.paths import ROOT
+
+
+@pytest.fixture(scope="module")
+def dask_scheduler(tmp_path_factory):
+    """The address of a Dask scheduler with two workers, which gives up a job whose worker has died once."""
+    folder = tmp_path_factory.mktemp("dask")
+    contact = folder / "scheduler.json"
+    settings = os.environ | {
+        "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "0",
+        "DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED": "False",  # it watches what takes long: our imports
+        "PYTHONPATH": str(ROOT),
+    }
+    roles = {
+        "scheduler": ["--port", "0"],
+        "worker": ["--nworkers", "2", "--nthreads", "1", "--local-directory", str(folder)],
+    }
+    common = ["--scheduler-file", str(contact), "--no-dashboard", "--host", "127.0.0.1"]
+    processes = [
+        subprocess.Popen(
+            [sys.executable, "-m", f"distributed.cli.dask_{role}", *options, *common],
+            env=settings,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        for role, options in roles.items()
+    ]
+    try:
+        until(lambda: contact.exists() and contact.stat().st_size, seconds=60.0)
+        yield json.loads(contact.read_text())["address"]
+    finally:
+        for process in reversed(processes):
+            process.terminate()
+            process.wait()
 
 
 @pytest.fixture(params=["here", "processes", "dask"])

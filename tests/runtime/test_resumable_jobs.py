@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from mapper.core.errors import DataError, RunError
+from mapper.core.errors import ConfigError, DataError, RunError
 from mapper.evaluators.study.engine import run_study
 from mapper.runtime.atomic import locked
 from mapper.runtime.executor import Workers
@@ -60,9 +60,12 @@ def test_results_come_in_order_and_are_not_worked_out_again(diary, tmp_path):
 
 def test_finished_cells_need_no_workers(diary, tmp_path):
     (first,) = run_cells([cell(diary, 1)], tmp_path / "cells")
-    (again,) = run_cells([cell(diary, 1)], tmp_path / "cells", workers=Workers(scheduler="nonsense"))
+    cluster = {"workers": Workers(scheduler="nonsense")}
+    (again,) = run_cells([cell(diary, 1)], tmp_path / "cells", **cluster)
     assert again == first
-    assert run_cells([], tmp_path / "cells", workers=Workers(scheduler="nonsense")) == []
+    assert run_cells([], tmp_path / "cells", **cluster) == []
+    with pytest.raises(ConfigError, match="nonsense"):
+        run_cells([cell(diary, 2)], tmp_path / "cells", **cluster)
 
 
 def test_more_cells_leave_the_finished_ones_alone(diary, tmp_path):
@@ -73,13 +76,6 @@ def test_more_cells_leave_the_finished_ones_alone(diary, tmp_path):
     assert told(diary) == {"1": 1, "2": 1, "3": 1, "4": 1}
     assert observer.notes == ["2 of 4 cells were finished before and are kept"]
     assert observer.reports == [(0, 2), (1, 2), (2, 2)]
-
-
-def test_a_cluster_comes_to_the_same(diary, tmp_path, dask_scheduler):
-    cells = [cell(diary, n) for n in range(3)]
-    ours = run_cells(cells, tmp_path / "ours")
-    theirs = run_cells(cells, tmp_path / "theirs", workers=Workers(scheduler=dask_scheduler))
-    assert [result.records for result in ours] == [result.records for result in theirs]
 
 
 def test_a_failed_cell_is_told_written_and_tried_again(diary, tmp_path):

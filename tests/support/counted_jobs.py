@@ -1,13 +1,18 @@
 """Jobs for workers in other processes, which import them by name; what they do is counted in a file."""
 
 import os
+import pickle
 import signal
 import time
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from mapper.core.errors import SourceError
+from mapper.runtime.executor import run_jobs
 
 
 def told(diary: Path) -> Counter[str]:
@@ -68,6 +73,14 @@ class Work:
 
     def _nan(self, _before: int) -> list[dict[str, float]]:
         return [{"ratio": float("nan")}]
+
+
+def run_elsewhere(jobs: list, executor: object, **options: object) -> Iterator[tuple[int, object]]:
+    """Run jobs as other processes get them: pickled, and in another order."""
+    order = np.random.default_rng(0).permutation(len(jobs)).tolist()
+    copies = [pickle.loads(pickle.dumps(jobs[i])) for i in order]
+    for index, result in run_jobs(copies, executor, **options):
+        yield order[index], pickle.loads(pickle.dumps(result))
 
 
 def alive(pid: int) -> bool:

@@ -12,10 +12,10 @@ from mapper.evaluators.study.engine import SameVersions, versions
 from mapper.evaluators.sweep.page import write_sweep
 from mapper.evaluators.sweep.plan import plan_sweep, run_sweep
 from mapper.evaluators.sweep.tables import QUANTITIES, best_of, grouped, summary_text, sweep_records
-from mapper.runtime.executor import Workers
 from mapper.runtime.resumable_jobs import Job, JobResult
 from tests.support.chromium import CHROMIUM, MISSING, Page
 from tests.support.command_line import mapper
+from tests.support.counted_jobs import run_elsewhere
 
 FEW = "source.last_frame=11"
 TIMES = {"cell_s", "track_s", "solve_s", "level_s", "fuse_s", "write_s", "total_s", "frames_per_s"}
@@ -273,11 +273,12 @@ def test_a_sweep_goes_on_where_it_was_ended(interrupted, resumable_folder):
 
 
 @pytest.mark.slow
-def test_builds_in_other_processes_come_to_the_same(interrupted, resumable_folder, tmp_path, dask_scheduler):
+def test_builds_in_other_processes_come_to_the_same(interrupted, resumable_folder, tmp_path, monkeypatch):
     assert resumable_folder
     file, out, _ = interrupted
     plan = plan_sweep(file, tmp_path / "out")
-    write_sweep(plan, run_sweep(plan, workers=Workers(scheduler=dask_scheduler)), title="again")
+    monkeypatch.setattr("mapper.runtime.resumable_jobs.run_jobs", run_elsewhere)
+    write_sweep(plan, run_sweep(plan), title="again")
 
     theirs, ours = (
         parquet.read_table(folder / "results.parquet").drop_columns(sorted(TIMES)).to_pylist()
