@@ -36,7 +36,7 @@ def elsewhere(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def short_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A log of sixteen frames before a desk, for what is built again and again."""
     log = tmp_path_factory.mktemp("logs") / "short"
-    write_tum_log(log, DESK.model_copy(update={"duration_s": 1.0}))
+    write_tum_log(log, DESK.model_copy(update={"duration_s": 1.0, "width_px": 160, "height_px": 120}))
     return log
 
 
