@@ -57,12 +57,6 @@ def test_scans_come_back_as_they_were(tmp_path):
         assert back.stamp_ns == places[node].stamp_ns
 
 
-def test_the_same_places_are_the_same_bytes(tmp_path):
-    for name in ("a", "b"):
-        write_places(tmp_path / name, {0: scan(10, 30, np.random.default_rng(0))})
-    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
-
-
 @pytest.mark.parametrize("damage", [lambda data: data[:-20], lambda data: b"x" + data, lambda _: b""])
 def test_a_damaged_file_is_refused_by_name(tmp_path, damage):
     path = tmp_path / "places.bin"

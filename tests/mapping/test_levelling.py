@@ -208,11 +208,6 @@ def test_a_laser_s_plane_is_as_high_as_it_is_above_the_robot_s_footprint(footpri
     assert level.T_level_world[2, 3] + 0.22 == pytest.approx(layer_m + 0.05 / 3.0)
 
 
-def test_the_same_log_gives_the_same_frame_to_the_bit():
-    scans, trajectory, _ = log_of(ROOM, around())
-    assert (level_of(scans, trajectory).T_level_world == level_of(scans, trajectory).T_level_world).all()
-
-
 def test_a_log_without_poses_is_refused():
     with pytest.raises(DataError, match="no poses"):
         level_of([], Trajectory(np.empty(0, np.int64), np.empty((0, 4, 4))))

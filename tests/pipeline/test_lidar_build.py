@@ -72,9 +72,8 @@ def test_the_log_shows_scans_in_the_body_frame(run):
     assert topics.count("/tf") == 21
 
 
-@pytest.mark.parametrize("workers", [1, 3])
-def test_the_same_log_gives_the_same_bytes(run, log, tmp_path, workers):
-    again = built(log, tmp_path / "again", f"workers={workers}")
+def test_the_same_log_gives_the_same_bytes(run, log, tmp_path):
+    again = built(log, tmp_path / "again", "workers=1")
 
     same = {path.name for path in run.path.iterdir()} - {"manifest.json", "frame_ms.csv", "config.json"}
     for name in sorted(same):

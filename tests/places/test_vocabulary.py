@@ -44,12 +44,6 @@ def test_clusters_that_are_there_are_found():
     assert (tree.centres[1:][words[:, 0]] == things).all()
 
 
-def test_training_is_deterministic(images, vocabulary):
-    again = train(images, config=SMALL, trained_on="things", rng=np.random.default_rng(1))
-    assert (again.tree.centres == vocabulary.tree.centres).all()
-    assert (again.idf == vocabulary.idf).all()
-
-
 def test_a_word_is_the_nearest_child_all_the_way_down(images, vocabulary):
     tree, bits = vocabulary.tree, images[0]
     words = vocabulary.words_of(bits)
