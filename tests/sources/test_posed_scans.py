@@ -14,10 +14,12 @@ from mapper.config.loading import load_config
 from mapper.core.errors import DependencyError, FrameError, SourceError
 from mapper.evaluators.metrics.evaluate import evaluate
 from mapper.pipeline.build import build
+from mapper.simulation.source import CameraSimulator
 from mapper.sources import open_source
 from mapper.sources.config import CameraConfig, SourceConfig
 from mapper.sources.inspection import inspect_log
 from mapper.sources.writers import write_log
+from tests.support.desk import DESK
 from tests.support.posed_scans import WRITERS, Shots, shots_of, write_klg, write_record3d
 
 DEVICE = {"stray-scanner", "record3d", "polycam", "nerfstudio"}
@@ -27,8 +29,9 @@ LOSSLESS = {"nerfstudio", "bop", "redwood", "openloris"}
 
 
 @pytest.fixture(scope="module")
-def shots(desk_log):
-    log = open_source(desk_log, SourceConfig(stride=2))
+def shots():
+    small = {"width_px": 160, "height_px": 120, "frame_rate_hz": 7.5}
+    log = CameraSimulator(DESK.model_copy(update=small)).log()
     frames = list(log)
     at = np.searchsorted(log.truth.stamps_ns, [frame.stamp_ns for frame in frames])
     return shots_of(frames, log.truth.T_world_body[at])
@@ -43,7 +46,7 @@ def test_every_layout_is_read_as_it_was_taken(shots, tmp_path, kind):
         np.diff(log.stamps_ns) / 1e9, 1.0 / (30.0 if kind in UNTIMED else 15.0), atol=1e-3
     )
     for frame, shot in zip(log, shots.frames, strict=True):
-        assert (frame.camera.width_px, frame.camera.height_px) == (320, 240)
+        assert (frame.camera.width_px, frame.camera.height_px) == (160, 120)
         np.testing.assert_allclose(frame.camera.intrinsics, shots.camera.intrinsics, rtol=1e-6)
         expected_mm = shot.depth_mm * (shot.confidence > 0) if kind in CONFIDENT else shot.depth_mm
         np.testing.assert_allclose(frame.depth_m[::2, ::2] * 1000.0, expected_mm, atol=0.1)
@@ -115,7 +118,7 @@ def test_a_missing_camera_of_stray_scanner_can_be_set(shots, tmp_path):
     (folder / "camera_matrix.csv").unlink()
     with pytest.raises(SourceError, match=r"source\.camera\.fx_px"):
         open_source(folder)
-    camera = CameraConfig(fx_px=250.0, fy_px=251.0, cx_px=160.0, cy_px=120.0)
+    camera = CameraConfig(fx_px=250.0, fy_px=251.0, cx_px=80.0, cy_px=60.0)
     assert open_source(folder, SourceConfig(camera=camera))[0].camera.fx_px == 250.0
 
 

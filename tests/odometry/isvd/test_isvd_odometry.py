@@ -83,11 +83,11 @@ def follow(odometry: IsvdOdometry, wall: Wall, poses: list[np.ndarray], *, first
     ids=lambda changes: "-".join(changes.values()) or "defaults",
 )
 def test_follows_a_path(changes):
-    poses = path(60)
+    poses = path(30)
 
     tracks = follow(IsvdOdometry(config(**changes)), Wall(0), poses)
 
-    assert [track.node for track in tracks] == list(range(60))
+    assert [track.node for track in tracks] == list(range(30))
     gaps = [
         np.linalg.norm(track.T_world_body[:3, 3] - T[:3, 3]) for track, T in zip(tracks, poses, strict=True)
     ]

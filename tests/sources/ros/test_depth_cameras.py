@@ -150,7 +150,7 @@ def test_a_rotation_that_is_none_is_a_damaged_message():
 
 def test_a_pose_that_is_not_stated_is_estimated_by_outlines(tmp_path, desk_log):
     """A tilted camera, as an Azure Kinect's."""
-    registered = open_source(desk_log)[::2]
+    registered = open_source(desk_log)[::3]
     T_color_depth = exp(np.radians([6.0, 0.3, -0.2]), np.array([-0.032, -0.002, 0.004]))
     camera = PinholeCamera(320, 288, 252.0, 252.0, 160.3, 150.1)
     write_unregistered(tmp_path / "bag", registered, camera, T_color_depth, stated_in=None)
@@ -163,7 +163,7 @@ def test_a_pose_that_is_not_stated_is_estimated_by_outlines(tmp_path, desk_log):
 
 
 def test_depth_of_another_time_tells_no_pose(tmp_path, desk_log):
-    registered = open_source(desk_log)[::2]
+    registered = open_source(desk_log)[::3]
     late = replace(registered, entry_at=lambda index: OtherDepth(registered, index))
     write_unregistered(tmp_path / "bag", late, D435, stated_in=None)
     with pytest.raises(SourceError, match=r"standard deviations .*depth_in_color"):
