@@ -121,6 +121,7 @@ def test_grey_and_colour_of_a_frame_agree():
     grey = RgbdFrame(7, shot.gray, shot.depth_m, PLAIN)
     np.testing.assert_array_equal(grey.rgb, np.dstack([shot.gray] * 3))
     assert grey.gray is grey.image
+    assert grey.scan().colors is None
 
 
 def test_distorting_undoes_undistorting():
@@ -154,7 +155,3 @@ def test_points_project_back_onto_their_pixels(depth_m, stride_px):
     assert len(points_body) == len(kept)
     np.testing.assert_allclose(points_camera[:, 2], [depth_m[r, c] for c, r in kept], atol=1e-5)
     np.testing.assert_allclose(CAMERA.project(points_camera), CAMERA.undistort(np.array(kept)), atol=1e-4)
-
-
-def test_a_grey_image_gives_no_colours(depth_m):
-    assert RgbdFrame(0, np.zeros((5, 7), np.uint8), depth_m, CAMERA).scan().colors is None

@@ -47,11 +47,11 @@ def test_quaternion_of_a_turn_about_one_axis(axis, angle_rad):
 
 
 @pytest.mark.parametrize(
-    "q", [np.zeros(4), np.full(4, 1e-12), np.array([np.nan, 0, 0, 1]), np.full(4, np.inf)]
+    "q", [np.zeros(4), np.full(4, 1e-12), [np.nan, 0, 0, 1], np.full(4, np.inf), [0.0, -1e308, 0.0, 1.0]]
 )
 def test_a_quaternion_without_direction_is_refused(q):
     with pytest.raises(DataError, match="has no direction"):
-        rotation_from_quaternion(q)
+        rotation_from_quaternion(np.array(q))
 
 
 @given(ANGLE, ANGLE, ANGLE)
@@ -99,8 +99,3 @@ def test_many_turns_are_converted_as_one_would_be():
     q[7] = 0.0
     with pytest.raises(DataError, match=r"\(0.0, 0.0, 0.0, 0.0\) has no direction"):
         rotation_from_quaternion(q)
-
-
-def test_a_quaternion_whose_length_overflows_is_refused():
-    with pytest.raises(DataError, match="has no direction"):
-        rotation_from_quaternion(np.array([0.0, -1e308, 0.0, 1.0]))

@@ -83,9 +83,3 @@ def test_keeps_the_first_point_of_every_voxel(seed, voxel_m):
 
 def test_of_nothing_nothing_is_kept():
     assert len(thin(np.empty((0, 3), np.float32), 0.2)) == 0
-
-
-def test_cells_on_both_sides_of_the_origin_differ():
-    points = np.array([[-0.05, 0.0, 0.0], [0.05, 0.0, 0.0]], np.float32)
-
-    assert thin(points, 0.2).tolist() == [0, 1]

@@ -41,20 +41,16 @@ def poses(path, T=T_WORLD_LIDAR):
     write_kitti(path, Trajectory(np.arange(len(T)), T))
 
 
-def stamps_of(source):
-    return [entry.stamp_ns for entry in source.entries()]
-
-
 def test_poses_without_a_calibration_are_the_lidars(tmp_path):
     poses(scans(tmp_path / "drive") / "poses.txt")
     source = open_source(tmp_path / "drive")
     assert (source.kind, source.sensor, source.name, len(source)) == ("kitti", "lidar", "drive", N)
-    assert stamps_of(source) == [i * NS_PER_S // 10 for i in range(N)]
+    assert source.stamps_ns.tolist() == [i * NS_PER_S // 10 for i in range(N)]
     assert source.notes == [
         "no stamps in the names or in a times.txt; 10 scans a second assumed (source.rate_hz)"
     ]
     np.testing.assert_allclose(source.truth.T_world_body, T_WORLD_LIDAR, atol=1e-12)
-    assert source.truth.stamps_ns.tolist() == stamps_of(source)
+    assert source.truth.stamps_ns.tolist() == source.stamps_ns.tolist()
     np.testing.assert_array_equal(next(source.entries()).load().points_body, records_of(0)[:, :3])
 
 
@@ -91,7 +87,7 @@ def test_the_layout_of_the_benchmark(tmp_path, opened):
     poses(tmp_path / "poses/07.txt")
     source = open_source(tmp_path / opened)
     assert source.name == "07"
-    assert stamps_of(source) == [103_700_000 * i for i in range(N)]
+    assert source.stamps_ns.tolist() == [103_700_000 * i for i in range(N)]
     assert source.notes == []
     np.testing.assert_allclose(source.truth.T_world_body, T_WORLD_LIDAR, atol=1e-12)
 
@@ -114,7 +110,7 @@ def test_a_raw_recording_has_the_times_of_its_list(tmp_path, opened, kind):
     source = open_source(tmp_path / opened)
     assert (source.kind, source.notes) == (kind, [])
     first_ns = 1317042145594360375
-    assert stamps_of(source) == [first_ns, first_ns + NS_PER_S, first_ns + 3 * NS_PER_S]
+    assert source.stamps_ns.tolist() == [first_ns, first_ns + NS_PER_S, first_ns + 3 * NS_PER_S]
 
 
 def test_a_date_that_is_none_is_named_with_its_line(tmp_path):
@@ -136,13 +132,13 @@ def test_more_or_fewer_poses_than_scans_pair_by_the_scans_numbers_and_another_tr
     poses(folder / "gps/poses.txt", T_WORLD_LIDAR[::-1])
     source = open_source(folder)
     np.testing.assert_allclose(source.truth.T_world_body, T_WORLD_LIDAR[[1, 3]], atol=1e-12)
-    assert source.truth.stamps_ns.tolist() == stamps_of(source) == [100_000_000, 300_000_000]
+    assert source.truth.stamps_ns.tolist() == source.stamps_ns.tolist() == [100_000_000, 300_000_000]
     other = open_source(folder, SourceConfig(truth_file="gps/poses.txt")).truth
     np.testing.assert_allclose(other.T_world_body, T_WORLD_LIDAR[::-1][[1, 3]], atol=1e-12)
     folder = scans(tmp_path / "fewer")
     poses(folder / "poses.txt", T_WORLD_LIDAR[:3])
     source = open_source(folder)
-    assert source.truth.stamps_ns.tolist() == stamps_of(source)[:3]
+    assert source.truth.stamps_ns.tolist() == source.stamps_ns.tolist()[:3]
     assert "poses.txt: 3 poses for 3 of 5 scans" in source.notes
 
 

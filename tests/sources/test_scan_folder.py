@@ -42,10 +42,6 @@ def cloud_folder(folder, names):
     return folder
 
 
-def stamps_of(source):
-    return [entry.stamp_ns for entry in source.entries()]
-
-
 def first_x(source):
     """Which scans these are, by their first coordinate."""
     return [entry.scan().points_body[0, 0] for entry in source.entries()]
@@ -63,7 +59,7 @@ def test_a_folder_of_clouds_is_a_lidar_log(tmp_path, ending):
     assert (source.kind, source.sensor, source.name, len(source)) == ("clouds", "lidar", "yard", 12)
     assert source.truth is None
     assert source.notes == [assumed(10)]
-    assert stamps_of(source) == [i * PERIOD_NS for i in range(12)]
+    assert source.stamps_ns.tolist() == [i * PERIOD_NS for i in range(12)]
     assert first_x(source) == [points_of(i)[0, 0] for i in range(12)]  # 10 comes after 9
     for _ in range(2):
         scan = next(iter(source.entries())).load()
@@ -99,14 +95,14 @@ def test_nothing_is_read_before_it_is_asked_for(tmp_path):
 def test_names_that_are_stamps(tmp_path, names, step_ns):
     source = open_source(cloud_folder(tmp_path, [f"{name}.npy" for name in names]))
     assert source.notes == []
-    stamps_ns = stamps_of(source)
+    stamps_ns = source.stamps_ns.tolist()
     assert np.diff(stamps_ns).tolist() == [step_ns] * (len(names) - 1)
     assert 0 <= FIRST_NS - stamps_ns[0] < NS_PER_S
 
 
 def test_names_sort_by_time_even_where_text_would_not(tmp_path):
     source = open_source(cloud_folder(tmp_path, ["100.05.npy", "99.9.npy", "100.0.npy"]))
-    assert stamps_of(source) == [99_900_000_000, 100_000_000_000, 100_050_000_000]
+    assert source.stamps_ns.tolist() == [99_900_000_000, 100_000_000_000, 100_050_000_000]
     assert first_x(source) == [points_of(i)[0, 0] for i in (1, 2, 0)]
 
 
@@ -173,7 +169,7 @@ def test_a_list_of_stamps(tmp_path, listed):
     folder = cloud_folder(tmp_path, ["a.npy", "b.npy", "c.npy"])
     (folder / listed).write_text("1544676777.123456789\n1544676777223456789\n1.544676777323456789e9\n")
     source = open_source(folder)
-    assert stamps_of(source) == [FIRST_NS + i * PERIOD_NS for i in range(3)]
+    assert source.stamps_ns.tolist() == [FIRST_NS + i * PERIOD_NS for i in range(3)]
     assert source.notes == []
 
 
@@ -188,7 +184,7 @@ def test_a_list_of_stamps(tmp_path, listed):
 def test_a_list_of_files_and_stamps(tmp_path, text):
     folder = cloud_folder(tmp_path, ["000000.npy", "000001.npy", "000002.npy"])
     (folder / "timestamps.csv").write_text(text)
-    assert stamps_of(open_source(folder)) == [1544676777100000000 + i * PERIOD_NS for i in range(3)]
+    assert open_source(folder).stamps_ns.tolist() == [1544676777100000000 + i * PERIOD_NS for i in range(3)]
 
 
 @pytest.mark.parametrize(("unit", "per_s"), [("milli", 1000), ("micro", 10**6), ("nano", 10**9)])
@@ -196,14 +192,14 @@ def test_whole_numbers_that_advance_as_times_do_are_in_their_unit(tmp_path, unit
     folder = cloud_folder(tmp_path, ["0.npy", "1.npy", "2.npy"])
     (folder / "times.txt").write_text("".join(f"{12 * per_s + i * per_s // 10}\n" for i in range(3)))
     source = open_source(folder)
-    assert stamps_of(source) == [12_000_000_000 + i * PERIOD_NS for i in range(3)]
+    assert source.stamps_ns.tolist() == [12_000_000_000 + i * PERIOD_NS for i in range(3)]
     assert unit in source.notes[0]
 
 
 def test_a_list_for_all_numbers_serves_some_of_the_scans(tmp_path):
     folder = cloud_folder(tmp_path, ["000002.npy", "000005.npy"])
     (folder / "times.txt").write_text("".join(f"{0.5 * i}\n" for i in range(9)))
-    assert stamps_of(open_source(folder)) == [1_000_000_000, 2_500_000_000]
+    assert open_source(folder).stamps_ns.tolist() == [1_000_000_000, 2_500_000_000]
 
 
 @pytest.mark.parametrize(
@@ -229,7 +225,7 @@ def test_the_list_that_the_user_names_goes_before_names(tmp_path):
     folder = cloud_folder(tmp_path / "log", ["10.5.npy", "11.5.npy"])
     (tmp_path / "clock.txt").write_text("3\n4\n")
     source = open_source(folder, SourceConfig(stamps_file="../clock.txt"))
-    assert stamps_of(source) == [3 * NS_PER_S, 4 * NS_PER_S]
+    assert source.stamps_ns.tolist() == [3 * NS_PER_S, 4 * NS_PER_S]
     with pytest.raises(SourceError, match=r"clock.txt: no such file; source.stamps_file"):
         open_source(folder, SourceConfig(stamps_file="clock.txt"))
 
@@ -240,10 +236,10 @@ def test_fractions_without_leading_zeros_are_whole_numbers_and_those_without_zer
 ):
     expected_ns = [1_700_000_000 * NS_PER_S + 7_000_000 + k * 100_000_000 for k in range(25)]
     names = [f"{ns // NS_PER_S}.{ns % NS_PER_S // 10 ** (9 - digits)}.npy" for ns in expected_ns]
-    assert stamps_of(open_source(cloud_folder(tmp_path / "a", names))) == expected_ns
+    assert open_source(cloud_folder(tmp_path / "a", names)).stamps_ns.tolist() == expected_ns
     expected_ns = [1_700_000_000 * NS_PER_S + 105_000_000 + k * 5_000_000 for k in range(25)]
     names = [f"{ns / NS_PER_S:.3f}".rstrip("0") + ".npy" for ns in expected_ns]
-    assert stamps_of(open_source(cloud_folder(tmp_path / "b", names))) == expected_ns
+    assert open_source(cloud_folder(tmp_path / "b", names)).stamps_ns.tolist() == expected_ns
 
 
 @pytest.mark.parametrize(
@@ -257,7 +253,7 @@ def test_fractions_without_leading_zeros_are_whole_numbers_and_those_without_zer
 def test_the_rate_is_an_option_and_missing_numbers_keep_their_time(tmp_path, names, stamps_ms, note):
     folder = cloud_folder(tmp_path, [f"{name}.npy" for name in names])
     source = open_source(folder, SourceConfig(rate_hz=20.0))
-    assert stamps_of(source) == [ms * 1_000_000 for ms in stamps_ms]
+    assert source.stamps_ns.tolist() == [ms * 1_000_000 for ms in stamps_ms]
     assert [note in one for one in source.notes] == [True]
 
 
@@ -275,7 +271,7 @@ def test_repeated_stamps_are_dropped_and_disorder_is_sorted(tmp_path):
     folder = cloud_folder(tmp_path, ["a.npy", "b.npy", "c.npy", "d.npy"])
     (folder / "times.txt").write_text("1\n3\n3\n2\n")
     source = open_source(folder)
-    assert stamps_of(source) == [1 * NS_PER_S, 2 * NS_PER_S, 3 * NS_PER_S]
+    assert source.stamps_ns.tolist() == [1 * NS_PER_S, 2 * NS_PER_S, 3 * NS_PER_S]
     assert first_x(source) == [points_of(i)[0, 0] for i in (0, 3, 1)]
     assert source.notes == [
         "scans: out of time order in 1 places; sorted",
@@ -289,7 +285,7 @@ def test_the_commonest_ending_is_the_log_and_a_pattern_chooses_another(tmp_path)
     assert len(source) == 3
     assert "2 .xyz files left out; source.pattern chooses others" in source.notes
     source = open_source(folder, SourceConfig(pattern="velo_*"))
-    assert stamps_of(source) == [PERIOD_NS, 3 * PERIOD_NS]
+    assert source.stamps_ns.tolist() == [PERIOD_NS, 3 * PERIOD_NS]
     assert len(source.notes) == 1
     with pytest.raises(SourceError, match=r"no cloud matches source.pattern=livox_\*"):
         open_source(folder, SourceConfig(pattern="livox_*"))

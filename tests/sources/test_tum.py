@@ -14,10 +14,6 @@ from tests.support.paths import FR1_XYZ
 from tests.support.tum_logs import DEPTH_LEAD_NS, FIRST_NS, PERIOD_NS, picture, write_picture
 
 
-def stamps_of(source):
-    return [entry.stamp_ns for entry in source.entries()]
-
-
 def edit(path, change):
     path.write_text(change(path.read_text()))
 
@@ -25,7 +21,7 @@ def edit(path, change):
 def test_reads_every_frame_with_exact_stamps_pixels_and_truth(tiny_tum_log):
     source = open_source(tiny_tum_log(4))
     assert (source.kind, source.name, len(source), source.notes) == ("tum", "log", 4, [])
-    assert stamps_of(source) == [FIRST_NS + i * PERIOD_NS for i in range(4)]
+    assert source.stamps_ns.tolist() == [FIRST_NS + i * PERIOD_NS for i in range(4)]
     for i, entry in enumerate(source.entries()):
         rgb, units = picture(i)
         frame = entry.load()
@@ -36,7 +32,7 @@ def test_reads_every_frame_with_exact_stamps_pixels_and_truth(tiny_tum_log):
     assert (frame.camera.fx_px, frame.camera.cy_px, frame.camera.width_px) == (60.0, 23.5, 64)
     np.testing.assert_allclose(source.truth.positions_world[:, 0], [0, 0.01, 0.02, 0.03])
     assert source.accelerations is None
-    assert stamps_of(source) == stamps_of(source)
+    assert source.stamps_ns.tolist() == source.stamps_ns.tolist()
     np.testing.assert_array_equal(source[1].depth_m, source[1].depth_m)
 
 
@@ -71,10 +67,10 @@ def test_listed_files_that_do_not_exist_are_dropped_and_counted(tiny_tum_log):
 
 def test_lists_out_of_order_are_sorted_and_repeats_dropped(tiny_tum_log):
     log = tiny_tum_log(4)
-    want = stamps_of(open_source(log))
+    want = open_source(log).stamps_ns.tolist()
     edit(log / "rgb.txt", lambda text: "\n".join([*reversed(text.splitlines()), text.splitlines()[-1]]))
     source = open_source(log)
-    assert stamps_of(source) == want
+    assert source.stamps_ns.tolist() == want
     assert any("out of time order in 3 places; sorted" in note for note in source.notes)
     assert any("1 stamps appear twice" in note for note in source.notes)
 
@@ -198,7 +194,7 @@ def test_the_users_camera_wins_over_the_file_and_a_depth_factor_leaves_it_alone(
 def test_the_real_freiburg1_xyz():
     source = open_source(FR1_XYZ)
     assert (len(source), len(source.truth), source.notes) == (798, 3000, [])
-    stamps = np.array(stamps_of(source))
+    stamps = np.array(source.stamps_ns.tolist())
     assert stamps[[0, -1]].tolist() == [1305031102175304000, 1305031128747363000]
     _, gap_ns = nearest(source.truth.stamps_ns, stamps)
     assert (gap_ns <= 20_000_000).sum() == 796
@@ -270,12 +266,12 @@ def test_stamps_that_count_frames_are_noted(tiny_tum_log, apart_s, noted):
 )
 def test_lists_of_other_programs_are_read(tiny_tum_log, header, separator, slash):
     log = tiny_tum_log(3)
-    expected = stamps_of(open_source(log))
+    expected = open_source(log).stamps_ns.tolist()
     for name in ("rgb.txt", "depth.txt"):
         lines = [line.split() for line in (log / name).read_text().splitlines() if line[0] != "#"]
         rows = [f"{stamp}{separator}{file.replace('/', slash)}" for stamp, file in lines]
         (log / name).write_text(header + "\n".join(rows))
-    assert stamps_of(open_source(log)) == expected
+    assert open_source(log).stamps_ns.tolist() == expected
 
 
 def test_a_header_names_the_order_of_the_truths_columns(tiny_tum_log):
