@@ -23,7 +23,7 @@ TEXTS = {page_name(path): path.read_text(encoding="utf-8") for path in PAGES}
 RUN_PAGES = [name for name, text in TEXTS.items() if list(blocks_of(text))]
 
 QUICKER = {
-    "compare": ["--last", "6", "--pairs", "1"],
+    "compare": ["--last", "3", "--pairs", "1"],
     "sweep": ["--processes", "1"],
     "synth": ["--seconds", "4"],
 }
