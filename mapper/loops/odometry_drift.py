@@ -12,7 +12,7 @@ from mapper.graph.model import BetweenFactor
 from mapper.loops.closure import Discrepancy
 from mapper.loops.config import SLACK_RAD, GateConfig
 
-_MAX_STEP_M, _MAX_STEP_RAD = 1.0, 0.5
+LARGEST_SIGMA_M, LARGEST_SIGMA_RAD = 1.0, 0.5
 """Largest standard deviations of an odometry's step: a motion that surfaces leave open is still predicted."""
 
 
@@ -162,7 +162,7 @@ class OdometryChain:
 
 
 def _edge(factor: BetweenFactor) -> _Edge:
-    least = np.diag([_MAX_STEP_RAD**-2.0] * 3 + [_MAX_STEP_M**-2.0] * 3)
+    least = np.diag([LARGEST_SIGMA_RAD**-2.0] * 3 + [LARGEST_SIGMA_M**-2.0] * 3)
     information = factor.information + least if factor.origin == "odometry" else factor.information
     covariance = np.asarray(np.linalg.inv(information), np.float64)
     path_m, turned_rad = length_and_angle(factor.T_i_j)

@@ -17,6 +17,7 @@ from mapper.graph.components import component_numbers
 from mapper.graph.inertial_smoothing import SmoothedPath, smooth_path
 from mapper.graph.measurement_covariance import information_of
 from mapper.graph.model import BetweenFactor, PoseGraph
+from mapper.loops.odometry_drift import LARGEST_SIGMA_M, LARGEST_SIGMA_RAD
 from mapper.odometry.base import FrameResult
 from mapper.odometry.gyroscope_calibration import (
     body_readings,
@@ -32,7 +33,7 @@ from mapper.sensing.inertial import InertialReadings
 from mapper.sources.base import Accelerations, Log
 
 _TRUSTED_MPS = 0.1
-"""Standard deviation of the velocity up to which a frame is placed, as of motions that scans do not show."""
+"""Standard deviation of the velocity up to which a motion that surfaces leave open is known."""
 _CONTRADICTION = 25.0
 """Variance factor from which on residuals are not noise but wrong readings: 5 standard deviations."""
 METHOD = "inertial"
@@ -302,10 +303,10 @@ def _place_frames(
         if track.is_keyframe:
             changed.append(replace(track, doubts=doubts))
             continue
-        if track.node is None and not is_known:
+        covariance = path.covariance(before, k)
+        if track.node is None and not _is_useful(covariance):
             changed.append(track)
             continue
-        covariance = path.covariance(before, k)
         if track.node is None:
             off_m = float(np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1]))
             doubts = (Doubt("unobservable", f"nothing is seen, placed by the IMU to ±{off_m:.2g} m"),)
@@ -353,9 +354,12 @@ def _connect_parts(
     by_time = sorted(index_of.items(), key=lambda one: one[1])
     joined = dict(part_of)
     for (a, i), (b, j) in pairwise(by_time):
-        if joined[a] == joined[b] or path.velocity_sigmas_mps[i : j + 1].max() > _TRUSTED_MPS:
+        if joined[a] == joined[b]:
             continue
-        factor = _factor(path, a, b, i, j, path.covariance(i, j))
+        covariance = path.covariance(i, j)
+        if not _is_useful(covariance):
+            continue
+        factor = _factor(path, a, b, i, j, covariance)
         T_new_old = graph.T_world_node[a] @ factor.T_i_j @ inverse(graph.T_world_node[b])
         moved = {node for node, part in joined.items() if part == joined[b]}
         joined |= dict.fromkeys(moved, joined[a])
@@ -365,6 +369,12 @@ def _connect_parts(
         others, loops = graph.without_loops().factors, graph.loops
         graph = graph.with_factors([*others, factor, *loops])
     return graph
+
+
+def _is_useful(covariance: Array) -> bool:
+    """Return whether a motion is known better than loops take an odometry's step to be that saw nothing."""
+    rad2, m2 = (np.linalg.eigvalsh(covariance[part, part])[-1] for part in _PARTS)
+    return bool(rad2 <= LARGEST_SIGMA_RAD**2 and m2 <= LARGEST_SIGMA_M**2)
 
 
 def _factor(path: SmoothedPath, a: int, b: int, i: int, j: int, covariance: Array) -> BetweenFactor:
