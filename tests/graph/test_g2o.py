@@ -9,6 +9,7 @@ from mapper.graph.g2o import read_g2o, write_g2o
 from mapper.graph.model import BetweenFactor, PoseGraph
 from mapper.graph.optimize import optimize
 from tests.support.paths import POSE_GRAPHS
+from tests.support.progress import Observer
 
 needs_posegraphs = pytest.mark.skipif(not POSE_GRAPHS.is_dir(), reason=f"{POSE_GRAPHS} is not here")
 
@@ -102,17 +103,13 @@ def test_indefinite_information_is_what_gtsam_makes_of_it(tmp_path):
         lines.append(f"EDGE_SE3:QUAT {k} {k + 1} 1.1 0.2 0 0 0 0.1 1 {upper}")
     path = tmp_path / "indefinite.g2o"
     path.write_text("\n".join(lines) + "\n")
-    notes = []
-
-    class Noting:
-        note = staticmethod(notes.append)
-
-    graph = read_g2o(path, progress=Noting())
+    observer = Observer()
+    graph = read_g2o(path, progress=observer)
     factors, values = gtsam.readG2o(str(path), True)
 
     assert 5 < indefinite < 35, "the test must hold both kinds"
-    assert len(notes) == 1
-    assert f"{indefinite} of 40 edges have indefinite information" in notes[0]
+    (note,) = observer.notes
+    assert f"{indefinite} of 40 edges have indefinite information" in note
     for k, factor in enumerate(graph.factors):
         R = factors.at(k).noiseModel().R()
         np.testing.assert_allclose(factor.information, R.T @ R, rtol=1e-9, atol=1e-9)

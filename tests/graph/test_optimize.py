@@ -1,5 +1,3 @@
-from contextlib import contextmanager
-
 import numpy as np
 import pytest
 
@@ -10,10 +8,10 @@ from mapper.graph.config import GraphConfig
 from mapper.graph.g2o import read_g2o
 from mapper.graph.model import BetweenFactor, PoseGraph, PoseSigmas
 from mapper.graph.optimize import optimize
-from mapper.runtime.progress import Silent
 from tests.support.noisy_graphs import noisy_measure, odometry_chain, winding_street, wrong_alignment
 from tests.support.paths import POSE_GRAPHS
 from tests.support.planar import on_a_circle
+from tests.support.progress import Observer
 
 needs_posegraphs = pytest.mark.skipif(not POSE_GRAPHS.is_dir(), reason=f"{POSE_GRAPHS} is not here")
 
@@ -113,15 +111,11 @@ def test_a_fixed_node_keeps_its_pose_in_place_of_the_first(initial):
 
 
 def test_further_fixed_nodes_of_a_component_are_noted():
-    notes = []
-
-    class Noting(Silent):
-        note = staticmethod(notes.append)
-
+    observer = Observer()
     graph, _ = loop(rng=np.random.default_rng(1))
     graph.fixed = (7, 3)
-    optimize(graph, GraphConfig(), progress=Noting())
-    assert notes == ["of 2 connected nodes that are fixed only node 7 keeps its pose"]
+    optimize(graph, GraphConfig(), progress=observer)
+    assert observer.notes == ["of 2 connected nodes that are fixed only node 7 keeps its pose"]
 
 
 def test_the_graph_is_left_as_it_was_and_the_answer_repeats_to_the_bit():
@@ -262,19 +256,11 @@ def test_auto_keeps_estimates_that_fit():
 
 
 def test_the_iterations_are_reported():
-    seen = []
-
-    class Watching:
-        @contextmanager
-        def stage(self, name):
-            yield lambda done, total: seen.append((name, done, total))
-
-        def note(self, message):
-            raise AssertionError(message)
-
+    observer = Observer()
     graph, _ = loop(rng=np.random.default_rng(8))
-    solution = optimize(graph, GraphConfig(initial="given"), progress=Watching())
-    assert seen[-1] == ("solve", solution.iterations, solution.iterations)
+    solution = optimize(graph, GraphConfig(initial="given"), progress=observer)
+    assert observer.reached == {"solve": (solution.iterations, solution.iterations)}
+    assert observer.notes == []
 
 
 def test_damped_steps_go_on_until_the_error_is_least():
@@ -287,15 +273,11 @@ def test_damped_steps_go_on_until_the_error_is_least():
 
 @pytest.mark.parametrize(("limit", "noted"), [(2, 1), (100, 0)])
 def test_a_solve_that_did_not_converge_says_so(limit, noted):
-    notes = []
-
-    class Noting(Silent):
-        note = staticmethod(notes.append)
-
+    observer = Observer()
     graph, _ = loop(rng=np.random.default_rng(8))
-    optimize(graph, GraphConfig(initial="given", max_iterations=limit), progress=Noting())
+    optimize(graph, GraphConfig(initial="given", max_iterations=limit), progress=observer)
     sentence = "the solve of 12 nodes was ended by max_iterations=2, not by convergence; raise it"
-    assert notes == [sentence] * noted
+    assert observer.notes == [sentence] * noted
 
 
 @needs_posegraphs

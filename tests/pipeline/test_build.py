@@ -1,6 +1,5 @@
 import json
 import shutil
-from contextlib import contextmanager
 
 import cv2
 import numpy as np
@@ -22,6 +21,7 @@ from mapper.sources import open_source
 from mapper.sources.cloud_files import read_cloud
 from tests.support.desk import REPEATABLE
 from tests.support.files import files_of
+from tests.support.progress import Observer
 
 
 def build_run(log, out, *overrides, **options):
@@ -37,25 +37,6 @@ def run(desk_run):
 @pytest.fixture
 def damaged_log(desk_log, tmp_path):
     return shutil.copytree(desk_log, tmp_path / "damaged")
-
-
-class Observer:
-    """Interrupts a stage, or remembers what it was told."""
-
-    def __init__(self, interrupt=None):
-        self.interrupt, self.notes, self.reached = interrupt, [], {}
-
-    @contextmanager
-    def stage(self, name):
-        def report(done, total):
-            self.reached[name] = (done, total)
-            if name == self.interrupt and done == 12:
-                raise KeyboardInterrupt
-
-        yield report
-
-    def note(self, message):
-        self.notes.append(message)
 
 
 def test_every_frame_is_tracked_close_to_the_truth(run):
@@ -275,7 +256,7 @@ def test_an_interrupted_build_says_so_and_spares_the_old_run(run, desk_log, tmp_
     before = files_of(old)
 
     with pytest.raises(KeyboardInterrupt):
-        build_run(desk_log, old, progress=Observer(interrupt=stage), overwrite=True)
+        build_run(desk_log, old, progress=Observer(stage, 12), overwrite=True)
 
     assert files_of(old) == before
     assert json.loads((tmp_path / "run.partial" / "manifest.json").read_text())["status"] == "interrupted"

@@ -7,11 +7,10 @@ import pytest
 
 from mapper.runtime.archive import Archive
 from mapper.runtime.atomic import partial_of
+from tests.support.progress import Observer, Stopped
 from tests.support.stopped_builds import (
     CHECKPOINTS,
-    Stage,
     StopAt,
-    Stopped,
     assert_same,
     newest,
     resumed,
@@ -30,7 +29,7 @@ def damage(path, how):
 
 
 def test_a_damaged_checkpoint_leaves_the_one_before_it(short_log, short_run, unfinished):
-    folder, progress = partial_of(unfinished) / CHECKPOINTS, Stage()
+    folder, progress = partial_of(unfinished) / CHECKPOINTS, Observer()
     damage(newest(folder), "torn")
     run = start(short_log, unfinished, progress=progress)
     assert "the newest checkpoint is damaged or torn; the one before it is used" in progress.notes
@@ -40,7 +39,7 @@ def test_a_damaged_checkpoint_leaves_the_one_before_it(short_log, short_run, unf
 
 @pytest.mark.parametrize("what", ["both checkpoints", "journal"])
 def test_damaged_checkpoints_begin_anew_with_a_word(short_log, short_run, unfinished, what):
-    folder, progress = partial_of(unfinished) / CHECKPOINTS, Stage()
+    folder, progress = partial_of(unfinished) / CHECKPOINTS, Observer()
     if what == "journal":
         data = bytearray((folder / "tracking.journal").read_bytes())
         data[100] ^= 1
@@ -64,7 +63,7 @@ def test_a_torn_tail_of_the_journal_costs_nothing(short_log, short_run, unfinish
 
 def test_a_torn_file_of_updates_is_not_used(short_log, short_run, tmp_path):
     out = tmp_path / "run"
-    stopped(short_log, out, progress=Stage("fuse", 11))
+    stopped(short_log, out, progress=Observer("fuse", 11))
     damage(partial_of(out) / "scan_updates.bin", "flipped")
     run = start(short_log, out)
     assert_same(run, short_run)
@@ -75,7 +74,7 @@ def test_a_torn_file_of_updates_is_not_used(short_log, short_run, tmp_path):
 def half_fused(short_log, tmp_path_factory):
     """A build of the short log that was stopped while its frames were fused; tests work on copies."""
     out = tmp_path_factory.mktemp("half_fused") / "run"
-    stopped(short_log, out, progress=Stage("fuse", 11))
+    stopped(short_log, out, progress=Observer("fuse", 11))
     return out
 
 

@@ -12,22 +12,10 @@ from mapper.odometry.base import Diagnostics, FrameResult
 from mapper.pipeline.disconnected_components import DISCONNECTED, largest_component, without_doubtful_ends
 from mapper.pipeline.solve import solve
 from mapper.pipeline.tracking_result import TrackingResult
-from mapper.runtime.progress import SILENT
 from tests.support.feature_room import track
 from tests.support.loop_closures import SURE, loop
 from tests.support.planar import at
-
-
-class Listener:
-    """Keeps what it is told."""
-
-    stage = SILENT.stage
-
-    def __init__(self) -> None:
-        self.notes: list[str] = []
-
-    def note(self, message: str) -> None:
-        self.notes.append(message)
+from tests.support.progress import Observer
 
 
 def two_parts(*, tied: bool) -> TrackingResult:
@@ -48,7 +36,7 @@ def two_parts(*, tied: bool) -> TrackingResult:
 
 
 def test_only_the_largest_part_is_kept_and_it_is_said():
-    listener = Listener()
+    listener = Observer()
     kept = largest_component(two_parts(tied=False), progress=listener)
     assert sorted(kept.graph.T_world_node) == [3, 4, 5, 6, 7]
     assert [t.node for t in kept.tracks] == [None, None, None, 3, 4, 5, 6, 7]
@@ -63,7 +51,7 @@ def test_only_the_largest_part_is_kept_and_it_is_said():
 
 
 def test_what_a_loop_ties_is_kept_whole():
-    listener = Listener()
+    listener = Observer()
     tracking = two_parts(tied=True)
     assert largest_component(tracking, progress=listener) is tracking
     assert listener.notes == []

@@ -8,7 +8,8 @@ from mapper.pipeline.fuse import fuse
 from mapper.run.folder import open_run
 from mapper.sources import open_source
 from tests.support.files import files_of
-from tests.support.stopped_builds import MEASURED, Stage, resumed, start, stopped
+from tests.support.progress import Observer
+from tests.support.stopped_builds import MEASURED, resumed, start, stopped
 
 
 @pytest.fixture
@@ -37,7 +38,7 @@ def test_a_build_that_was_stopped_while_fusing_makes_the_same_map(
     short_log, short_run, tmp_path, grown, limit_mb
 ):
     limit = f"octree.max_memory_mb={limit_mb}"
-    stopped(short_log, tmp_path / "run", limit, progress=Stage("fuse", 14))
+    stopped(short_log, tmp_path / "run", limit, progress=Observer("fuse", 14))
     run = start(short_log, tmp_path / "run", limit)
 
     assert max(grown) * sparse_grid.BLOCK_BYTES > 1e6 * limit_mb
@@ -47,7 +48,7 @@ def test_a_build_that_was_stopped_while_fusing_makes_the_same_map(
 
 @pytest.mark.parametrize("limits", [[], ["octree.max_memory_mb=0.1"]])
 def test_a_build_goes_on_with_another_limit(short_log, short_run, tmp_path, grown, limits):
-    stopped(short_log, tmp_path / "run", *limits, progress=Stage("fuse", 14))
+    stopped(short_log, tmp_path / "run", *limits, progress=Observer("fuse", 14))
     grown.clear()
 
     run = start(short_log, tmp_path / "run", "octree.max_memory_mb=0.15")

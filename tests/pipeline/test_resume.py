@@ -25,11 +25,10 @@ from tests.support.command_line import mapper
 from tests.support.desk import REPEATABLE
 from tests.support.files import files_of
 from tests.support.paths import ROOT
+from tests.support.progress import Observer, Stopped
 from tests.support.stopped_builds import (
     CHECKPOINTS,
-    Stage,
     StopAt,
-    Stopped,
     assert_same,
     newest,
     resumed,
@@ -84,8 +83,8 @@ def test_every_image_odometry_goes_on_to_the_same_bytes(short_log, tmp_path, set
 def test_fusing_goes_on_without_casting_again(short_log, short_run, street, street_run, tmp_path):
     for log, wanted, frame in ((short_log, short_run, 6), (street, street_run, 8)):
         out = tmp_path / log.name
-        stopped(log, out, progress=Stage("fuse", frame))
-        progress = Stage("fuse", frame + 4)
+        stopped(log, out, progress=Observer("fuse", frame))
+        progress = Observer("fuse", frame + 4)
         stopped(log, out, progress=progress)
         run = start(log, out)
         assert_same(run, wanted)
@@ -169,7 +168,7 @@ def test_a_full_disk_ends_the_checkpoints_and_not_the_build(short_log, short_run
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(StateFile, "write", full)
-    progress = Stage()
+    progress = Observer()
     run = start(short_log, tmp_path / "run", progress=progress)
     (note,) = [note for note in progress.notes if note.startswith("checkpoints")]
     assert note.startswith("checkpoints cannot be written (No space left on device); the build goes on")
@@ -180,7 +179,7 @@ def test_a_state_that_cannot_be_written_ends_the_checkpoints_and_not_the_build(
     short_log, short_run, tmp_path, monkeypatch
 ):
     monkeypatch.setattr(KeyframeOdometry, "__getstate__", lambda _: {"its": lambda: None}, raising=False)
-    progress = Stage()
+    progress = Observer()
     run = start(short_log, tmp_path / "run", progress=progress)
     (note,) = [note for note in progress.notes if note.startswith("checkpoints")]
     assert "a state that cannot be written" in note

@@ -5,6 +5,7 @@ import pytest
 import small_gicp
 
 from mapper.core.errors import DataError
+from mapper.registration.planes import flat_cells
 from mapper.registration.surfaces import prepared
 
 VOXEL_M = 0.3
@@ -57,3 +58,21 @@ def test_an_empty_cloud_is_near_nothing():
 def test_points_beyond_exact_voxels_are_refused():
     with pytest.raises(DataError, match=r"900000 m is beyond 209715 m"):
         prepared(np.full((30, 3), 9e5, np.float32), voxel_m=0.2)
+
+
+def test_cells_are_flat_by_their_thickness_their_breadth_and_their_points():
+    middle = np.array([3.7, 3.2, 0.25])  # of a cell of 0.49 m, a tenth of its distance
+    offsets = np.random.default_rng(2).uniform(-0.1, 0.1, (200, 3))
+    offsets -= offsets.mean(axis=0)
+
+    def found(scale, points=200):
+        return len(flat_cells(middle + offsets[:points] * scale, 0.02)[0])
+
+    assert found([0.1, 1.0, 1.0]) == 1
+    assert found([0.6, 2.0, 2.0]) == 0, "thicker than the tolerance"
+    assert found([0.3, 0.5, 0.5]) == 0, "thinner than the tolerance, but not for its size"
+    assert found([0.02, 0.15, 1.0]) == 0, "a line"
+    assert found([0.0, 1.0, 1.0], points=7) == 0
+    centres, normals = flat_cells(middle + offsets * [0.0, 1.0, 1.0], 0.02)
+    np.testing.assert_allclose(centres, [middle], atol=1e-9)
+    np.testing.assert_allclose(normals, [[-1.0, 0.0, 0.0]], atol=1e-9)

@@ -1,8 +1,10 @@
 """Verdict on a run by its warnings."""
 
+import numpy as np
 import pytest
 
 from mapper.run.manifest import RunWarning
+from mapper.run.timeline import TimeLine
 from mapper.run.verdict import find_warnings, verdict_of
 from tests.support.run_results import MANIFEST, doubted, lost, results_of
 
@@ -52,3 +54,10 @@ def test_of_results():
     assert verdict_of(find_warnings(many, MANIFEST)).state == "doubtful"
     gone = results_of(changed={k: lost() for k in range(100, 140)})
     assert verdict_of(find_warnings(gone, MANIFEST)).state == "broken in parts"
+
+
+def test_a_place_is_told_in_seconds_of_the_log_once_if_both_ends_round_to_one():
+    line = TimeLine(5_000_000_000 + np.array([0, 40, 1_020, 2_000], np.int64) * 1_000_000, 4e7, ())
+    assert line.place(0, 3) == "0.0 … 2.0 s"
+    assert line.place(2, 2) == "1.0 s"
+    assert line.place(0, 1) == "0.0 s"

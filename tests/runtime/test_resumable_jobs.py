@@ -13,25 +13,7 @@ from mapper.runtime.executor import Workers
 from mapper.runtime.resumable_jobs import Job
 from tests.support.counted_jobs import Work, told, until
 from tests.support.paths import ROOT
-
-
-class Notes:
-    """Remembers what it was told."""
-
-    def __init__(self):
-        self.notes, self.reports = [], []
-
-    def note(self, message):
-        self.notes.append(message)
-
-    def stage(self, _name):
-        return self
-
-    def __enter__(self):
-        return lambda done, total: self.reports.append((done, total))
-
-    def __exit__(self, *_):
-        pass
+from tests.support.progress import Observer
 
 
 @pytest.fixture
@@ -70,16 +52,16 @@ def test_finished_cells_need_no_workers(diary, tmp_path):
 
 def test_more_cells_leave_the_finished_ones_alone(diary, tmp_path):
     run_cells([cell(diary, 1), cell(diary, 2)], tmp_path / "cells")
-    observer = Notes()
+    observer = Observer()
     run_cells([cell(diary, n) for n in (1, 2, 3, 4)], tmp_path / "cells", progress=observer)
 
     assert told(diary) == {"1": 1, "2": 1, "3": 1, "4": 1}
     assert observer.notes == ["2 of 4 cells were finished before and are kept"]
-    assert observer.reports == [(0, 2), (1, 2), (2, 2)]
+    assert observer.counts == [(0, 2), (1, 2), (2, 2)]
 
 
 def test_a_failed_cell_is_told_written_and_tried_again(diary, tmp_path):
-    observer = Notes()
+    observer = Observer()
     cells = [cell(diary, 1, "refuse"), cell(diary, 2), cell(diary, 3, "nan")]
     failed, fine, nan = run_cells(cells, tmp_path / "cells", progress=observer, attempts=1)
 
@@ -101,7 +83,7 @@ def test_a_file_that_is_no_cell_is_worked_out_again(diary, tmp_path, text):
     good = file.read_text()
     file.write_text(good.replace("cell-1", "cell-2") if text is None else text)
 
-    observer = Notes()
+    observer = Observer()
     (again,) = run_cells([cell(diary, 1)], tmp_path / "cells", progress=observer)
     assert again.records == result.records
     assert told(diary)["1"] == 2

@@ -9,7 +9,6 @@ from mapper.config.loading import load_config
 from mapper.core.errors import FrameError
 from mapper.core.frames import Scan
 from mapper.pipeline.build import build
-from mapper.runtime.progress import Silent
 from mapper.simulation.config import STREET, LidarSensorConfig
 from mapper.simulation.lidar import write_lidar_log
 from mapper.sources import open_source
@@ -21,6 +20,7 @@ from mapper.sources.ros.recording import Topic
 from mapper.sources.scan_folders.scans import read_scan
 from mapper.sources.valid_returns import FARTHEST_M
 from tests.support.clouds import save_cloud
+from tests.support.progress import Observer
 
 
 def sweep(n: int = 200) -> np.ndarray:
@@ -97,18 +97,8 @@ def street(tmp_path_factory) -> Path:
     return log
 
 
-class Noted(Silent):
-    """Keeps the notes of a job."""
-
-    def __init__(self):
-        self.notes = []
-
-    def note(self, message):
-        self.notes.append(message)
-
-
 def test_a_far_return_does_not_end_a_build(street, tmp_path):
-    source, progress = open_source(street), Noted()
+    source, progress = open_source(street), Observer()
     config = load_config(None, ["octree.resolution_m=0.1"], sensor="lidar")
     run = build(source, config, tmp_path / "run", progress=progress)
     assert run.manifest.counts.tracked == len(source) == 11

@@ -48,7 +48,6 @@ class Laser:
 
 SICK = Laser(beams=180, fov_rad=np.pi, max_m=80.0, rate_hz=5.0)
 RPLIDAR = Laser(beams=360, rate_hz=8.0, sweep_share=1.0)
-HOKUYO = Laser(beams=1080, fov_rad=1.5 * np.pi, max_m=30.0, rate_hz=40.0)
 
 
 @dataclass(frozen=True)
@@ -268,15 +267,6 @@ def _wheels(truth: np.ndarray, slip: float, rng: np.random.Generator) -> np.ndar
         c, s = np.cos(heading), np.sin(heading)
         poses.append(np.array([x + c * forward - s * side, y + s * forward + c * side, heading + turn]))
     return np.array(poses)
-
-
-def write_truth(path: Path, drive: Drive) -> Path:
-    """Write TUM's lines of the base's true poses."""
-    with path.open("w") as file:
-        for time_s, (x, y, yaw) in zip(drive.times_s, drive.truth, strict=True):
-            stamp = FIRST_NS / 1e9 + time_s
-            file.write(f"{stamp:.6f} {x:.6f} {y:.6f} 0 0 0 {np.sin(yaw / 2):.9f} {np.cos(yaw / 2):.9f}\n")
-    return path
 
 
 def write_carmen(path: Path, drive: Drive, *, message: str = "FLASER", is_relative: bool = False) -> Path:

@@ -1,7 +1,5 @@
 """Builds that are stopped, and what they have to end in."""
 
-from contextlib import contextmanager
-
 import pytest
 
 from mapper.config.loading import load_config
@@ -10,18 +8,14 @@ from mapper.run.file_checks import check_run
 from mapper.run.observers import Observers
 from mapper.runtime.atomic import partial_of
 from mapper.runtime.journal import StateFile
-from mapper.runtime.progress import Silent
 from mapper.sources import open_source
 from tests.support.desk import REPEATABLE
 from tests.support.files import files_of
+from tests.support.progress import Stopped
 
 CHECKPOINTS = ".checkpoints.part"
 MEASURED = {"manifest.json", "frame_ms.csv", "summary.png", "cloud.png"}
 """What is not compared: measured times, and pictures, which these builds do not draw."""
-
-
-class Stopped(KeyboardInterrupt):
-    """Ctrl-C at a certain frame."""
 
 
 class StopAt(Observers):
@@ -36,24 +30,6 @@ class StopAt(Observers):
             if self.stop is not None:
                 self.stop()
             raise Stopped
-
-
-class Stage(Silent):
-    """Keeps notes, and stops a build at a frame of a stage."""
-
-    def __init__(self, name="", frame=0):
-        self.notes, self.name, self.frame = [], name, frame
-
-    @contextmanager
-    def stage(self, name):
-        def report(done, _total):
-            if name == self.name and done == self.frame:
-                raise Stopped
-
-        yield report
-
-    def note(self, message):
-        self.notes.append(message)
 
 
 def start(log, out, *overrides, checkpoint_s=0.0, **arguments):

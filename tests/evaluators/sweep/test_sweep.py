@@ -1,7 +1,6 @@
 import csv
 import json
 import re
-from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -16,6 +15,7 @@ from mapper.runtime.resumable_jobs import Job, JobResult
 from tests.support.chromium import CHROMIUM, MISSING, Page
 from tests.support.command_line import mapper
 from tests.support.counted_jobs import run_elsewhere
+from tests.support.progress import Observer
 
 FEW = "source.last_frame=11"
 TIMES = {"cell_s", "track_s", "solve_s", "level_s", "fuse_s", "write_s", "total_s", "frames_per_s"}
@@ -196,21 +196,6 @@ def test_a_mistake_is_told_before_anything_is_built(swept, desk_log, tmp_path, l
     assert not (tmp_path / "out").exists()
 
 
-class Interrupts:
-    """Watches until the first cell is finished, then is Ctrl-C; test_cells.py kills for good."""
-
-    def note(self, _message):
-        pass
-
-    @contextmanager
-    def stage(self, _name):
-        def report(done, _total):
-            if done:
-                raise KeyboardInterrupt
-
-        yield report
-
-
 @pytest.fixture(scope="module")
 def interrupted(desk_log, tmp_path_factory):
     """A sweep that was ended after its first cell; its file, its folder and the cell."""
@@ -229,7 +214,7 @@ def interrupted(desk_log, tmp_path_factory):
         )
     )
     with pytest.raises(KeyboardInterrupt):
-        run_sweep(plan_sweep(file, out), progress=Interrupts())
+        run_sweep(plan_sweep(file, out), progress=Observer("cells", 1))
     (out / "scratch/tmp1/run.partial").mkdir(parents=True)  # as a killed one leaves it
     (cell,) = out.glob("cells/*.json")
     return file, out, cell
