@@ -92,6 +92,11 @@ def made(seed, *, lost=(), seconds=16.0):
     return log_, TrackingResult(tuple(tracks), (), graph, (), {}, gyroscope=CALIBRATION), truth
 
 
+def felt_times(log_, factor):
+    felt = log_.accelerations
+    return replace(log_, accelerations=replace(felt, acceleration_mps2=factor * felt.acceleration_mps2))
+
+
 def relative(result, truth, a, b):
     """Error (rotation, translation) of frame b's pose relative to frame a's."""
     poses = [result.graph.T_world_node[result.tracks[k].node] @ result.tracks[k].T_node_body for k in (a, b)]
@@ -181,8 +186,7 @@ def test_where_the_path_is_too_short_for_the_sign_that_one_is_used_by_which_read
     factors = list(tracking.graph.factors)
     factors[1] = replace(factors[1], T_i_j=factors[1].T_i_j @ exp(np.zeros(3), 0.3 * np.eye(3)[0]))
     tracking = replace(tracking, graph=tracking.graph.with_factors(factors))
-    felt = log_.accelerations
-    given = replace(log_, accelerations=replace(felt, acceleration_mps2=-felt.acceleration_mps2))
+    given = felt_times(log_, -1.0)
     assert [check_accelerations(one, tracking)[2] for one in (log_, given)] == [False, False]
     right, reversed_ = (bridge(one, tracking, progress=SILENT).graph.factors for one in (log_, given))
     for one, other in zip(right, reversed_, strict=True):
@@ -288,9 +292,7 @@ def test_a_gap_of_the_accelerations_is_one_of_the_readings():
 @pytest.mark.parametrize(("factor", "notes"), [(1.0 / 9.80665, 0), (-1.0, 1)], ids=["in g", "reversed"])
 def test_accelerations_in_g_and_of_the_opposite_sign_bridge_as_well(factor, notes):
     log_, tracking, truth = made(6, lost=range(70, 90))
-    felt = log_.accelerations
-    given = replace(log_, accelerations=replace(felt, acceleration_mps2=factor * felt.acceleration_mps2))
-    found = bridge(given, tracking, progress=SILENT)
+    found = bridge(felt_times(log_, factor), tracking, progress=SILENT)
     assert len(components(found.graph)) == 1
     assert np.linalg.norm(relative(found, truth, 69, 95)[3:]) < 0.04
     assert sum("opposite sign" in warning.sentence for warning in found.warnings) == notes
@@ -298,21 +300,12 @@ def test_accelerations_in_g_and_of_the_opposite_sign_bridge_as_well(factor, note
 
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_accelerations_of_either_sign_point_up_at_rest(seed, sign):
-    log_, tracking, _ = made(seed)
-    felt = log_.accelerations
-    given = replace(log_, accelerations=replace(felt, acceleration_mps2=sign * felt.acceleration_mps2))
-    checked, warnings, _ = check_accelerations(given, tracking)
-    assert np.array_equal(checked.accelerations.acceleration_mps2, felt.acceleration_mps2)
-    assert [(warning.kind, warning.weight) for warning in warnings] == [("imu", "note")] * (sign < 0.0)
-
-
-@pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_accelerations_are_the_body_s_where_the_gyroscope_shows_the_mounting(seed, sign):
+def test_accelerations_of_either_sign_point_up_at_rest_and_are_the_body_s_by_the_mounting(seed, sign):
     log_, tracking, truth = made(seed)
-    felt = log_.accelerations
-    given = replace(log_, accelerations=replace(felt, acceleration_mps2=sign * felt.acceleration_mps2))
+    given = felt_times(log_, sign)
+    checked, warnings, _ = check_accelerations(given, tracking)
+    assert np.array_equal(checked.accelerations.acceleration_mps2, log_.accelerations.acceleration_mps2)
+    assert [(warning.kind, warning.weight) for warning in warnings] == [("imu", "note")] * (sign < 0.0)
     found = with_body_readings(given, tracking).accelerations
     assert (found.are_axes_stated, found.are_checked) == (True, True)
     at_ns = np.array([track.stamp_ns for track in tracking.tracks])
@@ -379,8 +372,7 @@ def test_frames_that_surfaces_do_not_place_tell_nothing_of_accelerations():
     log_, tracking, _ = made(1)
     unseen = Diagnostics(unobservable="translation along x")
     tracks = tuple(replace(track, diagnostics=unseen) for track in tracking.tracks)
-    negated = replace(log_.accelerations, acceleration_mps2=-log_.accelerations.acceleration_mps2)
-    given = replace(log_, accelerations=negated)
+    given = felt_times(log_, -1.0)
     assert check_accelerations(given, replace(tracking, tracks=tracks)) == (given, (), False)
 
 

@@ -79,6 +79,10 @@ def written(reproduction):
     return folder
 
 
+def rows_of(table):
+    return shown_cells(table.columns, table.records)
+
+
 def shifted(x_m, y_m=0.0):
     T = np.eye(4)
     T[:2, 3] = x_m, y_m
@@ -87,10 +91,8 @@ def shifted(x_m, y_m=0.0):
 
 def test_a_line_tells_printed_ours_spread_ratio_verdict_and_failures():
     shown = compared(ITERATIONS)
-    columns, records = shown.columns, shown.records
-
-    rows = shown_cells(columns, records)
-    assert [column.title for column in columns][1:] == (
+    rows = rows_of(shown)
+    assert [column.title for column in shown.columns][1:] == (
         ["iterations", "printed", "ours", "spread", "ratio", "verdict", "failed"]
     )
     assert rows[0] == ["fr1/xyz", "1", "0.0659", "0.0600", "0.0500–0.0700", "0.91", "better", "–"]
@@ -100,10 +102,7 @@ def test_a_line_tells_printed_ours_spread_ratio_verdict_and_failures():
 
 
 def test_the_printed_layout_has_a_line_for_each_kind_of_figure():
-    shown = as_printed(ITERATIONS, with_spread=True)
-    columns, records = shown.columns, shown.records
-
-    assert shown_cells(columns, records) == [
+    assert rows_of(as_printed(ITERATIONS, with_spread=True)) == [
         ["fr1/xyz", "printed", "0.0659", "0.0420", "0.0204"],
         ["", "ours", "0.0600", "0.0503", "–"],
         ["", "lowest", "0.0500", "–", "–"],
@@ -116,10 +115,7 @@ def test_the_printed_layout_has_a_line_for_each_kind_of_figure():
 
 
 def test_columns_of_their_own_units_have_digits_of_their_own():
-    shown = as_printed(OURS, with_spread=False)
-    columns, records = shown.columns, shown.records
-
-    assert shown_cells(columns, records) == [["street", "0.0289", "136"]]
+    assert rows_of(as_printed(OURS, with_spread=False)) == [["street", "0.0289", "136"]]
 
 
 def test_the_terminal_sees_all_but_no_empty_table(reproduction):
@@ -195,8 +191,4 @@ def test_small_figures_beside_large_ones_keep_their_digits():
         "Table 5", "sizes", "a paper", "file size", "MB",
         (PaperCell("fr1/xyz", "cloud", 7.7, (0.4,)), PaperCell("fr1/xyz", "octree", 0.216, (0.0213,))),
     )  # fmt: skip
-
-    shown = compared(sizes)
-    columns, records = shown.columns, shown.records
-
-    assert [row[3] for row in shown_cells(columns, records)] == ["0.4", "0.021"]
+    assert [row[3] for row in rows_of(compared(sizes))] == ["0.4", "0.021"]
