@@ -25,7 +25,7 @@ from mapper.simulation.config import SynthConfig, SynthWheelsConfig
 from mapper.simulation.lidar import LidarSimulator
 from mapper.sources import open_source
 from mapper.sources.multi_session_log import chained
-from tests.support.logs import CountedReads, EntryWithoutFiles
+from tests.support.logs import CountedReads, changed_frames
 from tests.support.paths import CONFIGS
 from tests.support.wheeled_worlds import EXACT, FLAT, STREET_ON_WHEELS
 
@@ -38,17 +38,6 @@ def scene():
 @pytest.fixture(scope="module")
 def flat(scene):
     return CameraSimulator(FLAT, scene).log()
-
-
-class BlankEntry(EntryWithoutFiles):
-    """An entry whose image may be of a wall without texture."""
-
-    def __init__(self, entry, *, is_blank):
-        self.entry, self.is_blank, self.stamp_ns = entry, is_blank, entry.stamp_ns
-
-    def load(self, *, colour=True):
-        frame = self.entry.load(colour=colour)
-        return replace(frame, image=np.full_like(frame.image, 128)) if self.is_blank else frame
 
 
 def by_wheels(*overrides):
@@ -146,7 +135,10 @@ def test_loops_read_keyframes_only_and_skip_a_damaged_one(flat):
 
 @pytest.mark.parametrize("blank_frames", [(0,), range(6, 49), range(49)])
 def test_keyframes_without_features_close_no_loop_and_end_nothing(flat, blank_frames):
-    log = replace(flat, entry_at=lambda i: BlankEntry(flat.entry_at(i), is_blank=i in blank_frames))
+    def without_texture(index, frame):
+        return replace(frame, image=np.full_like(frame.image, 128)) if index in blank_frames else frame
+
+    log = changed_frames(flat, without_texture)
     tracking = track_log(
         log, by_wheels("loops.kind=places", "loops.min_gap_s=0.1", "loops.min_gap_m=0.1"), progress=SILENT
     )

@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -10,30 +10,23 @@ import pytest
 
 from mapper.core.frames import DepthImage, RgbdFrame
 from mapper.sources import open_source
-from mapper.sources.base import Log, WrappedEntry
+from mapper.sources.base import Log
 from mapper.sources.depth_outlines import outline_warnings, why_flipped
 from mapper.sources.depth_scale import read_spread
+from tests.support.logs import changed_frames
 from tests.support.paths import DATA
 
 
-@dataclass(frozen=True, slots=True)
-class Moved(WrappedEntry):
-    """A frame whose depth is moved by some pixels, and whose image has another contrast."""
+def moved(log: Log, x_px: int, y_px: int, *, contrast: float = 1.0) -> Log:
+    """Frames whose depth is moved by some pixels, and whose image has another contrast."""
 
-    shift_px: tuple[int, int]
-    contrast: float = 1.0
-
-    def load(self, *, colour: bool = True) -> RgbdFrame:
-        frame = self.entry.load(colour=colour)
-        assert isinstance(frame, RgbdFrame)
-        T = np.array([[1.0, 0.0, self.shift_px[0]], [0.0, 1.0, self.shift_px[1]]])
+    def change(_index: int, frame: RgbdFrame) -> RgbdFrame:
+        T = np.array([[1.0, 0.0, x_px], [0.0, 1.0, y_px]])
         depth_m = cv2.warpAffine(frame.depth_m, T, frame.depth_m.shape[::-1], flags=cv2.INTER_NEAREST)
-        image = (128 + self.contrast * (frame.image.astype(np.float32) - 128)).astype(np.uint8)
+        image = (128 + contrast * (frame.image.astype(np.float32) - 128)).astype(np.uint8)
         return replace(frame, depth_m=depth_m, image=image)
 
-
-def moved(log: Log, x_px: int, y_px: int, *, contrast: float = 1.0) -> Log:
-    return replace(log, entry_at=lambda index: Moved(log.entry_at(index), (x_px, y_px), contrast))
+    return changed_frames(log, change)
 
 
 def warnings_of(log: Log) -> list[str]:

@@ -23,7 +23,8 @@ from mapper.sources.base import Log
 from mapper.sources.config import CameraConfig, SourceConfig
 from mapper.sources.depth_scale import depth_warnings, read_spread, why_no_depth
 from tests.support.command_line import mapper
-from tests.support.logs import MemoryEntry, log_in_memory
+from tests.support.desk_frames import blank
+from tests.support.logs import MemoryEntry, changed_frames, log_in_memory
 from tests.support.tum_logs import copy_numbered
 
 CAMERA = PinholeCamera(40, 30, 30.0, 30.0, 19.5, 14.5)
@@ -80,15 +81,8 @@ def test_depth_that_no_camera_measures_is_refused_before_tracking(desk_log, tmp_
 def in_other_units(source, scale):
     """The same log, but for depth that is wrong by a factor."""
 
-    def entry_at(index):
-        frame = source.entry_at(index).load()
-        wrong = RgbdFrame(frame.stamp_ns, frame.image, frame.depth_m * np.float32(scale), frame.camera)
-        return MemoryEntry(frame.stamp_ns, wrong)
-
-    return Log(
-        path=source.path, name="wrong", kind="memory", sensor="rgbd", stamps_ns=source.stamps_ns,
-        entry_at=entry_at, wheels=source.wheels,
-    )  # fmt: skip
+    wrong = changed_frames(source, lambda _, frame: replace(frame, depth_m=frame.depth_m * np.float32(scale)))
+    return replace(wrong, truth=None)
 
 
 def test_wheels_are_enough():
@@ -194,14 +188,8 @@ def test_black_images_show_no_scale(desk_log):
     """A covered lens; OpenCV refuses to match nothing."""
     source = desk(desk_log, 5000)
 
-    def covered(index):
-        if index < len(source) // 2:
-            return source.entry_at(index)
-        frame = source.entry_at(index).load()
-        black = replace(frame, image=np.zeros_like(frame.image), depth_m=np.zeros_like(frame.depth_m))
-        return MemoryEntry(int(source.stamps_ns[index]), black)
-
-    assert warnings_of(replace(source, entry_at=covered)) == []
+    covered = changed_frames(source, lambda i, frame: frame if i < len(source) // 2 else blank(frame))
+    assert warnings_of(covered) == []
 
 
 def millimetres_for_redwood(desk_log, folder):

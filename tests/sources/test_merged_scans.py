@@ -1,6 +1,7 @@
 """Scans of several LiDARs that are tracked as one."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -14,12 +15,12 @@ from mapper.pipeline.track import track_log
 from mapper.runtime.progress import SILENT
 from mapper.simulation.config import LidarSensorConfig, LidarSynthConfig
 from mapper.simulation.lidar import LidarSimulator
-from mapper.sources.base import SensorBeside, WrappedEntry
+from mapper.sources.base import SensorBeside
 from mapper.sources.config import SourceConfig
 from mapper.sources.frame_selection import selected
 from mapper.sources.merged_scans import with_merged_scans, with_whole_turns
 from mapper.sources.reading_checks import ReadingChecks
-from tests.support.logs import MemoryEntry, log_in_memory
+from tests.support.logs import MemoryEntry, changed_frames, log_in_memory
 
 MS = 1_000_000
 T_BODY_REAR = transform(rotation_exp(np.array([0.0, 0.0, np.pi])), np.array([-1.0, 0.0, 0.0]))
@@ -77,29 +78,17 @@ def test_other_logs_stay_as_they_are(facts):
     assert with_merged_scans(log) is log
 
 
-@dataclass(frozen=True, slots=True)
-class View(WrappedEntry):
+def narrow_view(T_body_sensor, _index, scan):
     """The part of a scan that a LiDAR with a view of 70° sees, in the frame of that LiDAR."""
-
-    T_body_sensor: np.ndarray
-
-    def load(self, *, colour=True):
-        scan = self.entry.load(colour=colour)
-        points = apply(inverse(self.T_body_sensor), scan.points_body.astype(np.float64)).astype(np.float32)
-        azimuth_rad = np.arctan2(points[:, 1], points[:, 0])
-        return replace(scan, points_body=points).select(np.abs(azimuth_rad) < np.radians(35.0))
-
-    def scan(self):
-        return self.load()
+    points = apply(inverse(T_body_sensor), scan.points_body.astype(np.float64)).astype(np.float32)
+    azimuth_rad = np.arctan2(points[:, 1], points[:, 0])
+    return replace(scan, points_body=points).select(np.abs(azimuth_rad) < np.radians(35.0))
 
 
 def test_two_narrow_views_track_better_than_one():
     sensor = LidarSensorConfig(rings=24, azimuth_steps=600)
     whole = LidarSimulator(LidarSynthConfig(seed=6, loop_m=60.0, duration_s=6.0, sensor=sensor)).log()
-    front, rear = (
-        replace(whole, entry_at=lambda index, T=T: View(whole.entry_at(index), T))
-        for T in (np.eye(4), T_BODY_REAR)
-    )
+    front, rear = (changed_frames(whole, partial(narrow_view, T)) for T in (np.eye(4), T_BODY_REAR))
     log = replace(front, beside=[SensorBeside(rear, T_BODY_REAR)])
 
     def error_m(others):
@@ -170,7 +159,7 @@ def test_parts_without_returns_belong_to_their_turn_and_damaged_ones_cost_it():
 def test_views_of_one_direction_are_no_parts_of_turns():
     sensor = LidarSensorConfig(rings=8, azimuth_steps=600)
     whole = LidarSimulator(LidarSynthConfig(seed=6, loop_m=60.0, duration_s=2.0, sensor=sensor)).log()
-    front = replace(whole, entry_at=lambda index: View(whole.entry_at(index), np.eye(4)))
+    front = changed_frames(whole, partial(narrow_view, np.eye(4)))
     assert with_whole_turns(front) is front
 
 

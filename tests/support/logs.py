@@ -1,6 +1,8 @@
 """Logs whose frames lie in memory."""
 
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -50,20 +52,38 @@ def log_in_memory(entries: list[MemoryEntry], *, name: str = "memory", **facts: 
     )
 
 
+@dataclass(frozen=True)
+class ChangedEntry(EntryWithoutFiles):
+    """An entry whose frame is changed as it is read."""
+
+    entry: FrameRef
+    change: Callable[[Any], Any]
+
+    @property
+    def stamp_ns(self) -> int:
+        return self.entry.stamp_ns
+
+    def load(self, *, colour: bool = True) -> Any:
+        return self.change(self.entry.load(colour=colour))
+
+    def scan(self) -> Any:
+        return self.load().scan()
+
+
+def changed_frames(log: Log, change: Callable[[int, Any], Any]) -> Log:
+    """A log whose frames are what ``change`` makes of their numbers and of them; it may raise."""
+    return replace(log, entry_at=lambda i: ChangedEntry(log.entry_at(i), partial(change, i)))
+
+
 class CountedReads:
     """A log that counts how often its frames are read, and of which some cannot be."""
 
-    def __init__(self, source, damaged=()):
-        self.damaged, self.reads = damaged, []
-        self.log = replace(source, entry_at=lambda index: CountedEntry(self, index, source.entry_at(index)))
+    def __init__(self, source: Log, damaged: Collection[int] = ()) -> None:
+        self.damaged, self.reads = damaged, list[int]()
+        self.log = changed_frames(source, self._read)
 
-
-class CountedEntry(EntryWithoutFiles):
-    def __init__(self, counted, index, entry):
-        self.counted, self.index, self.entry, self.stamp_ns = counted, index, entry, entry.stamp_ns
-
-    def load(self, *, colour=True):
-        self.counted.reads.append(self.index)
-        if self.index in self.counted.damaged:
-            raise FrameError(f"frame {self.index}: damaged")
-        return self.entry.load(colour=colour)
+    def _read(self, index: int, frame: Any) -> Any:
+        self.reads.append(index)
+        if index in self.damaged:
+            raise FrameError(f"frame {index}: damaged")
+        return frame

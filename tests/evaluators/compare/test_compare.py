@@ -30,7 +30,7 @@ from mapper.sources import open_source
 from mapper.sources.config import SourceConfig
 from mapper.sources.trajectory_files import read_tum
 from tests.support.command_line import mapper
-from tests.support.logs import MemoryEntry
+from tests.support.logs import changed_frames
 from tests.support.paths import KITTI
 
 RGBD = CompareConfig(methods=("pnp", "rgbd", "gicp", "kiss-icp"), pairs=3)
@@ -197,12 +197,12 @@ def test_a_method_that_breaks_down_does_not_take_the_others_along(desk, on_desk,
 def damaged(log, bad):
     """A log of which some frames cannot be read."""
 
-    def entry_at(index):
-        entry = log.entry_at(index)
-        torn = FrameError(f"frame {entry.stamp_ns}: torn")
-        return MemoryEntry(entry.stamp_ns, torn) if index in bad else entry
+    def tear(index, frame):
+        if index in bad:
+            raise FrameError(f"frame {frame.stamp_ns}: torn")
+        return frame
 
-    return replace(log, entry_at=entry_at)
+    return changed_frames(log, tear)
 
 
 def test_frames_that_cannot_be_read_are_skipped_for_all(desk, tmp_path):

@@ -7,7 +7,7 @@ from mapper.features.config import OrbConfig
 from mapper.odometry.config import IsvdOdometryConfig, LocalMapConfig, WheelsOdometryConfig
 from mapper.odometry.factory import build_frame_odometry, build_odometry
 from mapper.sources import open_source
-from tests.support.logs import EntryWithoutFiles
+from tests.support.desk_frames import blank
 
 CONFIGS = {"local-map": LocalMapConfig(), "isvd": IsvdOdometryConfig(detector=OrbConfig())}
 
@@ -58,22 +58,8 @@ def test_the_first_frame_has_no_earlier_pixels_and_a_lost_one_no_matches(config,
     odometry.track(odometry.read(entries[0]))
     odometry.track(odometry.read(entries[1]))
     assert len(odometry.matches().is_inlier) > 0
-    dark = DarkEntry(entries[2])
-    assert odometry.track(odometry.read(dark)).node is None
+    assert odometry.track(odometry.observe(blank(entries[2].load()))).node is None
     assert odometry.matches() is None
-
-
-class DarkEntry(EntryWithoutFiles):
-    """A frame taken with the lens covered."""
-
-    def __init__(self, entry):
-        self.entry, self.stamp_ns = entry, entry.stamp_ns
-
-    def load(self, *, colour=True):
-        frame = self.entry.load(colour=colour)
-        return type(frame)(
-            frame.stamp_ns, np.zeros_like(frame.image), np.zeros_like(frame.depth_m), frame.camera
-        )
 
 
 def test_wheel_odometry_has_no_matches(desk_log):

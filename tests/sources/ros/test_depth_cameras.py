@@ -1,18 +1,17 @@
 """Recordings whose depth comes from a camera of its own: registered as they are read, or refused."""
 
 import struct
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from mapper.core.errors import DataError, SourceError
-from mapper.core.frames import PinholeCamera, RgbdFrame
+from mapper.core.frames import PinholeCamera
 from mapper.core.geometry import apply, exp, inverse
 from mapper.core.rotations import row_of_pose
 from mapper.sources import open_source
-from mapper.sources.base import Log
 from mapper.sources.config import CameraConfig, SourceConfig
 from mapper.sources.inspection import inspect_log
 from mapper.sources.ros.decode import decode
@@ -22,27 +21,12 @@ from mapper.sources.ros.topic_ranks import is_called_rectified
 from mapper.sources.ros.typestore import make_message, serialize
 from mapper.sources.writers import write_log
 from tests.support.depth_cameras import BESIDE, D435, extrinsics, write_unregistered
+from tests.support.logs import changed_frames
 from tests.support.recordings import CAMERA, COLOR, camera_info, changed, image, shots, transforms, write
 from tests.support.tum_logs import FIRST_NS, picture
 
 WIDE = PinholeCamera(106, 60, 53.0, 53.0, 52.4, 30.1)
 DEPTH = "/cam/depth/image_rect_raw"
-
-
-@dataclass(frozen=True, slots=True)
-class OtherDepth:
-    """A frame with the depth of one half the log later."""
-
-    log: Log
-    index: int
-
-    @property
-    def stamp_ns(self) -> int:
-        return self.log.entry_at(self.index).stamp_ns
-
-    def load(self) -> RgbdFrame:
-        other = self.log[(self.index + len(self.log) // 2) % len(self.log)]
-        return replace(self.log[self.index], depth_m=other.depth_m)
 
 
 @pytest.fixture
@@ -164,7 +148,8 @@ def test_a_pose_that_is_not_stated_is_estimated_by_outlines(tmp_path, desk_log):
 
 def test_depth_of_another_time_tells_no_pose(tmp_path, desk_log):
     registered = open_source(desk_log)[::3]
-    late = replace(registered, entry_at=lambda index: OtherDepth(registered, index))
+    half = len(registered) // 2
+    late = changed_frames(registered, lambda i, frame: replace(frame, depth_m=registered[i - half].depth_m))
     write_unregistered(tmp_path / "bag", late, D435, stated_in=None)
     with pytest.raises(SourceError, match=r"standard deviations .*depth_in_color"):
         open_source(tmp_path / "bag")
