@@ -56,7 +56,7 @@ def placed_frames(source: Log, trajectory: Trajectory) -> Iterator[PlacedFrame]:
     for entry in source.entries_of(index_of):
         index = index_of[entry.stamp_ns]
         T_world_body = trajectory.T_world_body[index]
-        if delay_ns := entry.depth_stamp_ns - entry.stamp_ns:
+        if delay_ns := entry.depth_delay_ns:
             T_world_body = T_world_body @ twist_at(trajectory, index).over(delay_ns / NS_PER_S)
         yield PlacedFrame(
             entry, source.sensor, index, T_world_body, trajectory, source.gyroscope, source.wheels

@@ -32,10 +32,9 @@ from mapper.simulation.readings import measure_gnss, measure_imu, measure_wheels
 from mapper.simulation.scene import Scene, make_scene
 from mapper.simulation.shutter import Shutter
 from mapper.simulation.streams import Stream, noise_index, rng_of
-from mapper.sources.base import Log
+from mapper.sources.base import FrameRef, Log
 from mapper.sources.calibration_file import calibration_text
 from mapper.sources.image_files.reading import TUM_UNITS_PER_M
-from mapper.sources.lazy_frame import LazyFrame
 from mapper.sources.readings_beside import write_readings
 from mapper.sources.trajectory_files import write_tum
 
@@ -98,7 +97,7 @@ def synthetic_log(
         kind="synthetic",
         sensor=sensor,
         stamps_ns=truth.stamps_ns,
-        entry_at=lambda index: LazyFrame(int(truth.stamps_ns[index]), partial(simulate, index)),
+        entry_at=lambda index: FrameRef(int(truth.stamps_ns[index]), partial(simulate, index)),
         truth=truth,
         wheels=wheels,
         gyroscope=gyroscope,

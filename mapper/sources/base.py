@@ -46,7 +46,6 @@ class ImageFiles:
     Attributes:
         colour: Colour image.
         depth: 16-bit depth image.
-        depth_stamp_ns: Time of the depth image, nanoseconds.
         depth_units_per_m: Depth image units per metre.
         colour_px: Width and height of the colour image; None if they are the frame's.
         depth_px: As ``colour_px``, of the depth image.
@@ -56,30 +55,35 @@ class ImageFiles:
 
     colour: ImageFile
     depth: ImageFile
-    depth_stamp_ns: int
     depth_units_per_m: float
     colour_px: tuple[int, int] | None
     depth_px: tuple[int, int] | None
     recorded_units_per_m: float | None = None
 
 
-class FrameRef(Protocol):
-    """One frame of a log that has not been read yet, so that reading can run ahead in other threads."""
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameRef:
+    """One frame of a log that has not been read yet, so that reading can run ahead in other threads.
 
-    @property
-    def stamp_ns(self) -> int:
-        """Time of the frame, nanoseconds."""
-        ...
+    Attributes:
+        stamp_ns: Time of the frame, nanoseconds.
+        read: Returns the frame, as ``load``. Where its argument is false an image may be grey, and a scan has
+            neither colours nor intensities.
+        returns: Returns what ``scan`` does, where that is less work than the frame; None takes the frame's.
+        depth_delay_ns: Time from the frame to its depth image, nanoseconds.
+        files: The frame's encoded images, where the log has them.
+    """
+
+    stamp_ns: int
+    read: Callable[[bool], Frame]
+    returns: Callable[[], Scan] | None = None
+    depth_delay_ns: int = 0
+    files: ImageFiles | None = None
 
     @property
     def depth_stamp_ns(self) -> int:
         """Time of the depth image, nanoseconds; the frame's where it has no other."""
-        ...
-
-    @property
-    def files(self) -> ImageFiles | None:
-        """The frame's encoded images, where the log has them."""
-        ...
+        return self.stamp_ns + self.depth_delay_ns
 
     def load(self, *, colour: bool = True) -> Frame:
         """Read and decode the frame; safe in any thread, and the same every time.
@@ -90,7 +94,7 @@ class FrameRef(Protocol):
         Raises:
             FrameError: This frame cannot be used; the message says which file and why.
         """
-        ...
+        return self.read(colour)
 
     def scan(self) -> Scan:
         """Read the returns alone, without the cost of an image.
@@ -101,48 +105,7 @@ class FrameRef(Protocol):
         Raises:
             FrameError: As ``load``.
         """
-        ...
-
-
-@dataclass(frozen=True, slots=True)
-class WrappedEntry:
-    """Frame of another log as it is; subclasses change what is read of it. See :class:`FrameRef`."""
-
-    entry: FrameRef
-
-    @property
-    def stamp_ns(self) -> int:
-        """Time of the frame, nanoseconds."""
-        return self.entry.stamp_ns
-
-    @property
-    def depth_stamp_ns(self) -> int:
-        """Time of the depth image, nanoseconds."""
-        return self.entry.depth_stamp_ns
-
-    @property
-    def files(self) -> ImageFiles | None:
-        """The encoded images as they were recorded."""
-        return self.entry.files
-
-    def load(self, *, colour: bool = True) -> Frame:
-        """Read and decode the frame."""
-        return self.entry.load(colour=colour)
-
-    def scan(self) -> Scan:
-        """Read the returns alone."""
-        return self.entry.scan()
-
-
-@dataclass(frozen=True, slots=True)
-class _ChangedEntry(WrappedEntry):
-    change: Callable[[Frame], Frame]
-
-    def load(self, *, colour: bool = True) -> Frame:
-        return self.change(self.entry.load(colour=colour))
-
-    def scan(self) -> Scan:
-        return self.change(self.entry.scan()).scan()
+        return self.read(False).scan() if self.returns is None else self.returns()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -371,7 +334,16 @@ class Log:
 
         Encoded images stay as they were recorded. The function raises ``FrameError`` where nothing is left.
         """
-        return replace(self, entry_at=lambda index: _ChangedEntry(self.entry_at(index), change))
+
+        def entry_at(index: int) -> FrameRef:
+            entry = self.entry_at(index)
+            return replace(
+                entry,
+                read=lambda colour: change(entry.read(colour)),
+                returns=lambda: change(entry.scan()).scan(),
+            )
+
+        return replace(self, entry_at=entry_at)
 
     def subset(self, indices: NDArray[np.intp]) -> "Log":
         """Return the log with only the frames of some increasing indices; all else stays as it is."""

@@ -1,7 +1,7 @@
 """Time of an RGB-D log's depth, as outlines in it and edges in its images show."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -11,7 +11,7 @@ from mapper.core.frames import RgbdFrame
 from mapper.core.geometry import Array, spread_indices
 from mapper.core.timebase import NS_PER_S
 from mapper.runtime.ordered_map import ordered_map
-from mapper.sources.base import FrameRef, Log, WrappedEntry
+from mapper.sources.base import FrameRef, Log
 from mapper.sources.config import SourceConfig
 from mapper.sources.depth_outlines import Pixels, outlines
 from mapper.sources.time_offsets import FEWEST_ESTIMATES, TimeOffset, peak_of, time_offset
@@ -48,22 +48,15 @@ def with_depth_on_time(log: Log, config: SourceConfig) -> tuple[Log, str]:
     if not offset.remedy or offset.late_s is None:
         return log, ""
     late_ns = round(offset.late_s * NS_PER_S)
-    moved = replace(log, entry_at=lambda index: _RetimedEntry(log.entry_at(index), late_ns))
+
+    def entry_at(index: int) -> FrameRef:
+        entry = log.entry_at(index)
+        return replace(entry, depth_delay_ns=entry.depth_delay_ns - late_ns)
+
     return (
-        moved,
+        replace(log, entry_at=entry_at),
         f"depth: {offset.found}: it is fused at its true time, but paired by its stamps; {offset.remedy}",
     )
-
-
-@dataclass(frozen=True, slots=True)
-class _RetimedEntry(WrappedEntry):
-    """An entry whose depth was measured some time before its stamp."""
-
-    late_ns: int
-
-    @property
-    def depth_stamp_ns(self) -> int:
-        return self.entry.depth_stamp_ns - self.late_ns
 
 
 class _Timed(NamedTuple):

@@ -2,17 +2,17 @@
 
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.errors import FrameError
-from mapper.core.frames import Frame, Scan
+from mapper.core.frames import Scan
 from mapper.core.geometry import Transform, stride_for
 from mapper.core.timebase import NS_PER_S, nearest
-from mapper.sources.base import FrameRef, Log, WrappedEntry
+from mapper.sources.base import FrameRef, Log
 
 _LOOKED_AT, _FEWEST_PARTS, _MOST_DIRECTIONS = 16, 8, 2000
 _WIDEST_PART_RAD = 1.5 * np.pi
@@ -23,28 +23,25 @@ _LEAST_TURNED_RAD, _SAME_RATE, _MIN_USUAL = 1e-3, 0.25, 0.75
 another, and packets are lost."""
 
 
-@dataclass(frozen=True, slots=True)
-class _MergedEntry(WrappedEntry):
-    """An entry whose scan has the points of other LiDARs' scans, too, each at its own time.
+def _merged_entry(entry: FrameRef, others: Sequence[tuple[FrameRef, Transform | None]]) -> FrameRef:
+    """Return an entry whose scan has the points of other LiDARs' scans, too, each at its own time.
 
-    Attributes:
+    Args:
+        entry: The entry.
         others: Their entries, and the poses T_body_other of their bodies; None of the same body.
     """
 
-    others: Sequence[tuple[FrameRef, Transform | None]]
-
-    def load(self, *, colour: bool = True) -> Frame:
-        scans = [self.entry.load(colour=colour).scan()]
-        for entry, T_body_other in self.others:
+    def read(colour: bool) -> Scan:
+        scans = [entry.read(colour).scan()]
+        for other, T_body_other in others:
             if T_body_other is None:
-                scans.append(entry.load(colour=colour).scan())
+                scans.append(other.read(colour).scan())
                 continue
             with suppress(FrameError):  # fusing reports it
-                scans.append(entry.load(colour=colour).scan().moved(T_body_other))
+                scans.append(other.read(colour).scan().moved(T_body_other))
         return _merged(scans)
 
-    def scan(self) -> Scan:
-        return self.load(colour=False).scan()
+    return replace(entry, read=read, returns=None)
 
 
 def with_merged_scans(log: Log) -> Log:
@@ -65,7 +62,7 @@ def with_merged_scans(log: Log) -> Log:
             best = int(candidates[gap_ns[candidates].argmin()])
             if gap_ns[best] <= 0.5 * np.median(np.diff(log.stamps_ns)):
                 others[index].append((one.log.entry_at(best), one.T_body_sensor))
-    return replace(log, entry_at=lambda index: _MergedEntry(log.entry_at(index), others[index]))
+    return replace(log, entry_at=lambda index: _merged_entry(log.entry_at(index), others[index]))
 
 
 def with_whole_turns(log: Log) -> Log:
@@ -83,7 +80,7 @@ def with_whole_turns(log: Log) -> Log:
 
     def entry_at(index: int) -> FrameRef:
         first, *others = (log.entry_at(k) for k in range(begins[index], ends[index]))
-        return _MergedEntry(first, [(one, None) for one in others])
+        return _merged_entry(first, [(one, None) for one in others])
 
     note = (
         f"the {len(log)} clouds are parts of turns: {np.median(ends - begins):.0f} of them are joined to "

@@ -2,45 +2,18 @@
 
 from bisect import bisect_right
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import accumulate, pairwise
 
 import numpy as np
 
-from mapper.core.frames import Frame, Scan
 from mapper.core.timebase import NS_PER_S
 from mapper.core.trajectory import Positions, Trajectory
 from mapper.sensing.gyroscope import Gyroscope
-from mapper.sources.base import FrameRef, ImageFiles, Log, Session, WrappedEntry, later
+from mapper.sources.base import FrameRef, Log, Session, later
 
 _PAUSE_NS = NS_PER_S
 """Time between two logs whose own stamps are not in order."""
-
-
-@dataclass(frozen=True, slots=True)
-class _ShiftedEntry(WrappedEntry):
-    """An entry on another clock."""
-
-    shift_ns: int
-
-    @property
-    def stamp_ns(self) -> int:
-        return self.entry.stamp_ns + self.shift_ns
-
-    @property
-    def depth_stamp_ns(self) -> int:
-        return self.entry.depth_stamp_ns + self.shift_ns
-
-    @property
-    def files(self) -> ImageFiles | None:
-        files = self.entry.files
-        return files and replace(files, depth_stamp_ns=files.depth_stamp_ns + self.shift_ns)
-
-    def load(self, *, colour: bool = True) -> Frame:
-        return replace(self.entry.load(colour=colour), stamp_ns=self.stamp_ns)
-
-    def scan(self) -> Scan:
-        return replace(self.entry.scan(), stamp_ns=self.stamp_ns)
 
 
 def chained(first: Log, second: Log, *, shift_ns: int | None = None) -> Log:
@@ -111,10 +84,21 @@ def shifted(log: Log, shift_ns: int) -> Log:
     """Return a log on a clock that is ahead of its own."""
     if not shift_ns:
         return log
+
+    def entry_at(index: int) -> FrameRef:
+        entry = log.entry_at(index)
+        stamp_ns = entry.stamp_ns + shift_ns
+        return replace(
+            entry,
+            stamp_ns=stamp_ns,
+            read=lambda colour: replace(entry.read(colour), stamp_ns=stamp_ns),
+            returns=lambda: replace(entry.scan(), stamp_ns=stamp_ns),
+        )
+
     return replace(
         log,
         stamps_ns=log.stamps_ns + shift_ns,
-        entry_at=lambda index: _ShiftedEntry(log.entry_at(index), shift_ns),
+        entry_at=entry_at,
         truth=later(log.truth, shift_ns),
         device_poses=later(log.device_poses, shift_ns),
         T_body_base=replace(log.T_body_base, stamps_ns=log.T_body_base.stamps_ns + shift_ns),

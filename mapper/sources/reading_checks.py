@@ -8,7 +8,7 @@ from typing import Any, Literal
 from mapper.core.doubts import Doubt
 from mapper.core.frames import Frame, Scan
 from mapper.core.timebase import NS_PER_S
-from mapper.sources.base import Log, WrappedEntry
+from mapper.sources.base import FrameRef, Log
 from mapper.sources.point_times import MAX_SWEEP_S
 from mapper.sources.valid_returns import FARTHEST_M
 
@@ -49,7 +49,18 @@ class ReadingChecks:
     def __init__(self, log: Log) -> None:
         self._stamps_ns = log.stamps_ns
         self._readings: dict[int, _Reading] = {}
-        self.log = replace(log, entry_at=lambda index: _CheckedEntry(log.entry_at(index), self, index))
+
+        def entry_at(index: int) -> FrameRef:
+            entry = log.entry_at(index)
+
+            def read(colour: bool) -> Frame:
+                frame = entry.read(colour)
+                self.add(index, frame)
+                return frame
+
+            return replace(entry, read=read, returns=entry.scan)
+
+        self.log = replace(log, entry_at=entry_at)
 
     def add(self, index: int, frame: Frame) -> None:
         """Take in frame ``index`` of the log; what was loaded first counts, be it in colour or in grey."""
@@ -136,19 +147,6 @@ class ReadingChecks:
                 f"{are_timed.count(False)} of {len(are_timed)} scans have no times of their points and are "
                 "not deskewed, unlike the others"
             )
-
-
-@dataclass(frozen=True, slots=True)
-class _CheckedEntry(WrappedEntry):
-    """An entry whose frame is checked when it is loaded."""
-
-    checks: ReadingChecks
-    index: int
-
-    def load(self, *, colour: bool = True) -> Frame:
-        frame = self.entry.load(colour=colour)
-        self.checks.add(self.index, frame)
-        return frame
 
 
 def _reading_of(frame: Frame) -> _Reading:

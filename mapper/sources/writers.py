@@ -171,12 +171,12 @@ def _write_images(entry: FrameRef, out: Path) -> _Written:
     """Copy or encode both images; return their paths relative to ``out``."""
     stamp = seconds_text_from_ns(entry.stamp_ns)
     if (files := entry.files) is not None:
-        depth_stamp = seconds_text_from_ns(files.depth_stamp_ns)
+        depth_stamp = seconds_text_from_ns(entry.depth_stamp_ns)
         colour = Path("rgb", stamp + files.colour.suffix)
         depth = Path("depth", depth_stamp + files.depth.suffix)
         write_bytes(out / colour, image_bytes(files.colour))
         write_bytes(out / depth, image_bytes(files.depth))
-        return _Written(entry.stamp_ns, colour, depth, files.depth_stamp_ns, files.depth_units_per_m)
+        return _Written(entry.stamp_ns, colour, depth, entry.depth_stamp_ns, files.depth_units_per_m)
     frame = _load(entry)
     depth_stamp = seconds_text_from_ns(frame.depth_stamp_ns)
     colour, depth = Path("rgb", f"{stamp}.png"), Path("depth", f"{depth_stamp}.png")

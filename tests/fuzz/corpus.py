@@ -31,7 +31,7 @@ from tests.support.clouds import save_cloud
 from tests.support.depth_cameras import write_unregistered
 from tests.support.desk import DESK, build_desk_run
 from tests.support.driver_recordings import write_livox
-from tests.support.logs import MemoryEntry, log_in_memory
+from tests.support.logs import log_in_memory, memory_entry
 from tests.support.octree_maps import COLORED, mapped
 from tests.support.posed_scans import WRITERS, shots_of
 from tests.support.recordings import CAMERA, add_messages, shots, write, write_folder, write_foxglove
@@ -74,7 +74,7 @@ def lidar_log() -> Log:
 
 
 def _log_of(frames: list[Frame], **facts: object) -> Log:
-    entries = [MemoryEntry(frame.stamp_ns, frame) for frame in frames]
+    entries = [memory_entry(frame.stamp_ns, frame) for frame in frames]
     return log_in_memory(entries, truth=truth(), wheels=truth(), **facts)
 
 

@@ -8,7 +8,7 @@ from mapper.core.frames import PinholeCamera, RgbdFrame, ray_table
 from mapper.mapping.depth_noise_estimation import measure_noise
 from mapper.sensing.config import KINECT_NOISE, DepthNoiseConfig
 from mapper.sensing.depth import depth_sigma_m
-from tests.support.logs import MemoryEntry, log_in_memory
+from tests.support.logs import log_in_memory, memory_entry
 
 CAMERA = PinholeCamera(width_px=320, height_px=240, fx_px=260.0, fy_px=260.0, cx_px=159.5, cy_px=119.5)
 GREY = np.zeros((240, 320), np.uint8)
@@ -27,8 +27,8 @@ def walls(noise, *, relief_m=0.0, frames=24):
         relief = rng.standard_normal((120, 160)).repeat(2, axis=0).repeat(2, axis=1)
         depth_m += relief_m * relief * (np.arange(320) % 80 < 40)
         depth_m += depth_sigma_m(noise, depth_m) * rng.standard_normal(depth_m.shape)
-        entries.append(MemoryEntry(k, frame(k, depth_m)))
-    entries.append(MemoryEntry(frames, FrameError("damaged")))
+        entries.append(memory_entry(k, frame(k, depth_m)))
+    entries.append(memory_entry(frames, FrameError("damaged")))
     return log_in_memory(entries)
 
 
@@ -62,8 +62,8 @@ def test_the_number_of_threads_changes_nothing():
 
 def test_without_planes_it_is_a_kinect_s():
     rng = np.random.default_rng(0)
-    clutter = [MemoryEntry(k, frame(k, rng.uniform(0.5, 4.0, (240, 320)))) for k in range(4)]
-    for entries in (clutter, [MemoryEntry(0, FrameError("damaged"))]):
+    clutter = [memory_entry(k, frame(k, rng.uniform(0.5, 4.0, (240, 320)))) for k in range(4)]
+    for entries in (clutter, [memory_entry(0, FrameError("damaged"))]):
         measured = measure_noise(log_in_memory(entries), workers=1)
         assert measured.noise == KINECT_NOISE
         assert "too few planes" in measured.detail

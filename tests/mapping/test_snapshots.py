@@ -12,7 +12,7 @@ from mapper.octree.scan_updates import ScanUpdateWriter
 from mapper.runtime.progress import SILENT
 from mapper.simulation import CameraSimulator
 from mapper.simulation.config import SynthConfig
-from tests.support.logs import MemoryEntry, log_in_memory
+from tests.support.logs import log_in_memory, memory_entry
 
 
 def snapshots(log, trajectory, tmp_path, *settings):
@@ -47,7 +47,7 @@ def test_images_have_the_width_that_is_set(tmp_path):
 def test_scans_are_thinned_to_a_point_per_voxel(tmp_path):
     x, y = np.meshgrid(np.arange(-4.0, 4.0, 0.1), np.arange(-4.0, 4.0, 0.1))
     points = np.stack([x.ravel(), y.ravel(), np.full(x.size, -1.55)], axis=1).astype(np.float32)
-    log = log_in_memory([MemoryEntry(k, Scan(k, points, np.zeros(3))) for k in range(2)], sensor="lidar")
+    log = log_in_memory([memory_entry(k, Scan(k, points, np.zeros(3))) for k in range(2)], sensor="lidar")
     still = Trajectory(log.stamps_ns, np.tile(np.eye(4), (2, 1, 1)))
     seen = snapshots(log, still, tmp_path, "slice.min_height_m=-2")
     assert len(seen) == 2

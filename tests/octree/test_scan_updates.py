@@ -20,7 +20,6 @@ from mapper.octree.scan_updates import ScanUpdateWriter, decompress, displacemen
 from mapper.runtime.progress import SILENT
 from mapper.simulation import CameraSimulator
 from mapper.simulation.config import SynthConfig
-from tests.support.logs import EntryWithoutFiles
 
 FRAMES = 16
 CONFIG = overridden(BuildConfig(), ["cloud.frame_stride=1000", "mcap.image_stride=0", "workers=0"])
@@ -32,19 +31,17 @@ class Counted:
 
     def __init__(self, source):
         self.read = []
-        self.log = replace(source, entry_at=lambda index: CountedEntry(source.entry_at(index), self.read))
 
+        def entry_at(index):
+            entry = source.entry_at(index)
 
-class CountedEntry(EntryWithoutFiles):
-    def __init__(self, entry, read):
-        self.stamp_ns, self._entry, self._read = entry.stamp_ns, entry, read
+            def scan():
+                self.read.append(entry.stamp_ns)
+                return entry.scan()
 
-    def scan(self):
-        self._read.append(self.stamp_ns)
-        return self._entry.scan()
+            return replace(entry, returns=scan)  # the cloud reads the first frame
 
-    def load(self):  # for the cloud, of the first frame alone
-        return self._entry.load()
+        self.log = replace(source, entry_at=entry_at)
 
 
 @pytest.fixture(scope="module")

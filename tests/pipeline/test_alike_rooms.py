@@ -15,8 +15,7 @@ from mapper.pipeline.solve import solve
 from mapper.pipeline.track import track_log
 from mapper.runtime.progress import SILENT
 from mapper.simulation.source import CameraSimulator
-from mapper.sources.base import Log
-from mapper.sources.lazy_frame import LazyFrame
+from mapper.sources.base import FrameRef, Log
 from tests.support.desk_frames import DESK_WALK, desk_frames
 
 APART_M = 10.0
@@ -24,8 +23,8 @@ PAUSE_NS = 12 * NS_PER_S
 """In which the camera is carried on without images."""
 
 
-def entry(frame: RgbdFrame) -> LazyFrame:
-    return LazyFrame(frame.stamp_ns, lambda _colour: frame)
+def entry(frame: RgbdFrame) -> FrameRef:
+    return FrameRef(frame.stamp_ns, lambda _colour: frame)
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ from mapper.core.geometry import inverse
 from mapper.run.folder import open_run
 from mapper.sources.writers import write_log
 from tests.support.command_line import mapper
-from tests.support.logs import MemoryEntry, log_in_memory
+from tests.support.logs import log_in_memory, memory_entry
 from tests.support.stepped_wall import facing, painting, wall_image
 
 INTERVAL_NS = 100_000_000
@@ -18,7 +18,7 @@ FAR = [facing(-0.3, 0.3 - 0.03 * k, -5.5 + 0.01 * k, yaw=0.1) for k in range(12)
 def walk(folder, poses, seed):
     painted = painting(seed)
     images = [wall_image(painted, pose, INTERVAL_NS * k) for k, pose in enumerate(poses)]
-    log = log_in_memory([MemoryEntry(image.stamp_ns, image) for image in images])
+    log = log_in_memory([memory_entry(image.stamp_ns, image) for image in images])
     assert not write_log(log, folder, kind="tum")
     return folder
 

@@ -16,7 +16,7 @@ from mapper.pipeline.solve import solve
 from mapper.pipeline.tracking_result import TrackingResult
 from mapper.runtime.progress import SILENT
 from tests.support.feature_room import track
-from tests.support.logs import MemoryEntry, log_in_memory
+from tests.support.logs import log_in_memory, memory_entry
 from tests.support.stepped_wall import facing, painting, wall_image
 
 SURE = PoseSigmas(rotation_rad=0.01, translation_m=0.01).information
@@ -33,7 +33,7 @@ def broken(*paintings: int, pause_ns: int = 5_000_000_000):
     for node, pose in enumerate([*NEAR, *FAR]):
         stamp_ns = INTERVAL_NS * node + (pause_ns if node >= len(NEAR) else 0)
         painted = painting(paintings[node // len(NEAR)])
-        entries.append(MemoryEntry(stamp_ns, wall_image(painted, pose, stamp_ns)))
+        entries.append(memory_entry(stamp_ns, wall_image(painted, pose, stamp_ns)))
         tracked = pose if node < len(NEAR) else elsewhere @ pose
         tracks.append(track(node, stamp_ns, tracked))
         graph.add_node(node, stamp_ns, tracked)

@@ -16,7 +16,7 @@ from mapper.pipeline.track import track_log
 from mapper.runtime.progress import SILENT
 from mapper.simulation.config import SynthConfig
 from mapper.simulation.source import CameraSimulator
-from tests.support.logs import MemoryEntry
+from tests.support.logs import memory_entry
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +39,7 @@ def interrupted():
         step = inverse(before) @ after
         step[:3, 3] *= 1.02
         T.append(T[-1] @ step @ exp(rng.normal(0.0, 5e-4, 3), rng.normal(0.0, 5e-4, 3)))
-    entries = [MemoryEntry(entry.stamp_ns, entry.load()) for entry in source.entries()]  # drawn once
+    entries = [memory_entry(entry.stamp_ns, entry.load()) for entry in source.entries()]  # drawn once
     return replace(source, entry_at=entries.__getitem__, wheels=Trajectory(source.stamps_ns, np.array(T)))
 
 

@@ -24,7 +24,7 @@ from mapper.sources.frame_selection import selected
 from mapper.sources.time_offsets import time_offset
 from mapper.sources.trajectory_files import write_tum
 from tests.support.command_line import mapper
-from tests.support.logs import MemoryEntry, log_in_memory
+from tests.support.logs import log_in_memory, memory_entry
 from tests.support.paths import DATA
 
 FR1_XYZ = DATA / "tum_fr1_xyz"
@@ -56,7 +56,7 @@ def walk(tmp_path, *, turns=True, seconds=30.0, **facts):
     """A log whose odometry is known: 10 scans per second."""
     frames = path_at(np.arange(0.0, seconds, 0.1), turns=turns)
     point = np.ones((1, 3), np.float32)
-    entries = [MemoryEntry(stamp_ns, Scan(stamp_ns, point)) for stamp_ns in frames.stamps_ns.tolist()]
+    entries = [memory_entry(stamp_ns, Scan(stamp_ns, point)) for stamp_ns in frames.stamps_ns.tolist()]
     write_tum(tmp_path / "known.tum", frames)
     settings = ["odometry.kind=given", f"odometry.path={tmp_path / 'known.tum'}", "loops.kind=none"]
     return log_in_memory(entries, sensor="lidar", **facts), load_config(None, settings, sensor="lidar")

@@ -12,7 +12,7 @@ from mapper.places.config import VocabularyConfig
 from mapper.places.training import descriptors_of, grow, train
 from mapper.places.vocabulary import ONE, Vocabulary, WordTree, load_vocabulary
 from tests.support.descriptors import noisy, random_bits
-from tests.support.logs import MemoryEntry, log_in_memory
+from tests.support.logs import log_in_memory, memory_entry
 
 SMALL = VocabularyConfig(branching=4, levels=3)
 
@@ -74,7 +74,7 @@ def test_one_image_is_nothing_to_train_on(images):
 
 
 def test_a_log_without_images_is_refused():
-    scans = [MemoryEntry(i, Scan(i, np.zeros((1, 3), np.float32))) for i in range(3)]
+    scans = [memory_entry(i, Scan(i, np.zeros((1, 3), np.float32))) for i in range(3)]
     with pytest.raises(VocabularyError, match="lidar: holds scans without images"):
         descriptors_of(log_in_memory(scans, name="lidar", sensor="lidar"), SMALL)
 

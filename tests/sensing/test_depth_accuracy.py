@@ -14,7 +14,7 @@ from mapper.simulation.config import SensorConfig, SynthConfig
 from mapper.simulation.source import CameraSimulator
 from mapper.sources import open_source
 from mapper.sources.config import SourceConfig
-from tests.support.logs import MemoryEntry, log_in_memory
+from tests.support.logs import log_in_memory, memory_entry
 from tests.support.paths import FR1_XYZ
 
 CAMERA = PinholeCamera(320, 240, 262.5, 262.5, 159.5, 119.5)
@@ -24,7 +24,7 @@ A, B, C = 0.0012, 0.0008, 0.0015
 def log_of(depths, camera=CAMERA):
     image = np.full((camera.height_px, camera.width_px), 128, np.uint8)
     frames = [RgbdFrame(i, image, depth.astype(np.float32), camera) for i, depth in enumerate(depths)]
-    return log_in_memory([MemoryEntry(i, frame) for i, frame in enumerate(frames)], name="made")
+    return log_in_memory([memory_entry(i, frame) for i, frame in enumerate(frames)], name="made")
 
 
 def plane_m(distance_m, *, tilt_rad=0.0):
@@ -135,7 +135,7 @@ def test_one_frame_tells_nothing_of_time():
 def test_the_patch_decides_what_is_seen():
     log = wall(1.0)
     for entry in log.entries():
-        entry.frame.depth_m[:, 200:] = 0.7
+        entry.load().depth_m[:, 200:] = 0.7
     level, _ = depth_at(log, 1.0, patch=Patch(0, 0, 200, 240))
     assert level.typical.raw.max_error_m < 0.03
     with pytest.raises(DataError, match=r"none of 4 frames shows a plane; the first: .* lie \d+% off any"):
@@ -145,7 +145,7 @@ def test_the_patch_decides_what_is_seen():
 def test_a_patch_with_little_depth_is_refused():
     log = wall(1.0)
     for entry in log.entries():
-        entry.frame.depth_m[:, 20:] = 0.0
+        entry.load().depth_m[:, 20:] = 0.0
     with pytest.raises(DataError, match=r"10% of the patch .* has depth, want at least 50%"):
         depth_at(log, 1.0, patch=Patch(0, 0, 200, 240))
 
@@ -157,7 +157,7 @@ def test_a_wall_seen_at_a_slant_is_refused():
 
 def test_frames_without_the_plane_are_left_out():
     log = wall(1.0, frames=5)
-    log.entry_at(2).frame.depth_m[:] = 0.0
+    log.entry_at(2).load().depth_m[:] = 0.0
     assert depth_at(log, 1.0)[0].frames == 4
 
 
@@ -176,7 +176,7 @@ def test_distances_in_the_wrong_order_are_refused():
 
 
 def test_scans_are_refused():
-    scans = [MemoryEntry(0, Scan(0, np.zeros((1, 3), np.float32)))]
+    scans = [memory_entry(0, Scan(0, np.zeros((1, 3), np.float32)))]
     with pytest.raises(SourceError, match="a log of scans"):
         depth_at(log_in_memory(scans, sensor="lidar"), 1.0)
     with pytest.raises(SourceError, match="no frame can be read; the last: frame 0: a scan"):

@@ -24,7 +24,7 @@ from mapper.sources.config import CameraConfig, SourceConfig
 from mapper.sources.depth_scale import depth_warnings, read_spread, why_no_depth
 from tests.support.command_line import mapper
 from tests.support.desk_frames import blank
-from tests.support.logs import MemoryEntry, changed_frames, log_in_memory
+from tests.support.logs import changed_frames, log_in_memory, memory_entry
 from tests.support.tum_logs import copy_numbered
 
 CAMERA = PinholeCamera(40, 30, 30.0, 30.0, 19.5, 14.5)
@@ -101,7 +101,7 @@ def plain(depths_m, *, image=None):
     """A log of images without texture, each of one depth."""
     image = np.zeros((30, 40), np.uint8) if image is None else image
     return log_in_memory([
-        MemoryEntry(i * NS_PER_S, RgbdFrame(i * NS_PER_S, image, np.full((30, 40), m, np.float32), CAMERA))
+        memory_entry(i * NS_PER_S, RgbdFrame(i * NS_PER_S, image, np.full((30, 40), m, np.float32), CAMERA))
         for i, m in enumerate(depths_m)
     ])  # fmt: skip
 
@@ -181,7 +181,7 @@ def test_motion_that_no_scale_fits_says_nothing_of_depth(desk_log):
 
 
 def test_frames_that_cannot_be_read_and_scans_are_left_alone():
-    assert warnings_of(log_in_memory([MemoryEntry(0, OSError())], sensor="lidar")) == []
+    assert warnings_of(log_in_memory([memory_entry(0, OSError())], sensor="lidar")) == []
 
 
 def test_black_images_show_no_scale(desk_log):

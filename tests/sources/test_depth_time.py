@@ -1,7 +1,5 @@
 """Depth at the time of its own stamps, or at that which the images show."""
 
-from dataclasses import dataclass
-
 import numpy as np
 import pytest
 
@@ -13,22 +11,11 @@ from mapper.sources import open_source
 from mapper.sources.config import SourceConfig
 from mapper.sources.depth_time import with_depth_on_time
 from mapper.sources.multi_session_log import chained
-from tests.support.logs import MemoryEntry, log_in_memory
+from tests.support.logs import log_in_memory, memory_entry
 from tests.support.paths import DATA
 
 MS = 1_000_000
 real = pytest.mark.skipif(not (DATA / "tum_fr1_xyz").exists(), reason=f"{DATA}/tum_fr1_xyz is not there")
-
-
-@dataclass(frozen=True)
-class LateEntry(MemoryEntry):
-    """An entry whose depth image has a stamp of its own."""
-
-    delay_ns: int = 0
-
-    @property
-    def depth_stamp_ns(self) -> int:
-        return self.stamp_ns + self.delay_ns
 
 
 def moment(stamp_ns):
@@ -39,7 +26,7 @@ def moment(stamp_ns):
 
 @pytest.mark.parametrize("delay_ms", [0, 16, -30])
 def test_a_frame_has_the_pose_of_the_time_of_its_depth(delay_ms):
-    entries = [LateEntry(k * 33 * MS, None, delay_ms * MS) for k in range(5)]
+    entries = [memory_entry(k * 33 * MS, None, depth_delay_ns=delay_ms * MS) for k in range(5)]
     log = log_in_memory(entries)
     path = Trajectory(log.stamps_ns, np.array([moment(stamp_ns) for stamp_ns in log.stamps_ns]))
     for placed in placed_frames(log, path):

@@ -9,7 +9,7 @@ import pytest
 from mapper.core.frames import PinholeCamera, RgbdFrame
 from mapper.core.timebase import NS_PER_S
 from mapper.sources.image_order import time_warnings
-from tests.support.logs import MemoryEntry, log_in_memory
+from tests.support.logs import log_in_memory, memory_entry
 
 WALL = cv2.resize(
     np.random.default_rng(4).integers(0, 255, (4, 40)).astype(np.uint8),
@@ -27,7 +27,7 @@ def passing(order, *, period_ns=10**8, step_px=8):
         seen = WALL[:, step_px * place : step_px * place + 128]
         image = np.clip(seen + random.normal(0.0, 3.0, seen.shape), 0, 255).astype(np.uint8)
         entries.append(
-            MemoryEntry(
+            memory_entry(
                 k * period_ns, RgbdFrame(k * period_ns, image, np.ones(image.shape, np.float32), CAMERA)
             )
         )

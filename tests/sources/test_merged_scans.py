@@ -20,7 +20,7 @@ from mapper.sources.config import SourceConfig
 from mapper.sources.frame_selection import selected
 from mapper.sources.merged_scans import with_merged_scans, with_whole_turns
 from mapper.sources.reading_checks import ReadingChecks
-from tests.support.logs import MemoryEntry, changed_frames, log_in_memory
+from tests.support.logs import changed_frames, log_in_memory, memory_entry
 
 MS = 1_000_000
 T_BODY_REAR = transform(rotation_exp(np.array([0.0, 0.0, np.pi])), np.array([-1.0, 0.0, 0.0]))
@@ -32,7 +32,7 @@ def scans(*stamps_ms, times_s=None):
     for at in stamps_ms:
         points = np.array([[at, 0.0, 0.0], [at, 1.0, 0.0]], np.float32)
         times = None if times_s is None else np.array(times_s, np.float32)
-        entries.append(MemoryEntry(at * MS, Scan(at * MS, points, times_s=times)))
+        entries.append(memory_entry(at * MS, Scan(at * MS, points, times_s=times)))
     return log_in_memory(entries, sensor="lidar")
 
 
@@ -66,7 +66,7 @@ def test_each_scan_is_in_the_nearest_alone(others_ms, taken_ms):
 
 def test_three_sensors_and_a_scan_that_cannot_be_read():
     damaged = log_in_memory(
-        [MemoryEntry(0, FrameError("damaged")), *map(scans(100).entry_at, [0])], sensor="lidar"
+        [memory_entry(0, FrameError("damaged")), *map(scans(100).entry_at, [0])], sensor="lidar"
     )
     log = merged(scans(0, 100), scans(0, 100), damaged)
     assert [len(frame.points_body) for frame in log] == [4, 6]
@@ -104,7 +104,8 @@ def test_two_narrow_views_track_better_than_one():
 def test_a_frozen_sensor_is_noticed_beside_one_that_is_not():
     frozen = scans(*range(0, 800, 100))
     entries = [
-        MemoryEntry(entry.stamp_ns, replace(frozen[0], stamp_ns=entry.stamp_ns)) for entry in frozen.entries()
+        memory_entry(entry.stamp_ns, replace(frozen[0], stamp_ns=entry.stamp_ns))
+        for entry in frozen.entries()
     ]
     checks = ReadingChecks(log_in_memory(entries, sensor="lidar"))
     log = merged(checks.log, scans(*range(0, 800, 100)))
@@ -121,7 +122,7 @@ def parts_of(log, count, *, timed):
             late_ns = k * 100 * MS // count
             times_s = scan.times_s - np.float32(late_ns / 1e9) if timed else None
             cut = replace(scan, stamp_ns=scan.stamp_ns + late_ns, times_s=times_s).select(part == k)
-            entries.append(MemoryEntry(cut.stamp_ns, cut))
+            entries.append(memory_entry(cut.stamp_ns, cut))
     return log_in_memory(entries, sensor="lidar")
 
 
@@ -147,8 +148,8 @@ def test_parts_without_returns_belong_to_their_turn_and_damaged_ones_cost_it():
     entries = [parts.entry_at(k) for k in range(len(parts))]
     for k in (0, 5):
         seen = entries[k].load()
-        entries[k] = MemoryEntry(seen.stamp_ns, seen.select(np.zeros(len(seen.points_body), bool)))
-    entries[17] = MemoryEntry(entries[17].stamp_ns, FrameError("damaged"))
+        entries[k] = memory_entry(seen.stamp_ns, seen.select(np.zeros(len(seen.points_body), bool)))
+    entries[17] = memory_entry(entries[17].stamp_ns, FrameError("damaged"))
     joined = with_whole_turns(log_in_memory(entries, sensor="lidar"))
     np.testing.assert_array_equal(joined.stamps_ns, whole.stamps_ns)
     assert 0 < len(joined.entry_at(0).scan().points_body) < len(whole.entry_at(0).scan().points_body)
@@ -169,10 +170,10 @@ def test_a_view_that_a_pan_unit_turns_stays_a_scan_of_its_own():
     for k in range(20):  # at 10 Hz, a turn in a second
         direction_rad = angles_rad + 0.2 * np.pi * k
         points = np.column_stack([np.cos(direction_rad), np.sin(direction_rad), 0.0 * direction_rad])
-        entries.append(MemoryEntry(100 * k * MS, Scan(100 * k * MS, points.astype(np.float32))))
+        entries.append(memory_entry(100 * k * MS, Scan(100 * k * MS, points.astype(np.float32))))
     log = log_in_memory(entries, sensor="lidar")
     assert with_whole_turns(log) is log
     faster = log_in_memory(
-        [MemoryEntry(k * 10 * MS, e.load()) for k, e in enumerate(entries)], sensor="lidar"
+        [memory_entry(k * 10 * MS, e.load()) for k, e in enumerate(entries)], sensor="lidar"
     )
     assert len(with_whole_turns(faster)) == 2

@@ -53,7 +53,7 @@ def test_frames_and_scans_are_those_of_the_logs_on_the_common_clock(two):
         np.testing.assert_array_equal(frame.image, own_frame.image)
         np.testing.assert_array_equal(entry.scan().points_body, own.scan().points_body)
         assert entry.files.colour == own.files.colour
-        assert entry.files.depth_stamp_ns == own.files.depth_stamp_ns + shift_ns
+        assert entry.depth_stamp_ns == own.depth_stamp_ns + shift_ns
 
 
 def test_three_logs_follow_one_another(two, tiny_tum_log):

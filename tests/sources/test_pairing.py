@@ -25,7 +25,7 @@ def test_depth_is_paired_by_corrected_stamps(tiny_tum_log, tmp_path, kind):
     for i in range(4):
         then, now = plain.entry_at(i), late.entry_at(i)
         np.testing.assert_array_equal(depth_of(now), depth_of(then))
-        assert now.files.depth_stamp_ns == then.files.depth_stamp_ns + PERIOD_NS
+        assert now.depth_stamp_ns == then.depth_stamp_ns + PERIOD_NS
         assert now.load().depth_delay_s == pytest.approx(-DEPTH_LEAD_NS * 1e-9)
     assert any("1 of 5 colour images" in note for note in late.notes)
 

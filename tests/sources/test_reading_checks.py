@@ -17,7 +17,7 @@ from mapper.sources import inspection, open_source
 from mapper.sources.config import SourceConfig
 from mapper.sources.inspection import inspect_log
 from mapper.sources.reading_checks import FROZEN_IMAGES, FROZEN_SCANS, ReadingChecks
-from tests.support.logs import MemoryEntry, log_in_memory
+from tests.support.logs import log_in_memory, memory_entry
 
 CAMERA = PinholeCamera(8, 6, 6.0, 6.0, 3.5, 2.5)
 
@@ -28,7 +28,9 @@ def log_of(images, depths):
     for i, seeds in enumerate(zip(images, depths, strict=True)):
         image = np.random.default_rng(seeds[0]).integers(0, 256, (6, 8, 3), dtype=np.uint8)
         depth_m = np.random.default_rng(seeds[1]).uniform(1.0, 2.0, (6, 8)).astype(np.float32)
-        entries.append(MemoryEntry(i * NS_PER_S // 10, RgbdFrame(i * NS_PER_S // 10, image, depth_m, CAMERA)))
+        entries.append(
+            memory_entry(i * NS_PER_S // 10, RgbdFrame(i * NS_PER_S // 10, image, depth_m, CAMERA))
+        )
     return log_in_memory(entries)
 
 
@@ -77,7 +79,7 @@ def scans_of(seeds):
         Scan(i * NS_PER_S // 10, np.random.default_rng(seed).uniform(1.0, 2.0, (50, 3)).astype(np.float32))
         for i, seed in enumerate(seeds)
     ]
-    return log_in_memory([MemoryEntry(scan.stamp_ns, scan) for scan in scans])
+    return log_in_memory([memory_entry(scan.stamp_ns, scan) for scan in scans])
 
 
 def test_scans_that_repeat_are_noted_and_doubted():
@@ -104,7 +106,7 @@ def test_a_second_of_the_same_image_is_long_whatever_the_frame_rate():
 def test_a_damaged_frame_among_the_same_ones_hides_nothing():
     log = log_of(frozen(30, 5, 20), range(100, 130))
     entries = [log.entry_at(i) for i in range(30)]
-    entries[14] = MemoryEntry(entries[14].stamp_ns, FrameError("damaged"))
+    entries[14] = memory_entry(entries[14].stamp_ns, FrameError("damaged"))
     assert notes_on(log_in_memory(entries))[0].startswith("frames 5 … 24, ")
 
 
@@ -114,7 +116,7 @@ def test_the_same_image_now_and_again_is_no_frozen_camera():
 
 def test_far_returns_are_counted_over_the_log():
     scans = [Scan(i, np.full((20, 3), i, np.float32), far_returns=i % 3) for i in range(6)]
-    entries = [MemoryEntry(scan.stamp_ns, scan) for scan in scans]
+    entries = [memory_entry(scan.stamp_ns, scan) for scan in scans]
     assert notes_on(log_in_memory(entries, sensor="lidar")) == [
         "6 returns in 4 of 6 scans are farther than 5000 m, which no sensor reaches; left out"
     ]
@@ -159,6 +161,6 @@ def test_scans_without_times_among_others_with_times_are_counted(untimed, noted)
     points = np.random.default_rng(2).uniform(1.0, 9.0, (6, 20, 3)).astype(np.float32)
     times_s = np.linspace(0.0, 0.1, 20, dtype=np.float32)
     scans = [Scan(k * 10**8, points[k], times_s=None if k in untimed else times_s) for k in range(6)]
-    notes = notes_on(log_in_memory([MemoryEntry(scan.stamp_ns, scan) for scan in scans], sensor="lidar"))
+    notes = notes_on(log_in_memory([memory_entry(scan.stamp_ns, scan) for scan in scans], sensor="lidar"))
     assert sum(note.startswith("3 of 6 scans have no times") for note in notes) == noted
     assert len(notes) == noted

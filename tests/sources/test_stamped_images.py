@@ -42,14 +42,14 @@ def test_images_named_by_their_stamps_need_no_list(tmp_path, colour, depth, name
     log = open_source(written(tmp_path, colour, depth, name, late_ns=4_000_000))
     assert (log.kind, len(log), list(log.notes)) == ("tum", N, [MILLIMETRES_NOTE])
     assert log.stamps_ns.tolist() == [stamp_ns // 1000 * 1000 for stamp_ns in STAMPS_NS]
-    files = log.entry_at(1).files
-    assert (files.depth_units_per_m, files.depth_stamp_ns - log.stamps_ns[1]) == (1000.0, 4_000_000)
+    entry = log.entry_at(1)
+    assert (entry.files.depth_units_per_m, entry.depth_delay_ns) == (1000.0, 4_000_000)
 
 
 def test_depth_before_colour_pairs_by_time_and_not_by_its_place(tmp_path):
     log = open_source(written(tmp_path, late_ns=-PERIOD_NS))
     assert len(log) == N - 1
-    assert log.entry_at(0).files.depth_stamp_ns == log.stamps_ns[0]
+    assert log.entry_at(0).depth_stamp_ns == log.stamps_ns[0]
 
 
 @pytest.mark.parametrize("name", ["associations.txt", "associate.txt", "assoc.txt", "desk.txt"])
@@ -64,9 +64,10 @@ def test_a_list_of_pairs_takes_the_place_of_both_lists(tmp_path, name, is_depth_
     (tmp_path / "calibration.toml").write_text(CALIBRATION)
     log = open_source(tmp_path)
     assert (log.kind, len(log), list(log.notes)) == ("tum", N, [UNITS_NOTE])
-    files = log.entry_at(2).files
+    entry = log.entry_at(2)
+    files = entry.files
     assert (files.colour.name, files.depth.name, files.depth_units_per_m) == ("a2.png", "b2.png", 5000.0)
-    assert files.depth_stamp_ns - log.stamps_ns[2] == 5_000_000
+    assert entry.depth_delay_ns == 5_000_000
 
 
 def test_pairs_that_lead_out_of_the_folder_are_refused(tmp_path):

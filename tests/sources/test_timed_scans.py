@@ -7,7 +7,7 @@ from mapper.core.frames import Scan
 from mapper.sources.config import SourceConfig
 from mapper.sources.frame_selection import selected
 from mapper.sources.point_times import azimuth_times_s
-from tests.support.logs import MemoryEntry, log_in_memory
+from tests.support.logs import log_in_memory, memory_entry
 
 COLUMNS, RINGS, SWEEP_S = 360, 4, 0.1
 COLUMN_S = np.arange(COLUMNS) * SWEEP_S / COLUMNS
@@ -51,7 +51,7 @@ def test_points_in_another_order_have_no_times():
 def read(times_s, **settings):
     points, _ = turn(clockwise=True)
     scan = Scan(7, points.astype(np.float32), times_s=times_s)
-    log = log_in_memory([MemoryEntry(7, scan)], sensor="lidar")
+    log = log_in_memory([memory_entry(7, scan)], sensor="lidar")
     entry = selected(log, SourceConfig(**settings)).entry_at(0)
     np.testing.assert_array_equal(entry.load().points_body, scan.points_body)
     return entry.load().times_s, entry.scan().times_s

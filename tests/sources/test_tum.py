@@ -27,7 +27,7 @@ def test_reads_every_frame_with_exact_stamps_pixels_and_truth(tiny_tum_log):
         frame = entry.load()
         np.testing.assert_array_equal(frame.rgb, rgb)
         np.testing.assert_array_equal(frame.depth_m, units.astype(np.float32) / np.float32(5000))
-        assert entry.files.depth_stamp_ns == entry.stamp_ns - DEPTH_LEAD_NS
+        assert entry.depth_stamp_ns == entry.stamp_ns - DEPTH_LEAD_NS
         assert entry.load(colour=False).image.shape == (48, 64)
     assert (frame.camera.fx_px, frame.camera.cy_px, frame.camera.width_px) == (60.0, 23.5, 64)
     np.testing.assert_allclose(source.truth.positions_world[:, 0], [0, 0.01, 0.02, 0.03])

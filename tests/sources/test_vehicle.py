@@ -11,7 +11,7 @@ from mapper.core.geometry import apply, exp, inverse
 from mapper.sources.base import SensorBeside
 from mapper.sources.config import BodyConfig, SourceConfig
 from mapper.sources.frame_selection import selected
-from tests.support.logs import MemoryEntry, log_in_memory
+from tests.support.logs import log_in_memory, memory_entry
 
 BOX = (-2.0, -1.0, -1.5, 0.5, 1.0, -0.3)
 INSIDE = [(-1.0, 0.0, -0.5), (0.5, 1.0, -1.5)]
@@ -25,7 +25,7 @@ def scan_log(points, **facts):
         colors=np.arange(3 * len(points), dtype=np.uint8).reshape(-1, 3),
         times_s=np.arange(len(points), dtype=np.float32),
     )
-    return log_in_memory([MemoryEntry(5, scan)], sensor="lidar", **facts)
+    return log_in_memory([memory_entry(5, scan)], sensor="lidar", **facts)
 
 
 def cleared(log, **body):
@@ -55,7 +55,7 @@ def test_depth_of_the_vehicle_is_not_measured():
     camera = PinholeCamera(width_px=4, height_px=3, fx_px=4.0, fy_px=4.0, cx_px=1.5, cy_px=1.0)
     depth_m = np.array([[0.0, 2.0, 2.0, 2.0], [2.0, 2.0, 0.0, 2.0], [0.4, 0.4, 0.4, 0.4]], np.float32)
     frame = RgbdFrame(5, np.zeros((3, 4, 3), np.uint8), depth_m, camera)
-    entry = cleared(log_in_memory([MemoryEntry(5, frame)]), box=(-1.0, 0.05, 0.0, 0.1, 1.0, 1.0))
+    entry = cleared(log_in_memory([memory_entry(5, frame)]), box=(-1.0, 0.05, 0.0, 0.1, 1.0, 1.0))
 
     loaded = entry.load()
     np.testing.assert_array_equal(loaded.depth_m[:2], depth_m[:2])

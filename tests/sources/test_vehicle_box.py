@@ -8,7 +8,7 @@ import pytest
 from mapper.core.frames import PinholeCamera, RgbdFrame, Scan
 from mapper.sources.config import BodyConfig, SourceConfig
 from mapper.sources.vehicle import clear_vehicle, vehicle_box
-from tests.support.logs import MemoryEntry, log_in_memory
+from tests.support.logs import log_in_memory, memory_entry
 from tests.support.street_scans import on_street, street, view
 
 FRAMES = 12
@@ -32,7 +32,7 @@ def street_log(*, vehicle, parked=False):
         own.append(bonnet_and_driver(rng))
         if vehicle:
             points = np.concatenate([points, own[-1].astype(np.float32)])
-        entries.append(MemoryEntry(k, Scan(k, points.astype(np.float32))))
+        entries.append(memory_entry(k, Scan(k, points.astype(np.float32))))
     return log_in_memory(entries, sensor="lidar"), np.concatenate(own)
 
 
@@ -65,7 +65,7 @@ def test_rings_on_a_ceiling_are_no_vehicle():
     def under_it(index):
         scan = log.entry_at(index).scan()
         points = np.concatenate([scan.points_body, ceiling.astype(np.float32)])
-        return MemoryEntry(index, Scan(index, points))
+        return memory_entry(index, Scan(index, points))
 
     assert vehicle_box(replace(log, entry_at=under_it)) is None
 
@@ -91,7 +91,7 @@ def box_before_a_camera(pixels):
     for k in range(FRAMES):
         depth_m = np.full((60, 80), 1.3 + 0.12 * k, np.float32)
         depth_m[pixels] = 0.4
-        entries.append(MemoryEntry(k, RgbdFrame(k, np.zeros((60, 80), np.uint8), depth_m, CAMERA)))
+        entries.append(memory_entry(k, RgbdFrame(k, np.zeros((60, 80), np.uint8), depth_m, CAMERA)))
     return vehicle_box(log_in_memory(entries))
 
 

@@ -7,7 +7,7 @@ from mapper.core.trajectory import trajectory_from
 from mapper.sources import open_source
 from mapper.sources.image_files.decoded import encode_depth
 from mapper.sources.writers import left_out, write_log
-from tests.support.logs import MemoryEntry, log_in_memory
+from tests.support.logs import log_in_memory, memory_entry
 from tests.support.tum_logs import FIRST_NS, PERIOD_NS, picture
 
 CAMERA = PinholeCamera(64, 48, 60.0, 61.0, 31.5, 23.5, (0.1, -0.2, 0.001, 0.002, 0.05))
@@ -58,7 +58,7 @@ def test_truth_is_written_only_where_it_is_near(tiny_tum_log, tmp_path):
 
 def test_frames_without_files_are_encoded_losslessly(tmp_path):
     stamps = [FIRST_NS, FIRST_NS + PERIOD_NS + 1]
-    source = log_in_memory([MemoryEntry(s, frame_at(s, i)) for i, s in enumerate(stamps)])
+    source = log_in_memory([memory_entry(s, frame_at(s, i)) for i, s in enumerate(stamps)])
     write_log(source, tmp_path / "out", kind="tum")
     again = open_source(tmp_path / "out")
     assert again.name == "memory"
@@ -66,30 +66,30 @@ def test_frames_without_files_are_encoded_losslessly(tmp_path):
         frame = entry.load()
         assert frame.stamp_ns == made.stamp_ns
         assert frame.camera == CAMERA
-        np.testing.assert_array_equal(frame.rgb, made.frame.rgb)
-        np.testing.assert_array_equal(frame.depth_m, made.frame.depth_m)
+        np.testing.assert_array_equal(frame.rgb, made.load().rgb)
+        np.testing.assert_array_equal(frame.depth_m, made.load().depth_m)
 
 
 def test_depth_beyond_16_bits_becomes_no_measurement(tmp_path):
     depth_m = np.full((48, 64), 13.2, np.float32)
     depth_m[0] = 1.0
     frame = RgbdFrame(FIRST_NS, picture(0)[0], depth_m, CAMERA)
-    write_log(log_in_memory([MemoryEntry(FIRST_NS, frame)]), tmp_path / "out", kind="tum")
+    write_log(log_in_memory([memory_entry(FIRST_NS, frame)]), tmp_path / "out", kind="tum")
     again = next(iter(open_source(tmp_path / "out").entries())).load()
     assert (again.depth_m[0] == 1.0).all()
     assert (again.depth_m[1:] == 0.0).all()
 
 
 def test_a_frame_that_cannot_be_read_is_skipped_and_returned(tmp_path):
-    bad = MemoryEntry(FIRST_NS, FrameError("broken"))
-    good = MemoryEntry(FIRST_NS + 1000, frame_at(FIRST_NS + 1000, 1))
+    bad = memory_entry(FIRST_NS, FrameError("broken"))
+    good = memory_entry(FIRST_NS + 1000, frame_at(FIRST_NS + 1000, 1))
     skipped = write_log(log_in_memory([bad, good]), tmp_path / "out", kind="mbag")
     assert [(s.stamp_ns, s.reason) for s in skipped] == [(FIRST_NS, "broken")]
     assert len(open_source(tmp_path / "out")) == 1
 
 
 def test_scans_and_empty_logs_are_refused_before_anything_is_written(tmp_path):
-    scan = MemoryEntry(5, Scan(5, np.zeros((1, 3), np.float32)))
+    scan = memory_entry(5, Scan(5, np.zeros((1, 3), np.float32)))
     with pytest.raises(SourceError, match="a scan without images; TUM and mbag hold RGB-D frames"):
         write_log(log_in_memory([scan]), tmp_path / "out", kind="tum")
     with pytest.raises(SourceError, match="no frame can be written: it has no frames"):
@@ -121,7 +121,7 @@ def test_a_log_that_was_interrupted_leaves_nothing_and_one_that_exists_is_not_ov
 
 
 def test_a_lidars_log_is_refused_before_its_scans_are_read(tmp_path):
-    source = log_in_memory([MemoryEntry(5, FrameError("was read"))], sensor="lidar")
+    source = log_in_memory([memory_entry(5, FrameError("was read"))], sensor="lidar")
     with pytest.raises(SourceError, match=r"memory: scans without images; .* --as kitti"):
         write_log(source, tmp_path / "out", kind="tum")
 
@@ -129,7 +129,7 @@ def test_a_lidars_log_is_refused_before_its_scans_are_read(tmp_path):
 @pytest.mark.parametrize("kind", ["mcap", "bag"])
 def test_recordings_leave_out_what_is_before_time_0_and_say_so(kind, tmp_path):
     truth = trajectory_from((stamp_ns, np.eye(4)) for stamp_ns in (-20_000_000, -10_000_000, 0, 40_000_000))
-    frames = [MemoryEntry(stamp_ns, frame_at(stamp_ns, 0)) for stamp_ns in (-5_000_000, 30_000_000)]
+    frames = [memory_entry(stamp_ns, frame_at(stamp_ns, 0)) for stamp_ns in (-5_000_000, 30_000_000)]
     log = log_in_memory(frames, truth=truth)
     assert left_out(log, kind) == [f"{kind} has no place for 2 true poses before the time 0; left out"]
     (skipped,) = write_log(log, tmp_path / f"log.{kind}", kind=kind)

@@ -1,8 +1,7 @@
 """Logs whose frames lie in memory."""
 
 from collections.abc import Callable, Collection
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,35 +11,18 @@ from mapper.core.errors import FrameError
 from mapper.sources.base import FrameRef, Log
 
 
-class EntryWithoutFiles:
-    """Part of entries whose whole frame was measured at the stamp."""
-
-    @property
-    def depth_stamp_ns(self: FrameRef) -> int:
-        return self.stamp_ns
-
-    @property
-    def files(self) -> None:
-        return None
-
-
-@dataclass(frozen=True)
-class MemoryEntry(EntryWithoutFiles):
+def memory_entry(stamp_ns: int, frame: Any, *, depth_delay_ns: int = 0) -> FrameRef:
     """An entry without files; ``frame`` may be an error to raise."""
 
-    stamp_ns: int
-    frame: Any
+    def read(_colour: bool) -> Any:
+        if isinstance(frame, Exception):
+            raise frame
+        return frame
 
-    def load(self, *, colour: bool = True) -> Any:  # noqa: ARG002
-        if isinstance(self.frame, Exception):
-            raise self.frame
-        return self.frame
-
-    def scan(self) -> Any:
-        return self.load().scan()
+    return FrameRef(stamp_ns, read, depth_delay_ns=depth_delay_ns)
 
 
-def log_in_memory(entries: list[MemoryEntry], *, name: str = "memory", **facts: Any) -> Log:
+def log_in_memory(entries: list[FrameRef], *, name: str = "memory", **facts: Any) -> Log:
     """An RGB-D log of some entries; ``facts`` are other fields of it."""
     return Log(
         path=Path(name),
@@ -52,27 +34,14 @@ def log_in_memory(entries: list[MemoryEntry], *, name: str = "memory", **facts: 
     )
 
 
-@dataclass(frozen=True)
-class ChangedEntry(EntryWithoutFiles):
-    """An entry whose frame is changed as it is read."""
-
-    entry: FrameRef
-    change: Callable[[Any], Any]
-
-    @property
-    def stamp_ns(self) -> int:
-        return self.entry.stamp_ns
-
-    def load(self, *, colour: bool = True) -> Any:
-        return self.change(self.entry.load(colour=colour))
-
-    def scan(self) -> Any:
-        return self.load().scan()
-
-
 def changed_frames(log: Log, change: Callable[[int, Any], Any]) -> Log:
     """A log whose frames are what ``change`` makes of their numbers and of them; it may raise."""
-    return replace(log, entry_at=lambda i: ChangedEntry(log.entry_at(i), partial(change, i)))
+
+    def entry_at(index: int) -> FrameRef:
+        entry = log.entry_at(index)
+        return FrameRef(entry.stamp_ns, lambda colour: change(index, entry.read(colour)))
+
+    return replace(log, entry_at=entry_at)
 
 
 class CountedReads:

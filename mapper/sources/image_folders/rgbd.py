@@ -12,7 +12,7 @@ from mapper.core.errors import FrameError, SourceError, listed
 from mapper.core.frames import DepthImage, Image, RgbdFrame, Scan
 from mapper.core.timebase import NS_PER_S
 from mapper.core.trajectory import Trajectory
-from mapper.sources.base import ImageFile, ImageFiles, Log
+from mapper.sources.base import FrameRef, ImageFile, ImageFiles, Log
 from mapper.sources.calibration import (
     PRIMESENSE,
     Calibration,
@@ -43,31 +43,29 @@ _MIRROR_Y = np.diag([1.0, -1.0, 1.0, 1.0])
 
 
 @dataclass(frozen=True, slots=True)
-class RgbdEntry:
+class RgbdImages:
     """Colour and depth image of a log, not read yet; the body is the camera.
 
     Attributes:
         stamp_ns: Time of the colour image, nanoseconds.
+        depth_stamp_ns: Time of the depth image, nanoseconds.
         encoded: Both images as they are encoded.
         recorded: Camera of the frame, and the sizes of both images as recorded.
     """
 
     stamp_ns: int
+    depth_stamp_ns: int
     encoded: ImageFiles
     recorded: RecordedCamera
 
-    @property
-    def depth_stamp_ns(self) -> int:
-        """Time of the depth image, nanoseconds."""
-        return self.encoded.depth_stamp_ns
+    def entry(self) -> FrameRef:
+        """Return the frame; without the encoded images where they show other views than it."""
+        files = self.encoded if self.recorded.shows_recorded_views else None
+        delay_ns = self.depth_stamp_ns - self.stamp_ns
+        return FrameRef(self.stamp_ns, self.load, self.scan, depth_delay_ns=delay_ns, files=files)
 
-    @property
-    def files(self) -> ImageFiles | None:
-        """The encoded images; None where they show other views than the frame."""
-        return self.encoded if self.recorded.shows_recorded_views else None
-
-    def load(self, *, colour: bool = True) -> RgbdFrame:
-        """Read and decode both images.
+    def load(self, colour: bool) -> RgbdFrame:
+        """Read and decode both images, or the brightness alone and the depth image.
 
         Raises:
             FrameError: An image is missing, damaged, of the wrong kind or not as large as the log's first.
@@ -163,22 +161,21 @@ def rgbd_log(
     pairs = [_with_array(pair, units_per_m, float_units_per_m) for pair in pairs]
     accelerations, acceleration_notes = read_accelerometer(folder)
 
-    def entry_of(camera: RecordedCamera, index: int) -> RgbdEntry:
+    def images_of(camera: RecordedCamera, index: int) -> RgbdImages:
         pair = pairs[index]
         files = ImageFiles(
             pair.colour,
             pair.depth,
-            pair.depth_stamp_ns,
             pair.depth.units_per_m if isinstance(pair.depth, DecodedDepth) else units_per_m,
             colour_px=camera.colour_px,
             depth_px=camera.depth_px,
             recorded_units_per_m=recorded_units_per_m,
         )
-        return RgbdEntry(pair.stamp_ns, files, camera)
+        return RgbdImages(pair.stamp_ns, pair.depth_stamp_ns, files, camera)
 
     camera = _camera_of(pairs, calibration, depth_units_per_m=units_per_m, path=path)
     if calibration.needs_depth_pose:
-        unplaced = partial(entry_of, camera)
+        unplaced = partial(images_of, camera)
         calibration = with_depth_pose(
             calibration, camera, lambda index: unplaced(index).pair(), len(pairs), where=f"{path}"
         )
@@ -189,7 +186,7 @@ def rgbd_log(
         kind=kind,
         sensor="rgbd",
         stamps_ns=np.array([pair.stamp_ns for pair in pairs], dtype=np.int64),
-        entry_at=partial(entry_of, camera),
+        entry_at=lambda index: images_of(camera, index).entry(),
         truth=poses,
         accelerations=accelerations,
         notes=[*notes, *camera.notes(), *calibration.notes(), *acceleration_notes],

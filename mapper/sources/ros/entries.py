@@ -7,12 +7,11 @@ import numpy as np
 
 from mapper.core.errors import DataError, FrameError
 from mapper.core.frames import DepthImage, Image, Scan
-from mapper.sources.base import ImageFiles
+from mapper.sources.base import FrameRef, ImageFiles
 from mapper.sources.image_files.decoded import DecodedColour, DecodedDepth
 from mapper.sources.image_files.image_sizes import RecordedCamera
-from mapper.sources.image_folders.rgbd import RgbdEntry
+from mapper.sources.image_folders.rgbd import RgbdImages
 from mapper.sources.laser_scan import planar
-from mapper.sources.lazy_frame import LazyFrame
 from mapper.sources.ros.cloud_messages import scan_from
 from mapper.sources.ros.decode import decode
 from mapper.sources.ros.frame_tree import FrameTree, is_fixed
@@ -58,7 +57,7 @@ class Located:
         return message
 
 
-def rgbd_entry(
+def rgbd_images(
     colour: Located,
     depth: Located,
     recorded: RecordedCamera,
@@ -67,8 +66,8 @@ def rgbd_entry(
     float_units_per_m: float | None,
     colour_suffix: str,
     shift: int,
-) -> RgbdEntry:
-    """Return the entry of a colour and a depth message; the body is the camera.
+) -> RgbdImages:
+    """Return the images of a colour and a depth message; the body is the camera.
 
     As files the images are what the messages hold where that is a file, else encoded as PNG.
 
@@ -90,8 +89,9 @@ def rgbd_entry(
             where=f"{depth}",
         )
 
-    return RgbdEntry(
+    return RgbdImages(
         colour.stamp_ns,
+        depth.stamp_ns,
         ImageFiles(
             DecodedColour(
                 colour,
@@ -100,7 +100,6 @@ def rgbd_entry(
                 colour_suffix,
             ),
             DecodedDepth(depth, depth_m, units_per_m, lambda: depth_file_of(depth.image())),
-            depth.stamp_ns,
             units_per_m,
             colour_px=recorded.colour_px,
             depth_px=recorded.depth_px,
@@ -112,7 +111,7 @@ def rgbd_entry(
 
 def stereo_entry(
     left: Located, right: Located, camera: StereoCamera, recorded: RecordedCamera, *, shift: int
-) -> RgbdEntry:
+) -> FrameRef:
     """Return the entry of a left and a right image, whose body is the rectified left camera.
 
     Args:
@@ -127,12 +126,11 @@ def stereo_entry(
     images = ImageFiles(
         camera.image_of(read_left, left),
         depth,
-        right.stamp_ns,
         depth.units_per_m,
         colour_px=recorded.colour_px,
         depth_px=recorded.depth_px,
     )
-    return RgbdEntry(left.stamp_ns, images, recorded)
+    return RgbdImages(left.stamp_ns, right.stamp_ns, images, recorded).entry()
 
 
 def read_image(image: Located, in_colour: bool, *, shift: int) -> Image:
@@ -146,7 +144,7 @@ def _file_of(message: ImageMessage) -> bytes | None:
 
 def cloud_entry(
     cloud: Located, body: str, tree: FrameTree, *, scale: float | None = None, is_planar: bool = False
-) -> LazyFrame:
+) -> FrameRef:
     """Return the entry of a point cloud message, with the time of each point where the message has it.
 
     It cannot be read if the message is damaged, its points have no x, y and z, or tf does not tie their frame
@@ -180,4 +178,4 @@ def cloud_entry(
             scan = replace(scan, origin_body=np.zeros(3), times_s=None)
         return planar(scan) if is_planar else scan
 
-    return LazyFrame(cloud.stamp_ns, read)
+    return FrameRef(cloud.stamp_ns, read)

@@ -127,8 +127,8 @@ def _cloud(entry: FrameRef) -> SerializedMessage:
 
 def _images(entry: FrameRef) -> tuple[SerializedMessage, SerializedMessage]:
     """Return the messages of a frame's colour and depth image."""
-    if entry.files is not None:
-        return _colour_of_files(entry.stamp_ns, entry.files), _depth_of_files(entry.files)
+    if (files := entry.files) is not None:
+        return _colour_of_files(entry.stamp_ns, files), _depth_of_files(entry.depth_stamp_ns, files)
     frame = entry.load()
     if isinstance(frame, Scan):
         raise FrameError(f"frame {entry.stamp_ns}: a scan among images")
@@ -158,8 +158,8 @@ def _colour_of_files(stamp_ns: int, files: ImageFiles) -> SerializedMessage:
     )
 
 
-def _depth_of_files(files: ImageFiles) -> SerializedMessage:
-    stamp_ns, topic = files.depth_stamp_ns, f"{DEPTH}/image_raw"
+def _depth_of_files(stamp_ns: int, files: ImageFiles) -> SerializedMessage:
+    topic = f"{DEPTH}/image_raw"
     if files.depth_units_per_m != MM_PER_M or files.depth.suffix.lower() != ".png":
         depth_m = read_depth_m(files.depth, files.depth_units_per_m)
         return image_message(stamp_ns, topic, depth_m, encoding="32FC1", frame=_CAMERA_FRAME)

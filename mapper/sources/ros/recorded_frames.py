@@ -17,12 +17,12 @@ from mapper.sources.depth_camera_pose import with_depth_pose
 from mapper.sources.image_files.image_sizes import RecordedCamera, recorded_camera
 from mapper.sources.image_files.reading import TUM_UNITS_PER_M
 from mapper.sources.image_folders.pairing import depth_offset_ns
-from mapper.sources.image_folders.rgbd import RgbdEntry
+from mapper.sources.image_folders.rgbd import RgbdImages
 from mapper.sources.laser_scan import MAX_TILT_RAD, tilt_rad
 from mapper.sources.point_times import times_told
 from mapper.sources.ros.cameras import calibrate
 from mapper.sources.ros.cloud_messages import values_of_returns
-from mapper.sources.ros.entries import Located, cloud_entry, read_image, rgbd_entry, stereo_entry
+from mapper.sources.ros.entries import Located, cloud_entry, read_image, rgbd_images, stereo_entry
 from mapper.sources.ros.frame_tree import is_fixed
 from mapper.sources.ros.image_messages import has_float_depth, size_of, unused_bits
 from mapper.sources.ros.message_index import Series, why_unread
@@ -124,8 +124,8 @@ def rgbd_frames(reader: RecordingReader, topics: CameraTopics, config: SourceCon
     shift = unused_bits(first_color, where=f"{where}: {color.topic.name}")
     is_jpeg = isinstance(first_color, FileMessage) and bytes(first_color.data[:2]) == _JPEG_START
 
-    def entry_of(camera: RecordedCamera, index: int) -> RgbdEntry:
-        return rgbd_entry(
+    def images_of(camera: RecordedCamera, index: int) -> RgbdImages:
+        return rgbd_images(
             reader.located(color, int(i[index])),
             reader.located(depth, int(j[index])),
             camera,
@@ -143,13 +143,15 @@ def rgbd_frames(reader: RecordingReader, topics: CameraTopics, config: SourceCon
     )
     camera = camera_of(calibration)
     if calibration.needs_depth_pose:
-        unplaced = partial(entry_of, camera)
+        unplaced = partial(images_of, camera)
         calibration = with_depth_pose(
             calibration, camera, lambda index: unplaced(index).pair(), len(i), where=where
         )
         camera = camera_of(calibration)
     notes += [*camera_notes, *camera.notes(), *calibration.notes()]
-    return RecordedFrames("rgbd", frame, color.stamps_ns[i], partial(entry_of, camera), notes)
+    return RecordedFrames(
+        "rgbd", frame, color.stamps_ns[i], lambda index: images_of(camera, index).entry(), notes
+    )
 
 
 def lidar_frames(reader: RecordingReader, clouds: Series, config: SourceConfig) -> RecordedFrames:

@@ -18,10 +18,9 @@ from mapper.core.geometry import Array, Transform, inverse, planar_motion
 from mapper.core.timebase import ns_from_seconds_text
 from mapper.core.trajectory import Trajectory
 from mapper.runtime.regular_files import read_text
-from mapper.sources.base import Log
+from mapper.sources.base import FrameRef, Log
 from mapper.sources.config import SourceConfig
 from mapper.sources.laser_scan import MOST_RAD, beam_points, planar_scan, rolling
-from mapper.sources.lazy_frame import LazyFrame
 from mapper.sources.text import time_order
 
 _ENDINGS = (".log", ".clf", ".txt")
@@ -119,7 +118,7 @@ def read_log(path: Path, config: SourceConfig) -> Log:  # noqa: ARG001
         kind="carmen",
         sensor="lidar-2d",
         stamps_ns=np.array([line.stamp_ns for line in scans]),
-        entry_at=lambda index: LazyFrame(
+        entry_at=lambda index: FrameRef(
             scans[index].stamp_ns, lambda _: _scan_of(scans[index], T_robot_laser, limit_m)
         ),
         truth=true_poses,

@@ -16,10 +16,9 @@ from mapper.core.rotations import pose_of_row
 from mapper.core.timebase import GPS_EPOCH_S, NS_PER_S, Stamps
 from mapper.runtime.atomic import atomic_file
 from mapper.runtime.extras import extra, require
-from mapper.sources.base import Log
+from mapper.sources.base import FrameRef, Log
 from mapper.sources.cloud_files.parsing import MIN_POINTS
 from mapper.sources.config import SourceConfig
-from mapper.sources.lazy_frame import LazyFrame
 from mapper.sources.listed_files import refuse_links_out
 from mapper.sources.scan_stamps import stamp_at
 from mapper.sources.text import time_order, truth_from
@@ -55,9 +54,9 @@ def read_log(path: Path, config: SourceConfig) -> Log:
     posed = [(int(stamps_ns[i]), stations[i].T_world_scanner) for i in order]
     poses, pose_notes = truth_from(posed, what="poses")
 
-    def entry_at(index: int) -> LazyFrame:
+    def entry_at(index: int) -> FrameRef:
         stamp_ns, station = int(stamps_ns[order[index]]), stations[int(order[index])]
-        return LazyFrame(stamp_ns, lambda colour: _read(station, stamp_ns, colour=colour))
+        return FrameRef(stamp_ns, lambda colour: _read(station, stamp_ns, colour=colour))
 
     return Log(
         path=path,

@@ -9,12 +9,11 @@ from numpy.typing import NDArray
 from mapper.core.errors import FrameError, SourceError
 from mapper.core.geometry import Array
 from mapper.core.timebase import NS_PER_S
-from mapper.sources.base import Log
+from mapper.sources.base import FrameRef, Log
 from mapper.sources.cloud_files.las import LAS_ENDINGS, LasExtent, las_extent, read_las, read_times_s
 from mapper.sources.cloud_files.parsing import MAX_RANGE_M, MIN_POINTS, Columns
 from mapper.sources.config import SourceConfig
 from mapper.sources.image_folders.tum import read_truth
-from mapper.sources.lazy_frame import LazyFrame
 from mapper.sources.listed_files import refuse_links_out
 from mapper.sources.point_times import MAX_SWEEP_S, counted_on
 from mapper.sources.scan_folders.scans import read_scan
@@ -84,9 +83,9 @@ def read_log(path: Path, config: SourceConfig) -> Log:
     truth, truth_notes = read_truth(truth_file) if truth_file.is_file() else (None, [])
     how = "as its points turn" if turns else "source.sweep_s"
 
-    def entry_at(index: int) -> LazyFrame:
+    def entry_at(index: int) -> FrameRef:
         file, stamp_ns, rows = sweeps[int(order[index])]
-        return LazyFrame(
+        return FrameRef(
             stamp_ns,
             lambda colour: read_scan(file, stamp_ns, colour=colour, scale=config.cloud_scale, rows=rows),
         )

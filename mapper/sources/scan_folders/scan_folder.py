@@ -12,12 +12,11 @@ from mapper.core.errors import FrameError, SourceError
 from mapper.core.geometry import Transform, inverse, spread_indices
 from mapper.core.timebase import NS_PER_S, Stamps
 from mapper.core.trajectory import Trajectory
-from mapper.sources.base import Log
+from mapper.sources.base import FrameRef, Log
 from mapper.sources.cloud_files import EMPTY, ENDINGS, read_cloud, why_no_points
 from mapper.sources.cloud_files.las import LAS_ENDINGS, first_time_s
 from mapper.sources.config import SourceConfig
 from mapper.sources.image_folders.tum import read_truth
-from mapper.sources.lazy_frame import LazyFrame
 from mapper.sources.listed_files import refuse_links_out
 from mapper.sources.point_times import times_told
 from mapper.sources.scan_folders.scans import read_scan
@@ -118,9 +117,9 @@ def scan_log(
     ordered = [files[k] for k in order]
     bin_columns, choices, time_notes = _told_by(ordered[0], int(stamps_ns[order[0]]), config)
 
-    def entry_at(index: int) -> LazyFrame:
+    def entry_at(index: int) -> FrameRef:
         stamp_ns = int(stamps_ns[order[index]])
-        return LazyFrame(
+        return FrameRef(
             stamp_ns,
             lambda colour: read_scan(
                 ordered[index],

@@ -11,10 +11,9 @@ import numpy as np
 
 from mapper.core.errors import DataError, FrameError, SourceError
 from mapper.core.frames import Scan
-from mapper.sources.base import Log
+from mapper.sources.base import FrameRef, Log
 from mapper.sources.captures import ENDINGS, Datagram, captured, first_datagrams
 from mapper.sources.config import SourceConfig
-from mapper.sources.lazy_frame import LazyFrame
 from mapper.sources.ros.cloud_messages import scan_from
 from mapper.sources.ros.messages import CloudMessage
 from mapper.sources.text import time_order
@@ -71,9 +70,9 @@ def read_log(path: Path, config: SourceConfig) -> Log:
     stamps_ns = np.array([turn.stamp_ns for turn in whole], np.int64)
     order, order_notes = time_order(stamps_ns, what=path.name)
 
-    def entry_at(index: int) -> LazyFrame:
+    def entry_at(index: int) -> FrameRef:
         turn = whole[int(order[index])]
-        return LazyFrame(
+        return FrameRef(
             turn.stamp_ns, lambda colour: _read(path, sender, turn, config.cloud_scale, colour=colour)
         )
 

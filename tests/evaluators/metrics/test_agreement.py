@@ -18,7 +18,7 @@ from mapper.evaluators.metrics.agreement import (
 )
 from mapper.sources import open_source
 from mapper.sources.config import SourceConfig
-from tests.support.logs import MemoryEntry, log_in_memory
+from tests.support.logs import log_in_memory, memory_entry
 from tests.support.street_scans import SENSOR, on_street, still_scan, street
 
 
@@ -31,7 +31,7 @@ def drive():
         Scan(int(stamp_ns), still_scan(street(7), SENSOR, T, seed=k), np.zeros(3))
         for k, (stamp_ns, T) in enumerate(zip(stamps_ns, poses, strict=True))
     ]
-    log = log_in_memory([MemoryEntry(scan.stamp_ns, scan) for scan in scans], sensor="lidar")
+    log = log_in_memory([memory_entry(scan.stamp_ns, scan) for scan in scans], sensor="lidar")
     return log, Trajectory(stamps_ns, poses)
 
 

@@ -16,7 +16,7 @@ from mapper.simulation.config import STREET, LidarSensorConfig
 from mapper.simulation.lidar import LidarSimulator
 from mapper.sources import open_source
 from mapper.sources.config import SourceConfig
-from tests.support.logs import MemoryEntry
+from tests.support.logs import memory_entry
 from tests.support.paths import DATA
 
 
@@ -41,7 +41,7 @@ def test_a_real_sensor_by_hand_that_sees_a_part_of_the_scene_is_followed():
     log = open_source(DATA / "courtyard_2hz", SourceConfig(first_frame=30, last_frame=59))
     scans = [entry.scan() for entry in log.entries()]
     seen = [scan.select(are_ahead(scan.points_body)) for scan in scans]
-    entries = [MemoryEntry(int(at), scan) for at, scan in zip(log.stamps_ns, seen, strict=True)]
+    entries = [memory_entry(int(at), scan) for at, scan in zip(log.stamps_ns, seen, strict=True)]
     config = load_config(None, ["loops.kind=none"], sensor="lidar")
 
     tracking = track_log(replace(log, entry_at=entries.__getitem__), config, progress=SILENT)

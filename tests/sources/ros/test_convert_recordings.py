@@ -16,7 +16,7 @@ KINDS = ["mcap", "bag"]
 def assert_same_frames(source, again):
     assert len(again) == len(source)
     for entry, other in zip(source.entries(), again.entries(), strict=True):
-        assert (other.stamp_ns, other.files.depth_stamp_ns) == (entry.stamp_ns, entry.files.depth_stamp_ns)
+        assert (other.stamp_ns, other.depth_stamp_ns) == (entry.stamp_ns, entry.depth_stamp_ns)
         assert other.files.colour.read_bytes() == entry.files.colour.read_bytes()
         for colour in (True, False):
             frame, expected = other.load(colour=colour), entry.load(colour=colour)

@@ -90,7 +90,7 @@ def test_a_converted_log_is_registered(tmp_path, room):
     assert entry.files is None
     assert write_log(log, tmp_path / "tum", kind="tum") == []
     again = open_source(tmp_path / "tum")
-    assert again.entry_at(0).files.depth_stamp_ns == log[0].depth_stamp_ns < log[0].stamp_ns
+    assert again.entry_at(0).depth_stamp_ns == log[0].depth_stamp_ns < log[0].stamp_ns
     np.testing.assert_allclose(again[0].depth_m, log[0].depth_m, atol=1.1e-4)
     assert again[0].camera == log[0].camera
     assert write_log(log, tmp_path / "log.mcap", kind="mcap") == []

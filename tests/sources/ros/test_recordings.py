@@ -67,7 +67,7 @@ def test_a_recording_is_a_log_by_the_stamps_of_its_headers(tmp_path, name):
         rgb, units = picture(i)
         frame = entry.load()
         assert entry.stamp_ns == frame.stamp_ns == FIRST_NS + i * PERIOD_NS
-        assert entry.files.depth_stamp_ns == entry.stamp_ns - 5_000_000
+        assert entry.depth_stamp_ns == entry.stamp_ns - 5_000_000
         assert frame.camera == CAMERA
         np.testing.assert_array_equal(frame.image, rgb)
         np.testing.assert_array_equal(frame.depth_m, units.astype(np.float32) / np.float32(1000))
