@@ -16,6 +16,7 @@ from mapper.octree.grid import with_obstacles
 from mapper.octree.map import read_octree
 from mapper.run import files
 from mapper.run.folder import Run
+from mapper.run.map_folder import has_grid
 from mapper.runtime.regular_files import AnyPath
 
 
@@ -45,7 +46,7 @@ def plan(
     config = overridden(PlanConfig(), settings=settings)
     built = run if isinstance(run, Run) else open_map_folder(Path(run))
     on_floor = config.layer == "traversable"
-    has_storeys = on_floor and not in_3d and (built.path / f"{files.storey(0)}.yaml").exists()
+    has_storeys = on_floor and not in_3d and has_grid(built, files.storey(0))
     ends = [np.asarray(end, np.float64) for end in (start, goal)]
     sizes = (3,) if in_3d else (2, 3) if has_storeys else (2,)
     if any(end.ndim != 1 or len(end) not in sizes for end in ends):

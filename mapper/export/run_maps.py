@@ -1,7 +1,8 @@
 """A finished run's maps and pictures, read back from its files."""
 
 from collections.abc import Iterator
-from itertools import count
+from functools import partial
+from itertools import count, takewhile
 from pathlib import Path
 
 import numpy as np
@@ -16,10 +17,11 @@ from mapper.mapping.edits import MapEditor
 from mapper.mapping.map_building import Maps, Snapshot
 from mapper.navigation.reachable_floor import reachable_floor
 from mapper.navigation.traversable_grid import TraversableFloor, traversable
-from mapper.octree.grid import OccupancyGrid, stored_grid_if_any
+from mapper.octree.grid import OccupancyGrid
 from mapper.run import files
 from mapper.run.cloud import read_cloud
 from mapper.run.folder import Run
+from mapper.run.map_folder import has_grid, stored_grid
 from mapper.sources.ros.decode import decode
 from mapper.sources.ros.mcap_file import open_mcap
 from mapper.sources.ros.messages import CameraMessage, FileMessage
@@ -63,11 +65,8 @@ def floor_of_run(run: Run) -> TraversableFloor:
 
 
 def _storeys(run: Run) -> Iterator[OccupancyGrid]:
-    for stem in map(files.storey, count()):
-        grid = stored_grid_if_any(run, stem)
-        if grid is None:
-            return
-        yield grid
+    stems = takewhile(partial(has_grid, run), map(files.storey, count()))
+    return map(partial(stored_grid, run), stems)
 
 
 def snapshots_of(run: Run) -> Iterator[Snapshot]:

@@ -1,9 +1,9 @@
 """Merged map on disk: its manifest, its tiling, and the opening of all or a part of it."""
 
 import json
-from collections.abc import Iterable, Mapping
-from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
 from math import log2
 from pathlib import Path
 from typing import Literal
@@ -24,11 +24,12 @@ from mapper.mapping.config import Region
 from mapper.merging.multi_session_graph import Tie
 from mapper.navigation.config import CostmapConfig, TraversableConfig
 from mapper.octree.config import OctreeConfig, SliceConfig
-from mapper.octree.grid import OccupancyGrid, stored_grid, stored_grid_if_any
+from mapper.octree.grid import OccupancyGrid
 from mapper.octree.keys import BLOCK_BITS, KEY_BITS, KEY_ZERO, keys_of
 from mapper.octree.map import OctreeMap, read_octree
 from mapper.run import files
 from mapper.run.manifest import is_merged_map
+from mapper.run.map_folder import MapFolder, has_grid, stored_grid
 from mapper.runtime.atomic import MANIFEST_NAME, FolderKind, partial_of, write_text
 from mapper.sources.trajectory_files import read_tum
 
@@ -195,44 +196,21 @@ def tiling_for(resolution_m: float, tile_m: float) -> Tiling:
     return Tiling(resolution_m, round(log2(tile_m / resolution_m)))
 
 
-@dataclass(frozen=True, slots=True, repr=False)
-class MergedMap:
+@dataclass(frozen=True, repr=False)
+class MergedMap(MapFolder):
     """A merged map on disk.
 
     Attributes:
         path: Its folder.
-        manifest: Its ``manifest.json``.
         config: Settings of its maps: those of its first run.
+        manifest: Its ``manifest.json``.
     """
 
-    path: Path
     manifest: MapManifest
-    config: BuildConfig
+    _octree = files.OCTREE_OT
 
     def __repr__(self) -> str:
         return f"MergedMap({str(self.path)!r})"
-
-    @property
-    def octree(self) -> OctreeMap:
-        """The whole map, without colours; see ``load`` for a part of it.
-
-        Raises:
-            MapFileError: It cannot be read.
-            MapSizeError: It does not fit into memory.
-        """
-        return read_octree(self.path / files.OCTREE_OT)
-
-    def with_config(self, config: BuildConfig) -> "MergedMap":
-        """Return the same map with other settings, for what is made from its files."""
-        return replace(self, config=config)
-
-    def changing(self, _names: Iterable[str]) -> AbstractContextManager[None]:
-        """Return a context in which its files may be written; no digests are kept of them."""
-        return nullcontext()
-
-    def file(self, name: str) -> Path:
-        """Return the path of one of its files."""
-        return self.path / name
 
     def trajectory(self, run: RunInMap) -> Trajectory:
         """Return the poses in the map of the frames that a run's maps are made from.
@@ -245,32 +223,17 @@ class MergedMap:
             raise RunError(f"{self.path}: has no trajectory of {run.path}; merge again")
         return read_tum(path)
 
-    @property
-    def slice(self) -> OccupancyGrid:
-        """2D navigation map.
-
-        Raises:
-            MapFileError: There is none, as of a map with a tilted run.
-        """
-        return stored_grid(self, files.SLICE)
-
-    @property
+    @cached_property
     def traversable(self) -> OccupancyGrid:
         """Floor that a robot can drive on, of the storey on which the first run begins.
 
         Raises:
             RunError: There is none; the message says why, if the manifest does.
         """
-        grid = stored_grid_if_any(self, files.TRAVERSABLE)
-        if grid is None:
+        if not has_grid(self, files.TRAVERSABLE):
             why = self.manifest.no_floor or "merge again"
             raise RunError(f"{self.path}: has no {files.TRAVERSABLE}.yaml; {why}")
-        return grid
-
-    @property
-    def keepout(self) -> OccupancyGrid | None:
-        """Keep-out regions of its runs in the slice's cells; None if there are none."""
-        return stored_grid_if_any(self, files.KEEPOUT)
+        return stored_grid(self, files.TRAVERSABLE)
 
     @property
     def graph(self) -> PoseGraph | None:
@@ -327,4 +290,4 @@ def open_map(folder: Path) -> MergedMap:
         traversable=manifest.traversable,
         costmap=manifest.costmap,
     )
-    return MergedMap(folder, manifest, config)
+    return MergedMap(folder, config, manifest)

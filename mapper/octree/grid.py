@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -166,31 +166,6 @@ def read_grid(path: Path) -> OccupancyGrid:
     cells[darkness < free] = FREE
     cells[darkness > occupied] = OCCUPIED
     return OccupancyGrid(cells, np.array(origin[:2]), resolution_m)
-
-
-class _Folder(Protocol):
-    """Run or merged map."""
-
-    @property
-    def path(self) -> Path: ...
-
-    def file(self, name: str, /) -> Path: ...
-
-
-def stored_grid(folder: _Folder, stem: str) -> OccupancyGrid:
-    """Return a grid of a run or of a merged map, such as its slice.
-
-    Raises:
-        RunError: A file is not as it was written.
-        MapperError: As for ``read_grid``.
-    """
-    folder.file(f"{stem}.pgm")
-    return read_grid(folder.file(f"{stem}.yaml"))
-
-
-def stored_grid_if_any(folder: _Folder, stem: str) -> OccupancyGrid | None:
-    """Return a grid as :func:`stored_grid` does; None if there is none of this name."""
-    return stored_grid(folder, stem) if (folder.path / f"{stem}.yaml").exists() else None
 
 
 def _read_settings(path: Path) -> dict[str, str]:

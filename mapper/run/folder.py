@@ -7,7 +7,7 @@ from functools import cached_property
 from importlib import import_module
 from pathlib import Path
 from shlex import quote
-from typing import TYPE_CHECKING, Any, Literal, Self
+from typing import TYPE_CHECKING, Any, Literal
 
 from mapper.config.build import BuildConfig
 from mapper.config.loading import load_run_config
@@ -25,6 +25,7 @@ from mapper.run.frame_records import FrameRecord, read_frame_ms, read_records, s
 from mapper.run.gnss_file import read_fixes
 from mapper.run.input_logs import open_inputs
 from mapper.run.manifest import Manifest, Verdict, is_localised_log, is_merged_map, read_manifest
+from mapper.run.map_folder import MapFolder
 from mapper.run.pose_covariances import UncertainPoses, read_poses
 from mapper.run.results import RunResults, aligned_truth
 from mapper.runtime.atomic import partial_of
@@ -37,13 +38,11 @@ if TYPE_CHECKING:  # compiled code, which takes longer to load than most files o
     from matplotlib.axes import Axes
 
     from mapper.core.frames import Cloud
-    from mapper.octree.grid import OccupancyGrid
-    from mapper.octree.map import OctreeMap
     from mapper.runtime.progress import Progress
 
 
-@dataclass(frozen=True)
-class Run:
+@dataclass(frozen=True, repr=False)
+class Run(MapFolder):
     """A finished run: its folder, whose files are read on first access, each once.
 
     Attributes:
@@ -52,8 +51,6 @@ class Run:
         manifest: Its ``manifest.json``.
     """
 
-    path: Path
-    config: BuildConfig
     manifest: Manifest
 
     def file(self, name: str) -> Path:
@@ -66,10 +63,6 @@ class Run:
             return regular(self.path / name)
         digests = read_manifest(self.path / files.MANIFEST).files  # exports and plans add theirs
         return checked(self.path, name, digests)
-
-    def with_config(self, config: BuildConfig) -> Self:
-        """Return the same run with other settings, for what is made from its files."""
-        return replace(self, config=config)
 
     def changing(self, names: Iterable[str]) -> AbstractContextManager[None]:
         """Return a context in which files of the run may be written; it records their digests at its end."""
@@ -147,39 +140,11 @@ class Run:
         return self.manifest.verdict
 
     @cached_property
-    def octree(self) -> "OctreeMap":
-        """Occupancy map, with colours and times if it was built with ``octree.attributes``."""
-        from mapper.octree.map import read_octree
-
-        return read_octree(self.file(files.OCTREE_MAP))
-
-    @cached_property
     def cloud(self) -> "Cloud":
         """Coloured cloud."""
         from mapper.run.cloud import read_cloud
 
         return read_cloud(self.file(files.CLOUD))
-
-    @cached_property
-    def slice(self) -> "OccupancyGrid":
-        """2D navigation map: the band of heights above the floor of ``config.slice``."""
-        from mapper.octree.grid import stored_grid
-
-        return stored_grid(self, files.SLICE)
-
-    @cached_property
-    def traversable(self) -> "OccupancyGrid":
-        """Floor that a robot can drive on, of the storey on which the log begins."""
-        from mapper.octree.grid import stored_grid
-
-        return stored_grid(self, files.TRAVERSABLE)
-
-    @cached_property
-    def keepout(self) -> "OccupancyGrid | None":
-        """Keep-out regions in the slice's cells; None if there are none."""
-        from mapper.octree.grid import stored_grid_if_any
-
-        return stored_grid_if_any(self, files.KEEPOUT)
 
     def plot(self, axes: "Axes | None" = None) -> "Axes":
         """Draw the path over the slice, seen from above, with loops, uncertainty and the truth if known.
