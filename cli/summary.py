@@ -10,6 +10,7 @@ from statistics import median
 from typing import Any
 
 from mapper.cli.answer import Answer, rows_text
+from mapper.core.errors import DataError
 from mapper.evaluators.metrics.evaluate import (
     ATE_RMSE,
     ATE_WITH_LEVER_ARM,
@@ -34,7 +35,10 @@ _SHOWN = frozenset({ATE_RMSE, RPE_RMSE_M, RPE_RMSE_RAD, PATH_LENGTH, START_TO_EN
 
 def summary_of(run: Run) -> Answer:
     """Return a run as the answer of the verb that made it, its path judged by the truth if there is any."""
-    metrics = evaluate(run.trajectory, run.truth).metrics
+    try:
+        metrics = evaluate(run.trajectory, run.truth).metrics
+    except DataError:  # no pose of the truth is near a frame: mapper eval says so
+        metrics = evaluate(run.trajectory, None).metrics
     return Answer(run_document(run, metrics), short_text(run, metrics), summary_text(run, metrics))
 
 

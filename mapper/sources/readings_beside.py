@@ -3,17 +3,12 @@
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
-from mapper.core.timebase import Stamps, seconds_text_from_ns
-from mapper.sources.base import Log, Readings
+from mapper.sources.base import Log
 from mapper.sources.config import SourceConfig
 from mapper.sources.gnss_files import read_gnss, write_gnss
 from mapper.sources.imu_files import read_imu, write_gyroscope, write_imu
+from mapper.sources.time_offsets import in_log_time
 from mapper.sources.wheel_files import read_wheels, write_wheels
-
-_UNITS_NS = {"µs": 1_000, "ms": 1_000_000, "s": 1_000_000_000}
-"""Units in which files have stamps that should be nanoseconds."""
 
 
 def with_readings(log: Log, folder: Path, config: SourceConfig) -> Log:
@@ -29,19 +24,21 @@ def with_readings(log: Log, folder: Path, config: SourceConfig) -> Log:
     """
     if log.wheels is None:
         wheels, used, notes = read_wheels(folder, config.wheels, sensor=log.sensor)
-        wheels, more = _in_log_time(wheels, log.stamps_ns, "wheel odometry")
+        wheels, more = in_log_time(wheels, log.stamps_ns, "wheels", offset_s=config.wheels_offset_s)
         choices = log.choices if wheels is None else [*log.choices, *used]
         log = replace(log, wheels=wheels, choices=choices, notes=[*log.notes, *notes, *more])
     if log.gyroscope is None:
         gyroscope, accelerations, notes = read_imu(folder)
-        gyroscope, more = _in_log_time(gyroscope, log.stamps_ns, "angular velocities")
+        gyroscope, more = in_log_time(gyroscope, log.stamps_ns, "gyroscope", offset_s=config.imu_offset_s)
         log = replace(log, gyroscope=gyroscope, notes=[*log.notes, *notes, *more])
         if log.accelerations is None:
-            accelerations, more = _in_log_time(accelerations, log.stamps_ns, "accelerations")
+            accelerations, more = in_log_time(
+                accelerations, log.stamps_ns, "accelerations", offset_s=config.imu_offset_s
+            )
             log = replace(log, accelerations=accelerations, notes=[*log.notes, *more])
     if log.gnss is None:
         gnss, notes = read_gnss(log.path)
-        gnss, more = _in_log_time(gnss, log.stamps_ns, "GNSS fixes")
+        gnss, more = in_log_time(gnss, log.stamps_ns, "GNSS fixes")
         log = replace(log, gnss=gnss, notes=[*log.notes, *notes, *more])
     return log
 
@@ -62,27 +59,3 @@ def write_readings(log: Log, folder: Path, *, are_imu: bool = False) -> None:
         write_gyroscope(folder, log.gyroscope)
     if log.gnss is not None:
         write_gnss(folder, log.gnss)
-
-
-def _in_log_time(
-    readings: Readings | None, frames_ns: Stamps, name: str
-) -> tuple[Readings | None, list[str]]:
-    """Return readings with stamps of the frames' time, and a note on stamps in another unit, or of no use."""
-    if readings is None or not len(readings.stamps_ns) or _overlap(readings.stamps_ns, frames_ns):
-        return readings, []
-    for unit, unit_ns in _UNITS_NS.items():
-        if readings.stamps_ns[-1] <= np.iinfo(np.int64).max // unit_ns:
-            stamps_ns = readings.stamps_ns * unit_ns
-            if _overlap(stamps_ns, frames_ns):
-                note = f"{name}: stamps are taken in {unit}, as in ns none is of the frames' time"
-                return replace(readings, stamps_ns=stamps_ns), [note]
-    first_s, frames_s = (
-        seconds_text_from_ns(int(stamps_ns[0])) for stamps_ns in (readings.stamps_ns, frames_ns)
-    )
-    return None, [
-        f"{name}: they begin at {first_s} s and frames at {frames_s} s, so none is of their time; not used"
-    ]
-
-
-def _overlap(readings_ns: Stamps, frames_ns: Stamps) -> bool:
-    return bool(readings_ns[0] <= frames_ns[-1] and frames_ns[0] <= readings_ns[-1])

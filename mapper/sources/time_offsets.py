@@ -8,14 +8,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.geometry import Array
-from mapper.core.timebase import NS_PER_S
-from mapper.sources.base import Log, later
+from mapper.core.timebase import NS_PER_S, Stamps, seconds_text_from_ns
+from mapper.sources.base import Log, Readings, later
 from mapper.sources.config import SourceConfig
 
 FEWEST_ESTIMATES, _MOST_SIGMA_S = 3, 0.02
 """Estimates of parts of a log: fewer, or a median less sure, do not tell an offset."""
 _RESOLUTION_S, _SURE_SIGMAS = 0.002, 3.0
 """Error that estimates share (shutters, delays of filters), and standard deviations that are no chance."""
+_UNITS_NS = {"µs": 1_000, "ms": 1_000_000, "s": 1_000_000_000}
+"""Units in which files have stamps that should be nanoseconds."""
+_LONGEST_NS = 10**15
+"""Eleven days: stamps from 0 on, taken in another unit, last for decades."""
+_SETTINGS = {
+    "truth": "truth_offset_s",
+    "wheels": "wheels_offset_s",
+    **dict.fromkeys(("gyroscope", "accelerations"), "imu_offset_s"),
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,7 +99,10 @@ def peak_of(at_s: NDArray[np.floating], score: NDArray[np.floating]) -> float:
 
 
 def with_time_offsets(log: Log, config: SourceConfig) -> Log:
-    """Return a log whose readings and poses have the settings' offsets added to their stamps."""
+    """Return a log whose readings and poses have the settings' offsets added to their stamps.
+
+    A truth of another time than the frames' is left out.
+    """
     truth_ns, wheels_ns, imu_ns, images_ns = (
         round(offset_s * NS_PER_S)
         for offset_s in (
@@ -100,11 +112,52 @@ def with_time_offsets(log: Log, config: SourceConfig) -> Log:
             config.images_offset_s,
         )
     )
+    truth, notes = log.truth, list[str]()
+    if not config.require_truth:  # which refuses the log
+        truth, notes = in_log_time(truth, log.stamps_ns, "truth", offset_s=config.truth_offset_s)
     return replace(
         log,
-        truth=later(log.truth, truth_ns),
+        notes=[*log.notes, *notes],
+        truth=later(truth, truth_ns),
         wheels=later(log.wheels, wheels_ns),
         gyroscope=later(log.gyroscope, imu_ns),
         accelerations=later(log.accelerations, imu_ns),
         images=[replace(one, stamps_ns=one.stamps_ns + images_ns) for one in log.images],
     )
+
+
+def in_log_time(
+    readings: Readings | None, frames_ns: Stamps, name: str, *, offset_s: float = 0.0
+) -> tuple[Readings | None, list[str]]:
+    """Return readings with stamps of the frames' time, and a note on stamps in another unit, or of no use.
+
+    Args:
+        readings: As they were read.
+        frames_ns: (N,) stamps of the frames, increasing.
+        name: What they are: of ``wheels`` and the like a setting moves the stamps.
+        offset_s: What that setting is.
+    """
+    if readings is None or not len(readings.stamps_ns):
+        return readings, []
+    frames_ns = frames_ns - round(offset_s * NS_PER_S)
+    if _overlap(readings.stamps_ns, frames_ns):
+        return readings, []
+    for unit, unit_ns in _UNITS_NS.items():
+        if readings.stamps_ns[-1] <= np.iinfo(np.int64).max // unit_ns:
+            stamps_ns = readings.stamps_ns * unit_ns
+            if np.ptp(stamps_ns) < _LONGEST_NS and _overlap(stamps_ns, frames_ns):
+                note = f"{name}: stamps are taken in {unit}, as in ns none is of the frames' time"
+                return replace(readings, stamps_ns=stamps_ns), [note]
+    first_ns, frame_ns = int(readings.stamps_ns[0]), int(frames_ns[0])
+    apart_s = offset_s + (frame_ns - first_ns) / NS_PER_S
+    setting = _SETTINGS.get(name)
+    remedy = f"; source.{setting}={apart_s:.3f} lets them begin with the frames" if setting else ""
+    return None, [
+        f"{name}: stamps begin at {seconds_text_from_ns(first_ns)} s and frames at "
+        f"{seconds_text_from_ns(frame_ns)} s, so none is of their time; not used{remedy}"
+    ]
+
+
+def _overlap(readings_ns: Stamps, frames_ns: Stamps) -> bool:
+    """Return whether readings are of the frames' time, or less than a second from it."""
+    return bool(readings_ns[0] - NS_PER_S <= frames_ns[-1] and frames_ns[0] <= readings_ns[-1] + NS_PER_S)

@@ -16,6 +16,10 @@ from mapper.cli.answer import plain, rows_text
 from mapper.cli.console import print_help, print_text
 from mapper.cli.groups import PANELS
 from mapper.cli.main import app
+from mapper.cli.summary import summary_of
+from mapper.evaluators.metrics.evaluate import evaluate
+from mapper.run.folder import open_run
+from mapper.sources.base import later
 from tests.support.command_line import invoke, mapper
 
 OF_A_RUN = (
@@ -96,6 +100,13 @@ def test_json_is_one_document_with_the_keys_of_its_verb(verb, desk_run, desk_log
     document = json.loads(result.stdout)
     assert set(keys.split()) == document.keys() if verb != "config" else set(keys.split()) <= document.keys()
     assert result.stderr == "", "machines read errors there"
+
+
+def test_a_truth_that_is_near_no_frame_costs_a_run_its_accuracy_alone(desk_run):
+    run = open_run(desk_run.path)
+    vars(run)["truth"] = later(desk_run.truth, 10**12)
+    names = {metric["name"] for metric in summary_of(run).document["metrics"]}
+    assert names == {metric.name for metric in evaluate(run.trajectory, None).metrics}
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """Readings in files beside a log's frames: used by the frames' time, or named."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 from mapper.core.timebase import NS_PER_S, seconds_text_from_ns
 from mapper.core.trajectory import Trajectory
 from mapper.sources import open_source
+from mapper.sources.config import SourceConfig
 from mapper.sources.imu_files import BOTH_HEADER
 from mapper.sources.writers import write_log
 from tests.support.tum_logs import FIRST_NS
@@ -54,6 +56,22 @@ def test_readings_of_another_time_are_named_and_not_used(tiny_tum_log, write, ki
     used = [one for one in (log.wheels, log.gyroscope, log.accelerations, log.gnss) if one is not None]
     named = sum("none is of their time" in note for note in log.notes)
     assert (len(used), named) == ((kinds, 0) if first_ns == FIRST_NS else (0, kinds))
+
+
+@pytest.mark.parametrize("first_ns", [0, OTHER_YEAR_NS])
+def test_poses_and_readings_of_another_clock_name_the_setting_that_moves_them(tiny_tum_log, first_ns):
+    folder = tiny_tum_log(3)
+    write_imu(folder, first_ns)
+    write_wheels(folder, first_ns, step_m=0.01)
+    poses = [f"{seconds_text_from_ns(first_ns + k * 10**8)} {k} 0 0 0 0 0 1" for k in range(3)]
+    (folder / "groundtruth.txt").write_text("\n".join(poses))
+    log = open_source(folder)
+    assert (log.truth, log.wheels, log.gyroscope, log.accelerations) == (None, None, None, None)
+    stated = re.findall(r"source\.(\w+_offset_s)=([\d.]+)", " ".join(log.notes))
+    assert len(stated) == 4
+    moved = open_source(folder, SourceConfig(**{name: float(offset_s) for name, offset_s in stated}))
+    for readings in (moved.truth, moved.wheels, moved.gyroscope, moved.accelerations):
+        assert abs(readings.stamps_ns[0] - FIRST_NS) <= 2_000_000
 
 
 def test_wheels_that_stand_still_are_not_used(tiny_tum_log):

@@ -115,7 +115,11 @@ BAD = "1305031102.5 nan nan nan nan nan nan nan\n1305031102.6 0 0 0 0 0 0 0\nnan
             (f"{stamp} 0 0 0 0 0 0 1\n", [1305031102_500000123], [])
             for stamp in ("1305031102500000123", "1305031102500000.123", "1305031102500.000123")
         ),
-        (f"{BAD}1.0 0 0 0 0 0 0 1\n", [10**9], ["3 of 4 poses are not finite rigid motions; dropped"]),
+        (
+            f"{BAD}1305031102.5 0 0 0 0 0 0 1\n",
+            [1305031102_500000000],
+            ["3 of 4 poses are not finite rigid motions; dropped"],
+        ),
     ],
 )
 def test_truth_is_of_the_usable_poses(tiny_tum_log, text, stamps_ns, noted):
