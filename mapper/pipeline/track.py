@@ -35,7 +35,7 @@ from mapper.sources.depth_scale import depth_warnings, read_spread, why_no_depth
 from mapper.sources.image_order import time_warnings
 from mapper.sources.merged_scans import with_merged_scans
 from mapper.sources.reading_checks import ReadingChecks
-from mapper.sources.scan_frame import scan_frame_warnings
+from mapper.sources.scan_frame import scan_frame_warnings, sweep_warnings
 
 _LOOKED_AT = 6
 """Frames, spread over a log, that are tried before it is said that none can be tracked."""
@@ -359,6 +359,7 @@ def noted_log_warnings(source: Log, progress: Progress) -> list[RunWarning]:
             for text in [*depth_warnings(source, frames), *outline_warnings(frames.values())]
         ),
         *(RunWarning(kind="frame", sentence=text, weight="doubt") for text in scan_frame_warnings(source)),
+        *(RunWarning(kind="sweep", sentence=text, weight="doubt") for text in sweep_warnings(source)),
     ]
     for warning in warnings:
         progress.note(warning.sentence)

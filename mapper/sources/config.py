@@ -182,8 +182,8 @@ class SourceConfig(Config):
     for padded ones; None is KITTI's 4, or 5 and 6 with rings, and refuses what shows another number."""
     point_time_scale: float = 1.0
     """Factor on the times of a LiDAR's points: 0 for scans that were deskewed already, -1 for times that
-    count backwards, 0.1 for shares of sweeps of 0.1 s. The warning ``sweep`` reports which fits."""
+    count backwards, 0.1 for shares of sweeps of 0.1 s. The warning ``sweep`` reports the last."""
     sweep_s: PositiveFloat | None = None
     """Duration of one turn of a spinning LiDAR whose points have no times: they get times by their azimuth
-    from the first point of the file, and are deskewed. The warning ``sweep`` reports it if scans are bent. Of
-    a LAS strip, the duration of the sweeps that it is cut into; None is that of a turn, or 0.1 s."""
+    from the first point of the file, and are deskewed. Of a LAS strip, the duration of the sweeps that it is
+    cut into; None is that of a turn, or 0.1 s."""

@@ -24,7 +24,7 @@ from mapper.sources.ros import files as recordings
 from mapper.sources.ros.message_index import Series
 from mapper.sources.ros.reader import RecordingReader
 from mapper.sources.ros.source import recording_log
-from mapper.sources.scan_frame import scan_frame_warnings
+from mapper.sources.scan_frame import scan_frame_warnings, sweep_warnings
 from mapper.sources.time_offsets import TimeOffset
 from mapper.sources.valid_returns import FARTHEST_M
 from mapper.sources.vehicle import Box, vehicle_box
@@ -231,6 +231,7 @@ def _inspected(
             *depth_warnings(source, frames),
             *outline_warnings(frames.values()),
             *scan_frame_warnings(source),
+            *sweep_warnings(source),
         ],
         vehicle=vehicle_box(source) if config.body.finds_box else None,
     )

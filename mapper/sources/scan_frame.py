@@ -1,4 +1,4 @@
-"""Plausibility of the frame of a LiDAR's scans: around the sensor, or of a map in which the sensor moves."""
+"""Plausibility of a LiDAR's scans: their frame, the sensor's or a map's, and how long their sweeps last."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import pairwise
@@ -8,6 +8,7 @@ import numpy as np
 from mapper.core.errors import FrameError
 from mapper.core.frames import Scan
 from mapper.core.geometry import Array
+from mapper.core.timebase import NS_PER_S
 from mapper.sources.base import FrameRef, Log
 
 _LOOKED_AT_AT_FIRST, _LOOKED_AT = 3, 6
@@ -26,6 +27,8 @@ _MOVED_M = 0.5
 _STAYED_SHARE = 0.2
 """Scans lie in a map if surfaces move by less than this share of the way of the scans' middle."""
 _VOXEL_M, _PAIR_DISTANCES_M = 0.3, (1.0, 0.5)
+_MOST_PERIODS = 3.5
+"""Periods of the scans that a sweep lasts at most: three where as many LiDARs share a topic."""
 
 
 def scan_frame_warnings(log: Log) -> list[str]:
@@ -53,6 +56,22 @@ def scan_frame_warnings(log: Log) -> list[str]:
         f"{sum(ways_m[k] for k in stayed):.1f} m, and {np.median(behind):.0%} of the points lie behind "
         "others as seen from their origin; are they in the frame of a map and not around the sensor? map the "
         "driver's own clouds"
+    ]
+
+
+def sweep_warnings(log: Log) -> list[str]:
+    """Return that points have times of more than the time between scans, as columns or shares of a turn."""
+    if log.sensor == "rgbd" or len(log) < 2:
+        return []
+    scans = _readable(log.spread_entries(_LOOKED_AT_AT_FIRST))
+    sweeps_s = [float(np.ptp(scan.times_s)) for scan in scans if scan.times_s is not None]
+    period_s = float(np.median(np.diff(log.stamps_ns))) / NS_PER_S
+    if not sweeps_s or (sweep_s := float(np.median(sweeps_s))) <= _MOST_PERIODS * period_s:
+        return []
+    return [
+        f"times of points: a sweep lasts {sweep_s:.3g} s, but scans come every {period_s:.3g} s; are they "
+        f"shares of a turn, or columns? source.point_time_scale={period_s / sweep_s:.3g} makes a sweep as "
+        "long as that, 0 leaves its times out"
     ]
 
 

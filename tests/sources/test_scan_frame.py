@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mapper.core.frames import Scan
-from mapper.sources.scan_frame import scan_frame_warnings
+from mapper.sources.scan_frame import scan_frame_warnings, sweep_warnings
 from tests.support.logs import log_in_memory
 
 ROOM = np.array([[-6.0, -5.0, 0.0], [30.0, 5.0, 3.0]])
@@ -70,3 +70,13 @@ def test_images_and_single_scans_have_no_frame_to_doubt():
 
     assert scan_frame_warnings(log_in_memory([scan], sensor="lidar")) == []
     assert scan_frame_warnings(log_in_memory([scan] * 5, sensor="rgbd")) == []
+
+
+@pytest.mark.parametrize(("sweep_s", "is_told"), [(0.1, False), (0.3, False), (1.0, True)])
+def test_times_of_points_that_last_longer_than_scans_take_are_told_with_the_scale(sweep_s, is_told):
+    times_s = np.linspace(0.0, sweep_s, 50, dtype=np.float32)
+    scans = [Scan(k * 10**8, np.ones((50, 3), np.float32), times_s=times_s) for k in range(5)]
+    log = log_in_memory([ScanEntry(scan) for scan in scans], sensor="lidar")
+    told = sweep_warnings(log)
+    assert ["point_time_scale=0.1 " in sentence for sentence in told] == [True] * is_told
+    assert sweep_warnings(log[:1]) == []
