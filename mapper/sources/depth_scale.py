@@ -14,7 +14,7 @@ from mapper.core.units import MM_PER_M
 from mapper.sensing.wheel_kinematics import pose_at
 from mapper.sources.base import Log, read_depth
 from mapper.sources.depth_outlines import why_flipped
-from mapper.sources.image_files.reading import TUM_UNITS_PER_M
+from mapper.sources.image_files.reading import TUM_UNITS_PER_M, are_swapped
 
 _LOOKED_AT = 8
 """Frames, spread over the log, whose depth is looked at, and from which pairs begin."""
@@ -46,6 +46,8 @@ _WIDTH_PX, _WINDOW_PX, _STRAIGHT, _FEWEST_WINDOWS, _LEAST_INVERSE = 320, 32, 0.1
 the square of the slant (where one of z and 1/z is linear, that of the other is 0.07), and number and share of
 windows. Of seven real and made logs z is straighter than 1/z in 0 to 14 % of 14 to 354 windows."""
 
+_ROUNDING = 0.05
+"""Error of 16 bits in float32 metres, in units."""
 _PAIR_WITHIN_NS = NS_PER_S // 2
 _MIN_MOTION_M = 0.03
 _MAX_TURN_RAD = 0.2
@@ -78,6 +80,11 @@ def read_spread(log: Log) -> dict[int, RgbdFrame]:
 
 def why_no_depth(log: Log, frames: Mapping[int, RgbdFrame]) -> str | None:
     """Return why a log's depth is none that a camera measures, by :func:`read_spread`; None if it may be."""
+    if _has_swapped_bytes(log, frames.values()):
+        return (
+            "depth: the two bytes of its numbers are in the wrong order: neighbours differ as random numbers "
+            "do, and swapped they do not; write the images again with bytes swapped (NumPy: units.byteswap())"
+        )
     medians_m = [_median_m(frame) for frame in frames.values() if frame.depth_m.any()]
     if frames and not medians_m:
         return f"no depth in any of {len(frames)} frames looked at: all of it is 0, or the limit of 16 bits"
@@ -101,7 +108,7 @@ def depth_warnings(log: Log, frames: Mapping[int, RgbdFrame]) -> list[str]:
     at one scale of depth only. Range: without such a motion there is no scale to compare with, but cameras
     deliver depth of some ranges only.
     """
-    if not frames:
+    if not frames or _has_swapped_bytes(log, frames.values()):
         return []
     measured = float(np.median([(frame.depth_m > 0.0).mean() for frame in frames.values()]))
     if measured < _MIN_MEASURED_SHARE:
@@ -234,6 +241,18 @@ def _inverse_warning(frames: Collection[RgbdFrame]) -> list[str]:
         f"depth: planes are straight in it as in disparity ({(of_z < of_inverse).mean():.0%} of {len(of_z)} "
         "windows); is it disparity or inverse depth? write focal length · baseline / disparity"
     ]
+
+
+def _has_swapped_bytes(log: Log, frames: Collection[RgbdFrame]) -> bool:
+    """Return whether depth was recorded in 16 bits of the wrong order of bytes."""
+    units_per_m = _units_per_m(log) or MM_PER_M
+    for frame in frames:
+        units = frame.depth_m.astype(np.float64) * units_per_m
+        whole = np.rint(units)
+        is_recorded = np.abs(units - whole).max() < _ROUNDING and whole.max() <= np.iinfo(np.uint16).max
+        if not is_recorded or not are_swapped(whole.astype(np.uint16)):
+            return False
+    return bool(frames)
 
 
 def _median_m(frame: RgbdFrame) -> float:

@@ -2,8 +2,10 @@
 
 import json
 import re
+import shutil
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -222,6 +224,16 @@ def test_inspect_and_build_tell_and_the_setting_alone_mends_it(desk_log, desk_ru
     assert "warning" not in mended
 
 
+@pytest.mark.parametrize("units_per_m", [1000.0, 5000.0])
+def test_depth_with_its_bytes_swapped_is_refused_by_that_cause(desk_log, tmp_path, units_per_m):
+    folder = shutil.copytree(desk_log, tmp_path / "log")
+    for path in (folder / "depth").iterdir():
+        path.chmod(0o644)
+        cv2.imwrite(f"{path}", cv2.imread(f"{path}", cv2.IMREAD_UNCHANGED).byteswap())
+    for log, is_refused in ((desk(folder, units_per_m), True), (desk(desk_log, units_per_m), False)):
+        assert ("byteswap" in (why_no_depth(log, read_spread(log)) or "")) == is_refused
+
+
 @pytest.mark.parametrize("far_m", [1.2, 4.0, 10.0])
 def test_pixels_filled_with_the_farthest_depth_are_told(desk_log, far_m):
     log = open_source(desk_log)
@@ -244,4 +256,4 @@ def test_all_checks_of_depth_read_the_same_eight_frames_once(desk_log):
         return source.entry_at(index)
 
     assert noted_log_warnings(replace(source, entry_at=entry_at, truth=None), SILENT) == []
-    assert loaded == [0, *loaded[1:7], 19]
+    assert loaded == [0, *loaded[1:7], 19, 0, 0]  # the first is asked for its units

@@ -30,6 +30,8 @@ ARRAYS = (".npy", ".tif", ".tiff", ".pfm", ".exr")
 # A camera's calibration holds for the pixels as stored, so a rotation tag must not turn them.
 _RGB = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION
 _GREY = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
+_ROW_STEP, _LESS_SMOOTH = 8, 4.0
+"""Rows looked at, and how much more neighbours differ where bytes are swapped: by 40 times and more."""
 _PNG_END = b"IEND\xae\x42\x60\x82"
 
 
@@ -191,6 +193,22 @@ def decode_depth(
             "in a PNG of millimetres"
         )
     return cast(NDArray[np.uint16], units)
+
+
+def are_swapped(units: NDArray[np.integer]) -> bool:
+    """Return whether (H, W) depth of 16 bits is stored in the other order of bytes.
+
+    Neighbours in a row differ little where the order is right; values of one byte may be in either.
+    """
+    some = np.asarray(units[::_ROW_STEP]).astype(np.uint16)
+    swapped = some.byteswap()
+    is_measured = (some[:, 1:] > 0) & (some[:, :-1] > 0)
+    if not is_measured.any() or np.median(swapped[swapped > 0]) <= np.iinfo(np.uint8).max:
+        return False
+    apart, swapped_apart = (
+        np.abs(np.diff(one.astype(np.int32), axis=1))[is_measured].mean() for one in (some, swapped)
+    )
+    return bool(apart > _LESS_SMOOTH * swapped_apart)
 
 
 def depth_m_from(units: NDArray[np.uint16], units_per_m: float) -> DepthImage:

@@ -17,6 +17,7 @@ from mapper.core.units import MM_PER_M
 from mapper.sources.image_files import png
 from mapper.sources.image_files.decoded import SATURATED
 from mapper.sources.image_files.reading import (
+    are_swapped,
     decode_colour,
     decode_depth,
     decode_grey,
@@ -213,19 +214,14 @@ def _units(message: ImageMessage, *, where: str) -> NDArray[Any]:
     pixels = _pixels(message, order + kind, 1, where=where)
     if kind.startswith("f"):
         return pixels
-    if message.is_big_endian and _roughness(pixels) > _roughness(pixels.byteswap()):
-        pixels = pixels.byteswap()  # drivers label what they do not swap
+    if pixels.itemsize == 2 and are_swapped(pixels):
+        pixels = pixels.byteswap()  # drivers label what they do not swap, and the other way round
     return np.ascontiguousarray(pixels if kind == "u2" else np.clip(pixels, 0, SATURATED), dtype=np.uint16)
 
 
 def _depth_kind(message: PixelsMessage) -> str | None:
     """Return NumPy's name of the numbers of a depth image; None of other images."""
     return _DEPTH_KINDS.get(message.encoding.strip().lower())
-
-
-def _roughness(units: NDArray[Any]) -> float:
-    """Return the mean difference of neighbours in a row: of bytes in the wrong order it is large."""
-    return float(np.abs(np.diff(units.astype(np.int32), axis=1)).mean()) if units.shape[1] > 1 else 0.0
 
 
 def depth_file_of(message: ImageMessage) -> bytes | None:

@@ -229,7 +229,12 @@ def test_compressed_depth_of_32_bits_is_inverse_depth():
 
 def test_depth_is_in_the_order_of_bytes_that_makes_it_smooth():
     units = np.add.outer(np.arange(48), np.arange(64)).astype(np.uint16) + 900
-    for is_big_endian, stored in ((True, units), (True, units.byteswap()), (False, units)):
+    for is_big_endian, stored in (
+        (True, units),
+        (True, units.byteswap()),
+        (False, units),
+        (False, units.byteswap()),
+    ):
         message = pixels(stored, "16UC1", is_big_endian=is_big_endian)
         np.testing.assert_array_equal(depth_m_of(message, units_per_m=1.0, where="m"), units)
 
