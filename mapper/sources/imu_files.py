@@ -22,6 +22,9 @@ _RATES, _ACCELERATIONS = "(?:w|g(?!rav)|alpha|ang(?!le)|omega|rot(?!ation_?[xyz]
 """Beginnings of the names of columns."""
 _SHAKEN = 1.2
 """The end of a range is beyond this many times gravity: of those at rest many are the largest."""
+_LEAST_WITH_GRAVITY, _LEAST_SHAKEN = 0.55, 0.4
+"""Tenth percentile of the lengths of accelerations in their median where they feel gravity, and where they
+are as long as it in m/s²: 0.55 if shaken by 0.4 g in each axis; of noise without it 0.5, of driving 0.3."""
 BOTH_HEADER = (
     "#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],"
     "a_RS_S_x [m s^-2],a_RS_S_y [m s^-2],a_RS_S_z [m s^-2]"
@@ -194,8 +197,13 @@ def accelerations_of(
     stamps_ns, accelerations, notes = _finite(name, stamps_ns, accelerations, what="accelerations")
     if not len(stamps_ns):
         return None, [*notes, f"{name}: no accelerations"]
-    unit = _unit_of(accelerations) or 1.0
-    if unit != 1.0:
+    lengths = np.linalg.norm(accelerations, axis=1)
+    least, usual = np.percentile(lengths[lengths > 0.0], (10.0, 50.0)) if lengths.any() else (0.0, 0.0)
+    unit = _unit_of(accelerations)
+    if least <= (_LEAST_SHAKEN if unit == 1.0 else _LEAST_WITH_GRAVITY) * usual:
+        why = f"a tenth are below {least:.2g} and half below {usual:.2g}"
+        return None, [*notes, f"{name}: accelerations lack gravity ({why}); not used: record raw ones"]
+    if unit is not None and unit != 1.0:
         accelerations = accelerations * unit
         called = "g" if unit == GRAVITY_MPS2 else "mg"
         notes.append(f"{name}: accelerations are about {GRAVITY_MPS2 / unit:g} at rest: taken as {called}")

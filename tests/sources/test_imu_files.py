@@ -5,7 +5,7 @@ import pytest
 
 from mapper.core.errors import SourceError
 from mapper.sensing.gyroscope import Gyroscope
-from mapper.sources.imu_files import BOTH_HEADER, read_imu, write_gyroscope
+from mapper.sources.imu_files import BOTH_HEADER, accelerations_of, read_imu, write_gyroscope
 
 
 def test_a_csv_of_euroc_has_both_readings(tmp_path):
@@ -60,6 +60,18 @@ def test_columns_are_found_by_their_names_or_by_gravity(tmp_path, name, header, 
     assert gyroscope.stamps_ns.tolist() == [(1_700_000_000 + k) * 10**9 + 500_000_000 for k in range(3)]
     np.testing.assert_allclose(gyroscope.rates_radps, np.tile(RATES, (3, 1)), atol=1e-6)
     np.testing.assert_allclose(accelerations.acceleration_mps2, np.tile(FELT, (3, 1)), rtol=1e-3)
+
+
+@pytest.mark.parametrize("shaken_mps2", [0.05, 1.0, 3.0])
+def test_accelerations_without_gravity_are_not_used(shaken_mps2):
+    shaken = np.random.default_rng(3).normal(0.0, shaken_mps2, (400, 3))
+    stamps_ns = np.arange(400) * 5_000_000
+    felt, _ = accelerations_of("imu", stamps_ns, shaken + np.array([0.0, 0.0, 9.8]))
+    assert len(felt.stamps_ns) == 400
+    for accelerations in (shaken, shaken * 0.0):
+        felt, notes = accelerations_of("imu", stamps_ns, accelerations)
+        assert felt is None
+        assert sum("gravity" in note for note in notes) == 1
 
 
 def test_a_csv_of_another_layout_is_named_and_not_used(tmp_path):

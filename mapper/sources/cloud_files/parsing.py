@@ -7,8 +7,9 @@ from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import ValidationError
 
-from mapper.core.errors import FrameError
+from mapper.core.errors import FrameError, listed
 from mapper.core.units import MIB
 
 Column = NDArray[np.number[Any]]
@@ -51,6 +52,9 @@ def refusing_damage(path: object, *, what: str) -> Iterator[None]:
         if not (isinstance(error, Exception) or type(error).__name__ == _RUST_PANIC):
             raise
         reason = " ".join(str(error).split()) or type(error).__name__
+        if isinstance(error, ValidationError):
+            lines = [f"{one['loc'][0]}: {one['msg']}" for one in error.errors(include_url=False)]
+            reason = f"its header is not whole ({listed(lines)}); is the file empty, or was it cut?"
         raise FrameError(f"{path}: not a sound {what} file: {reason}") from None
 
 

@@ -106,6 +106,15 @@ def test_a_pcd_that_unpacks_to_more_than_lzf_can_is_refused(tmp_path):
         read_cloud(path)
 
 
+@pytest.mark.parametrize("begin", ["", "# .PCD v0.7\nVERSION 0.7\nFIELDS x y z\n"])
+def test_a_pcd_without_a_header_is_refused_in_words_of_its_lines(tmp_path, begin):
+    path = tmp_path / "1.pcd"
+    path.write_text(begin)
+    with pytest.raises(FrameError, match=r"size: .*was it cut") as caught:
+        read_cloud(path)
+    assert "pydantic" not in str(caught.value)
+
+
 def test_a_pcd_of_countless_values_a_point_is_refused(tmp_path):
     path = tmp_path / "1.pcd"
     PointCloud.from_xyz_points(POINTS.astype(np.float32)).save(path)
