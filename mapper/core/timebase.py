@@ -36,7 +36,10 @@ def check_stamp(stamp_ns: int) -> None:
         DataError: It is before 1970 or after 2038.
     """
     if not 0 <= stamp_ns < _LAST_SECOND * NS_PER_S:
-        raise DataError(f"stamp {stamp_ns} ns: MCAP messages hold 0 … 2³¹ s (1970 to 2038); shift the log")
+        raise DataError(
+            f"stamp {stamp_ns / NS_PER_S:.9g} s: MCAP messages hold 0 … 2³¹ s (1970 to 2038); shift the log, "
+            "or write seconds where these are ms, µs or ns"
+        )
 
 
 def check_stamps(stamps_ns: Stamps) -> None:

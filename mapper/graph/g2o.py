@@ -298,6 +298,8 @@ def _tables(path: Path, progress: Progress) -> dict[str, _Table]:
             raise GraphError(f"{path}:{line}: {len(words)} columns after the tag, want {form.columns}")
         table = tables.setdefault(tag, _Table())
         try:
+            if not all(word.lstrip("-").isdecimal() for word in words[: form.ids]):
+                raise ValueError(f"{' and '.join(words[: form.ids])}, want whole numbers as ids")
             table.ids.append([int(word) for word in words[: form.ids]])
             table.numbers.append(_floats(words[form.ids :]))
         except ValueError as error:

@@ -27,13 +27,16 @@ def within(folder: Path, name: str, *, where: str) -> Path:
 
     Args:
         folder: Folder that the names are relative to.
-        name: Relative to it; the backslashes of Windows may separate its parts.
+        name: Relative to it, or absolute and in it; the backslashes of Windows may separate its parts.
         where: Place of the name, for the message.
 
     Raises:
         SourceError: The name leads out of the folder, or is none.
     """
     path = PurePath(name.replace("\\", "/"))
+    if path.is_absolute():
+        homes = (folder.absolute(), folder.resolve())
+        path = next((path.relative_to(home) for home in homes if path.is_relative_to(home)), path)
     if path.is_absolute() or ".." in path.parts or "\0" in name:
         raise SourceError(
             f"{where}: {name!r} leads out of the log's folder; want the name of a file within it"

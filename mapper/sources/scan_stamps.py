@@ -35,6 +35,7 @@ _LEAST_STEP_US, _LEAST_STEP_MS = 2000, 10
 """Whole numbers that advance by less are no microseconds, as 500 images a second are the most that cameras
 take, and no milliseconds."""
 
+BY_NUMBERS = "by the numbers in their names, from 0 on"
 UNPADDED_NOTE = "fractions of the stamps are taken as whole numbers without leading zeros"
 
 
@@ -154,6 +155,8 @@ def listed_stamps(
             f"{path}: {len(stamps_ns)} stamps for {len(files)} {wording.files}; want a line for each, "
             f"or for each number in their names from 0 on ({wording.stamps_file} names another list)"
         )
+    if of_files.max() < len(stamps_ns) - 1:  # drives lack scans within, but not at their end
+        notes.append(f"{path.name}: {len(stamps_ns)} stamps for {len(files)} {wording.files}, {BY_NUMBERS}")
     return np.array(stamps_ns, dtype=np.int64)[of_files], notes
 
 
@@ -183,9 +186,9 @@ def _key_of(word: str) -> str:
 
 def _in_one_unit(stamps: Sequence[tuple[str, str]], name: str) -> tuple[list[int], list[str]]:
     """Return nanoseconds of places and texts of stamps, and a note on a unit that their steps tell."""
-    texts = [text for _, text in stamps if text.isdecimal() and len(text) < MOST_STAMP_DIGITS]
-    counts = [int(text) for text in texts if epoch_ns(text) is None]
-    unit = unit_of_counts(counts, least_ms=_LEAST_STEP_MS) if len(counts) == len(stamps) else None
+    counts = [int(text) for _, text in stamps if text.isdecimal() and len(text) < MOST_STAMP_DIGITS]
+    are_counts = len(counts) == len(stamps) and any(epoch_ns(text) is None for _, text in stamps)
+    unit = unit_of_counts(counts, least_ms=_LEAST_STEP_MS) if are_counts else None
     if unit is not None and max(counts) * unit.ns < MOST_NS:
         note = f"{name}: whole numbers are taken for {unit.name}: they advance by {unit.step}"
         return [count * unit.ns for count in counts], [note]

@@ -46,7 +46,8 @@ def rows(path: Path, *, separator: str | None = None) -> Iterator[tuple[int, lis
 def table(path: Path, *columns: str) -> Iterator[tuple[str, list[str]]]:
     """Yield place and words of every row of a file that has these columns; the place is for messages.
 
-    Columns may be separated by commas, and a first row of letters alone is a header.
+    Columns may be separated by commas, and a first row of letters alone is a header. The name of a file after
+    one other column may have blanks, or quotes around it.
 
     Raises:
         SourceError: As :func:`read_lines`, or a row has another number of columns.
@@ -57,6 +58,8 @@ def table(path: Path, *columns: str) -> Iterator[tuple[str, list[str]]]:
             continue
         if len(words) != len(columns) or any(word.endswith(",") for word in words):
             words = " ".join(words).replace(",", " ").split()
+        if columns[1:] == ("filename",) and len(words) > 1:
+            words = [words[0], " ".join(words[1:]).strip("\"'")]  # a name with blanks, or quoted
         if len(words) != len(columns):
             raise SourceError(f"{where}: {len(words)} columns, want {len(columns)}: {' '.join(columns)}")
         yield where, words

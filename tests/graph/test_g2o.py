@@ -247,7 +247,7 @@ def test_exponents_of_fortran_are_read(tmp_path):
         (VERTICES + EDGE.strip() + " # origin guess\n", 3, "origin 'guess': want one of odometry, loop"),
         ("VERTEX_SE3:QUAT 9223372036854775808 0 0 0 0 0 0 1\n", 1, "an id is more than"),
         ("VERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 1 0 0\nEDGE_SE2 0 1 1 0 90 1 0 0 1 0 1\n", 3, "want radians"),
-        ("VERTEX_SE3:QUAT a 0 0 0 0 0 0 1\n", 1, "invalid literal"),
+        ("VERTEX_SE3:QUAT a 0 0 0 0 0 0 1\n", 1, "whole numbers"),
     ],
 )
 def test_a_bad_line_is_named(tmp_path, text, line, message):

@@ -1,3 +1,5 @@
+import re
+
 import cv2
 import numpy as np
 import pytest
@@ -53,8 +55,20 @@ def test_the_pair_gap_is_inclusive_to_the_nanosecond_and_says_how_far_the_closes
     with pytest.raises(SourceError, match=r"within 9\.998 ms; the closest pair is 0\.009999 s apart"):
         open_source(log, SourceConfig(max_pair_gap_s=0.009998))
     edit(log / "depth.txt", lambda text: text.replace("\n13050311", "\n13050411"))
-    with pytest.raises(SourceError, match=r"within 20 ms; the closest pair is 9999\.92 s apart"):
+    with pytest.raises(SourceError, match=r"within 20 ms; the closest pair is 9999\.92 s apart") as refused:
         open_source(log)
+    offset_s = float(re.search(r"source\.depth_offset_s=(-[\d.]+)", str(refused.value))[1])
+    assert len(open_source(log, SourceConfig(depth_offset_s=offset_s))) > 0
+
+
+@pytest.mark.parametrize("form", ["rgb of 1/{}", '"rgb/{}"', "'rgb of 1/{}'", "LOG/rgb/{}"])
+def test_names_in_lists_may_have_blanks_and_quotes_and_be_absolute(tiny_tum_log, form):
+    log = tiny_tum_log(3)
+    if "of 1" in form:
+        (log / "rgb").rename(log / "rgb of 1")
+    edit(log / "rgb.txt", lambda text: re.sub(r"rgb/(.*)", lambda name: form.format(name[1]), text))
+    edit(log / "rgb.txt", lambda text: text.replace("LOG", f"{log}"))
+    assert len(open_source(log)) == 3
 
 
 def test_listed_files_that_do_not_exist_are_dropped_and_counted(tiny_tum_log):
@@ -81,7 +95,7 @@ def test_lists_out_of_order_are_sorted_and_repeats_dropped(tiny_tum_log):
         ("rgb.txt", "", r"rgb\.txt: empty list"),
         ("depth.txt", None, r"depth\.txt: cannot be read: No such file"),
         ("depth.txt", "# only a comment\n", r"depth\.txt: empty list"),
-        ("rgb.txt", "1.0 rgb/a.png extra\n", r"rgb\.txt:1: 3 columns, want 2"),
+        ("rgb.txt", "1.0 rgb/a.png extra\n", r"rgb\.txt: none of its 1 images exists; .* extra"),
         ("rgb.txt", "# x\nsoon rgb/a.png\n", r"rgb\.txt:2: stamp 'soon' is not a decimal number"),
         ("rgb.txt", "1.0 rgb/none.png\n", r"rgb\.txt: none of its 1 images exists"),
         ("rgb.txt", b"\xff\xfe\x00", r"rgb\.txt: not a text file"),

@@ -29,6 +29,7 @@ from mapper.sources.image_folders.rgbd import FramePair, assumed_camera_note, fi
 from mapper.sources.image_folders.tum import read_truth
 from mapper.sources.listed_files import only_one
 from mapper.sources.scan_stamps import (
+    BY_NUMBERS,
     Wording,
     line_of_each,
     listed_stamps,
@@ -306,9 +307,12 @@ def _read_matrices(
     if at is None or at.max() >= len(lines):
         return None, [f"{path.name} is not used: {len(lines)} poses for {len(pairs)} pairs of images"]
     poses = [pose_from_matrix(lines[k].reshape(-1, 4)) if len(lines[k]) in (12, 16) else None for k in at]
-    return truth_from(
+    truth, notes = truth_from(
         [(pair.stamp_ns, pose) for pair, pose in zip(pairs, poses, strict=True)], what=path.name
     )
+    if at.max() < len(lines) - 1:
+        notes = [*notes, f"{path.name}: {len(lines)} poses for {len(pairs)} pairs of images, {BY_NUMBERS}"]
+    return truth, notes
 
 
 def _read_redwood(path: Path, pairs: Sequence[FramePair]) -> tuple[Trajectory | None, list[str]]:

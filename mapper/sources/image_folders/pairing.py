@@ -103,9 +103,12 @@ def pair_images(
     partner, gap_ns = nearest(depth_stamps_ns, colour.stamps_ns)
     paired = np.flatnonzero(gap_ns <= round(max_gap_s * NS_PER_S))
     if len(paired) == 0:
+        remedy, first_s = "source.max_pair_gap_s", int(colour.stamps_ns[0] - depth.stamps_ns[0]) / NS_PER_S
+        if gap_ns.min() > NS_PER_S and names[1] == "depth":
+            remedy = f"another clock? source.depth_offset_s={first_s:.3f} lets both begin together"
         raise SourceError(
             f"{path}: no {names[0]} image has a {names[1]} image within {max_gap_s * 1e3:g} ms; "
-            f"the closest pair is {int(gap_ns.min()) / NS_PER_S:g} s apart (source.max_pair_gap_s)"
+            f"the closest pair is {int(gap_ns.min()) / NS_PER_S:g} s apart ({remedy})"
         )
     pairs = [
         FramePair(

@@ -20,7 +20,7 @@ from mapper.sources.image_folders.tum import read_truth
 from mapper.sources.listed_files import refuse_links_out
 from mapper.sources.point_times import times_told
 from mapper.sources.scan_folders.scans import read_scan
-from mapper.sources.scan_stamps import in_order, line_of_each, scan_stamps
+from mapper.sources.scan_stamps import BY_NUMBERS, in_order, line_of_each, scan_stamps
 from mapper.sources.text import time_order, told_without_rotations, truth_from
 from mapper.sources.trajectory_files import is_mulran, is_tum, read_kitti, read_mulran
 
@@ -230,8 +230,10 @@ def _read_truth(
     lines = line_of_each(files, len(T_world_posed))
     posed = [] if lines is None else [(i, line) for i, line in enumerate(lines) if line < len(T_world_posed)]
     notes = []
-    if len(posed) < len(files):
-        notes.append(f"{path.name}: {len(T_world_posed)} poses for {len(posed)} of {len(files)} scans")
+    if len(posed) < len(files) or posed[-1][1] < len(T_world_posed) - 1:
+        notes.append(
+            f"{path.name}: {len(T_world_posed)} poses for {len(posed)} of {len(files)} scans, {BY_NUMBERS}"
+        )
     if not posed:
         return None, notes
     T_world_lidar = T_world_posed
