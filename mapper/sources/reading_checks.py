@@ -18,6 +18,9 @@ and drivers repeat a frame or two when a sensor is late."""
 FROZEN_SCANS = 3
 """As ``FROZEN_IMAGES``, of scans, of whose thousands of ranges even two never agree, or over a second."""
 
+_MOST_AGAIN = 0.2
+"""Share of the frames that repeat the one before: drivers repeat fewer."""
+
 _Repeating = Literal["image", "depth", "scan"]
 _FROZEN: tuple[tuple[_Repeating, str, str, int], ...] = (
     ("image", "show the same image; was the camera frozen?", "same image", FROZEN_IMAGES),
@@ -97,7 +100,13 @@ class ReadingChecks:
 
     def notes(self) -> list[str]:
         """Return what is suspicious about the frames loaded so far, a sentence each."""
-        return [*self.frozen(), *self.far_returns(), *self.untimed_returns(), *self.untimed_scans()]
+        return [
+            *self.frozen(),
+            *self.taken_again(),
+            *self.far_returns(),
+            *self.untimed_returns(),
+            *self.untimed_scans(),
+        ]
 
     def frozen(self) -> list[str]:
         """Return where a sensor seems to have been frozen, a sentence each."""
@@ -106,6 +115,17 @@ class ReadingChecks:
             for what, said, _, fewest in _FROZEN
             for run in self.repeated(what, fewest=fewest)
         ]
+
+    def taken_again(self) -> Iterator[str]:
+        """Yield a sentence about a sensor that is slower than its stamps, if many frames repeat the last."""
+        for what, _, named, fewest in _FROZEN:
+            runs = self.repeated(what, fewest=2) if what != "depth" else []  # which may be slower than colour
+            again = sum(len(run) - 1 for run in runs if len(run) < fewest and not self._lasts(run))
+            if again > max(_MOST_AGAIN * len(self._readings), FROZEN_IMAGES):
+                yield (
+                    f"{again} of {len(self._readings)} frames have the {named} as the one before at another "
+                    "stamp: the sensor is slower than its stamps; was the log converted to a higher rate?"
+                )
 
     def doubts(self) -> dict[int, list[Doubt]]:
         """Return why frames are doubtful, by stamp: they repeat the data of an earlier one."""

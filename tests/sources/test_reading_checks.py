@@ -114,6 +114,15 @@ def test_the_same_image_now_and_again_is_no_frozen_camera():
     assert notes_on(log_of([i % 2 for i in range(60)], [i % 3 for i in range(60)])) == []
 
 
+@pytest.mark.parametrize(("times", "noted"), [(1, 0), (2, 1), (3, 1)])
+def test_a_camera_that_is_slower_than_its_stamps_is_noted(times, noted):
+    notes = notes_on(log_of(np.repeat(range(20), times), range(20 * times)))
+    assert len(notes) == noted
+    assert all(note.startswith(f"{20 * (times - 1)} of {20 * times} frames") for note in notes)
+    slow_depth = log_of(range(20), np.repeat(range(100, 110), 2))
+    assert notes_on(slow_depth) == []
+
+
 def test_far_returns_are_counted_over_the_log():
     scans = [Scan(i, np.full((20, 3), i, np.float32), far_returns=i % 3) for i in range(6)]
     entries = [memory_entry(scan.stamp_ns, scan) for scan in scans]

@@ -8,6 +8,7 @@ import numpy as np
 from mapper.core.doubts import Doubt
 from mapper.core.geometry import Array, Transform, inverse, log
 from mapper.core.running_median import RunningMedian
+from mapper.odometry.camera.image_observation import ImageObservation
 from mapper.odometry.keyframes.depth_comparison import Displacement
 from mapper.odometry.keyframes.pose_tracker import TrackedPose
 
@@ -73,7 +74,7 @@ class FrameDoubts:
         jump = (math.nan, math.nan)
         if T_camera_world_predicted is not None:
             jump = _motion(tracked_pose.T_camera_world, T_camera_world_predicted)
-        if not _is_repeated(tracked_pose, last):
+        if not is_repeated(tracked_pose.observation, last.observation):
             self._shown_since_ns = stamp_ns
         shown_s = 1e-9 * (stamp_ns - self._shown_since_ns)
 
@@ -140,9 +141,8 @@ def _largest_sigma(covariance: Array) -> float:
     return math.sqrt(float(np.linalg.eigvalsh(covariance)[-1]))
 
 
-def _is_repeated(tracked_pose: TrackedPose, last: TrackedPose) -> bool:
-    """Return whether two images are the same to the last feature: the camera was frozen."""
-    now, before = tracked_pose.observation, last.observation
+def is_repeated(now: ImageObservation, before: ImageObservation) -> bool:
+    """Return whether two images are the same to the last feature: the camera was frozen, or is slower."""
     return (
         len(now) > 0 and np.array_equal(now.bits, before.bits) and np.array_equal(now.pixels, before.pixels)
     )

@@ -43,6 +43,20 @@ def test_a_frozen_camera_is_doubted_until_it_moves_again(frames, odometry):
     assert not tracks[-1].doubts
 
 
+def test_images_at_two_stamps_each_move_as_at_their_first(frames, odometry):
+    slow = frames[:40:2]
+    again = [later(frame, frames[2 * k + 1]) for k, frame in enumerate(slow)]
+    tracks = track([frame for pair in zip(slow, again, strict=True) for frame in pair], odometry)
+    of_slow = build_frame_odometry(LocalMapConfig())
+    known = track(slow, of_slow)
+    assert [bool(step.doubts) for step in tracks] == [False, True] * 20
+    places_m, known_m = (
+        np.array([step.T_world_body[:3, 3] for step in steps]) for steps in (tracks[::2], known)
+    )
+    np.testing.assert_allclose(places_m, known_m, atol=0.01)
+    np.testing.assert_allclose(odometry._shutter.twist_camera, of_slow._shutter.twist_camera, atol=0.02)
+
+
 def kinds(assessment):
     return [doubt.kind for doubt in assessment.doubts]
 
