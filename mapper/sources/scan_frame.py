@@ -27,6 +27,8 @@ _MOVED_M = 0.5
 _STAYED_SHARE = 0.2
 """Scans lie in a map if surfaces move by less than this share of the way of the scans' middle."""
 _VOXEL_M, _PAIR_DISTANCES_M = 0.3, (1.0, 0.5)
+_CONSECUTIVE = 7
+"""Scans at both ends that are compared where the first ones repeat: six pairs, for twos and threes."""
 _MOST_PERIODS = 3.5
 """Periods of the scans that a sweep lasts at most: three where as many LiDARs share a topic."""
 
@@ -60,19 +62,41 @@ def scan_frame_warnings(log: Log) -> list[str]:
 
 
 def sweep_warnings(log: Log) -> list[str]:
-    """Return that points have times of more than the time between scans, as columns or shares of a turn."""
+    """Return what is implausible about the times of scans and of their points, a sentence each; few are read.
+
+    Points may have times of more than the time between scans, as columns or shares of a turn; and scans may
+    come at several stamps each.
+    """
     if log.sensor == "rgbd" or len(log) < 2:
         return []
-    scans = _readable(log.spread_entries(_LOOKED_AT_AT_FIRST))
-    sweeps_s = [float(np.ptp(scan.times_s)) for scan in scans if scan.times_s is not None]
+    warnings = []
     period_s = float(np.median(np.diff(log.stamps_ns))) / NS_PER_S
-    if not sweeps_s or (sweep_s := float(np.median(sweeps_s))) <= _MOST_PERIODS * period_s:
-        return []
-    return [
-        f"times of points: a sweep lasts {sweep_s:.3g} s, but scans come every {period_s:.3g} s; are they "
-        f"shares of a turn, or columns? source.point_time_scale={period_s / sweep_s:.3g} makes a sweep as "
-        "long as that, 0 leaves its times out"
-    ]
+    scans = list(_readable(log[:_LOOKED_AT_AT_FIRST].entries()))
+    sweeps_s = [float(np.ptp(scan.times_s)) for scan in scans if scan.times_s is not None]
+    sweep_s = float(np.median(sweeps_s)) if sweeps_s else 0.0
+    if sweep_s > _MOST_PERIODS * period_s:
+        warnings.append(
+            f"times of points: a sweep lasts {sweep_s:.3g} s, but scans come every {period_s:.3g} s; are "
+            f"they shares of a turn, or columns? source.point_time_scale={period_s / sweep_s:.3g} makes a "
+            "sweep as long as that, 0 leaves its times out"
+        )
+    if not any(_repeats(log[:_LOOKED_AT_AT_FIRST])):
+        return warnings
+    parts = [_repeats(log[:_CONSECUTIVE]), _repeats(log[-_CONSECUTIVE:])]
+    if all(any(part) and not all(part) for part in parts):
+        again, pairs = sum(map(sum, parts)), sum(map(len, parts))
+        stride = max(round(pairs / (pairs - again)), 2)
+        warnings.append(
+            f"scans: {again} of {pairs} looked at have the points of the one before at another stamp: the "
+            f"LiDAR is slower than its stamps; source.stride={stride} takes each once"
+        )
+    return warnings
+
+
+def _repeats(log: Log) -> list[bool]:
+    """Return whether each scan after the first has the points of the one before."""
+    sums = [scan.checksum for scan in _readable(log.entries())]
+    return [one == other for one, other in pairwise(sums)]
 
 
 def _readable(entries: Iterable[FrameRef]) -> Iterator[Scan]:

@@ -80,3 +80,12 @@ def test_times_of_points_that_last_longer_than_scans_take_are_told_with_the_scal
     told = sweep_warnings(log)
     assert ["point_time_scale=0.1 " in sentence for sentence in told] == [True] * is_told
     assert sweep_warnings(log[:1]) == []
+
+
+@pytest.mark.parametrize(("times", "is_told"), [(1, False), (2, True), (3, True), (40, False)])
+def test_scans_at_several_stamps_each_are_told_with_the_stride(times, is_told):
+    seen = [np.random.default_rng(k).normal(0.0, 5.0, (50, 3)).astype(np.float32) for k in range(40)]
+    scans = [Scan(k * 10**8, points) for k, points in enumerate(np.repeat(seen, times, axis=0)[:40])]
+    log = log_in_memory([ScanEntry(scan) for scan in scans], sensor="lidar")
+    assert [f"stride={times} " in sentence for sentence in sweep_warnings(log)] == [True] * is_told
+    assert sweep_warnings(log[::times]) == []
