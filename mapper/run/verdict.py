@@ -358,7 +358,8 @@ def _truth(results: RunResults) -> Iterator[RunWarning]:
             sentence=f"turns of a second are {np.degrees(error_rad):.1f}° (RMSE) from the true ones of "
             f"{np.degrees(turned_rad):.1f}° (doubt from {_MAX_TURN_SHARE:.0%} and "
             f"{np.degrees(_LEAST_TURN_RAD):.0f}° on): one of both is wrong",
-            suggestion=f"{suggestion}; are the images mirrored, or its poses those of another frame?",
+            suggestion=f"{suggestion}; are the images mirrored, its quaternions w first, or its poses "
+            "inverse or of another frame?",
             weight="doubt",
         )
 
