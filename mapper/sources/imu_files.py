@@ -22,9 +22,10 @@ _RATES, _ACCELERATIONS = "(?:w|g(?!rav)|alpha|ang(?!le)|omega|rot(?!ation_?[xyz]
 """Beginnings of the names of columns."""
 _SHAKEN = 1.2
 """The end of a range is beyond this many times gravity: of those at rest many are the largest."""
-_LEAST_WITH_GRAVITY, _LEAST_SHAKEN = 0.55, 0.4
-"""Tenth percentile of the lengths of accelerations in their median where they feel gravity, and where they
-are as long as it in m/s²: 0.55 if shaken by 0.4 g in each axis; of noise without it 0.5, of driving 0.3."""
+_LEAST_WITH_GRAVITY, _LEAST_MEAN = 0.55, 0.5
+"""Tenth percentile of the lengths of accelerations, and length of their mean, in the median length, of which
+those that feel gravity exceed one: 0.55 if shaken by 0.4 g in each axis; of noise without it 0.5, of driving
+0.3, and their mean is near 0, as that of gravity is only in a unit that tumbles."""
 BOTH_HEADER = (
     "#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],"
     "a_RS_S_x [m s^-2],a_RS_S_y [m s^-2],a_RS_S_z [m s^-2]"
@@ -200,7 +201,8 @@ def accelerations_of(
     lengths = np.linalg.norm(accelerations, axis=1)
     least, usual = np.percentile(lengths[lengths > 0.0], (10.0, 50.0)) if lengths.any() else (0.0, 0.0)
     unit = _unit_of(accelerations)
-    if least <= (_LEAST_SHAKEN if unit == 1.0 else _LEAST_WITH_GRAVITY) * usual:
+    mean = np.linalg.norm(accelerations.mean(axis=0))
+    if least <= _LEAST_WITH_GRAVITY * usual and mean <= _LEAST_MEAN * usual:
         why = f"a tenth are below {least:.2g} and half below {usual:.2g}"
         return None, [*notes, f"{name}: accelerations lack gravity ({why}); not used: record raw ones"]
     if unit is not None and unit != 1.0:

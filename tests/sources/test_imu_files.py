@@ -62,13 +62,14 @@ def test_columns_are_found_by_their_names_or_by_gravity(tmp_path, name, header, 
     np.testing.assert_allclose(accelerations.acceleration_mps2, np.tile(FELT, (3, 1)), rtol=1e-3)
 
 
-@pytest.mark.parametrize("shaken_mps2", [0.05, 1.0, 3.0])
-def test_accelerations_without_gravity_are_not_used(shaken_mps2):
+@pytest.mark.parametrize("unit_mps2", [1.0, 9.80665])
+@pytest.mark.parametrize("shaken_mps2", [0.05, 1.0, 3.0, 6.0])
+def test_accelerations_without_gravity_are_not_used(shaken_mps2, unit_mps2):
     shaken = np.random.default_rng(3).normal(0.0, shaken_mps2, (400, 3))
     stamps_ns = np.arange(400) * 5_000_000
-    felt, _ = accelerations_of("imu", stamps_ns, shaken + np.array([0.0, 0.0, 9.8]))
+    felt, _ = accelerations_of("imu", stamps_ns, (shaken + np.array([0.0, 0.0, 9.8])) / unit_mps2)
     assert len(felt.stamps_ns) == 400
-    for accelerations in (shaken, shaken * 0.0):
+    for accelerations in (shaken / unit_mps2, shaken * 0.0):
         felt, notes = accelerations_of("imu", stamps_ns, accelerations)
         assert felt is None
         assert sum("gravity" in note for note in notes) == 1
