@@ -372,7 +372,7 @@ def _connect_parts(
 
 
 def _is_useful(covariance: Array) -> bool:
-    """Return whether a motion is known better than loops take an odometry's step to be that saw nothing."""
+    """Return whether a motion is known better than loops take a step to be of which nothing is seen."""
     rad2, m2 = (np.linalg.eigvalsh(covariance[part, part])[-1] for part in _PARTS)
     return bool(rad2 <= LARGEST_SIGMA_RAD**2 and m2 <= LARGEST_SIGMA_M**2)
 

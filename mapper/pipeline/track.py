@@ -277,7 +277,7 @@ class _FirstPass:
             conflicts = [*conflicts, conflict]
         warnings = [
             *(RunWarning(kind="frozen", sentence=note) for note in checks.frozen()),
-            *(RunWarning(kind="log", sentence=note) for note in checks.taken_again()),
+            *(RunWarning(kind="log", sentence=note) for note in checks.slow_sensors()),
             *(RunWarning(kind="far returns", sentence=note) for note in checks.far_returns()),
             *(RunWarning(kind="log", sentence=note) for note in checks.untimed_returns()),
             *(RunWarning(kind="log", sentence=note) for note in checks.untimed_scans()),

@@ -18,7 +18,7 @@ and drivers repeat a frame or two when a sensor is late."""
 FROZEN_SCANS = 3
 """As ``FROZEN_IMAGES``, of scans, of whose thousands of ranges even two never agree, or over a second."""
 
-_MOST_AGAIN = 0.2
+_MOST_REPEATS = 0.2
 """Share of the frames that repeat the one before: drivers repeat fewer."""
 
 _Repeating = Literal["image", "depth", "scan"]
@@ -102,7 +102,7 @@ class ReadingChecks:
         """Return what is suspicious about the frames loaded so far, a sentence each."""
         return [
             *self.frozen(),
-            *self.taken_again(),
+            *self.slow_sensors(),
             *self.far_returns(),
             *self.untimed_returns(),
             *self.untimed_scans(),
@@ -116,12 +116,12 @@ class ReadingChecks:
             for run in self.repeated(what, fewest=fewest)
         ]
 
-    def taken_again(self) -> Iterator[str]:
+    def slow_sensors(self) -> Iterator[str]:
         """Yield a sentence about a sensor that is slower than its stamps, if many frames repeat the last."""
         for what, _, named, fewest in _FROZEN:
             runs = self.repeated(what, fewest=2) if what != "depth" else []  # which may be slower than colour
             again = sum(len(run) - 1 for run in runs if len(run) < fewest and not self._lasts(run))
-            if again > max(_MOST_AGAIN * len(self._readings), FROZEN_IMAGES):
+            if again > max(_MOST_REPEATS * len(self._readings), FROZEN_IMAGES):
                 yield (
                     f"{again} of {len(self._readings)} frames have the {named} as the one before at another "
                     "stamp: the sensor is slower than its stamps; was the log converted to a higher rate?"

@@ -98,6 +98,14 @@ class ImageObservation(Archivable):
         else:
             _copy_fields(_unswept(state["measured"], state["has_disparity"]), self)
 
+    def repeats(self, earlier: "ImageObservation") -> bool:
+        """Return whether both are of one image, to the last feature: the camera was frozen, or is slower."""
+        return (
+            len(self) > 0
+            and np.array_equal(self.bits, earlier.bits)
+            and np.array_equal(self.pixels, earlier.pixels)
+        )
+
     def weights_among(self, moved: NDArray[np.bool_]) -> Array:
         """Return the (N, 3) inverse variances that tell which features agree on a motion.
 

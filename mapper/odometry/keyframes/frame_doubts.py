@@ -8,7 +8,6 @@ import numpy as np
 from mapper.core.doubts import Doubt
 from mapper.core.geometry import Array, Transform, inverse, log
 from mapper.core.running_median import RunningMedian
-from mapper.odometry.camera.image_observation import ImageObservation
 from mapper.odometry.keyframes.depth_comparison import Displacement
 from mapper.odometry.keyframes.pose_tracker import TrackedPose
 
@@ -57,6 +56,8 @@ class FrameDoubts:
         last: TrackedPose,
         T_camera_world_predicted: Transform | None,
         displaced: Displacement,
+        *,
+        repeats: bool,
     ) -> Assessment:
         """Return the doubts of a frame; the figures of undoubted ones become part of the usual.
 
@@ -66,6 +67,7 @@ class FrameDoubts:
             last: The tracked frame before it.
             T_camera_world_predicted: (4, 4) by constant velocity; None if nothing predicts it.
             displaced: Surfaces that lie elsewhere by this pose than in an earlier frame.
+            repeats: Whether its image is that of the frame before.
         """
         stamp_ns = tracked_pose.observation.stamp_ns
         elapsed_s = 1e-9 * (stamp_ns - last.observation.stamp_ns)
@@ -74,7 +76,7 @@ class FrameDoubts:
         jump = (math.nan, math.nan)
         if T_camera_world_predicted is not None:
             jump = _motion(tracked_pose.T_camera_world, T_camera_world_predicted)
-        if not is_repeated(tracked_pose.observation, last.observation):
+        if not repeats:
             self._shown_since_ns = stamp_ns
         shown_s = 1e-9 * (stamp_ns - self._shown_since_ns)
 
@@ -139,10 +141,3 @@ def _motion(T_camera_world: Transform, T_before_world: Transform) -> tuple[float
 
 def _largest_sigma(covariance: Array) -> float:
     return math.sqrt(float(np.linalg.eigvalsh(covariance)[-1]))
-
-
-def is_repeated(now: ImageObservation, before: ImageObservation) -> bool:
-    """Return whether two images are the same to the last feature: the camera was frozen, or is slower."""
-    return (
-        len(now) > 0 and np.array_equal(now.bits, before.bits) and np.array_equal(now.pixels, before.pixels)
-    )

@@ -25,7 +25,7 @@ from mapper.odometry.camera.image_observation import ImageObservation, observe_i
 from mapper.odometry.camera.readout_time import ReadoutTime
 from mapper.odometry.config import KeyframeOdometryConfig
 from mapper.odometry.keyframes.depth_comparison import EarlierDepth
-from mapper.odometry.keyframes.frame_doubts import UNDOUBTED, Assessment, FrameDoubts, is_repeated
+from mapper.odometry.keyframes.frame_doubts import UNDOUBTED, Assessment, FrameDoubts
 from mapper.odometry.keyframes.keyframe_decision import KeyframeDecision
 from mapper.odometry.keyframes.landmarks import LandmarkMap
 from mapper.odometry.keyframes.local_mapping import LocalMapping
@@ -100,7 +100,7 @@ class KeyframeOdometry(WithMotionPrior, FrameOdometry[ImageObservation]):
         """Track the next frame, in time order: predict, find its pose, assess it, extend the map."""
         last, was_lost = self._last, self._tracking.is_lost
         follows = last is not None and not was_lost and not is_gap(last.stamp_ns, observation.stamp_ns)
-        repeats = follows and last is not None and is_repeated(observation, last.observation)
+        repeats = last is not None and observation.repeats(last.observation)
         if not follows:
             self._shutter.restart()  # the motion before a gap is not that in this image
         observation = self._shutter.predict(observation)
@@ -112,10 +112,12 @@ class KeyframeOdometry(WithMotionPrior, FrameOdometry[ImageObservation]):
             pose = self._shutter.refine(pose, last, self._map.positions_of(pose.landmark_of_feature))
         information = self._tracking.information(pose)
         displaced = self._earlier_depth.displacement(pose.observation, pose.T_camera_world, pose.reference)
-        assessed = self._doubts.assess(pose, covariance_of(information), last, expected, displaced)
+        assessed = self._doubts.assess(
+            pose, covariance_of(information), last, expected, displaced, repeats=repeats
+        )
         if follows and not assessed.doubts:
             self._learn_turn(last, pose, by_velocity)
-        if not repeats:  # of an image the first stamp counts, by which velocities are known
+        if not (follows and repeats):  # of an image the first stamp counts, by which velocities are known
             # The motion before a gap does not predict the motion after it.
             self._before_last, self._last = None if was_lost else last, pose
         self._agreeing = pose.landmark_of_feature >= 0
