@@ -35,11 +35,15 @@ _SHOWN = frozenset({ATE_RMSE, RPE_RMSE_M, RPE_RMSE_RAD, PATH_LENGTH, START_TO_EN
 
 def summary_of(run: Run) -> Answer:
     """Return a run as the answer of the verb that made it, its path judged by the truth if there is any."""
+    unknown = ""
     try:
         metrics = evaluate(run.trajectory, run.truth).metrics
-    except DataError:  # no pose of the truth is near a frame: mapper eval says so
+    except DataError as error:  # as where no pose of the truth is near a frame
         metrics = evaluate(run.trajectory, None).metrics
-    return Answer(run_document(run, metrics), short_text(run, metrics), summary_text(run, metrics))
+        unknown = f"not known: {error}"
+    return Answer(
+        run_document(run, metrics), short_text(run, metrics, unknown), summary_text(run, metrics, unknown)
+    )
 
 
 def run_document(run: Run, metrics: Sequence[Metric]) -> dict[str, Any]:
@@ -75,8 +79,8 @@ def frame_counts(counts: Counts) -> dict[str, int]:
     return {key: getattr(counts, key) for key in ("listed", "read", "tracked", "doubtful", "lost", "skipped")}
 
 
-def short_text(run: Run, metrics: Sequence[Metric]) -> str:
-    """Return the main figures in eight lines, and why a run is not trusted."""
+def short_text(run: Run, metrics: Sequence[Metric], unknown: str = "") -> str:
+    """Return the main figures in eight lines, why the accuracy is unknown, and why a run is not trusted."""
     counts, timing, verdict = run.manifest.counts, run.manifest.timing, run.verdict
     logs = f", of {run.manifest.input.title}" if run.manifest.input.appended else ""
     lengths_m = [metric.value for metric in metrics if metric.quantity == PATH_LENGTH]
@@ -86,7 +90,7 @@ def short_text(run: Run, metrics: Sequence[Metric]) -> str:
     rows = [
         ("frames", f"{counts.frames_text}{logs}"),
         ("loops", f"{counts.loops} of {counts.loop_candidates} candidates hold"),
-        ("accuracy", _accuracy_text(metrics)),
+        ("accuracy", _accuracy_text(metrics) or unknown),
         ("map", f"{counts.voxels_text} of {run.config.octree.resolution_m:g} m{path}"),
         ("speed", f"{speed}; {timing.total_s:.1f} s and {timing.peak_memory_mb:.0f} MB in all"),
         ("resumed", _resumed_text(timing)),
@@ -102,14 +106,15 @@ def _resumed_text(timing: Timing) -> str:
     return "; ".join(resumption.text for resumption in timing.resumed)
 
 
-def summary_text(run: Run, metrics: Sequence[Metric]) -> str:
-    """Return the summary of a run, a line per fact."""
+def summary_text(run: Run, metrics: Sequence[Metric], unknown: str = "") -> str:
+    """Return the summary of a run, a line per fact, and why its accuracy is unknown."""
     counts, timing = run.manifest.counts, run.manifest.timing
     rows = [
         ("frames", counts.frames_text),
         ("keyframes", f"{counts.nodes}, with {counts.factors} factors"),
         ("loops", _loops_text(run.loops)),
         *((metric.name, _value_text(metric)) for metric in metrics if metric.quantity in _SHOWN),
+        *([("accuracy", unknown)] if unknown else []),
         *_left_open(run.records),
         ("octree", f"{counts.voxels_text} of {run.config.octree.resolution_m:g} m"),
     ]

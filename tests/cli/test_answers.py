@@ -105,7 +105,11 @@ def test_json_is_one_document_with_the_keys_of_its_verb(verb, desk_run, desk_log
 def test_a_truth_that_is_near_no_frame_costs_a_run_its_accuracy_alone(desk_run):
     run = open_run(desk_run.path)
     vars(run)["truth"] = later(desk_run.truth, 10**12)
-    names = {metric["name"] for metric in summary_of(run).document["metrics"]}
+    answer = summary_of(run)
+    names = {metric["name"] for metric in answer.document["metrics"]}
+    assert all(
+        re.search("^accuracy +not known", text, re.MULTILINE) for text in (answer.text, answer.details)
+    )
     assert names == {metric.name for metric in evaluate(run.trajectory, None).metrics}
 
 

@@ -96,6 +96,7 @@ def _indexed(file: BinaryIO) -> _Contents | None:
         while len(_MAGIC) < at < size:
             fields, start, end = _record_at(file, at, size)
             at = end
+            check_block_size(end - start)
             file.seek(start)
             if fields[b"op"][0] == _CONNECTION:
                 contents.add_connection(fields, file.read(end - start))

@@ -1,6 +1,7 @@
 """Recordings that announce too much cost what is good about them, and neither memory nor time."""
 
 import bz2
+import os
 import sqlite3
 import struct
 import tracemalloc
@@ -141,6 +142,22 @@ def test_a_bag_s_index_that_points_far_beyond_the_file_is_not_used(tmp_path, at)
     place = data.index(b"chunk_pos=", last) + len(b"chunk_pos=")
     path.write_bytes(data[:place] + struct.pack("<Q", at) + data[place + 8 :])
     assert [bytes(message.data) for message in open_bag(path).messages()] == expected
+
+
+def test_a_bag_s_index_that_announces_gigabytes_is_not_read(tmp_path):
+    path = write(tmp_path / "log.bag", shots(6))
+    expected = [bytes(message.data) for message in open_bag(path).messages()]
+    data = bytearray(path.read_bytes())
+    (header,) = struct.unpack_from("<I", data, last := last_record(data))
+    struct.pack_into("<I", data, last + 4 + header, 1 << 31)
+    path.write_bytes(data)
+    os.truncate(path, 3 << 30)
+    tracemalloc.start()
+    try:
+        assert [bytes(message.data) for message in open_bag(path).messages()] == expected
+        assert tracemalloc.get_traced_memory()[1] < 1 << 30
+    finally:
+        tracemalloc.stop()
 
 
 def last_record(data: bytes) -> int:
