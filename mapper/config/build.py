@@ -42,8 +42,6 @@ class RerunConfig(Config):
 
     image_stride: PositiveInt = 3
     """Every n-th frame is shown with its image and cloud, which costs reading it again."""
-    image_width_px: PositiveInt = 480
-    """Wider images are shrunk."""
     cloud_points: PositiveInt = 20_000
     """A frame's cloud is thinned to about this many points."""
 

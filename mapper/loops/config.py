@@ -102,8 +102,6 @@ class ScanVerificationConfig(Config):
 
     is_planar: bool = False
     """Scans of a 2D laser: the motion is guessed by their correlation (Olson 2009), in any heading."""
-    offset_m: PositiveFloat = 4.0
-    """Largest distance along x and along y at which planar scans are compared."""
     voxel_m: PositiveFloat = 0.5
     """One point is kept per voxel."""
     reach_m: PositiveFloat = 48.0

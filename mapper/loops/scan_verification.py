@@ -42,6 +42,8 @@ _SAME = Discrepancy(translation_m=3.0, rotation_rad=0.3)
 
 _CELLS, _SPREAD_CELLS = 2.0, 4.0
 """Voxels of a cell of the correlation of planar scans, and by which a guess is off at most."""
+_PLANAR_OFFSET_M = 4.0
+"""Largest distance along x and along y at which planar scans are compared."""
 _METRE_HIGH = transform(np.eye(3), np.array([0.0, 0.0, 1.0]))
 
 
@@ -141,7 +143,7 @@ class ScanVerifier:
             motions = correlate(
                 self._cloud(i).points,
                 self._cloud(j).points,
-                reach_m=config.offset_m,
+                reach_m=_PLANAR_OFFSET_M,
                 cell_m=_CELLS * config.voxel_m,
                 peaks=config.voting.peaks,
                 apart_m=_SPREAD_CELLS * config.voxel_m,

@@ -160,18 +160,17 @@ def fuse_run(workspace: Workspace, run: int, path: Path, trajectory: Trajectory,
     """
     built = open_run(path)
     settings = built.fused_config
-    near = settings.octree.model_copy(update={"stays_within_m": stays_within_m(workspace.config)})
-    config = settings.model_copy(update={"octree": near})
+    within_m = stays_within_m(workspace.config)
     before, written = built.scan_updates(), workspace.scratch / f"{run:04d}.updates"
     written.parent.mkdir(parents=True, exist_ok=True)
     with (
-        open_scan_updates(before) if before is not None else nullcontext() as known,
-        ScanUpdateWriter(written, near) as updates,
+        open_scan_updates(before, within_m=within_m) if before is not None else nullcontext() as known,
+        ScanUpdateWriter(written, settings.octree) as updates,
     ):
         fused = build_octree(
             built.open_log(),
             trajectory,
-            config,
+            settings,
             progress=SILENT,
             cached=known,
             updates=updates,

@@ -3,7 +3,7 @@
 import math
 from typing import Annotated, Literal, Self
 
-from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt, model_validator
+from pydantic import Field, PositiveFloat, PositiveInt, model_validator
 
 from mapper.core.config import Config
 from mapper.sensing.config import DepthNoiseConfig
@@ -45,9 +45,6 @@ class OctreeConfig(Config):
     """Cast one ray per end voxel (fast), not one per point; both are OctoMap's own modes."""
     attributes: bool = False
     """Keep mean colour, hit count and time of the last hit of the voxels where rays end."""
-    stays_within_m: NonNegativeFloat = 1e-9
-    """Fusing again along another trajectory keeps a frame's cached update if no end of a ray moves by more
-    than this; the default tolerates the rounding of poses stored as text."""
     max_memory_mb: PositiveFloat | None = None
     """Size of the voxels beyond which a build keeps them in a file in the run's folder, of which the system
     caches what fits; the map is the same. For maps larger than memory; tables of their blocks and the 2D maps

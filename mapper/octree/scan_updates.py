@@ -173,8 +173,11 @@ class ScanUpdateWriter:
 class ScanUpdateFile:
     """Reader with access by stamp, from any thread; a context manager. Only heads are kept in memory."""
 
-    def __init__(self, path: Path, first_line: bytes, heads: dict[int, tuple[NDArray[np.void], int]]) -> None:
+    def __init__(
+        self, path: Path, first_line: bytes, heads: dict[int, tuple[NDArray[np.void], int]], within_m: float
+    ) -> None:
         self.path = path
+        self._within_m = within_m
         self._first_line = first_line
         self._heads = heads
         self._descriptor = os.open(path, os.O_RDONLY)
@@ -219,12 +222,12 @@ class ScanUpdateFile:
         return self._first_line == _first_line(config)
 
     def lookup(self, stamp_ns: int, T_world_body: Transform, *, config: OctreeConfig) -> CachedUpdate | None:
-        """Return a frame's update if it still holds: no ray's end has moved further than ``stays_within_m``.
+        """Return a frame's update if it still holds: no ray's end has moved further than ``within_m``.
 
         Args:
             stamp_ns: The frame's stamp.
             T_world_body: (4, 4) current estimate of its pose.
-            config: Gives the maximum range and ``stays_within_m``.
+            config: Gives the maximum range.
         """
         if not self.holds(stamp_ns, T_world_body, config=config):
             return None
@@ -240,7 +243,7 @@ class ScanUpdateFile:
             return False
         head, _ = self._heads[stamp_ns]
         moved_m = displacement_m(head["T_world_body"], T_world_body, range_m=longest_ray_m(config))
-        return moved_m <= config.stays_within_m
+        return moved_m <= self._within_m
 
 
 def displacement_m(T_a_body: Transform, T_b_body: Transform, *, range_m: float) -> float:
@@ -259,8 +262,13 @@ def longest_ray_m(config: OctreeConfig) -> float:
     return config.range_limit_m if limit is None else 2.0 * limit.depth_m
 
 
-def open_scan_updates(path: Path) -> ScanUpdateFile:
+def open_scan_updates(path: Path, *, within_m: float = 1e-9) -> ScanUpdateFile:
     """Open a file of ``ScanUpdateWriter``.
+
+    Args:
+        path: The file.
+        within_m: A frame's update holds if no end of a ray moves by more; the default tolerates the rounding
+            of poses stored as text.
 
     Raises:
         MapFileError: The file cannot be read, is foreign or truncated.
@@ -284,7 +292,7 @@ def open_scan_updates(path: Path) -> ScanUpdateFile:
                 file.seek(end)
     except OSError as error:
         raise MapFileError(f"{path}: cannot be read: {error.strerror}") from None
-    return ScanUpdateFile(path, first_line, heads)
+    return ScanUpdateFile(path, first_line, heads, within_m)
 
 
 def _head(raw: bytes) -> NDArray[np.void]:

@@ -143,19 +143,18 @@ def test_another_sensor_model_needs_no_frame_and_another_resolution_needs_all(so
 
 
 def test_within_the_tolerance_frames_stay_as_they_were_fused_and_do_not_drift(source, first, tmp_path):
-    config = overridden(CONFIG, ["octree.stays_within_m=0.02"])
     step = exp(np.zeros(3), np.array([0.015, 0.0, 0.0]))
     nudged = moved(source.truth, [2], step)
     nudged_again = moved(nudged, [2], step)
     counted = Counted(source)
 
-    with open_scan_updates(first) as before:
-        stayed = fused(counted.log, nudged, tmp_path / "stayed.bin", before=before, config=config)
+    with open_scan_updates(first, within_m=0.02) as before:
+        stayed = fused(counted.log, nudged, tmp_path / "stayed.bin", before=before)
     assert counted.read == []
     assert_same_bits(stayed, fused(source, source.truth, tmp_path / "scratch.bin"))
 
-    with open_scan_updates(tmp_path / "stayed.bin") as before:
-        went = fused(counted.log, nudged_again, tmp_path / "went.bin", before=before, config=config)
+    with open_scan_updates(tmp_path / "stayed.bin", within_m=0.02) as before:
+        went = fused(counted.log, nudged_again, tmp_path / "went.bin", before=before)
     assert counted.read == [int(source.truth.stamps_ns[2])]
     assert_same_bits(went, fused(source, nudged_again, tmp_path / "scratch.bin"))
 

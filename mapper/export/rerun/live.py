@@ -30,6 +30,7 @@ from mapper.sources.base import Log
 _LIVE = "world/live"
 _BODY = f"{_LIVE}/body"
 _GROWTH = 0.02  # a path is logged anew once it has grown by this share: so in all 50 times its length
+_IMAGE_WIDTH_PX = 480
 _LOGGED_DIAGNOSTICS = ("features", "matches", "inliers", "residual")
 _UPRIGHT: dict[Sensor, Transform] = {
     # x right, y down, z forward, held level, becomes x right, y forward, z up.
@@ -102,11 +103,10 @@ class LiveRerun:
             self._show_cloud(frame)
 
     def _show_image(self, frame: RgbdFrame, step: Step) -> None:
-        width_px = self._config.image_width_px
-        camera = shrunk_camera(frame.camera, width_px=width_px)
+        camera = shrunk_camera(frame.camera, width_px=_IMAGE_WIDTH_PX)
         if self._frames == 0:
             self._log.mount(camera, frame.T_body_camera)
-        jpeg = encode_jpeg(frame.image, width_px=width_px)
+        jpeg = encode_jpeg(frame.image, width_px=_IMAGE_WIDTH_PX)
         image = rr.EncodedImage(contents=jpeg, media_type="image/jpeg")
         self._log.log(self._log.camera, image, stamp_ns=frame.stamp_ns)
         view = step.view()
