@@ -1,7 +1,7 @@
 """Frames of a recording's sensors: RGB-D cameras, stereo pairs, LiDARs and 2D lasers, not decoded yet."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -10,8 +10,7 @@ from mapper.core.errors import SourceError, listed
 from mapper.core.frames import Sensor
 from mapper.core.timebase import Stamps
 from mapper.core.units import MM_PER_M
-from mapper.sensing.config import DepthNoiseConfig
-from mapper.sources.base import FrameRef
+from mapper.sources.base import FrameRef, Log
 from mapper.sources.config import SourceConfig
 from mapper.sources.depth_camera_pose import with_depth_pose
 from mapper.sources.image_files.image_sizes import RecordedCamera, recorded_camera
@@ -45,35 +44,46 @@ from mapper.sources.velodyne_packets import require_decoder
 _JPEG_START = b"\xff\xd8"
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class RecordedFrames:
-    """Frames of one sensor of a recording.
-
-    Attributes:
-        sensor: What took them.
-        body: Coordinate frame of all.
-        stamps_ns: (N,) int64 nanoseconds.
-        entry_at: Makes the entry of frame 0 … N − 1.
-        notes: Sentences on what was left out or assumed.
-        depth_noise: Noise of their depth, where the recording states it.
-        choices: Sentences on what was recognised.
-    """
-
-    sensor: Sensor
-    body: str
-    stamps_ns: Stamps
-    entry_at: Callable[[int], FrameRef]
-    notes: Sequence[str]
-    depth_noise: DepthNoiseConfig | None = None
-    choices: Sequence[str] = ()
-
-
-def stereo_frames(reader: RecordingReader, topics: StereoTopics, config: SourceConfig) -> RecordedFrames:
-    """Return the frames of a stereo pair, whose depth is computed as they are read.
+def log_of_frames(
+    reader: RecordingReader, topics: CameraTopics | StereoTopics | Series, config: SourceConfig
+) -> Log:
+    """Return the frames of one sensor of a recording, as a log that has nothing else yet.
 
     Raises:
         SourceError: They cannot be mapped, or their camera is unknown.
     """
+    match topics:
+        case CameraTopics():
+            return _rgbd_log(reader, topics, config)
+        case StereoTopics():
+            return _stereo_log(reader, topics, config)
+        case _:
+            return _lidar_log(reader, topics, config)
+
+
+def _log(
+    reader: RecordingReader,
+    sensor: Sensor,
+    body: str,
+    stamps_ns: Stamps,
+    entry_at: Callable[[int], FrameRef],
+    notes: Sequence[str],
+) -> Log:
+    recording = reader.recording
+    return Log(
+        path=recording.path,
+        name=recording.path.resolve().stem,
+        kind=recording.kind,
+        sensor=sensor,
+        stamps_ns=stamps_ns,
+        entry_at=entry_at,
+        body_frame=body,
+        notes=notes,
+    )
+
+
+def _stereo_log(reader: RecordingReader, topics: StereoTopics, config: SourceConfig) -> Log:
+    """Return the frames of a stereo pair, whose depth is computed as they are read."""
     refuse_settings(config.camera)
     left, right, where = topics.left, topics.right, f"{reader.recording.path}"
     i, j, notes = paired(left, right, max_gap_s=config.max_pair_gap_s, where=where)
@@ -95,15 +105,12 @@ def stereo_frames(reader: RecordingReader, topics: StereoTopics, config: SourceC
         f"{where}: {left.topic.name}",
     )
     notes.append(camera.note)
-    return RecordedFrames("rgbd", frame_of(first), left.stamps_ns[i], entry_at, notes, camera.noise)
+    log = _log(reader, "rgbd", frame_of(first), left.stamps_ns[i], entry_at, notes)
+    return replace(log, depth_noise=camera.noise)
 
 
-def rgbd_frames(reader: RecordingReader, topics: CameraTopics, config: SourceConfig) -> RecordedFrames:
-    """Return the frames of an RGB-D camera.
-
-    Raises:
-        SourceError: They cannot be mapped, or their camera is unknown.
-    """
+def _rgbd_log(reader: RecordingReader, topics: CameraTopics, config: SourceConfig) -> Log:
+    """Return the frames of an RGB-D camera."""
     color, depth = topics.color, topics.depth
     depth = replace(depth, stamps_ns=depth.stamps_ns + depth_offset_ns(config))
     where = f"{reader.recording.path}"
@@ -149,17 +156,13 @@ def rgbd_frames(reader: RecordingReader, topics: CameraTopics, config: SourceCon
         )
         camera = camera_of(calibration)
     notes += [*camera_notes, *camera.notes(), *calibration.notes()]
-    return RecordedFrames(
-        "rgbd", frame, color.stamps_ns[i], lambda index: images_of(camera, index).entry(), notes
+    return _log(
+        reader, "rgbd", frame, color.stamps_ns[i], lambda index: images_of(camera, index).entry(), notes
     )
 
 
-def lidar_frames(reader: RecordingReader, clouds: Series, config: SourceConfig) -> RecordedFrames:
-    """Return the scans of a LiDAR or a 2D laser.
-
-    Raises:
-        SourceError: They cannot be mapped, or their camera is unknown.
-    """
+def _lidar_log(reader: RecordingReader, clouds: Series, config: SourceConfig) -> Log:
+    """Return the scans of a LiDAR or a 2D laser."""
     if clouds.topic.type in VELODYNE:
         require_decoder()
     i, notes = ordered(clouds)
@@ -200,14 +203,8 @@ def lidar_frames(reader: RecordingReader, clouds: Series, config: SourceConfig) 
         # Before and after the others a part of the path is missing, so there they count as skipped.
         i = i[kept | ~seen(kept) | ~seen(kept[::-1])[::-1]]
     tree = reader.tree_of(body, frame)
-    return RecordedFrames(
-        "lidar-2d" if is_planar else "lidar",
-        body,
-        clouds.stamps_ns[i],
-        entry_at,
-        notes,
-        choices=[f"{clouds.topic.name}: {choice}" for choice in choices],
-    )
+    log = _log(reader, "lidar-2d" if is_planar else "lidar", body, clouds.stamps_ns[i], entry_at, notes)
+    return replace(log, choices=[f"{clouds.topic.name}: {choice}" for choice in choices])
 
 
 def _usual_frame(reader: RecordingReader, clouds: Series, first: str) -> str:

@@ -1,6 +1,7 @@
 """Sensors of a recording beside the one that is tracked, and where tf says that they are on its body."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -12,14 +13,14 @@ from mapper.sources.config import SourceConfig
 from mapper.sources.multi_session_log import shifted
 from mapper.sources.ros.message_index import Series
 from mapper.sources.ros.reader import RecordingReader
-from mapper.sources.ros.recorded_frames import RecordedFrames, lidar_frames, rgbd_frames
+from mapper.sources.ros.recorded_frames import log_of_frames
 from mapper.sources.ros.topics import CameraTopics
 
 
 def sensors_beside(
     reader: RecordingReader,
     topics: Sequence[Series | CameraTopics],
-    tracked: RecordedFrames,
+    tracked: Log,
     config: SourceConfig,
 ) -> tuple[list[SensorBeside], list[str]]:
     """Return the sensors that can be fused, and a sentence on what is done with each.
@@ -36,51 +37,40 @@ def sensors_beside(
     for one in topics:
         name = one.depth.topic.name if isinstance(one, CameraTopics) else one.topic.name
         try:
-            if isinstance(one, CameraTopics):
-                frames = rgbd_frames(reader, one, config)
-            else:
-                frames = lidar_frames(reader, one, config)
-            T_body_sensor = _mounting(reader, tracked.body, frames)
+            log = log_of_frames(reader, one, config)
+            T_body_sensor = _mounting(reader, tracked.body_frame, log)
         except SourceError as error:
             sentences.append(f"{name}: not fused: {error}")
             continue
         taken_ns = [tracked.stamps_ns, *(sensor.log.stamps_ns for sensor in found)]
-        found.append(SensorBeside(_log(reader, name, frames, np.concatenate(taken_ns)), T_body_sensor))
-        is_tracked = config.topics.others == "tracked" and tracked.sensor == frames.sensor == "lidar"
+        distinct = _with_own_stamps(replace(log, name=name), np.concatenate(taken_ns))
+        found.append(SensorBeside(distinct, T_body_sensor))
+        is_tracked = config.topics.others == "tracked" and tracked.sensor == log.sensor == "lidar"
         how = "tracked with the others, and fused" if is_tracked else "fused too, at the poses of the path"
         sentences.append(f"{name}: {how}; source.topics.others=unused leaves it out")
-        sentences += frames.notes
+        sentences += log.notes
     return found, sentences
 
 
-def _mounting(reader: RecordingReader, body: str, frames: RecordedFrames) -> Transform:
+def _mounting(reader: RecordingReader, body: str, log: Log) -> Transform:
     """Return T_body_sensor by tf.
 
     Raises:
         SourceError: tf does not state it, or it moves, or a LiDAR's frame is the robot's base.
     """
-    sensor = frames.body
+    sensor = log.body_frame
     T_body_sensor = reader.tree.find(body, sensor)
     if T_body_sensor is None:
         raise SourceError(f"tf does not say where {sensor} is on {body}")
     if reader.tree.moves(body, sensor):
         raise SourceError(f"{sensor} moves on {body}")
-    if frames.sensor == "lidar" and sensor == reader.base_of(sensor):
+    if log.sensor == "lidar" and sensor == reader.base_of(sensor):
         raise SourceError(f"{sensor} is the robot's base, where copies of other sensors' clouds are")
     return T_body_sensor
 
 
-def _log(reader: RecordingReader, name: str, frames: RecordedFrames, taken_ns: Stamps) -> Log:
-    """Return a sensor's log; its stamps are raised by as few nanoseconds as make them differ from others."""
-    log = Log(
-        path=reader.recording.path,
-        name=name,
-        kind=reader.recording.kind,
-        sensor=frames.sensor,
-        stamps_ns=frames.stamps_ns,
-        entry_at=frames.entry_at,
-        depth_noise=frames.depth_noise,
-    )
+def _with_own_stamps(log: Log, taken_ns: Stamps) -> Log:
+    """Return a log whose stamps are raised by as few nanoseconds as make them differ from others."""
     shift_ns = 0
     while np.isin(log.stamps_ns + shift_ns, taken_ns).any():
         shift_ns += 1

@@ -16,13 +16,7 @@ from mapper.sources.ros.frame_tree import BY_TF, is_fixed, is_of_wheels
 from mapper.sources.ros.message_index import Series, why_unread
 from mapper.sources.ros.messages import READ, frame_of
 from mapper.sources.ros.reader import SAME_CLOCK_NS, RecordingReader
-from mapper.sources.ros.recorded_frames import (
-    RecordedFrames,
-    lidar_frames,
-    refuse_body_frame,
-    rgbd_frames,
-    stereo_frames,
-)
+from mapper.sources.ros.recorded_frames import log_of_frames, refuse_body_frame
 from mapper.sources.ros.sensors_beside import sensors_beside
 from mapper.sources.ros.topics import CameraTopics, Choice, StereoTopics, choose
 from mapper.sources.wheel_files import usable
@@ -61,55 +55,41 @@ def recording_log(reader: RecordingReader, config: SourceConfig) -> Log:
         )
     reader.follow_clock(main)
     choice, clock_notes = _on_clock_of(main, choice)
-    if isinstance(choice.frames, CameraTopics):
-        frames = rgbd_frames(reader, choice.frames, config)
-    elif isinstance(choice.frames, StereoTopics):
-        frames = stereo_frames(reader, choice.frames, config)
-    else:
-        frames = lidar_frames(reader, choice.frames, config)
-    truth, truth_choices, truth_notes = _truth(reader, choice, config, body=frames.body)
-    accelerations, imu_notes = reader.accelerations(choice.imu, body=frames.body)
-    gyroscope, gyroscope_notes = reader.gyroscope(choice.gyroscope, body=frames.body)
+    log = log_of_frames(reader, choice.frames, config)
+    body, is_planar = log.body_frame, log.sensor == "lidar-2d"
+    truth, truth_choices, truth_notes = _truth(reader, choice, config, body=body)
+    accelerations, imu_notes = reader.accelerations(choice.imu, body=body)
+    gyroscope, gyroscope_notes = reader.gyroscope(choice.gyroscope, body=body)
     imu_notes = list(dict.fromkeys([*imu_notes, *gyroscope_notes]))  # of one topic, the same order
-    wheels, wheel_notes = reader.wheels(
-        choice.wheels, body=frames.body, config=config.wheels, sensor=frames.sensor
-    )
-    if choice.wheels is None and frames.sensor == "lidar-2d":
-        wheels, wheel_notes = reader.wheels_by_tf(frames.body, config=config.wheels, sensor=frames.sensor)
-    wheels, use_notes = (rolling if frames.sensor == "lidar-2d" else usable)(wheels)
-    wheel_notes = [*wheel_notes, *use_notes]
-    gnss, gnss_notes = reader.gnss(choice.gnss, body=frames.body)
+    wheels, wheel_notes = reader.wheels(choice.wheels, body=body, config=config.wheels, sensor=log.sensor)
+    if choice.wheels is None and is_planar:
+        wheels, wheel_notes = reader.wheels_by_tf(body, config=config.wheels, sensor=log.sensor)
+    wheels, use_notes = (rolling if is_planar else usable)(wheels)
+    gnss, gnss_notes = reader.gnss(choice.gnss, body=body)
     tf_notes = [
         f"tf {link}: its poses are not finite or have no direction; left out" for link in reader.tree.damaged
     ]
     if reader.tree.contradicted:
         told = listed(reader.tree.contradicted)
         tf_notes.append(f"tf contradicts itself; of static frames the last is used, as in tf2: {told}")
-    mounting, mounting_choices = _mounting(reader, frames, config)
-    cameras = [images_beside(reader, camera, body=frames.body) for camera in choice.cameras]
+    mounting, mounting_choices = _mounting(reader, log, config)
+    cameras = [images_beside(reader, camera, body=body) for camera in choice.cameras]
     images = [one for one in cameras if isinstance(one, CameraImages)]
-    beside, beside_choices = sensors_beside(reader, choice.beside, frames, config)
-    return Log(
-        path=recording.path,
-        name=recording.path.resolve().stem,
-        kind=recording.kind,
-        sensor=frames.sensor,
-        stamps_ns=frames.stamps_ns,
-        entry_at=frames.entry_at,
+    beside, beside_choices = sensors_beside(reader, choice.beside, log, config)
+    return replace(
+        log,
         truth=truth,
         accelerations=accelerations,
         gyroscope=gyroscope,
         gnss=gnss,
         images=images,
         beside=beside,
-        body_frame=frames.body,
-        sensors=_sensors(reader, frames.body, mounting.get("base_frame", frames.body)),
+        sensors=_sensors(reader, body, mounting.get("base_frame", body)),
         **mounting,
         wheels=wheels,
-        depth_noise=frames.depth_noise,
         choices=[
             *choice.choices,
-            *frames.choices,
+            *log.choices,
             *truth_choices,
             *(one.choice if isinstance(one, CameraImages) else one for one in cameras),
             *beside_choices,
@@ -119,10 +99,11 @@ def recording_log(reader: RecordingReader, config: SourceConfig) -> Log:
             *choice.notes,
             *problems,
             *clock_notes,
-            *frames.notes,
+            *log.notes,
             *tf_notes,
             *truth_notes,
             *wheel_notes,
+            *use_notes,
             *imu_notes,
             *gnss_notes,
         ],
@@ -159,17 +140,15 @@ def _offered_truth(reader: RecordingReader, body: str) -> list[str]:
     ]
 
 
-def _mounting(
-    reader: RecordingReader, frames: RecordedFrames, config: SourceConfig
-) -> tuple[dict[str, Any], list[str]]:
+def _mounting(reader: RecordingReader, log: Log, config: SourceConfig) -> tuple[dict[str, Any], list[str]]:
     """Return the fields of a log that say where the body is on the robot, and which frames have a base.
 
     Raises:
         SourceError: The frame that the settings name is none of the robot's.
     """
-    body = frames.body
+    body = log.body_frame
     base = reader.base_of(body)
-    if frames.sensor == "rgbd" and config.body_frame is not None:  # a LiDAR's body is that frame itself
+    if log.sensor == "rgbd" and config.body_frame is not None:  # a LiDAR's body is that frame itself
         base = config.body_frame.lstrip("/")
         refuse_body_frame(reader, base, body)
     if base is None:
@@ -177,14 +156,14 @@ def _mounting(
     fields = {"base_frame": base, "base_height_m": reader.height_of(base)}
     if not reader.tree.moves(base, body):
         return {**fields, "T_base_body": reader.tree.find(base, body)}, []
-    known, T_body_base = reader.tree_of(base, body).find_each(body, base, frames.stamps_ns)
+    known, T_body_base = reader.tree_of(base, body).find_each(body, base, log.stamps_ns)
     choices = []
     if not known.all():
         choices.append(
             f"tf moves {body} on {base}, and says where at {known.sum()} of {len(known)} frames: only of "
             "these are the robot's poses written (base.tum)"
         )
-    return {**fields, "T_body_base": Trajectory(frames.stamps_ns[known], T_body_base)}, choices
+    return {**fields, "T_body_base": Trajectory(log.stamps_ns[known], T_body_base)}, choices
 
 
 def _sensors(reader: RecordingReader, body: str, base: str) -> list[MountedSensor]:
