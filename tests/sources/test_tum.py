@@ -180,7 +180,7 @@ def test_the_camera_is_as_large_as_the_first_readable_image(tiny_tum_log):
     assert open_source(log)[1].camera.width_px == 64
     for path in (log / "rgb").iterdir():
         path.write_bytes(b"")
-    with pytest.raises(SourceError, match=r"none of 3 colour images can be read; the first: .*: empty file"):
+    with pytest.raises(SourceError, match=r"none of 3 images can be read; the first: .*: empty file"):
         open_source(log)
 
 

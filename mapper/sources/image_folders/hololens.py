@@ -61,9 +61,7 @@ def read_log(path: Path, config: SourceConfig) -> Log:
     folder = next((path / name for name in _COLOUR_FOLDERS if (path / name).is_dir()), path / "PV")
     colour_ns, colours = _stamped(folder, ".bytes", ".png")
     depth_ns, depths = _stamped(path / _DEPTH, ".pgm")
-    depth_px, reason = first_size(depths, lambda file: read_depth_m(file, MM_PER_M))
-    if depth_px is None:
-        raise SourceError(f"{path / _DEPTH}: none of {len(depths)} images can be read; the first: {reason}")
+    depth_px = first_size(depths, lambda file: read_depth_m(file, MM_PER_M), where=f"{path / _DEPTH}")
     rays = _unit_rays(path / f"{_DEPTH}_lut.bin", depth_px)
     stated = replace(stated, depth=_depth_camera(path, poses, rays))
     camera = camera_of(path, config, stated)

@@ -37,7 +37,7 @@ from mapper.sources.kitti_calibration import (
 from mapper.sources.listed_files import only_one
 from mapper.sources.scan_stamps import Wording, in_order, scan_stamps
 from mapper.sources.stereo import StereoCamera, rectified_pair, rectify, refuse_settings
-from mapper.sources.text import time_order, truth_from
+from mapper.sources.text import truth_from
 from mapper.sources.trajectory_files import read_kitti
 
 _COLOUR, _GREY = ("2", "3"), ("0", "1")
@@ -91,14 +91,10 @@ def read_log(path: Path, config: SourceConfig) -> Log:
             )
         right_ns, more = _stamps(pairs, pairs.right, config)
         notes = list(dict.fromkeys([*notes, *more]))
-    size_px, reason = first_size(pairs.left, read_grey)
-    if size_px is None:
-        raise SourceError(
-            f"{pairs.left[0].parent}: none of {len(pairs.left)} images can be read; the first: {reason}"
-        )
+    size_px = first_size(pairs.left, read_grey, where=f"{pairs.left[0].parent}")
     camera, T_body_first = _raw_camera(pairs, size_px) if pairs.is_raw else _camera(pairs, size_px)
-    left, order_notes = _in_time(left_ns, pairs.left)
-    right, _ = _in_time(right_ns, pairs.right)
+    left, order_notes = ImageList.in_time(left_ns, pairs.left, what="pairs")
+    right, _ = ImageList.in_time(right_ns, pairs.right, what="pairs")
     log = stereo_log(
         left,
         right,
@@ -145,11 +141,6 @@ def _stamps(pairs: _Pairs, files: Sequence[Path], config: SourceConfig) -> tuple
         rate_hz=config.rate_hz,
         wording=Wording("pairs", stamps_file=beside.name),
     )
-
-
-def _in_time(stamps_ns: Stamps, files: Sequence[Path]) -> tuple[ImageList, list[str]]:
-    order, notes = time_order(stamps_ns, what="pairs")
-    return ImageList(stamps_ns[order], [files[i] for i in order]), notes
 
 
 def _camera(pairs: _Pairs, size_px: Size) -> tuple[StereoCamera, Transform]:

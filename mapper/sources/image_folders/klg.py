@@ -48,12 +48,10 @@ def read_frames(path: Path, config: SourceConfig) -> PosedFrames:
         is_jpeg = file.read(len(jpeg.START)) == jpeg.START
     width_px = isqrt(first.size * 4 // 9)  # of 4:3, as its depth cameras have
     size_px = (
-        first_size([image for *_, image in frames], read_grey)[0]
+        first_size([image for *_, image in frames], read_grey, where=f"{path}")
         if is_jpeg
         else (width_px, width_px * 3 // 4)
     )
-    if size_px is None:
-        raise SourceError(f"{path}: none of its images can be read")
     camera = camera_of(path, config, None)
     units_per_m = camera.depth_units_per_m or MM_PER_M
     is_packed = first_depth.size != 2 * size_px[0] * size_px[1]

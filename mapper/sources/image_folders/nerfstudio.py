@@ -90,10 +90,9 @@ def read_frames(folder: Path, config: SourceConfig) -> PosedFrames:
 
 def _camera_by_angles(listed: _Transforms, images: Sequence[Path], origin: str) -> Calibration | None:
     """Return the camera of NeRF's lists: its angles of view, with the images' centre as principal point."""
-    size_px, _ = first_size(images, read_grey)
-    if size_px is None or listed.camera_angle_x is None:
+    if listed.camera_angle_x is None:
         return None
-    width_px, height_px = size_px
+    width_px, height_px = size_px = first_size(images, read_grey, where=origin)
     fx_px = 0.5 * width_px / tan(0.5 * listed.camera_angle_x)
     fy_px = 0.5 * height_px / tan(0.5 * listed.camera_angle_y) if listed.camera_angle_y else fx_px
     return Calibration(origin, fx_px, fy_px, 0.5 * (width_px - 1), 0.5 * (height_px - 1), size_px=size_px)

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 
@@ -26,6 +27,15 @@ class ImageList:
 
     stamps_ns: Stamps
     paths: Sequence[ImageFile]
+
+    @classmethod
+    def in_time(
+        cls, stamps_ns: Stamps | Sequence[int], paths: Sequence[ImageFile], *, what: str
+    ) -> tuple[Self, list[str]]:
+        """Return images of any order by their stamps, and notes on what that changed in ``what``."""
+        stamps = np.asarray(stamps_ns, np.int64)
+        order, notes = time_order(stamps, what=what)
+        return cls(stamps[order], [paths[i] for i in order]), notes
 
 
 def usable_pairs(

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -266,19 +267,21 @@ def assumed_camera_note(camera: Calibration) -> str:
 def _camera_of(
     pairs: Sequence[FramePair], calibration: Calibration, *, depth_units_per_m: float, path: Path
 ) -> RecordedCamera:
-    colour_px, why = first_size([pair.colour for pair in pairs], read_grey)
-    if colour_px is None:
-        raise SourceError(f"none of {len(pairs)} colour images can be read; the first: {why}")
-    depth_px, _ = first_size(
-        [pair.depth for pair in pairs], lambda file: read_depth_m(file, depth_units_per_m)
-    )
-    return recorded_camera(calibration, colour_px=colour_px, depth_px=depth_px or colour_px, where=f"{path}")
+    colour_px = depth_px = first_size([pair.colour for pair in pairs], read_grey, where=f"{path}")
+    with suppress(SourceError):  # each frame says why it has no depth
+        depths = [pair.depth for pair in pairs]
+        depth_px = first_size(depths, lambda file: read_depth_m(file, depth_units_per_m), where=f"{path}")
+    return recorded_camera(calibration, colour_px=colour_px, depth_px=depth_px, where=f"{path}")
 
 
 def first_size(
-    files: Sequence[ImageFile], read: Callable[[ImageFile], Image | DepthImage]
-) -> tuple[Size | None, str]:
-    """Return width and height of the first image that can be read; None, and why not the first, without."""
+    files: Sequence[ImageFile], read: Callable[[ImageFile], Image | DepthImage], *, where: str
+) -> Size:
+    """Return width and height of the first image that can be read.
+
+    Raises:
+        SourceError: None can; the message begins with ``where``.
+    """
     first_reason = ""
     for file in files:
         try:
@@ -286,8 +289,8 @@ def first_size(
         except FrameError as error:
             first_reason = first_reason or str(error)
         else:
-            return (width_px, height_px), ""
-    return None, first_reason
+            return width_px, height_px
+    raise SourceError(f"{where}: none of {len(files)} images can be read; the first: {first_reason}")
 
 
 def unpaired_note(

@@ -9,8 +9,6 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-import numpy as np
-
 from mapper.core.errors import SourceError
 from mapper.core.geometry import Transform, inverse
 from mapper.core.trajectory import Trajectory
@@ -23,7 +21,7 @@ from mapper.sources.image_folders.rgbd import FramePair, first_size, rgbd_log
 from mapper.sources.imu_files import read_euroc_imu
 from mapper.sources.listed_files import within
 from mapper.sources.stereo import StereoCamera, rectify, refuse_settings
-from mapper.sources.text import parse_stamp, rows, time_order
+from mapper.sources.text import parse_stamp, rows
 from mapper.sources.trajectory_files import read_tum
 
 _TRUTH = ("state_groundtruth_estimate0", "mocap0")
@@ -99,11 +97,7 @@ def _euroc(path: Path) -> Path | None:
 def _euroc_log(path: Path, folder: Path, config: SourceConfig) -> Log:
     notes: list[str] = []
     left, right = (_listed(folder / name, notes) for name in ("cam0", "cam1"))
-    size_px, reason = first_size(left.paths, partial(read_view, in_colour=False))
-    if size_px is None:
-        raise SourceError(
-            f"{folder / 'cam0'}: none of {len(left.paths)} images can be read; the first: {reason}"
-        )
+    size_px = first_size(left.paths, partial(read_view, in_colour=False), where=f"{folder / 'cam0'}")
     left_camera, right_camera = _euroc_cameras(path, folder)
     T_left_right = inverse(left_camera.T_unit_camera) @ right_camera.T_unit_camera
     camera = rectify(left_camera.calibration, right_camera.calibration, T_left_right, size_px)
@@ -137,10 +131,9 @@ def _listed(folder: Path, notes: list[str]) -> ImageList:
         paths.append(within(folder / "data", words[1], where=where))
     if not paths:
         raise SourceError(f"{path}: empty list; want lines of: stamp in nanoseconds, filename")
-    stamps = np.array(stamps_ns, np.int64)
-    order, order_notes = time_order(stamps, what=f"{folder.name}/{path.name}")
+    images, order_notes = ImageList.in_time(stamps_ns, paths, what=f"{folder.name}/{path.name}")
     notes += order_notes
-    return ImageList(stamps[order], [paths[i] for i in order])
+    return images
 
 
 def _euroc_cameras(path: Path, folder: Path) -> tuple[UnitCamera, UnitCamera]:

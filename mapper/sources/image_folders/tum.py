@@ -32,7 +32,6 @@ from mapper.sources.text import (
     poses_from_numbers,
     read_lines,
     table,
-    time_order,
     told_without_rotations,
     truth_from,
 )
@@ -222,10 +221,9 @@ def _images(folder: Path, rows: Sequence[tuple[str, ...]], notes: list[str], *, 
         raise SourceError(f"{path}: none of its {len(paths)} images exists; the first is {paths[0]}")
     if len(kept) < len(paths):
         notes.append(f"{name}: {len(paths) - len(kept)} of {len(paths)} listed images do not exist; dropped")
-    stamps = np.array([stamps_ns[i] for i in kept], dtype=np.int64)
-    order, order_notes = time_order(stamps, what=name)
+    images, order_notes = ImageList.in_time([stamps_ns[i] for i in kept], [paths[i] for i in kept], what=name)
     notes.extend(order_notes)
-    return ImageList(stamps[order], [paths[kept[i]] for i in order])
+    return images
 
 
 def _name_of(path: Path) -> str:

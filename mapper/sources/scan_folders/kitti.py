@@ -121,9 +121,7 @@ def with_images(log: Log, sequence: Path, scans: Sequence[Path]) -> Log:
     stamps_ns, files = zip(*paired, strict=True)
     refuse_links_out(files, log=sequence)
     try:
-        size_px, reason = first_size(files, read_grey)
-        if size_px is None:
-            raise SourceError(f"none of {len(files)} images in {folder} can be read; the first: {reason}")
+        size_px = first_size(files, read_grey, where=f"{folder}")
         projection, T_camera_lidar = _camera(sequence, is_raw=folder.name == "data")
         fx, fy, cx, cy = (projection[k] for k in ((0, 0), (1, 1), (0, 2), (1, 2)))
         recorded = recorded_camera(
