@@ -4,9 +4,11 @@ import os
 import shutil
 import stat
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from hashlib import sha256
 from pathlib import Path
+from threading import Event, Thread
 from typing import Any, Literal, get_args, get_origin
 
 import numpy as np
@@ -200,7 +202,8 @@ class Sandbox:
         rng, work = np.random.default_rng(line.seed), self._folder / "work"
         file = ", ".join(f"{damage(work, kind, rng)} ({kind})" for kind in line.damages)
         before = _content(self._folder)
-        reading = self._child.ask([LINE, str(work), *line.verb, *line.words], limit_s=SECOND_LIMIT_S)
+        with _written(work / "pipe"):
+            reading = self._child.ask([LINE, str(work), *line.verb, *line.words], limit_s=SECOND_LIMIT_S)
         if not reading.is_fault and (broken := self._broken_rule(line, reading, before)):
             reading = Reading("error", f"{broken}; {reading.outcome}: {reading.detail}")
         return replace(reading, file=file, command=repr([*line.verb, *line.words]))
@@ -221,6 +224,25 @@ class Sandbox:
         results = [*map(_within(self._folder), line.results), "work"]
         new = [name for name in new if not any(_lies_in(name, one) for one in results)]
         return f"lost {lost[:3]}" if lost else f"wrote {new[:3]}" if new else ""
+
+
+@contextmanager
+def _written(pipe: Path) -> Iterator[None]:
+    """Write nothing into a pipe whenever it is read; a verb that it is named to as a text waits for that."""
+    done = Event()
+
+    def write() -> None:
+        while not done.wait(0.05):
+            with suppress(OSError):  # nobody reads it
+                os.close(os.open(pipe, os.O_WRONLY | os.O_NONBLOCK))
+
+    writer = Thread(target=write)
+    writer.start()
+    try:
+        yield
+    finally:
+        done.set()
+        writer.join()
 
 
 def _within(folder: Path) -> Any:
