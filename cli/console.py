@@ -88,7 +88,7 @@ def log_kept(path: Path | None) -> Iterator[None]:
     try:
         if path.exists() and not (path.is_file() and _LOGGED.match(path.open("rb").read(_LOGGED_BYTES))):
             raise ConfigError(f"--log-file {path}: is there already, and is no log of mapper; name another")
-        handler = logging.FileHandler(path, encoding="utf-8")
+        handler = logging.FileHandler(path, encoding="utf-8", errors="backslashreplace")
     except OSError as error:
         raise ConfigError(f"--log-file {path}: {error.strerror}") from None
     handler.setFormatter(logging.Formatter("%(asctime)s %(message)s"))

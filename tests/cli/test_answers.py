@@ -148,6 +148,8 @@ def test_a_log_file_keeps_what_is_printed_with_times(desk_run, tmp_path):
     printed = [line for line in shown.splitlines() if line]
     assert [line for line in lines if line in printed] == 2 * printed
     assert lines[-1] == f"SourceError: {tmp_path / 'none'}: no such file or folder"
+    mapper("inspect", tmp_path / "\udcff", "--log-file", log, status=1)  # a name that is no UTF-8
+    assert r"\udcff: no such file or folder" in log.read_text().splitlines()[-1]
     mapper("inspect", tmp_path, "--log-file", tmp_path / "none" / "a.log", status=1)
     for name in ("graph.g2o", "cloud.ply"):
         before = desk_run.file(name).read_bytes()
