@@ -6,7 +6,7 @@ from pydantic import Field, PositiveFloat, PositiveInt
 
 from mapper.core.config import Config
 
-_ENOUGH = 0.3  # of the most features
+_ENOUGH = 300  # however many are allowed: a limit that is raised must not lower the threshold
 
 
 class _DetectorConfig(Config):
@@ -26,8 +26,8 @@ class _AdaptiveConfig(_DetectorConfig):
 
     @property
     def enough_features(self) -> int:
-        """With fewer features the threshold is halved: three tenths of the most."""
-        return round(_ENOUGH * self.max_features)
+        """With fewer features the threshold is halved."""
+        return min(_ENOUGH, self.max_features)
 
 
 class SurfConfig(_AdaptiveConfig):

@@ -9,7 +9,7 @@ import pytest
 
 from mapper.core.errors import DataError
 from mapper.features.base import Features
-from mapper.features.config import DetectorConfig, OrbConfig, UniformOrbConfig
+from mapper.features.config import DetectorConfig, OrbConfig, SurfConfig, UniformOrbConfig
 from mapper.features.factory import build_detector
 from mapper.features.uniform_orb_kernels import corners, fast_scores, orientations, spread
 
@@ -114,6 +114,15 @@ def test_threshold_falls_until_a_faint_image_gives_enough(kind):
     strict = build_detector(config.model_copy(update={"min_threshold": config.threshold})).detect(faint)
 
     assert len(eager) > len(strict)
+
+
+def test_a_larger_limit_does_not_lower_the_threshold():
+    image = texture(1)
+
+    few, many = (build_detector(SurfConfig(max_features=n)).detect(image) for n in (1000, 5000))
+
+    assert 300 < len(few) < 1000
+    assert same(few, many)
 
 
 def test_features_refuse_rows_that_differ():
