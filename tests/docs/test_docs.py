@@ -163,9 +163,9 @@ def layers() -> tuple[str, ...]:
 
 
 def test_what_does_not_exist_is_found():
-    assert {"seams", "decisions"} <= anchors_of(ROOT / "docs/architecture.md")
+    assert {"extension-points", "decisions"} <= anchors_of(ROOT / "docs/architecture.md")
     assert "the-sensors-own-vehicle" in anchors_of(ROOT / "docs/your-sensor.md")
-    assert "seems" not in anchors_of(ROOT / "docs/architecture.md")
+    assert "extension-point" not in anchors_of(ROOT / "docs/architecture.md")
     assert "Isvd.fit_weighted" in names_in(ROOT / "mapper/registration/isvd.py")
     assert "Isvd.weighted_fit" not in names_in(ROOT / "mapper/registration/isvd.py")
     assert resolves("mapper.pipeline.build.build")
