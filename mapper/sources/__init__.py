@@ -36,6 +36,7 @@ FORMATS = (
     "image_folders.stereo_pairs",
     RECORDING,
     "scan_folders.ouster_pcap",
+    "scan_folders.ouster_osf",
     "scan_folders.velodyne_pcap",
     "scan_folders.e57",
     "scan_folders.carmen",
@@ -54,7 +55,6 @@ _OTHER_FILES = {
     **dict.fromkeys(_ARCHIVES, "an archive; unpack it, and open the folder"),
     **dict.fromkeys(_VIDEOS, "a video, which has no depth; open the folder of its log"),
     **dict.fromkeys((*_IMAGES, ".exr"), "one image; open the folder of its log"),
-    ".osf": "an Ouster's format; with ouster-sdk in a venv of its own: ouster-cli source X.osf save X.pcap",
     **dict.fromkeys(
         (".svo", ".svo2"),
         "a ZED's own format; export images and depth with its SDK, or record zed-ros2-wrapper's topics",
@@ -67,7 +67,7 @@ _OTHER_FILES = {
     ".npz": "arrays of NumPy; write each cloud as .npy, or images as .png, into a folder",
 }
 """What files are that are no logs, and what to do, by their ending."""
-_RECORDINGS = (".mcap", ".bag", ".db3", ".klg", ".mkv", ".r3d", ".pcap", ".pcapng")
+_RECORDINGS = (".mcap", ".bag", ".db3", ".klg", ".mkv", ".r3d", ".pcap", ".pcapng", ".osf")
 """Endings of logs that are one file each, of which a folder may hold several."""
 
 
@@ -77,7 +77,7 @@ def open_source(path: Path, config: SourceConfig = _DEFAULTS) -> "Log":
     Args:
         path: Folder of a TUM, ICL-NUIM, Poznań, 7-Scenes, Redwood, ScanNet, Replica, EuRoC or KITTI log,
             of an app's export (Stray Scanner, Record3D, Polycam, nerfstudio), of a HoloLens 2 or of clouds;
-            an mbag, .sens, .klg, .r3d, .mkv (Azure Kinect), .e57, .pcap or MCAP file, CARMEN log or ROS bag.
+            an mbag, .sens, .klg, .r3d, .mkv (Azure), .e57, .pcap, .osf or MCAP file, CARMEN log or ROS bag.
         config: Selection, pairing, camera, and what the files of a log do not state.
 
     Raises:

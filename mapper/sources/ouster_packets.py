@@ -90,6 +90,8 @@ class OusterMetadata(BaseModel):
     beam_to_lidar_transform: Matrix | None = None
     lidar_to_sensor_transform: Matrix = [-1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1, 36.18, 0, 0, 0, 1]
     imu_to_sensor_transform: Matrix = [1, 0, 0, 6.253, 0, 1, 0, -11.775, 0, 0, 1, 7.645, 0, 0, 0, 1]
+    extrinsic: Matrix = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
+    pixel_shift_by_row: list[Annotated[int, Field(ge=-(1 << 12), le=1 << 12)]] = []
     prod_sn: int | str = 0
 
     @model_validator(mode="before")
@@ -118,6 +120,9 @@ class OusterSensor:
         packet_bytes: Size of its LiDAR packets.
         T_sensor_imu: Pose of its IMU in its own frame.
         T_sensor_lidar: Pose of its LiDAR in its own frame.
+        T_base_sensor: Its pose as the user told Ouster's SDK; the identity if it was not told.
+        shape: Its beams, and the columns of a turn.
+        shifts: (beams,) columns by which the SDK moves each beam's, so that images are upright.
     """
 
     def __init__(self, text: str, *, where: str) -> None:
@@ -142,6 +147,9 @@ class OusterSensor:
         self.serial = int(found.prod_sn) if f"{found.prod_sn}".isdecimal() else 0
         self.T_sensor_imu = _pose_m(found.imu_to_sensor_transform, where=where)
         self.T_sensor_lidar = _pose_m(found.lidar_to_sensor_transform, where=where)
+        self.T_base_sensor = _pose_m(found.extrinsic, where=where, unit_m=1.0)
+        self.shape = beams, found.columns_per_frame
+        self.shifts = found.pixel_shift_by_row
         self._is_legacy = found.udp_profile_lidar == "LEGACY"
         is_fusa = found.udp_profile_lidar.startswith("FUSA")
         column_bytes = (20 if self._is_legacy else 12) + beams * layout.pixel_bytes
@@ -192,27 +200,48 @@ class OusterSensor:
         columns = np.ascontiguousarray(data[:, self._first : end]).view(self._column).reshape(-1)
         columns = columns[(columns["status"] & 1 == 1) & (columns["number"] < self._found.columns_per_frame)]
         words = np.ascontiguousarray(columns["pixels"]).view(np.uint8)
-        beams = len(self._found.beam_altitude_angles)
-        words = words.reshape(len(columns), beams, self._layout.pixel_bytes)
-        times_s = ((_signed(columns["ns"]) - stamp_ns) / NS_PER_S).astype(np.float32)
-        parts = [self._returns(words, columns["number"], times_s, k) for k in range(self._layout.returns)]
+        words = words.reshape(len(columns), self.shape[0], self._layout.pixel_bytes)
+        returns = [self._return(words, k) for k in range(self._layout.returns)]
+        return self.scan_of(returns, columns["number"], _signed(columns["ns"]), stamp_ns)
+
+    def scan_of(
+        self,
+        returns: Sequence[tuple[NDArray[np.unsignedinteger], NDArray[np.unsignedinteger]]],
+        numbers: NDArray[np.integer],
+        columns_ns: Stamps,
+        stamp_ns: int,
+    ) -> Scan:
+        """Return measured columns in the sensor's frame, with times and reflectivities.
+
+        Args:
+            returns: (N, beams) ranges in millimetres, 0 of none, and reflectivities of each return of a beam.
+            numbers: (N,) number of each column within its turn.
+            columns_ns: (N,) time of each.
+            stamp_ns: Time of the scan.
+        """
+        times_s = ((columns_ns - stamp_ns) / NS_PER_S).astype(np.float32)
+        parts = [self._points(*one, numbers.astype(np.intp), times_s) for one in returns]
         points, times, reflectivities = (np.concatenate(part) for part in zip(*parts, strict=True))
         return Scan(stamp_ns, points, times_s=times, intensities=reflectivities)
 
-    def _returns(
-        self, words: NDArray[np.uint8], numbers: NDArray[np.uint16], times_s: NDArray[np.float32], k: int
+    def _return(self, words: NDArray[np.uint8], k: int) -> tuple[NDArray[np.uint32], NDArray[np.uint8]]:
+        ranges = np.ascontiguousarray(words[:, :, 4 * k : 4 * k + 4]).view("<u4")[:, :, 0]
+        ranges_mm = (ranges & (1 << self._layout.range_bits) - 1) * np.uint32(self._layout.unit_mm)
+        return ranges_mm.astype(np.uint32), words[:, :, 4 * k + self._layout.reflectivity]
+
+    def _points(
+        self,
+        ranges_mm: NDArray[np.unsignedinteger],
+        reflectivities: NDArray[np.unsignedinteger],
+        numbers: NDArray[np.intp],
+        times_s: NDArray[np.float32],
     ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-        beams = words.shape[1]
-        ranges = np.ascontiguousarray(words[:, :, 4 * k : 4 * k + 4]).view("<u4")[:, :, 0].reshape(-1)
-        ranges = ranges & (1 << self._layout.range_bits) - 1
-        measured = np.flatnonzero(ranges)
-        column, beam = np.divmod(measured, beams)
+        column, beam = np.nonzero(ranges_mm)
         directions, offsets, apart_m = self._rays
-        number = numbers[column].astype(np.intp)
-        ranges_m = (ranges[measured] * (self._layout.unit_mm / MM_PER_M) - apart_m).astype(np.float32)
-        points = directions[number * beams + beam] * ranges_m[:, None] + offsets[number]
-        reflectivities = words[:, :, 4 * k + self._layout.reflectivity].reshape(-1)[measured]
-        return points, times_s[column], reflectivities.astype(np.float32)
+        number = numbers[column]
+        ranges_m = (ranges_mm[column, beam] / MM_PER_M - apart_m).astype(np.float32)
+        points = directions[number * ranges_mm.shape[1] + beam] * ranges_m[:, None] + offsets[number]
+        return points, times_s[column], reflectivities[column, beam].astype(np.float32)
 
     @cached_property
     def _rays(self) -> tuple[NDArray[np.float32], NDArray[np.float32], float]:
@@ -293,9 +322,9 @@ def packet_sizes() -> frozenset[int]:
     )
 
 
-def _pose_m(numbers: Sequence[float], *, where: str) -> Transform:
+def _pose_m(numbers: Sequence[float], *, where: str, unit_m: float = 1.0 / MM_PER_M) -> Transform:
     T = np.array(numbers, np.float64).reshape(4, 4)
-    T[:3, 3] /= MM_PER_M
+    T[:3, 3] *= unit_m
     if not is_rigid(T):
         raise SourceError(f"{where}: a transform that is no rigid motion")
     return T

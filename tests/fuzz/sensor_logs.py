@@ -9,7 +9,16 @@ from tests.support.driver_recordings import street, write_pcap, write_vlp16
 from tests.support.e57_files import fields as e57_fields
 from tests.support.e57_files import write as write_e57
 from tests.support.las_files import write_las
-from tests.support.ouster_packets import imu_packet, simulated, write_capture, write_recording
+from tests.support.ouster_osf import metadata, scan_message, write_osf
+from tests.support.ouster_packets import (
+    SCAN_NS,
+    Ouster,
+    drawn,
+    imu_packet,
+    simulated,
+    write_capture,
+    write_recording,
+)
 from tests.support.planar_drives import Drive, Laser, drive, hall, write_carmen, write_ros
 from tests.support.recordings import write
 from tests.support.stereo_rig import (
@@ -41,6 +50,21 @@ def _ouster(folder: Path, *, is_captured: bool) -> Path:
     if is_captured:
         return write_capture(folder / "log.pcap", lidar, imu, metadata=sensor.metadata())
     return write_recording(folder / "log.bag", lidar, imu, metadata=sensor.metadata(flat=True))
+
+
+def _osf(folder: Path) -> Path:
+    sensor, stamps_ns = Ouster(), [k * SCAN_NS for k in range(1, 5)]
+    readings = np.array(stamps_ns), np.ones((4, 3)), np.ones((4, 3))
+    scans = [
+        (
+            ns,
+            scan_message(
+                sensor, drawn(sensor, k), stamp_ns=ns, imu=readings, encoding=("png", "zpng")[k % 2]
+            ),
+        )
+        for k, ns in enumerate(stamps_ns)
+    ]
+    return write_osf(folder / "log.osf", [scans], [metadata(sensor)], per_chunk=1)
 
 
 def _stereo(folder: Path) -> Path:
@@ -76,6 +100,7 @@ SENSOR_LOGS: Mapping[str, Callable[[Path], Path]] = {
     "pcap": _pcap,
     "pcap, ouster": lambda folder: _ouster(folder, is_captured=True),
     "bag, ouster": lambda folder: _ouster(folder, is_captured=False),
+    "osf": _osf,
     "rosbag2, stereo": _stereo,
     "euroc": _euroc,
     "euroc, kalibr": lambda folder: write_euroc(folder / "log", FISHEYE, kalibr=True),

@@ -23,6 +23,8 @@ from tests.support.ouster_packets import (
     PIXELS,
     SCAN_NS,
     Ouster,
+    check_scan,
+    drawn,
     imu_packet,
     nmea_packet,
     simulated,
@@ -31,17 +33,6 @@ from tests.support.ouster_packets import (
 )
 
 SENSOR = Ouster()
-
-
-def drawn(sensor, seed, *, holes=0.1):
-    """Return ranges such as a sensor measures, with some returns missing."""
-    returns = 2 if "DUAL" in sensor.profile else 1
-    rng = np.random.default_rng(seed)
-    ranges_mm = rng.integers(500, 120_000, (returns, len(sensor.altitudes_deg), sensor.columns)).astype(
-        np.uint32
-    )
-    ranges_mm[rng.random(ranges_mm.shape) < holes] = 0
-    return ranges_mm // 8 * 8
 
 
 def recorded(sensor, scans, **options):
@@ -66,21 +57,6 @@ def writers():
 @pytest.fixture(params=writers())
 def write(request):
     return writers()[request.param]
-
-
-def check_scan(scan: Scan, sensor, ranges_mm, stamp_ns, *, invalid=()):
-    """Compare points, times and reflectivities with those that were written, column by column."""
-    measured = ranges_mm > 0
-    measured[:, :, list(invalid)] = False
-    by_column = (0, 2, 1)
-    where = measured.transpose(by_column)
-    points = sensor.points(ranges_mm).transpose(*by_column, 3)[where]
-    times_s = np.broadcast_to(np.arange(sensor.columns)[None, :, None] * 0.1 / sensor.columns, where.shape)
-    beams = np.broadcast_to(np.arange(where.shape[2]), where.shape)
-    assert len(scan.points_body) == len(points)
-    np.testing.assert_allclose(scan.points_body, points, atol=1e-4)
-    np.testing.assert_allclose((scan.stamp_ns - stamp_ns) / 1e9 + scan.times_s, times_s[where], atol=1e-7)
-    np.testing.assert_array_equal(scan.intensities, beams[where])
 
 
 @pytest.mark.parametrize("profile", PIXELS)
@@ -237,13 +213,10 @@ def test_packets_without_fitting_metadata_are_refused_in_a_line(tmp_path, metada
     assert "\n" not in str(refused.value)
 
 
-def test_inspect_says_that_metadata_are_missing_and_osf_is_refused_with_the_command(tmp_path):
+def test_inspect_says_that_metadata_are_missing(tmp_path):
     path = write_recording(tmp_path / "a.bag", recorded(SENSOR, [drawn(SENSOR, 0)] * 2))
     with pytest.raises(SourceError, match="record its metadata topic too"):
         inspect_log(path, config=load_config(None).source)
-    (tmp_path / "a.osf").write_bytes(bytes(100))
-    with pytest.raises(SourceError, match=r"ouster-cli source .*\.osf save .*\.pcap"):
-        open_source(tmp_path / "a.osf")
 
 
 @pytest.mark.parametrize("has_metadata", [True, False])

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from mapper.core.frames import Scan
 from mapper.core.geometry import rotation_exp, transform
 from mapper.sources.base import Log
 from tests.support.driver_recordings import DriverRecording, write_captured
@@ -254,3 +255,29 @@ def simulated(
         ):
             imu.append((stamp_ns, imu_packet(stamp_ns, rates, one)))
     return sensor, lidar, imu
+
+
+def drawn(sensor, seed, *, holes=0.1):
+    """Return ranges such as a sensor measures, with some returns missing."""
+    returns = 2 if "DUAL" in sensor.profile else 1
+    rng = np.random.default_rng(seed)
+    ranges_mm = rng.integers(500, 120_000, (returns, len(sensor.altitudes_deg), sensor.columns)).astype(
+        np.uint32
+    )
+    ranges_mm[rng.random(ranges_mm.shape) < holes] = 0
+    return ranges_mm // 8 * 8
+
+
+def check_scan(scan: Scan, sensor, ranges_mm, stamp_ns, *, invalid=()):
+    """Compare points, times and reflectivities with those that were written, column by column."""
+    measured = ranges_mm > 0
+    measured[:, :, list(invalid)] = False
+    by_column = (0, 2, 1)
+    where = measured.transpose(by_column)
+    points = sensor.points(ranges_mm).transpose(*by_column, 3)[where]
+    times_s = np.broadcast_to(np.arange(sensor.columns)[None, :, None] * 0.1 / sensor.columns, where.shape)
+    beams = np.broadcast_to(np.arange(where.shape[2]), where.shape)
+    assert len(scan.points_body) == len(points)
+    np.testing.assert_allclose(scan.points_body, points, atol=1e-4)
+    np.testing.assert_allclose((scan.stamp_ns - stamp_ns) / 1e9 + scan.times_s, times_s[where], atol=1e-7)
+    np.testing.assert_array_equal(scan.intensities, beams[where])

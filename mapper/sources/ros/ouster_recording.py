@@ -19,18 +19,16 @@ from mapper.sources.ros.messages import CLOUDS, IMAGES, OUSTER_PACKETS
 from mapper.sources.ros.recording import Place, Recorded, Recording, Topic
 from mapper.sources.ros.topic_ranks import shared_namespaces
 
-_SENSOR, _LIDAR, _IMU = "os_sensor", "os_lidar", "os_imu"
+SENSOR, _LIDAR, _IMU = "os_sensor", "os_lidar", "os_imu"
 """The driver's names of its frames."""
-_CLOUD, _READING, _FRAMES = "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/Imu", "tf2_msgs/msg/TFMessage"
+CLOUD, READING, FRAMES = "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/Imu", "tf2_msgs/msg/TFMessage"
 _STRING = "std_msgs/msg/String"
 _CDR = b"\0\1\0\0"
-_HEAD_CDR, _IMU_CDR = struct.Struct("<4siII10s"), struct.Struct("<4siII7s5x37d")
-"""Header of a message in each of the two frames; behind one the numbers of an Imu."""
 _FRAMES_AT = -1
-_LAST_NS = (1 << 31) * NS_PER_S
+LAST_NS = (1 << 31) * NS_PER_S
 _LATE_TURNS = 3
 """A packet of so few turns ago was late; a larger step is a sensor that began anew to count."""
-_LEAST_SHARE = 0.5
+LEAST_SHARE = 0.5
 """Share of the usual number of packets that a scan must have: the first and the last one are cut."""
 
 _Scan = tuple[int, NDArray[np.intp]]
@@ -107,9 +105,9 @@ class OusterRecording:
             stream.add(log_ns, place)
             block = -1 - self._streams.index(stream)
             for k, reading in enumerate(imu_readings(packet)):
-                if reading[0] < _LAST_NS:
-                    topic = Topic(stream.topic.name, _READING, "cdr")
-                    yield Recorded(topic, log_ns, Place(block, number, k), _imu_cdr(*reading))
+                if reading[0] < LAST_NS:
+                    topic = Topic(stream.topic.name, READING, "cdr")
+                    yield Recorded(topic, log_ns, Place(block, number, k), imu_cdr(*reading))
                 else:
                     damaged[topic.name] = damaged.get(topic.name, 0) + 1
         self._notes += [f"{name}: {count} damaged readings; left out" for name, count in damaged.items()]
@@ -129,12 +127,12 @@ class OusterRecording:
         stream = self._streams[-1 - place.block]
         if stream.sensor is None:
             readings = list(imu_readings(self._packet(stream, place.offset)))
-            return _imu_cdr(*readings[place.length])
+            return imu_cdr(*readings[place.length])
         if place.offset == _FRAMES_AT:
-            return _frames_cdr(stream.sensor, stream.scans[0][0])
+            return frames_cdr(stream.sensor, stream.scans[0][0])
         stamp_ns, packets = stream.scans[place.offset]
         scan = stream.sensor.scan([self._packet(stream, i) for i in packets.tolist()], stamp_ns)
-        return memoryview(cloud_message(stream.topic.name, scan, frame=_SENSOR).cdr)
+        return memoryview(cloud_message(stream.topic.name, scan, frame=SENSOR).cdr)
 
     def _packet(self, stream: _Stream, i: int) -> memoryview:
         packet = _packet_of(stream.topic, self._inner.read(stream.place(i)))
@@ -162,7 +160,7 @@ class OusterRecording:
         if sensor is None:
             return
         turns, stamps_ns, _ = sensor.heads(stream.heads)
-        is_sound = (sizes == sensor.packet_bytes) & (stamps_ns >= 0) & (stamps_ns < _LAST_NS)
+        is_sound = (sizes == sensor.packet_bytes) & (stamps_ns >= 0) & (stamps_ns < LAST_NS)
         if not is_sound.all():
             self._notes.append(
                 f"{name}: {(~is_sound).sum()} of {len(sizes)} packets are damaged or have another size than "
@@ -173,7 +171,7 @@ class OusterRecording:
         scans = _scans(np.flatnonzero(is_sound), turns, stamps_ns)
         usual = int(np.median([len(packets) for _, packets in scans]))
         stream.sensor = sensor
-        stream.scans = [one for one in scans if len(one[1]) >= _LEAST_SHARE * usual]
+        stream.scans = [one for one in scans if len(one[1]) >= LEAST_SHARE * usual]
         if len(stream.scans) < len(scans):
             self._notes.append(
                 f"{name}: {len(scans) - len(stream.scans)} of {len(scans)} scans are cut; left out"
@@ -181,12 +179,11 @@ class OusterRecording:
         if missing := sum(max(0, usual - len(packets)) for _, packets in stream.scans):
             self._notes.append(f"{name}: {missing} of {usual * len(stream.scans)} packets are missing")
         block, log_ns = -1 - self._streams.index(stream), stream.numbers[::4]
-        frames, first_ns = Topic(f"{name}/tf", _FRAMES, "cdr"), stream.scans[0][0]
-        yield Recorded(frames, log_ns[0], Place(block, _FRAMES_AT, 0), _frames_cdr(sensor, first_ns))
+        frames, first_ns = Topic(f"{name}/tf", FRAMES, "cdr"), stream.scans[0][0]
+        yield Recorded(frames, log_ns[0], Place(block, _FRAMES_AT, 0), frames_cdr(sensor, first_ns))
         for number, (stamp_ns, packets) in enumerate(stream.scans):
-            head = _HEAD_CDR.pack(_CDR, *divmod(stamp_ns, NS_PER_S), len(_SENSOR) + 1, _SENSOR.encode())
-            place = Place(block, number, 0)
-            yield Recorded(Topic(name, _CLOUD, "cdr"), log_ns[int(packets[0])], place, memoryview(head))
+            place, head = Place(block, number, 0), memoryview(head_cdr(stamp_ns, SENSOR))
+            yield Recorded(Topic(name, CLOUD, "cdr"), log_ns[int(packets[0])], place, head)
 
     def _sensor_of(
         self, stream: _Stream, sizes: NDArray[np.int64], sensors: Mapping[str, OusterSensor]
@@ -251,13 +248,25 @@ def _packet_of(topic: Topic, data: memoryview) -> memoryview | None:
     return found if len(found) == size else None
 
 
-def _imu_cdr(stamp_ns: int, rates_radps: Array, acceleration_mps2: Array) -> memoryview:
+def head_cdr(stamp_ns: int, frame: str) -> bytes:
+    """Return how a message with a header begins."""
+    name = frame.encode() + b"\0"
+    return struct.pack(f"<4siII{len(name)}s", _CDR, *divmod(stamp_ns, NS_PER_S), len(name), name)
+
+
+def imu_cdr(stamp_ns: int, rates_radps: Array, acceleration_mps2: Array, *, suffix: str = "") -> memoryview:
+    """Return an Imu in the frame of a sensor's IMU."""
+    head = head_cdr(stamp_ns, _IMU + suffix)
     numbers = (*(0.0,) * 13, *rates_radps.tolist(), *(0.0,) * 9, *acceleration_mps2.tolist(), *(0.0,) * 9)
-    return memoryview(
-        _IMU_CDR.pack(_CDR, *divmod(stamp_ns, NS_PER_S), len(_IMU) + 1, _IMU.encode(), *numbers)
-    )
+    return memoryview(head + bytes((len(_CDR) - len(head)) % 8) + struct.pack("<37d", *numbers))
 
 
-def _frames_cdr(sensor: OusterSensor, stamp_ns: int) -> memoryview:
-    links = [(_SENSOR, _LIDAR, sensor.T_sensor_lidar), (_SENSOR, _IMU, sensor.T_sensor_imu)]
+def frames_cdr(
+    sensor: OusterSensor, stamp_ns: int, *, suffix: str = "", base: str | None = None
+) -> memoryview:
+    """Return the transforms of a sensor's frames, and that from a base on which it is mounted."""
+    own = SENSOR + suffix
+    links = [(own, _LIDAR + suffix, sensor.T_sensor_lidar), (own, _IMU + suffix, sensor.T_sensor_imu)]
+    if base is not None:
+        links.append((base, own, sensor.T_base_sensor))
     return memoryview(transforms_message(stamp_ns, "", links).cdr)
