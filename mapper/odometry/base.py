@@ -211,7 +211,11 @@ class GyroscopeUser(Protocol):
         ...
 
     def gyroscope_calibration(self) -> GyroscopeCalibration | None:
-        """Return its calibration once the log has ended; None if it was of no use."""
+        """Return its calibration by the frames until now; None if it was of no use."""
+        ...
+
+    def begin_calibrated(self, calibration: GyroscopeCalibration, frames: int) -> None:
+        """Begin with its calibration by that many first frames, which are tracked again."""
         ...
 
 

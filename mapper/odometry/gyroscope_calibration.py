@@ -51,6 +51,11 @@ class GyroscopeCalibration:
     covariance: Array
     ratio: float = 1.0
 
+    @property
+    def is_mounting_known(self) -> bool:
+        """Whether the mounting is certain about every axis."""
+        return bool(np.sqrt(np.diag(self.covariance)[:3].max()) <= CERTAIN_RAD)
+
     def turns(
         self, gyroscope: Gyroscope, begins_ns: Stamps, ends_ns: Stamps
     ) -> tuple[Array, Array, NDArray[np.bool_]]:
@@ -103,8 +108,7 @@ def body_readings(log: Log, calibration: GyroscopeCalibration) -> InertialReadin
     states the unit's place.
     """
     gyroscope, felt = log.gyroscope, log.accelerations
-    mounting_rad = float(np.sqrt(np.diag(calibration.covariance)[:3].max()))
-    if gyroscope is None or felt is None or mounting_rad > CERTAIN_RAD:
+    if gyroscope is None or felt is None or not calibration.is_mounting_known:
         return None
     unit = unit_of_gravity(float(np.median(np.linalg.norm(felt.acceleration_mps2, axis=1))))
     turned = calibration.applied_to(gyroscope)

@@ -14,7 +14,6 @@ from mapper.core.timebase import NS_PER_S, Stamps
 from mapper.core.trajectory import Trajectory
 from mapper.graph.config import WheelNoiseConfig
 from mapper.odometry.gyroscope_calibration import (
-    CERTAIN_RAD,
     DEGREES,
     GyroscopeCalibration,
     calibrate,
@@ -81,6 +80,10 @@ class MotionPrior:
     def __getstate__(self) -> dict[str, Any]:
         """Return the state without what is made again when it is needed."""
         return {**self.__dict__, "_of_body": None, "_turns": {}}
+
+    def begin_calibrated(self, calibration: GyroscopeCalibration, frames: int) -> None:
+        """Begin with the gyroscope's calibration by the first frames; it is fitted again after as many."""
+        self._calibration, self._next_fit = calibration, frames
 
     def turn(self, begin_ns: int, end_ns: int) -> Array | None:
         """Return the rotation (3, 3) of the body between two times; None if constant velocity is better."""
@@ -238,7 +241,7 @@ class MotionPrior:
         if stated is not None:
             off = angle_between(stated.T, found.R_body_imu.T)
             origin = "from tf"
-            if off > _ANOTHER_RAD and sigmas[:3].max() < CERTAIN_RAD:
+            if off > _ANOTHER_RAD and found.is_mounting_known:
                 notes.append(
                     f"{name}: tf has it {np.degrees(off):.0f}° from where the turns of the frames have it; "
                     "the latter is used"
@@ -321,3 +324,7 @@ class WithMotionPrior:
     def gyroscope_calibration(self) -> GyroscopeCalibration | None:
         """Return the gyroscope's calibration, if the log has one that was of use."""
         return self._prior.calibration
+
+    def begin_calibrated(self, calibration: GyroscopeCalibration, frames: int) -> None:
+        """Begin with the gyroscope's calibration by that many first frames."""
+        self._prior.begin_calibrated(calibration, frames)

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterable, Sequence
+from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -37,6 +38,8 @@ from mapper.sources.merged_scans import with_merged_scans
 from mapper.sources.reading_checks import ReadingChecks
 from mapper.sources.scan_frame import scan_frame_warnings, sweep_warnings
 
+_MOST_TRACKED_TWICE = 40
+"""Scans by which a gyroscope is calibrated in advance; 8 to 21 show a mounting if the sensor turns."""
 _LOOKED_AT = 6
 """Frames, spread over a log, that are tried before it is said that none can be tracked."""
 
@@ -130,6 +133,8 @@ def track_log(
         start, _wheel_measurements(source, config), are_predicted=source.sensor == "lidar-2d"
     )
     first_pass.repeat(known, searches)
+    if not known and source.sensor != "rgbd":
+        begin_calibrated(odometry, read, config.workers)
     entries = map(read.entry_at, range(len(known), len(source)))
     observations = ordered_map(partial(_observe, odometry), entries, workers=config.workers)
     with progress.stage("track") as report:
@@ -152,6 +157,28 @@ def track_log(
             if checkpoints is not None:
                 checkpoints.add(FrameCheckpoint(result, search, ms, checks.reading(done - 1)), odometry)
     return first_pass.result(odometry, checks, progress)
+
+
+def begin_calibrated(odometry: Odometry[Any], log: Log, workers: int) -> None:
+    """Calibrate the gyroscope of an odometry before its first frame, by tracking the first scans in advance.
+
+    LI-Init (Zhu et al. 2022) does so, too: sweeps are bent until the gyroscope's mounting is known. Nothing
+    happens where the log has no gyroscope, states its mounting, or its first scans do not show it.
+    """
+    if log.gyroscope is None or log.gyroscope.R_body_imu is not None:
+        return
+    if not isinstance(odometry, GyroscopeUser):
+        return
+    trial = deepcopy(odometry)
+    entries = map(log.entry_at, range(min(len(log), _MOST_TRACKED_TWICE)))
+    for frames, observed in enumerate(ordered_map(partial(_observe, trial), entries, workers=workers), 1):
+        if isinstance(observed.observation, Skipped):
+            continue
+        trial.track(observed.observation)
+        calibration = trial.gyroscope_calibration()
+        if calibration is not None and calibration.is_mounting_known:
+            odometry.begin_calibrated(calibration, frames)
+            return
 
 
 @dataclass(frozen=True, slots=True, eq=False)

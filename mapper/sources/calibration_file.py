@@ -98,9 +98,9 @@ def read_calibration(path: Path) -> Calibration:
     These may be in text, or in .npy and .npz.
 
     TOML keys: fx_px fy_px cx_px cy_px, and optionally width_px height_px, distortion (k1 k2 p1 p2 k3, also k4
-    k5 k6 and more as OpenCV orders them, a fisheye's k1 k2 k3 k4, or a FOV lens' angle), distortion_model
-    ("equidistant", "fov"), depth_factor (image units per metre) and, where depth is not registered to colour,
-    depth_intrinsics_px (fx fy cx cy), depth_distortion and depth_in_color (x y z qx qy qz qw).
+    k5 k6 and more as OpenCV orders them, or a fisheye's k1 k2 k3 k4), distortion_model ("equidistant"),
+    depth_factor (image units per metre) and, where depth is not registered to colour, depth_intrinsics_px
+    (fx fy cx cy), depth_distortion and depth_in_color (x y z qx qy qz qw).
 
     Raises:
         SourceError: The file cannot be read, lacks a number, or (TOML) has a key of another meaning.
@@ -294,10 +294,9 @@ _BARE_NUMBERS, _BARE_COUNTS = re.compile(r"[-+\d.eE\s,;]+"), (4, 9, 16)
 _MAY_BE_OTHER = ("info.txt", "cameras.txt", "metadata.json", "transforms.json")
 _POLYNOMIAL_LENS = re.compile(r"radtan|plumb_bob|rational_polynomial", re.IGNORECASE)
 _OTHER_LENS = re.compile(
-    r"equidistant|fisheye|kannala_?brandt|(?:^|:)\s*\"?(?:(?P<unknown>omni|mei|eucm|ds)|(?P<fov>fov|atan))\"?\s*$",
+    r"equidistant|fisheye|kannala_?brandt|(?:^|:)\s*\"?(?P<unknown>omni|mei|eucm|ds|fov|atan)\"?\s*$",
     _ANY_LINE,
 )
-_KNOWN_LENSES = "plumb_bob, rational_polynomial, equidistant and fov"
 _KEY_AND_NUMBER = re.compile(
     r"(?:<camera_?matrix\b|<intrinsic_?matrix\b|<mtx\b)|(?:fl?_?x(?:_px)?|camera_?matrix|mtx|intrinsics?(?:_matrix)?(?=\"?\s*:\s*\[\s*[\d.]+\s*,)|"
     r"\bk(?=\"?\s*[:=]\s*(?:[\[-]|\S+[ ,]+\S)))\"?\s*[:=]",
@@ -321,10 +320,10 @@ def _lens_model(text: str) -> str:
     if found is None:
         return ""
     if found["unknown"]:
-        raise DataError(f"{found['unknown']} lens; known are {_KNOWN_LENSES}")
+        raise DataError(f"{found['unknown']} lens; known are plumb_bob, rational_polynomial and equidistant")
     if other := _POLYNOMIAL_LENS.search(text):
         raise DataError(f"lenses of two models, {other[0]} and {found[0]}; keep the colour camera's alone")
-    return "fov" if found["fov"] else "equidistant"
+    return "equidistant"
 
 
 def _yaml_numbers(text: str) -> tuple[dict[str, Sequence[float]], str]:
@@ -374,7 +373,7 @@ def _json_numbers(table: Any) -> tuple[Numbers, str]:
         is_by_column = not (K[2] or K[5])
         numbers["k"] = np.reshape(K, (3, 3)).T.ravel().tolist() if is_by_column else K
     if "inverse" in f"{camera.get('model', '')}".lower() and any(numbers.get("coeffs", ())):
-        raise DataError(f"{camera['model']} lens; known are {_KNOWN_LENSES}")
+        raise DataError(f"{camera['model']} lens; known are plumb_bob, rational_polynomial and equidistant")
     if camera is not table and "scale" in numbers:
         numbers["depth_factor"] = numbers["scale"]
     return numbers, model

@@ -9,17 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.frames import PinholeCamera
-from mapper.core.geometry import Array
 
 POLYNOMIAL_MODELS = frozenset({"plumb_bob", "brown_conrady", "radtan", "rational_polynomial"})
 """Names of OpenCV's model of 4, 5, 8 (rational), 12 (thin prism) or 14 (tilted) coefficients."""
 FISHEYE_MODELS = frozenset({"equidistant", "kannala_brandt", "kannala_brandt4", "fisheye"})
 """Names of the model of 4 coefficients of Kannala & Brandt (2006)."""
-FOV_MODELS = frozenset({"fov", "atan"})
-"""Names of the model of one angle of Devernay & Faugeras (2001), which OpenCV has not."""
-_CENTRE, _WIDEST_RAD = 1e-9, 1.56
 _COEFFICIENTS = {True: (4,), False: (4, 5, 8, 12, 14)}
-COEFFICIENTS_TEXT = "5, 8, 12 or 14 as OpenCV orders them, 4 of an equidistant lens, or 1 of a FOV lens"
+COEFFICIENTS_TEXT = "5, 8, 12 or 14 as OpenCV orders them, or 4 of an equidistant lens"
 
 
 def lens_model(name: str, coefficients: int) -> str:
@@ -50,29 +46,13 @@ class Lens:
         return self.model in FISHEYE_MODELS
 
     @property
-    def is_fov(self) -> bool:
-        """Whether the coefficient is the angle of the FOV model."""
-        return self.model in FOV_MODELS
-
-    @property
     def is_known(self) -> bool:
         """Whether images can be freed of it."""
-        if self.is_fov:
-            return len(self.coefficients) == 1 and 0.0 < self.coefficients[0] < np.pi
         names = FISHEYE_MODELS if self.is_fisheye else POLYNOMIAL_MODELS
         return self.model in names and len(self.coefficients) in _COEFFICIENTS[self.is_fisheye]
 
     def maps(self, camera: PinholeCamera) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Return for each pixel of the camera, (H, W) each, the column and row that it has in the image."""
-        if self.is_fov:
-            x, y = _plane(camera)
-            far, angle = np.maximum(np.hypot(x, y), _CENTRE), self.coefficients[0]
-            scale = np.arctan(2.0 * far * np.tan(angle / 2.0)) / (angle * far)
-            K = camera.matrix
-            return (
-                (K[0, 2] + K[0, 0] * x * scale).astype(np.float32),
-                (K[1, 2] + K[1, 1] * y * scale).astype(np.float32),
-            )
         size_px, coefficients = (camera.width_px, camera.height_px), np.array(self.coefficients)
         unturned = np.eye(3)
         undistort = cv2.fisheye.initUndistortRectifyMap if self.is_fisheye else cv2.initUndistortRectifyMap
@@ -81,21 +61,9 @@ class Lens:
 
     def rays(self, camera: PinholeCamera) -> NDArray[np.float32]:
         """Return the (H, W, 2) undistorted x/z and y/z of every pixel's ray of a camera with the lens."""
-        if self.is_fov:
-            x, y = _plane(camera)
-            far, angle = np.maximum(np.hypot(x, y), _CENTRE), self.coefficients[0]
-            scale = np.tan(np.minimum(far * angle, _WIDEST_RAD)) / (2.0 * far * np.tan(angle / 2.0))
-            return np.stack([x * scale, y * scale], axis=2).astype(np.float32)
         columns, rows = np.meshgrid(np.arange(camera.width_px), np.arange(camera.height_px))
         pixels = np.column_stack([columns.ravel(), rows.ravel()]).astype(np.float64)[:, np.newaxis]
         undistort = cv2.fisheye.undistortPoints if self.is_fisheye else cv2.undistortPoints
         criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-9)
         rays = np.asarray(undistort(pixels, camera.matrix, np.array(self.coefficients), criteria=criteria))
         return rays.astype(np.float32).reshape(camera.height_px, camera.width_px, 2)
-
-
-def _plane(camera: PinholeCamera) -> tuple[Array, Array]:
-    """Return x/z and y/z, (H, W) each, of every pixel of a camera without distortion."""
-    columns, rows = np.meshgrid(np.arange(camera.width_px), np.arange(camera.height_px))
-    K = camera.matrix
-    return (columns - K[0, 2]) / K[0, 0], (rows - K[1, 2]) / K[1, 1]

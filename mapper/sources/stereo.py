@@ -158,16 +158,12 @@ def rectify(left: Calibration, right: Calibration, T_left_right: Transform, size
         size_px: Size of both as recorded.
 
     Raises:
-        SourceError: A calibration is of another size or not in order, a lens is of the FOV model, one is a
-            fisheye and the other not, or the cameras do not lie side by side.
+        SourceError: A calibration is of another size or not in order, one lens is a fisheye and the other
+            not, or the cameras do not lie side by side.
     """
     width_px, height_px = size_px
     cameras = [one.camera(width_px=width_px, height_px=height_px) for one in (left, right)]
     is_fisheye = [one.lens is not None and one.lens.is_fisheye for one in (left, right)]
-    if any(one.lens is not None and one.lens.is_fov for one in (left, right)):
-        raise SourceError(
-            f"{left.origin}, {right.origin}: pairs of a FOV lens are not rectified; rectify them"
-        )
     if is_fisheye[0] != is_fisheye[1]:
         raise SourceError(f"{left.origin}, {right.origin}: one lens is a fisheye, the other is not")
     coefficients = [

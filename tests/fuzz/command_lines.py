@@ -24,7 +24,8 @@ LINE = "line"
 
 _RESULTS = ("--out", "--plot", "--rrd")
 _LOG_FILE = "--log-file"
-"""Option that appends to a file whatever comes of the line."""
+"""Option that appends to a file whatever comes of the line; to one that is empty, or a log of ours."""
+_EMPTY = sha256(b"").hexdigest()
 _UNUSED = ("--page", "--spawn", "--connect", "--step", "--scheduler", "--rerun", "--warm")
 """Options that open viewers, wait for a person or for another machine, or compile all kernels."""
 _BRIEF = {
@@ -35,7 +36,7 @@ _BRIEF = {
     "doctor": ("run",),
 }
 """Words without which a verb has a minute of work, whatever else it is given."""
-_LEFT = {"demo": "demo/log"}
+_LEFT = {"demo": "/log"}
 """What a verb leaves when it is refused, beside what is not whole and named so."""
 _INPUTS = (
     *("run", "log", "run/graph.g2o", "run/trajectory.tum", "run/manifest.json", "run/map.octree"),
@@ -212,7 +213,8 @@ class Sandbox:
         """Return what a line has changed that it must not; empty if there is nothing."""
         after = _content(self._folder)
         logs = [*map(_within(self._folder), line.log_files)]
-        lost = [name for name, what in before.items() if after.get(name) != what]
+        kept = {name: what for name, what in before.items() if what != _EMPTY or name not in logs}
+        lost = [name for name, what in kept.items() if after.get(name) != what]
         new = [name for name in after if name not in before and name not in logs]
         if reading.outcome == "refused":
             # A folder that is not whole stays for inspection, or to be resumed.

@@ -183,13 +183,6 @@ def test_the_first_pixel_of_colmap_s_camera_is_half_a_pixel_from_its_corner(
     assert read_calibration(path).size_px == (64, 48)
 
 
-def test_a_fov_lens_of_kalibr(tmp_path):
-    text = KALIBR.replace("radtan", "fov").replace("[0.1, -0.2, 0.001, 0.002]", "[0.92]")
-    (tmp_path / "camchain.yaml").write_text(text)
-    found = read_calibration(tmp_path / "camchain.yaml").lens
-    assert (found.model, list(found.coefficients)) == ("fov", [0.92])
-
-
 def test_lenses_of_colmap(tmp_path):
     path = tmp_path / "cameras.txt"
     path.write_text(f"{COLMAP_HEAD}1 OPENCV_FISHEYE 64 48 60 61 32 24 0.1 -0.2 0.001 0.002\n")
@@ -300,14 +293,10 @@ def test_notes_on_something_else_are_no_calibration_and_intrinsics_that_are_not_
         (
             "camchain.yaml",
             KALIBR.replace("radtan", "fov").replace(", 0.001, 0.002", ""),
-            "2 distortion coefficients; want",
+            "fov lens; known are",
         ),
         ("camchain.yaml", KALIBR + "  other: equidistant\n", "lenses of two models, radtan and equidistant"),
-        (
-            "transforms.json",
-            NERFSTUDIO.replace("{", '{"camera_model": "FOV", ', 1),
-            "distortion coefficients; want",
-        ),
+        ("transforms.json", NERFSTUDIO.replace("{", '{"camera_model": "FOV", ', 1), "FOV lens; known are"),
     ],
 )
 def test_what_is_none_or_of_two_cameras_is_refused_in_words(tmp_path, name, text, why):

@@ -36,7 +36,6 @@ _LEAST_FLOAT, _MOST_FLOAT, _MOST_STRANGE = 1e-12, 1e6, 0.1
 EMPTY = "the file is empty"
 _VELOVIEW = re.compile(r"points\w*:(?P<axis>[012])")
 _IN_METRES = re.compile(r"(?P<axis>[xyz])[_([]*m[)\]]?")
-_IN_BRACKETS = re.compile(r"_*[(\[][^()\[\]]*[)\]]$")
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*([eE][-+]?\d+)?|\.\d+([eE][-+]?\d+)?|nan|inf)", re.IGNORECASE)
 _WIDTHS = (3, 5, 6, 7, 8)  # x y z; with intensity and ring (nuScenes); with a time; with padding (PCL)
 _BLOCKS, _BLOCK_NUMBERS = 8, 3360  # in parts of whole records of every width up to 8
@@ -256,17 +255,11 @@ def _header(text: str) -> tuple[list[str], int | None]:
 
 
 def _column_name(word: str) -> str:
-    """Return a word of a header in lower case, x y z for VeloView's Points_m_XYZ:0, x_m, x[m] and so on.
-
-    Units of others, as in ``t_(us)``, are left away; of coordinates they are kept where they are not metres.
-    """
+    """Return a word of a header in lower case, x y z for VeloView's Points_m_XYZ:0, x_m, x[m] and so on."""
     name = word.strip('"#/').lower()
     if found := _VELOVIEW.fullmatch(name):
         return "xyz"[int(found["axis"])]
-    if found := _IN_METRES.fullmatch(name):
-        return found["axis"]
-    bare = _IN_BRACKETS.sub("", name)
-    return name if bare in ("", "x", "y", "z") else bare
+    return found["axis"] if (found := _IN_METRES.fullmatch(name)) else name
 
 
 def _xyz(table: Column, path: Path) -> Columns:

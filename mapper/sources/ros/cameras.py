@@ -19,7 +19,7 @@ from mapper.sources.calibration import (
 from mapper.sources.calibration_file import calibration_files, read_calibration
 from mapper.sources.config import CameraConfig
 from mapper.sources.image_files.image_sizes import Size, is_same_view, recorded_camera
-from mapper.sources.lens import FISHEYE_MODELS, FOV_MODELS, POLYNOMIAL_MODELS, Lens, lens_model
+from mapper.sources.lens import FISHEYE_MODELS, POLYNOMIAL_MODELS, Lens, lens_model
 from mapper.sources.ros.image_messages import image_of, size_of, unused_bits
 from mapper.sources.ros.message_index import Series
 from mapper.sources.ros.message_order import ordered
@@ -348,10 +348,10 @@ def _calibration(info: CameraMessage, *, is_rectified: bool, name: str) -> Calib
     if any(D) and (model not in POLYNOMIAL_MODELS or any(D[5:])):
         lens = Lens(model, D)
         if not lens.is_known:
-            names = ", ".join(sorted(POLYNOMIAL_MODELS | FISHEYE_MODELS | FOV_MODELS))
             raise SourceError(
                 f"{name}: distortion {info.model!r} with {len(D)} coefficients is not known; known are "
-                f"{names}: rectify the images, or --set source.camera.fx_px=… and so on"
+                f"{', '.join(sorted(POLYNOMIAL_MODELS | FISHEYE_MODELS))}: rectify the images, or --set "
+                "source.camera.fx_px=… and so on"
             )
         return Calibration(name, K[0], K[4], K[2], K[5], lens=lens, size_px=size_px)
     k1, k2, p1, p2, k3 = (*D[:5], *NO_DISTORTION)[:5]

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 
 from mapper.core.geometry import fit_rigid
@@ -10,9 +11,11 @@ from mapper.odometry.factory import odometry_for
 from mapper.odometry.motion_prior import MotionPrior
 from mapper.odometry.scans.config import GicpOdometryConfig
 from mapper.odometry.scans.motion_model import MotionModel
+from mapper.pipeline.track import begin_calibrated
 from mapper.sensing.gyroscope import Gyroscope
 from mapper.simulation.config import LidarSensorConfig, LidarSynthConfig, SynthImuConfig
 from mapper.simulation.lidar.source import LidarSimulator
+from mapper.sources.base import FrameRef, Log
 
 IMU = SynthImuConfig()
 SWINGING = LidarSynthConfig(
@@ -29,11 +32,17 @@ SWINGING = LidarSynthConfig(
 )
 
 
-def test_a_gyroscope_whose_mounting_is_stated_keeps_the_path():
-    log = LidarSimulator(SWINGING).log()
+def stated(log: Log) -> Log:
     R_body_imu = Rotation.from_rotvec(IMU.mounting_rad).as_matrix()
-    log = replace(log, gyroscope=replace(log.gyroscope, R_body_imu=R_body_imu))
+    return replace(log, gyroscope=replace(log.gyroscope, R_body_imu=R_body_imu))
+
+
+@pytest.mark.parametrize("is_stated", [True, False])
+def test_scans_are_deskewed_by_the_gyroscope_from_the_first_on(is_stated):
+    log = LidarSimulator(SWINGING).log()
+    log = stated(log) if is_stated else log
     odometry = odometry_for(GicpOdometryConfig(), log)
+    begin_calibrated(odometry, log, workers=0)
     results = [odometry.track(odometry.read(entry)) for entry in log.entries()]
     positions = np.array([result.T_world_body[:3, 3] for result in results])
     true = log.truth.positions_world
@@ -42,6 +51,32 @@ def test_a_gyroscope_whose_mounting_is_stated_keeps_the_path():
     assert np.sqrt((errors_m**2).mean()) < 0.03
     assert not any(result.doubts for result in results)
     assert any("offset 7 ±" in note for note in odometry.gyroscope_notes())
+
+
+@pytest.mark.parametrize("without", [True, False])
+def test_no_scan_is_read_in_advance_where_nothing_is_to_be_calibrated(without):
+    log = LidarSimulator(SWINGING).log()
+    log = replace(log, gyroscope=None) if without else stated(log)
+    begin_calibrated(odometry_for(GicpOdometryConfig(), log), replace(log, entry_at=None), workers=0)
+
+
+def thrice(log: Log, read: list[int]) -> Log:
+    """A log three times over; ``read`` keeps the indices of its scans that are read."""
+
+    def entry_at(index: int) -> FrameRef:
+        read.append(index)
+        return log.entry_at(index % len(log))
+
+    stamps_ns = log.stamps_ns[0] + 500_000_000 * np.arange(3 * len(log))
+    return replace(log, stamps_ns=stamps_ns, entry_at=entry_at)
+
+
+@pytest.mark.parametrize(("turns", "fewest", "most"), [(1.0, 8, 20), (0.0, 40, 40)])
+def test_scans_are_read_in_advance_until_they_show_the_mounting_but_not_all(turns, fewest, most):
+    log, read = LidarSimulator(SWINGING).log(), []
+    log = replace(log, gyroscope=replace(log.gyroscope, rates_radps=turns * log.gyroscope.rates_radps))
+    begin_calibrated(odometry_for(GicpOdometryConfig(), log), thrice(log, read), workers=0)
+    assert fewest <= len(read) <= most
 
 
 def swinging_model(frames: int) -> tuple[MotionModel, list[int], np.ndarray]:

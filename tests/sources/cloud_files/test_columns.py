@@ -29,23 +29,6 @@ def test_columns_of_metres_are_coordinates(tmp_path, names):
     np.testing.assert_allclose(read_cloud(path).points, POINTS, atol=1e-4)
 
 
-@pytest.mark.parametrize("name", ["t (us)", "Time[us]", "GPS Time (us)", "timestamp_(us)"])
-def test_a_unit_in_brackets_hides_no_times(tmp_path, name):
-    path = tmp_path / "cloud 1.csv"
-    times_us = np.arange(N) * 100.0
-    np.savetxt(
-        path,
-        np.column_stack([POINTS, times_us]),
-        delimiter=",",
-        header=f"x (m),y (m),z (m),{name}",
-        comments="",
-    )
-    np.testing.assert_allclose(read_cloud(path).times, times_us)
-    np.savetxt(path, POINTS, delimiter=",", header="x (mm),y (mm),z (mm)", comments="")
-    with pytest.raises(FrameError, match="want x y z"):
-        read_cloud(path)
-
-
 def test_an_array_of_objects_is_refused_in_words(tmp_path):
     for version in ((1, 0), (2, 0)):
         with (tmp_path / "cloud.npy").open("wb") as file:
