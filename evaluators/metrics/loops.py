@@ -11,6 +11,7 @@ from mapper.core.trajectory import Trajectory
 from mapper.evaluators.metrics.metric import Metric
 from mapper.graph.config import GraphConfig
 from mapper.graph.marginals import marginals_of
+from mapper.graph.measurement_covariance import LIMIT_CHI2
 from mapper.graph.model import PoseGraph
 from mapper.graph.optimize import optimize
 from mapper.loops.closure import LoopClosure, accepted_loops, discrepancy
@@ -21,8 +22,6 @@ MAX_ERROR_M, MAX_ERROR_RAD = 0.2, 0.1
 """A loop that is farther from the truth is wrong."""
 REVISIT_M, REVISIT_RAD, REVISIT_S = 0.5, np.deg2rad(20.0), 5.0
 """A keyframe revisits a place if an earlier one was within this distance and turn, and before this time."""
-_CERTAIN_CHI2 = 22.46
-"""99.9 % of χ² with six degrees of freedom."""
 
 
 def loop_metrics_of_run(run: Run, truth: Trajectory) -> list[Metric]:
@@ -89,7 +88,7 @@ def agreement_of_loops(graph: PoseGraph) -> list[Metric]:
         squares.append(float(left_out @ np.linalg.solve(covariance, left_out)))
     if not squares:
         return []
-    contradicting = sum(square > _CERTAIN_CHI2 for square in squares)
+    contradicting = sum(square > LIMIT_CHI2 for square in squares)
     return [
         Metric("loops compared with all others", len(squares), "loops"),
         Metric("loops off the others, median", float(np.median(distances_m)), "m"),

@@ -10,6 +10,8 @@ Bits = NDArray[np.uint64]
 
 ORB_BYTES = 32
 ORB_BITS = 8 * ORB_BYTES
+MAX_HAMMING = 64
+"""Descriptors that differ in more of their bits do not match."""
 
 
 @intrinsic

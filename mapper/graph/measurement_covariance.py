@@ -8,7 +8,7 @@ from mapper.core.geometry import Array, Transform, inverse, length_and_angle, lo
 
 MEDIAN_CHI2 = 5.348
 """Median of χ² with six degrees of freedom."""
-_LIMIT_CHI2 = 22.458
+LIMIT_CHI2 = 22.458
 """99.9 % of χ² with six degrees of freedom (Bar-Shalom, Li & Kirubarajan 2001, §1.5.4)."""
 MODEL_SHARE = 0.02
 """Model error as a share of distance and angle: calibration and depth distortion, common to all pixels."""
@@ -36,12 +36,12 @@ class Comparison:
     @property
     def is_possible(self) -> bool:
         """Whether both can be right."""
-        return self.sigmas**2 <= _LIMIT_CHI2
+        return self.sigmas**2 <= LIMIT_CHI2
 
     def __str__(self) -> str:
         return (
             f"{self.translation_m:.2f} m and {self.rotation_rad:.2f} rad off, at most {self.allowed_m:.2f} m "
-            f"and {self.allowed_rad:.2f} rad ({self.sigmas:.1f} sigma, at most {_LIMIT_CHI2**0.5:.1f})"
+            f"and {self.allowed_rad:.2f} rad ({self.sigmas:.1f} sigma, at most {LIMIT_CHI2**0.5:.1f})"
         )
 
 
@@ -65,11 +65,10 @@ def compare(
     """
     miss = inverse(T_i_j) @ T_i_j_predicted
     twist = np.concatenate(log(miss))
-    slack = np.square([slack_rad] * 3 + [slack_m] * 3) / _LIMIT_CHI2
+    slack = np.square([slack_rad] * 3 + [slack_m] * 3) / LIMIT_CHI2
     total = covariance + np.diag(slack)
     allowed_rad, allowed_m = (
-        float(np.sqrt(_LIMIT_CHI2 * np.linalg.eigvalsh(block)[-1]))
-        for block in (total[:3, :3], total[3:, 3:])
+        float(np.sqrt(LIMIT_CHI2 * np.linalg.eigvalsh(block)[-1])) for block in (total[:3, :3], total[3:, 3:])
     )
     return Comparison(
         float(np.linalg.norm(miss[:3, 3])),

@@ -15,7 +15,7 @@ from mapper.core.errors import ConfigError
 from mapper.core.frames import RgbdFrame
 from mapper.core.geometry import Array, Points, Transform, adjoint, apply, inverse
 from mapper.features.frame_view import FrameView, ImageView
-from mapper.features.hamming import match_mutual_bits
+from mapper.features.hamming import MAX_HAMMING, match_mutual_bits
 from mapper.features.matching import Pairs, homography_inliers, match_mutual
 from mapper.graph.measurement_covariance import MODEL_SHARE, inflated, with_model_error
 from mapper.loops.base import Verification
@@ -40,7 +40,6 @@ from mapper.sensing.depth import depth_sigma_m
 MAX_SIGMA_M = 0.05
 """A motion whose translation is less certain in any direction is no loop: far scenes leave it uncertain."""
 _LM_ROUNDS, _LM_ITERATIONS = 4, 10
-_MAX_HAMMING = 64
 _P3P_PAIRS, _P3P_TOLERANCE_PX, _P3P_ITERATIONS = 4, 4.0, 300
 
 _MAX_WIDE_RATIO = 0.85
@@ -127,7 +126,7 @@ class ImageVerifier:
     def _pairs(self, i: ImageView, j: ImageView) -> Pairs:
         match = self._config.match
         if i.is_orb and j.is_orb:
-            partner = match_mutual_bits(i.bits, j.bits, _MAX_HAMMING, match.max_ratio)
+            partner = match_mutual_bits(i.bits, j.bits, MAX_HAMMING, match.max_ratio)
             paired = np.flatnonzero(partner >= 0)
             pairs: Pairs = np.column_stack([paired, partner[paired]])
         else:

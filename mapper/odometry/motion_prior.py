@@ -26,10 +26,10 @@ from mapper.sensing.wheel_kinematics import pose_at
 
 _FIRST_FIT, _FITS_GROW, _MOST_BETWEEN_FITS = 8, 1.5, 100
 _KEPT = 400  # intervals that a fit uses: bias drifts over minutes
-_ERRORS, _FEWEST_ERRORS = 30, 5
+_ERRORS, FEWEST_ERRORS = 30, 5  # of predictions: the newest in the median, and fewest for one
 _MOST_REJECTED_FRAMES = 15
 """In a row: as many as images, and more than scans, are lost before a new sub-map begins."""
-_MEDIAN_LENGTH = 1.538  # of a vector of three independent normal errors, in standard deviations
+MEDIAN_LENGTH = 1.538  # of a vector of three independent normal errors, in standard deviations
 _LONGEST_TURN_RAD = 2.8
 _SLIPPED, _STANDING_M = 0.5, 0.05
 """Median miss of the wheels, as a share of the way and 5 cm, from which on constant velocity predicts better:
@@ -113,7 +113,7 @@ class MotionPrior:
 
     def rolled(self, begin_ns: int, end_ns: int) -> Transform | None:
         """Return T_begin_end (4, 4) by the wheels; None without readings, or if they have been wrong."""
-        if len(self._wheel_misses) >= _FEWEST_ERRORS and self._wheel_misses.median > _SLIPPED:
+        if len(self._wheel_misses) >= FEWEST_ERRORS and self._wheel_misses.median > _SLIPPED:
             return None
         return self._rolled(begin_ns, end_ns)
 
@@ -198,9 +198,9 @@ class MotionPrior:
         until a pose agrees with it again.
         """
         found = self._turn(begin_ns, end_ns)
-        if found is None or len(self._errors) < _FEWEST_ERRORS or not self._is_better(*found):
+        if found is None or len(self._errors) < FEWEST_ERRORS or not self._is_better(*found):
             return False
-        sigma_rad = math.hypot(found[1], float(np.median(self._errors)) / _MEDIAN_LENGTH)
+        sigma_rad = math.hypot(found[1], float(np.median(self._errors)) / MEDIAN_LENGTH)
         off_rad = angle_between(found[0], R_begin_end)
         if off_rad <= max(_CONTRADICTION_RAD, _CONTRADICTION_SIGMAS * sigma_rad):
             self._rejected_frames = 0
@@ -305,10 +305,10 @@ class MotionPrior:
 
     def _is_better(self, R: Array, sigma_rad: float) -> bool:
         """Return whether a rotation of the gyroscope is more certain than constant velocity."""
-        if len(self._errors_without) < _FEWEST_ERRORS:  # it may just have begun to turn
+        if len(self._errors_without) < FEWEST_ERRORS:  # it may just have begun to turn
             return sigma_rad < angle_of(R) / math.sqrt(3.0)
-        own = float(np.median(self._errors)) / _MEDIAN_LENGTH
-        without = float(np.median(self._errors_without)) / _MEDIAN_LENGTH
+        own = float(np.median(self._errors)) / MEDIAN_LENGTH
+        without = float(np.median(self._errors_without)) / MEDIAN_LENGTH
         return math.hypot(sigma_rad, own) < without
 
 

@@ -17,6 +17,8 @@ from mapper.core.geometry import Array, Transform, inverse
 
 MARGIN_RATIO = 0.01
 """Share of the range that is added to the margin: what an error of the rotation adds, and a range's noise."""
+DIRECTION_RAD = 0.0175
+"""Resolution of range images where nothing else is stated: one degree."""
 MIN_RETURNS = 3
 """Number of the nine directions around a point that need a return for the point to contradict: where the
 range image has fewer, it has holes."""

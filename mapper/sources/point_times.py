@@ -37,6 +37,8 @@ _UNIT_NAMES = dict(zip(UNITS_PER_S, ("seconds", "milliseconds", "microseconds", 
 MAX_SWEEP_S = 2.0
 """No sensor turns slower; points farther apart in time were put together from several sweeps."""
 
+LEAST_SHARE = 0.5
+"""Share of the usual number of points or packets that a sweep must have: the first and the last are cut."""
 _USUAL_SWEEP_NS = NS_PER_S // 10
 """A sweep whose returns all lie to one side is shorter, but begins no later after its stamp."""
 _MAX_WRONG_SHARE = 0.05

@@ -4,9 +4,9 @@ import numpy as np
 from numba import njit
 
 from mapper.core.linear import between, solve_positive, twist_exp
+from mapper.odometry.keyframes.landmark_kernels import MIN_DEPTH_M
 from mapper.registration.reprojection import chi2, classify, huber, linearise
 
-_MIN_DEPTH_M = 0.1
 _WIDEST = 4.0
 """Squared tangent from the axis beyond which no camera sees, and its distortion is not defined."""
 _HUBER = 1.5
@@ -26,7 +26,7 @@ def place_in_cells(T, p, optics, cell_px):
     x = T[0, 0] * p[0] + T[0, 1] * p[1] + T[0, 2] * p[2] + T[0, 3]
     y = T[1, 0] * p[0] + T[1, 1] * p[1] + T[1, 2] * p[2] + T[1, 3]
     z = T[2, 0] * p[0] + T[2, 1] * p[1] + T[2, 2] * p[2] + T[2, 3]
-    if z < _MIN_DEPTH_M:
+    if z < MIN_DEPTH_M:
         return -1.0, -1.0, z
     u, v = x / z, y / z
     s = u * u + v * v

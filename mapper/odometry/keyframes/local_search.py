@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.geometry import Array, Transform, apply
-from mapper.features.hamming import Bits
+from mapper.features.hamming import MAX_HAMMING, Bits
 from mapper.features.window_matching import GridFeatures, SearchWindows, match_windows
 from mapper.odometry.camera.image_observation import ImageObservation
 from mapper.odometry.config import KeyframeOdometryConfig
@@ -14,7 +14,7 @@ from mapper.odometry.keyframes.depth_comparison import EarlierDepth
 from mapper.odometry.keyframes.landmark_kernels import project_visible
 from mapper.odometry.keyframes.landmarks import Ids, LandmarkMap
 from mapper.odometry.keyframes.motion_segmentation import refined_by_established
-from mapper.odometry.keyframes.pose_tracker import MAX_HAMMING, TrackedPose, rms_px
+from mapper.odometry.keyframes.pose_tracker import TrackedPose, rms_px
 
 _MAX_RATIO = 0.8
 _RADIUS_PX = 4.0

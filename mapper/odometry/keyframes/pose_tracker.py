@@ -14,9 +14,6 @@ from mapper.odometry.keyframes.depth_alignment import DepthAlignment
 from mapper.odometry.keyframes.landmarks import Ids
 from mapper.registration.reprojection import NEAREST_M, refine_pose
 
-MAX_HAMMING = 64
-"""Descriptors that differ in more of their 256 bits do not match."""
-
 WEAK_INLIERS = 150
 """With fewer, a pose may be wrong, and is compared with others: repeated structure has led to a hundred."""
 _MAX_PREDICTED_STEPS = 10.0

@@ -5,13 +5,12 @@ from collections.abc import Callable, Iterable
 import numpy as np
 
 from mapper.core.geometry import Array, Points
-from mapper.features.hamming import Bits, match_mutual_bits
+from mapper.features.hamming import MAX_HAMMING, Bits, match_mutual_bits
 from mapper.odometry.camera.image_observation import ImageObservation
 from mapper.odometry.config import KeyframeOdometryConfig
 from mapper.odometry.keyframes.landmarks import Ids, LandmarkMap
 from mapper.odometry.keyframes.local_search import LocalSearch
 from mapper.odometry.keyframes.pose_tracker import (
-    MAX_HAMMING,
     WEAK_INLIERS,
     TrackedPose,
     refined,

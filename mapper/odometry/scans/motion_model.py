@@ -8,11 +8,10 @@ from mapper.core.deskew import STILL, SampledMotion, Twist, twist_between
 from mapper.core.geometry import Array, Transform, inverse, length_and_angle
 from mapper.core.running_median import RunningMedian
 from mapper.core.timebase import NS_PER_S
-from mapper.odometry.motion_prior import MotionPrior
+from mapper.odometry.motion_prior import FEWEST_ERRORS, MEDIAN_LENGTH, MotionPrior
 
 _MIN_ELAPSED_S = 0.005  # over less, an error of millimetres becomes a large velocity
-_ERRORS, _FEWEST_ERRORS = 50, 5  # of predictions' errors: the newest in the median, and fewest for one
-_MEDIAN_LENGTH = 1.538  # of a vector of three independent normal errors, in standard deviations
+_ERRORS = 50  # of predictions: the newest in the median
 _LEAST_M, _LEAST_RAD, _LEAST_SHARE = 2e-3, 1e-3, 0.02
 
 
@@ -43,7 +42,7 @@ class _Errors:
     @property
     def sigmas(self) -> tuple[float, float]:
         """Standard deviations of rotation and translation."""
-        return self._turns.median / _MEDIAN_LENGTH, self._shifts.median / _MEDIAN_LENGTH
+        return self._turns.median / MEDIAN_LENGTH, self._shifts.median / MEDIAN_LENGTH
 
 
 class MotionModel:
@@ -121,11 +120,11 @@ class MotionModel:
         if rolled is not None:
             return self._spread_of_wheels(rolled)
         is_turned = self.prior.turn(self._time_ns, time_ns) is not None
-        is_known = is_turned and len(self._of_gyroscope) >= _FEWEST_ERRORS
+        is_known = is_turned and len(self._of_gyroscope) >= FEWEST_ERRORS
         return self._spread_by(self._of_gyroscope if is_known else self._of_velocity, time_ns)
 
     def _spread_by(self, errors: _Errors, time_ns: int) -> Spread | None:
-        if len(errors) < _FEWEST_ERRORS:
+        if len(errors) < FEWEST_ERRORS:
             return None
         elapsed_s = self.elapsed_s(time_ns)
         rotation, translation = errors.sigmas

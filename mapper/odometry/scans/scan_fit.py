@@ -14,11 +14,10 @@ from mapper.odometry.scans.scan_fit_kernels import count_showing, pair_rows
 from mapper.odometry.scans.scan_matcher import DeskewedScan
 from mapper.registration.acceptance import weakest_direction
 from mapper.registration.degeneracy import Degeneracy, degeneracy_of, plane_rows
-from mapper.registration.free_space import FreeSpaceCheck, ScanDescription, range_image
+from mapper.registration.free_space import DIRECTION_RAD, FreeSpaceCheck, ScanDescription, range_image
 
 _MIN_PAIRS = 20
 _SURFACE_VOXELS = 0.33  # a point this near to a surface agrees with it
-_DIRECTION_RAD = 0.0175  # of the range images: one degree
 _MARGIN_M = 0.2
 _CHECKED_POINTS = 2000
 _GRAZING = 0.01  # least sine of the angle between a ray and a surface
@@ -116,8 +115,8 @@ class ScanFit:
 def described(deskewed: DeskewedScan) -> ScanDescription:
     """Return the points and rays of a scan for the free-space check."""
     scan = deskewed.scan
-    ranges_m = range_image(scan.points_body, scan.origin_body, _DIRECTION_RAD)
-    return ScanDescription(np.eye(4), _checked(deskewed), ranges_m, _DIRECTION_RAD, scan.origin_body)
+    ranges_m = range_image(scan.points_body, scan.origin_body, DIRECTION_RAD)
+    return ScanDescription(np.eye(4), _checked(deskewed), ranges_m, DIRECTION_RAD, scan.origin_body)
 
 
 def _checked(deskewed: DeskewedScan) -> Points32:
@@ -130,7 +129,7 @@ def _checked(deskewed: DeskewedScan) -> Points32:
     rays = prepared.points[::step] - origin
     facing = np.abs(np.einsum("ni,ni->n", prepared.normals[::step], rays))
     sine = np.clip(facing / np.maximum(np.linalg.norm(rays, axis=1), _MARGIN_M), _GRAZING, 1.0)
-    beyond = _PIXELS * _DIRECTION_RAD * np.sqrt(1.0 - sine**2) / sine
+    beyond = _PIXELS * DIRECTION_RAD * np.sqrt(1.0 - sine**2) / sine
     return np.ascontiguousarray((origin + rays * (1.0 + beyond[:, None])).astype(np.float32))
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mapper.core.frames import Points32, Scan
 from mapper.core.geometry import Array, Points, Transform, apply, stride_for
-from mapper.registration.free_space import ScanDescription, range_image
+from mapper.registration.free_space import DIRECTION_RAD, ScanDescription, range_image
 from mapper.registration.hough.config import CellsConfig, HoughConfig, ObjectsConfig
 from mapper.registration.hough.ground import Ground, surroundings
 from mapper.registration.hough.voting_kernels import draw_volume
@@ -80,8 +80,6 @@ _MIN_VOXELS_RATIO = 0.5
 _RAYS, _COMPARED = 40_000, 1000
 """Points of a scan, evenly chosen, whose rays make the range image; obstacles and ground columns that are
 compared."""
-DIRECTION_RAD = 0.0175
-"""Resolution of the range image: one degree."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

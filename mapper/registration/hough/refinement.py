@@ -9,8 +9,9 @@ import numpy as np
 
 from mapper.core.frames import Scan
 from mapper.core.geometry import Points, Transform, apply, planar_motion, rotation_exp, transform
+from mapper.registration.free_space import DIRECTION_RAD
 from mapper.registration.hough.config import HoughConfig, NdtStagesConfig
-from mapper.registration.hough.description import DIRECTION_RAD, HoughDescription
+from mapper.registration.hough.description import HoughDescription
 from mapper.registration.hough.ground import FITS, Ground
 from mapper.registration.hough.voting_kernels import FULL_OVERLAP, hill_climb
 from mapper.registration.ndt import refine_by_cells

@@ -11,6 +11,8 @@ from pathlib import Path
 from typing import BinaryIO
 
 from mapper.core.errors import SourceError
+from mapper.core.timebase import LATEST_NS
+from mapper.core.units import MIB
 from mapper.sources.image_files.decoded import FilePart
 
 MAGIC = b"\x1aE\xdf\xa3"
@@ -26,9 +28,8 @@ _READ = {
     *(_FILE_NAME, _FILE_DATA),
 }
 _BLOCKS = {0xA3, 0xA1}  # SimpleBlock, and Block of a BlockGroup
-_MOST_BYTES = 1 << 20  # of an element or a sample that is read whole
+_MOST_BYTES = MIB  # of an element or a sample that is read whole
 _HEAD_BYTES, _CHUNK_BYTES = 16, 1 << 14  # two numbers of variable length; read at once
-_LATEST_NS = 1 << 62  # stamps are 64-bit
 _EPOCH_NS = 978_307_200 * 10**9  # 2001-01-01, from which dates count
 
 
@@ -137,8 +138,8 @@ class _Reader:
             return
         ticks = self._cluster_time + int.from_bytes(head[after : after + 2], signed=True)
         stamp_ns = self._date_ns + ticks * self._scale_ns
-        if not 0 <= stamp_ns <= _LATEST_NS:
-            raise SourceError(f"{self._path}: a block's time is {stamp_ns} ns, not within 0 … {_LATEST_NS}")
+        if not 0 <= stamp_ns <= LATEST_NS:
+            raise SourceError(f"{self._path}: a block's time is {stamp_ns} ns, not within 0 … {LATEST_NS}")
         track.stamps_ns.append(stamp_ns)
         if track.width_px:
             track.images.append(FilePart(self._path, data, data_bytes, ""))

@@ -31,11 +31,10 @@ from mapper.sources.ros.recording import Place, Recording, Topic
 
 _TRIED = 10
 _KEPT_BYTES = 32 * MIB
-_FRAME_OFFSET = 12  # after a counter (ROS 1) or the encapsulation (CDR), seconds and nanoseconds
 _LONGEST_FRAME = 256  # bytes
 _UNPACK = {order: struct.Struct(f"{order}104x3d72x3d72x") for order in "<>"}
 """Orientation and its covariance, angular velocity, covariance, acceleration, covariance: 37 doubles."""
-_HEADER_BYTES = 12
+_HEADER_BYTES = 12  # a counter (ROS 1) or the encapsulation (CDR), seconds and nanoseconds; then the frame
 _NONE = (nan,) * 6
 
 
@@ -213,7 +212,7 @@ def stamp_of(topic: Topic, data: memoryview) -> int:
     if topic.encoding not in ("cdr", "ros1"):
         return decode_foxglove.stamp_of(topic, data)
     data = decompressed(topic, data)
-    if len(data) < 12:
+    if len(data) < _HEADER_BYTES:
         raise DataError(f"{topic.name}: a message of {len(data)} bytes has no header")
     if topic.encoding == "ros1":  # a sequence number, then seconds and nanoseconds
         sec, nanosec = struct.unpack_from("<II", data, 4)
@@ -227,8 +226,8 @@ def _header_frame(topic: Topic, data: memoryview) -> str:
     with suppress(DataError, struct.error):
         data = decompressed(topic, data)
         order = "<" if topic.encoding == "ros1" or data[1] & 1 else ">"
-        (length,) = struct.unpack_from(f"{order}I", data, _FRAME_OFFSET)
-        name = bytes(data[_FRAME_OFFSET + 4 :][: min(length, _LONGEST_FRAME)])
+        (length,) = struct.unpack_from(f"{order}I", data, _HEADER_BYTES)
+        name = bytes(data[_HEADER_BYTES + 4 :][: min(length, _LONGEST_FRAME)])
         return name.rstrip(b"\0").decode(errors="replace").lstrip("/")
     return ""
 

@@ -12,7 +12,7 @@ from mapper.core.errors import DataError, FrameError, SourceError
 from mapper.core.geometry import Array
 from mapper.core.timebase import NS_PER_S, Stamps
 from mapper.sources.ouster_packets import HEAD_BYTES, OusterSensor, imu_readings, is_imu, metadata_beside
-from mapper.sources.point_times import MAX_SWEEP_S
+from mapper.sources.point_times import LEAST_SHARE, MAX_SWEEP_S
 from mapper.sources.ros.decode import decompressed
 from mapper.sources.ros.encode_ros import cloud_message, transforms_message
 from mapper.sources.ros.messages import CLOUDS, IMAGES, OUSTER_PACKETS
@@ -28,8 +28,6 @@ _FRAMES_AT = -1
 LAST_NS = (1 << 31) * NS_PER_S
 _LATE_TURNS = 3
 """A packet of so few turns ago was late; a larger step is a sensor that began anew to count."""
-LEAST_SHARE = 0.5
-"""Share of the usual number of packets that a scan must have: the first and the last one are cut."""
 
 _Scan = tuple[int, NDArray[np.intp]]
 

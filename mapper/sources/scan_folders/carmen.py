@@ -17,14 +17,13 @@ from mapper.core.frames import Scan
 from mapper.core.geometry import Array, Transform, inverse, planar_motion
 from mapper.core.timebase import ns_from_seconds_text
 from mapper.core.trajectory import Trajectory
-from mapper.runtime.regular_files import read_text
+from mapper.runtime.regular_files import HEAD_BYTES, read_text
 from mapper.sources.base import FrameRef, Log
 from mapper.sources.config import SourceConfig
 from mapper.sources.laser_scan import MOST_RAD, beam_points, planar_scan, rolling
 from mapper.sources.text import time_order
 
 _ENDINGS = (".log", ".clf", ".txt")
-_HEAD_BYTES = 1 << 16
 _MESSAGE = re.compile(rb"^(?:[FR]LASER|(?:ROBOT|RAW)LASER\d|ODOM|PARAM) ", re.MULTILINE)
 _NAMES = re.compile(r"(?:[FR]LASER|(?:ROBOT|RAW)LASER\d)$")
 _OFFSET = {"FLASER": ("robot_frontlaser_offset", 0.0), "RLASER": ("robot_rearlaser_offset", np.pi)}
@@ -66,7 +65,7 @@ def recognise(path: Path) -> bool:
     if path.suffix.lower() not in _ENDINGS or not path.is_file():
         return False
     with path.open("rb") as file:
-        return _MESSAGE.search(file.read(_HEAD_BYTES)) is not None
+        return _MESSAGE.search(file.read(HEAD_BYTES)) is not None
 
 
 def read_log(path: Path, config: SourceConfig) -> Log:  # noqa: ARG001

@@ -15,7 +15,7 @@ from mapper.sources.cloud_files.parsing import MAX_RANGE_M, MIN_POINTS, Columns
 from mapper.sources.config import SourceConfig
 from mapper.sources.image_folders.tum import read_truth
 from mapper.sources.listed_files import refuse_links_out
-from mapper.sources.point_times import MAX_SWEEP_S, counted_on
+from mapper.sources.point_times import LEAST_SHARE, MAX_SWEEP_S, counted_on
 from mapper.sources.scan_folders.scans import read_scan
 from mapper.sources.scan_frame import scan_frame_warnings
 from mapper.sources.text import time_order
@@ -25,8 +25,6 @@ _SWEEP_S = 0.1
 _MOST_LATE, _ROUNDING_S, _AT_ENDS = 0.01, 1e-6, 1000
 """Share of the points that may come too late in the file, as packets overtake others; what is lost of times
 in 64 bits; and points at the ends of a strip, most of whose times are sound."""
-_LEAST_SHARE = 0.5
-"""Share of the usual number of points that the last sweep, which may be cut, must have."""
 _STEP_S, _LOOKED_AT_S, _FEWEST_POINTS = 0.005, 2.0, 10
 """Time in which a spinning LiDAR looks in one direction, part of the strip that is looked at, and how many
 points of a step, and steps, tell directions."""
@@ -202,7 +200,7 @@ def _sweeps(path: Path, times: _Times, sweep_s: float) -> list[_Sweep]:
         if row < len(latest_s) and latest_s[row] >= begin_s + sweep_s:
             begin_s = float(latest_s[row])
     counts = [end - begin for _, _, (begin, end) in sweeps]
-    return sweeps[:-1] if counts and counts[-1] < _LEAST_SHARE * np.median(counts) else sweeps
+    return sweeps[:-1] if counts and counts[-1] < LEAST_SHARE * np.median(counts) else sweeps
 
 
 def _turn_s(path: Path, times: _Times) -> float | None:

@@ -25,13 +25,12 @@ from mapper.sources.config import SourceConfig
 from mapper.sources.flatbuffer import Table
 from mapper.sources.image_files import png
 from mapper.sources.ouster_packets import OusterSensor
-from mapper.sources.point_times import MAX_SWEEP_S
+from mapper.sources.point_times import LEAST_SHARE, MAX_SWEEP_S
 from mapper.sources.ros.encode_ros import cloud_message
 from mapper.sources.ros.ouster_recording import (
     CLOUD,
     FRAMES,
     LAST_NS,
-    LEAST_SHARE,
     READING,
     SENSOR,
     frames_cdr,

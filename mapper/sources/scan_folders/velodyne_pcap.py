@@ -14,13 +14,12 @@ from mapper.core.frames import Scan
 from mapper.sources.base import FrameRef, Log
 from mapper.sources.captures import ENDINGS, Datagram, captured, first_datagrams
 from mapper.sources.config import SourceConfig
+from mapper.sources.point_times import LEAST_SHARE
 from mapper.sources.ros.cloud_messages import scan_from
 from mapper.sources.ros.messages import CloudMessage
 from mapper.sources.text import time_order
 from mapper.sources.velodyne_packets import PACKET_BYTES, decode_packets, require_decoder
 
-_LEAST_SHARE = 0.5
-"""Share of the usual number of packets that a turn must have: the first and the last one are cut."""
 _MAKERS = {b"\xee\xff": "a Hesai's", b"\x55\xaa": "a RoboSense's"}
 """Whose packets begin with these bytes."""
 
@@ -64,7 +63,7 @@ def read_log(path: Path, config: SourceConfig) -> Log:
             f"packets of {len(by_sender)} sensors; those of {ip_address(sender)}, the most, are mapped"
         )
     usual = np.median([turn.packets for turn in turns])
-    whole = [turn for turn in turns if turn.packets >= _LEAST_SHARE * usual]
+    whole = [turn for turn in turns if turn.packets >= LEAST_SHARE * usual]
     if len(whole) < len(turns):
         notes.append(f"{len(turns) - len(whole)} of {len(turns)} turns are cut; left out")
     stamps_ns = np.array([turn.stamp_ns for turn in whole], np.int64)
