@@ -5,6 +5,8 @@ from statistics import median
 
 SIGMAS_PER_MAD = 1.4826
 """Standard deviations in a median absolute deviation of normal errors."""
+MEDIAN_LENGTH = 1.538
+"""Median length of a vector of three independent normal errors, in their standard deviations."""
 
 
 class RunningMedian:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.geometry import Array, rotation_exp
+from mapper.core.running_median import MEDIAN_LENGTH
 from mapper.core.timebase import GAP_INTERVALS, NS_PER_S, Stamps
 from mapper.core.units import unit_of_gravity
 from mapper.sensing.gyroscope import Gyroscope
@@ -212,7 +213,9 @@ def _refine(
         residuals = _logs(R_turned.transpose(0, 2, 1) @ R)
         residuals[~known], J[~known] = 0.0, 0.0
         lengths = np.linalg.norm(residuals, axis=1)
-        sigma = max(float(np.median(lengths[known])) / 1.538 if known.any() else 0.0, _LEAST_SIGMA_RAD)
+        sigma = max(
+            float(np.median(lengths[known])) / MEDIAN_LENGTH if known.any() else 0.0, _LEAST_SIGMA_RAD
+        )
         weights = 1.0 / (1.0 + (lengths / (_KERNEL * sigma)) ** 2) / sigma**2
         tilt = np.zeros(3) if R_stated is None else _logs((R_stated @ found.R_body_imu.T)[None])[0]
         off = np.concatenate([tilt, -found.bias, [-found.offset_s]])

@@ -9,7 +9,7 @@ import numpy as np
 
 from mapper.core.deskew import SampledMotion, Twist
 from mapper.core.geometry import Array, Transform, angle_between, angle_of, inverse
-from mapper.core.running_median import RunningMedian
+from mapper.core.running_median import MEDIAN_LENGTH, RunningMedian
 from mapper.core.timebase import NS_PER_S, Stamps
 from mapper.core.trajectory import Trajectory
 from mapper.graph.config import WheelNoiseConfig
@@ -29,7 +29,6 @@ _KEPT = 400  # intervals that a fit uses: bias drifts over minutes
 _ERRORS, FEWEST_ERRORS = 30, 5  # of predictions: the newest in the median, and fewest for one
 _MOST_REJECTED_FRAMES = 15
 """In a row: as many as images, and more than scans, are lost before a new sub-map begins."""
-MEDIAN_LENGTH = 1.538  # of a vector of three independent normal errors, in standard deviations
 _LONGEST_TURN_RAD = 2.8
 _SLIPPED, _STANDING_M = 0.5, 0.05
 """Median miss of the wheels, as a share of the way and 5 cm, from which on constant velocity predicts better:

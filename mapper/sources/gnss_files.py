@@ -6,10 +6,11 @@ from pathlib import Path
 import numpy as np
 
 from mapper.core.errors import SourceError
-from mapper.core.geometry import FARTHEST_M, Array, Transform, is_rigid, transform
+from mapper.core.geometry import FARTHEST_M, Array
 from mapper.core.timebase import seconds_text_from_ns
 from mapper.runtime.atomic import write_text
 from mapper.sensing.gnss import NO_FIX, GnssFixes
+from mapper.sources.kitti_calibration import pose_beside
 from mapper.sources.listed_files import refuse_links_out
 from mapper.sources.nmea import fixes_from_sentences
 from mapper.sources.text import parse_date, parse_numbers, parse_stamp, read_lines, rows, time_order
@@ -112,7 +113,7 @@ def _read_oxts(folder: Path) -> tuple[GnssFixes | None, list[str]]:
     accuracy_m = np.minimum(readings[:, _ACCURACY], FARTHEST_M)
     modes = readings[:, _POSITION_MODE].astype(int)
     variances = np.square(accuracy_m[:, None] * [1.0, 1.0, _VERTICAL_RATIO])
-    T_lidar_imu = _mounting(folder.parent)
+    T_lidar_imu = pose_beside(folder.parent, "calib_imu_to_velo.txt")
     status = [NO_FIX if mode < _LEAST_MODE else _AUGMENTED_MODES.get(mode, 0) for mode in modes.tolist()]
     return in_order(
         GnssFixes(
@@ -133,17 +134,3 @@ def _oxts_rows(files: Iterable[Path]) -> Iterator[Array]:
         if len(words) != _OXTS_COLUMNS:
             raise SourceError(f"{file}: {len(words)} numbers, want the {_OXTS_COLUMNS} of OXTS")
         yield np.nan_to_num(parse_numbers(words, where=f"{file}"))
-
-
-def _mounting(drive: Path) -> Transform | None:
-    """Return T_lidar_imu of ``calib_imu_to_velo.txt``, in the drive's folder or beside it, if it is there."""
-    for folder in (drive, drive.resolve().parent):
-        path = folder / "calib_imu_to_velo.txt"
-        if not path.is_file():
-            continue
-        values = {words[0]: parse_numbers(words[1:], where=f"{path}:{n}") for n, words in rows(path) if n > 1}
-        R, t = values.get("R:", np.empty(0)), values.get("T:", np.empty(0))
-        if R.size != 9 or t.size != 3 or not is_rigid(T := transform(R.reshape(3, 3), t), tolerance=1e-3):
-            raise SourceError(f"{path}: want lines R: of nine and T: of three numbers, a rigid motion")
-        return T
-    return None

@@ -61,17 +61,21 @@ def rectification(path: Path) -> Transform:
     return np.eye(4) if R is None else rigid_motion(np.column_stack([R, np.zeros(3)]), f"{path}: R_rect_00")
 
 
-def lidar_in_first_camera(drive: Path) -> Transform | None:
-    """Return T_first_lidar of a raw drive, by ``calib_velo_to_cam.txt`` beside it; None without the file.
+def pose_beside(drive: Path, name: str) -> Transform | None:
+    """Return the pose of a file of R and T, such as ``calib_velo_to_cam.txt`` of T_first_lidar.
+
+    Args:
+        drive: Folder of a raw drive.
+        name: The file's name, in the folder or beside it; None is returned without it.
 
     Raises:
         SourceError: It lacks R or T, or they are no rigid motion.
     """
-    path = drive.resolve().parent / "calib_velo_to_cam.txt"
-    if not path.is_file():
-        return None
-    pose = np.column_stack([matrix_of(path, "R", 3, 3), matrix_of(path, "T", 3)])
-    return rigid_motion(pose, f"{path}")
+    for path in (drive / name, drive.resolve().parent / name):
+        if path.is_file():
+            pose = np.column_stack([matrix_of(path, "R", 3, 3), matrix_of(path, "T", 3)])
+            return rigid_motion(pose, f"{path}")
+    return None
 
 
 def rigid_motion(matrix: Array, where: str) -> Transform:

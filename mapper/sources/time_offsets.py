@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.geometry import Array
+from mapper.core.running_median import SIGMAS_PER_MAD
 from mapper.core.timebase import NS_PER_S, Stamps, seconds_text_from_ns
 from mapper.sources.base import Log, Readings, later
 from mapper.sources.config import SourceConfig
@@ -76,7 +77,7 @@ def time_offset(
     if len(estimates_s) < FEWEST_ESTIMATES:
         return TimeOffset(sensor, None, None)
     late_s = float(np.median(estimates_s))
-    deviation_s = 1.4826 * float(np.median(np.abs(np.asarray(estimates_s) - late_s)))
+    deviation_s = SIGMAS_PER_MAD * float(np.median(np.abs(np.asarray(estimates_s) - late_s)))
     sigma_s = sqrt(deviation_s**2 / len(estimates_s) + _RESOLUTION_S**2)
     if sigma_s > _MOST_SIGMA_S:
         return TimeOffset(sensor, None, None)

@@ -6,9 +6,9 @@ import numpy as np
 
 from mapper.core.deskew import STILL, SampledMotion, Twist, twist_between
 from mapper.core.geometry import Array, Transform, inverse, length_and_angle
-from mapper.core.running_median import RunningMedian
+from mapper.core.running_median import MEDIAN_LENGTH, RunningMedian
 from mapper.core.timebase import NS_PER_S
-from mapper.odometry.motion_prior import FEWEST_ERRORS, MEDIAN_LENGTH, MotionPrior
+from mapper.odometry.motion_prior import FEWEST_ERRORS, MotionPrior
 
 _MIN_ELAPSED_S = 0.005  # over less, an error of millimetres becomes a large velocity
 _ERRORS = 50  # of predictions: the newest in the median

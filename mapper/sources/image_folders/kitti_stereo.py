@@ -27,9 +27,9 @@ from mapper.sources.image_folders.pairing import ImageList
 from mapper.sources.image_folders.rgbd import first_size
 from mapper.sources.image_folders.stereo_pairs import stereo_log
 from mapper.sources.kitti_calibration import (
-    lidar_in_first_camera,
     matrix_of,
     offset_of,
+    pose_beside,
     read_matrix,
     rectification,
     rigid_motion,
@@ -202,7 +202,7 @@ def _gnss(drive: Path, T_body_first: Transform) -> tuple[GnssFixes | None, list[
     fixes, notes = read_gnss(drive)
     if fixes is None or fixes.name != OXTS or fixes.antenna_body is None:
         return fixes, notes if fixes else []
-    T_first_lidar = lidar_in_first_camera(drive)
+    T_first_lidar = pose_beside(drive, "calib_velo_to_cam.txt")
     antenna = (
         None if T_first_lidar is None else apply(T_body_first @ T_first_lidar, fixes.antenna_body[None])[0]
     )

@@ -24,9 +24,9 @@ from mapper.sources.image_files.image_sizes import recorded_camera
 from mapper.sources.image_files.reading import read_colour, read_grey
 from mapper.sources.image_folders.rgbd import first_size
 from mapper.sources.kitti_calibration import (
-    lidar_in_first_camera,
     matrix_of,
     offset_of,
+    pose_beside,
     read_matrix,
     rectification,
     rigid_motion,
@@ -148,7 +148,10 @@ def _camera(sequence: Path, *, is_raw: bool) -> tuple[Array, Transform]:
     """
     if is_raw:
         cameras = sequence.resolve().parent / "calib_cam_to_cam.txt"
-        projection, mounted = matrix_of(cameras, "P_rect_02", 3, 4), lidar_in_first_camera(sequence)
+        projection, mounted = (
+            matrix_of(cameras, "P_rect_02", 3, 4),
+            pose_beside(sequence, "calib_velo_to_cam.txt"),
+        )
         if mounted is None:
             raise SourceError(f"{cameras.parent}: no calib_velo_to_cam.txt, the LiDAR's pose")
         T_first_lidar = rectification(cameras) @ mounted
