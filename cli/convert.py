@@ -72,7 +72,7 @@ def convert(
     checks = ReadingChecks(source)
     with progress.stage("convert") as report:
         skipped = write_log(checks.log, out, kind=as_, on_progress=lambda done: report(done, len(source)))
-    for note in (*(f"skipped: {skip.reason}" for skip in skipped), *checks.notes()):
+    for note in (*(f"skipped: {skip.reason}" for skip in skipped), *(note for _, note in checks.notes())):
         progress.note(note)
     frames = len(source) - len(skipped)
     return Answer(

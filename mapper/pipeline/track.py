@@ -31,12 +31,10 @@ from mapper.runtime.ordered_map import ordered_map
 from mapper.runtime.progress import Progress
 from mapper.sensing.gyroscope import Gyroscope
 from mapper.sources.base import FrameRef, Log, Skipped
-from mapper.sources.depth_outlines import outline_warnings
-from mapper.sources.depth_scale import depth_warnings, read_spread, why_no_depth
-from mapper.sources.image_order import time_warnings
+from mapper.sources.depth_scale import read_spread, why_no_depth
 from mapper.sources.merged_scans import with_merged_scans
+from mapper.sources.plausibility import log_warnings
 from mapper.sources.reading_checks import ReadingChecks
-from mapper.sources.scan_frame import scan_frame_warnings, sweep_warnings
 
 _MOST_TRACKED_TWICE = 40
 """Scans by which a gyroscope is calibrated in advance; 8 to 21 show a mounting if the sensor turns."""
@@ -303,11 +301,7 @@ class _FirstPass:
         if conflict := wheel_conflict(graph, self._wheel_factors):
             conflicts = [*conflicts, conflict]
         warnings = [
-            *(RunWarning(kind="frozen", sentence=note) for note in checks.frozen()),
-            *(RunWarning(kind="log", sentence=note) for note in checks.slow_sensors()),
-            *(RunWarning(kind="far returns", sentence=note) for note in checks.far_returns()),
-            *(RunWarning(kind="log", sentence=note) for note in checks.untimed_returns()),
-            *(RunWarning(kind="log", sentence=note) for note in checks.untimed_scans()),
+            *(RunWarning(kind=kind, sentence=sentence) for kind, sentence in checks.notes()),
             *(RunWarning(kind="conflict", sentence=note, weight="doubt") for note in conflicts),
         ]
         if isinstance(odometry, SensorCheck):
@@ -381,13 +375,8 @@ def noted_log_warnings(source: Log, progress: Progress) -> list[RunWarning]:
     if (why := why_no_depth(source, frames)) is not None:
         raise DataError(f"{source.path}: {why}")
     warnings = [
-        *(RunWarning(kind="stamps", sentence=text, weight="doubt") for text in time_warnings(source)),
-        *(
-            RunWarning(kind="depth", sentence=text, weight="doubt")
-            for text in [*depth_warnings(source, frames), *outline_warnings(frames.values())]
-        ),
-        *(RunWarning(kind="frame", sentence=text, weight="doubt") for text in scan_frame_warnings(source)),
-        *(RunWarning(kind="sweep", sentence=text, weight="doubt") for text in sweep_warnings(source)),
+        RunWarning(kind=kind, sentence=sentence, weight="doubt")
+        for kind, sentence in log_warnings(source, frames)
     ]
     for warning in warnings:
         progress.note(warning.sentence)

@@ -14,17 +14,15 @@ from mapper.runtime.ordered_map import ordered_map
 from mapper.sources import RECORDING, format_of, open_source
 from mapper.sources.base import Log
 from mapper.sources.config import SourceConfig
-from mapper.sources.depth_outlines import outline_warnings
-from mapper.sources.depth_scale import depth_warnings, read_spread, why_no_depth
+from mapper.sources.depth_scale import read_spread, why_no_depth
 from mapper.sources.frame_selection import selected
-from mapper.sources.image_order import time_warnings
 from mapper.sources.image_quality import ImageChecks, ImageQuality
+from mapper.sources.plausibility import log_warnings
 from mapper.sources.reading_checks import ReadingChecks
 from mapper.sources.ros import files as recordings
 from mapper.sources.ros.message_index import Series
 from mapper.sources.ros.reader import RecordingReader
 from mapper.sources.ros.source import recording_log
-from mapper.sources.scan_frame import scan_frame_warnings, sweep_warnings
 from mapper.sources.time_offsets import TimeOffset
 from mapper.sources.valid_returns import FARTHEST_M
 from mapper.sources.vehicle import Box, vehicle_box
@@ -225,14 +223,8 @@ def _inspected(
         gnss=None if source.gnss is None else timing_of(source.gnss.stamps_ns),
         gnss_status="" if source.gnss is None else source.gnss.status_text,
         gnss_sigma_m=None if source.gnss is None else source.gnss.median_sigma_m,
-        notes=[*source.sentences, *damage, *checks.notes()],
-        warnings=[
-            *time_warnings(source),
-            *depth_warnings(source, frames),
-            *outline_warnings(frames.values()),
-            *scan_frame_warnings(source),
-            *sweep_warnings(source),
-        ],
+        notes=[*source.sentences, *damage, *(sentence for _, sentence in checks.notes())],
+        warnings=[sentence for _, sentence in log_warnings(source, frames)],
         vehicle=vehicle_box(source) if config.body.finds_box else None,
     )
     why = problem or why_no_depth(source, frames) or _unwritable(source) or check(source)

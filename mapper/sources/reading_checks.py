@@ -98,25 +98,23 @@ class ReadingChecks:
         lasted_ns = int(self._stamps_ns[run[-1]] - self._stamps_ns[run[0]])
         return len(run) >= FROZEN_SCANS and lasted_ns >= NS_PER_S
 
-    def notes(self) -> list[str]:
-        """Return what is suspicious about the frames loaded so far, a sentence each."""
-        return [
-            *self.frozen(),
-            *self.slow_sensors(),
-            *self.far_returns(),
-            *self.untimed_returns(),
-            *self.untimed_scans(),
-        ]
+    def notes(self) -> list[tuple[str, str]]:
+        """Return what is suspicious about the frames loaded so far: kind and sentence of each warning."""
+        found = (
+            ("frozen", self._frozen()),
+            ("log", self._slow_sensors()),
+            ("far returns", self._far_returns()),
+            ("log", self._untimed_returns()),
+            ("log", self._untimed_scans()),
+        )
+        return [(kind, sentence) for kind, sentences in found for sentence in sentences]
 
-    def frozen(self) -> list[str]:
-        """Return where a sensor seems to have been frozen, a sentence each."""
-        return [
-            f"{self._named(run)} {said}"
-            for what, said, _, fewest in _FROZEN
-            for run in self.repeated(what, fewest=fewest)
-        ]
+    def _frozen(self) -> Iterator[str]:
+        """Yield where a sensor seems to have been frozen, a sentence each."""
+        for what, said, _, fewest in _FROZEN:
+            yield from (f"{self._named(run)} {said}" for run in self.repeated(what, fewest=fewest))
 
-    def slow_sensors(self) -> Iterator[str]:
+    def _slow_sensors(self) -> Iterator[str]:
         """Yield a sentence about a sensor that is slower than its stamps, if many frames repeat the last."""
         for what, _, named, fewest in _FROZEN:
             runs = self.repeated(what, fewest=2) if what != "depth" else []  # which may be slower than colour
@@ -141,7 +139,7 @@ class ReadingChecks:
         begin_s, end_s = ((self._stamps_ns[[run[0], run[-1]]] - self._stamps_ns[0]) / NS_PER_S).tolist()
         return f"frames {run[0]} … {run[-1]}, {begin_s:.1f} … {end_s:.1f} s after the first,"
 
-    def far_returns(self) -> Iterator[str]:
+    def _far_returns(self) -> Iterator[str]:
         """Yield a sentence about the returns that were left out, if there were any."""
         counts = [reading.far_returns for reading in self._readings.values() if reading.far_returns]
         if counts:
@@ -150,7 +148,7 @@ class ReadingChecks:
                 f"{FARTHEST_M:g} m, which no sensor reaches; left out"
             )
 
-    def untimed_returns(self) -> Iterator[str]:
+    def _untimed_returns(self) -> Iterator[str]:
         """Yield a sentence about the returns whose time cannot be right, if there were any."""
         counts = [reading.untimed_returns for reading in self._readings.values() if reading.untimed_returns]
         if counts:
@@ -159,7 +157,7 @@ class ReadingChecks:
                 f"NaN, or more than {MAX_SWEEP_S:g} s from the others'); left out"
             )
 
-    def untimed_scans(self) -> Iterator[str]:
+    def _untimed_scans(self) -> Iterator[str]:
         """Yield a sentence about the scans without times among others that have them."""
         are_timed = [reading.is_timed for reading in self._readings.values() if reading.is_timed is not None]
         if any(are_timed) and not all(are_timed):

@@ -39,7 +39,7 @@ def notes_on(log, order=None):
     for index in range(len(log)) if order is None else order:
         with suppress(FrameError):
             checks.log.entry_at(index).load()
-    return checks.notes()
+    return [sentence for _, sentence in checks.notes()]
 
 
 def frozen(n, first, count):
