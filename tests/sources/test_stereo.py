@@ -157,6 +157,26 @@ def test_rectified_topics_have_the_baseline_in_their_projections(tmp_path):
     assert RECT[1] in log.choices[0]
 
 
+@pytest.mark.parametrize(
+    "names", ["rig/{port,starboard}", "usb_port1/{left,right}", "cam0/{left,right}", "rig/{l,r}"]
+)
+def test_pairs_are_found_by_the_last_word_for_a_side(tmp_path, names):
+    head, _, sides = names.partition("{")
+    topics = tuple(f"/{head}{side}/image_rect" for side in sides.strip("}").split(","))
+    log = open_source(write(tmp_path / "a.mcap", recorded(RECTIFIED, topics, projections=projections(0.12))))
+    assert_shows_wall(log, poses_world(2))
+
+
+def test_each_image_of_a_namespace_has_the_calibration_that_shares_its_words(tmp_path):
+    messages = recorded(RECTIFIED, ("/a/image_rect", "/b/image_rect"), projections=projections(0.12))
+    names = {
+        "/a/": ("/rig/image_rect_l", "/rig/camera_info_l"),
+        "/b/": ("/rig/image_rect_r", "/rig/camera_info_r"),
+    }
+    named = [one._replace(topic=names[one.topic[:3]]["camera_info" in one.topic]) for one in messages]
+    assert_shows_wall(open_source(write(tmp_path / "a.mcap", named)), poses_world(2))
+
+
 def test_raw_topics_are_rectified_by_their_calibrations(tmp_path):
     R_left, R_right, P_left, P_right = rectification(BARREL)
     messages = recorded(BARREL, RAW, projections=(P_left, P_right), rotations=(R_left, R_right))

@@ -73,14 +73,17 @@ def fix_rank(topic: Topic) -> tuple[int, ...]:
 def infos_beside(image: Series, infos: Sequence[Series]) -> list[Series]:
     """Return the calibrations in an image topic's own namespace, or in the one that it shares most with.
 
+    Of several in its own those come first that share more words with it: camera_info_l with image_l.
     realsense-viewer has /device_0/sensor_1/Color_0/info/camera_info beside …/Color_0/image/data.
     """
     name = image.topic.name
     for transport in TRANSPORTS:
         name = name.removesuffix(transport)
-    own = [one for one in infos if one.topic.name.rpartition("/")[0] == name.rpartition("/")[0]]
+    namespace, _, last = name.rpartition("/")
+    own = [one for one in infos if one.topic.name.rpartition("/")[0] == namespace]
     if own:
-        return own
+        words = set(last.split("_"))
+        return sorted(own, key=lambda one: -len(words & set(one.topic.name.rpartition("/")[2].split("_"))))
     shared = [shared_namespaces(name, one.topic.name) for one in infos]
     most = max(shared, default=0)
     return [infos[shared.index(most)]] if most and shared.count(most) == 1 else []

@@ -1,7 +1,7 @@
 """Choice of the topics that a map is made from: the user's, or a guess that a note reports."""
 
 import re
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -50,14 +50,11 @@ from mapper.sources.ros.unused_topics import (
 TRUTH, WHEELS = "/ground_truth", "/wheel_odometry"
 
 _OWN_TYPES = "mapper/msg/"
-_SIDES = re.compile(r"left|infra1|Infrared_1|cam0|camera0", re.IGNORECASE)
-_OTHER_SIDE = {
-    "left": "right",
-    "infra1": "infra2",
-    "infrared_1": "Infrared_2",
-    "cam0": "cam1",
-    "camera0": "camera1",
-}
+_SIDES = re.compile(
+    r"left|infra1|Infrared_1|cam0|camera0|port(?![a-z])|(?<![a-z0-9])l(?![a-z0-9])", re.IGNORECASE
+)
+_SIDE_WORDS = ("left:right", "infra1:infra2", "infrared_1:Infrared_2", "cam0:cam1", "camera0:camera1")
+_OTHER_SIDE = dict(pair.split(":") for pair in (*_SIDE_WORDS, "port:starboard", "l:r"))
 """Words in topics of left images, and in those of the right ones beside them."""
 
 
@@ -383,14 +380,19 @@ def _stereo_pairs(lefts: Sequence[Series], images: Sequence[Series]) -> list[tup
     found = [
         (left, by_name[other])
         for left in images
-        if (other := _SIDES.sub(_other_side, name := left.topic.name)) != name and other in by_name
+        if (other := next((one for one in _other_sides(left.topic.name) if one in by_name), None)) is not None
     ]
     found = [pair for left, right in found for pair in ((left, right), (right, left)) if pair[0] in lefts]
     return sorted(found, key=lambda pair: (not is_called_rectified(pair[0].topic.name), pair[0].topic.name))
 
 
-def _other_side(side: re.Match[str]) -> str:
-    return _OTHER_SIDE[side[0].lower()]
+def _other_sides(name: str) -> Iterator[str]:
+    """Yield a name with the other side's word for the last of its own, for one before it, and for all."""
+    sides = list(_SIDES.finditer(name))
+    for side in reversed(sides):
+        yield name[: side.start()] + _OTHER_SIDE[side[0].lower()] + name[side.end() :]
+    if len(sides) > 1:
+        yield _SIDES.sub(lambda side: _OTHER_SIDE[side[0].lower()], name)
 
 
 def _best(topics: Sequence[Series], rank: Callable[[str], tuple[int, ...]]) -> Series | None:
