@@ -254,6 +254,17 @@ def test_a_matrix_that_lost_a_number_is_no_pose(shots, tmp_path):
     assert (len(log), len(log.device_poses)) == (len(shots.frames), len(shots.frames) - 1)
 
 
+@pytest.mark.parametrize(("unit_s", "is_read"), [(1.0, True), (1e-9, True), (0.0, False)])
+def test_stamps_in_transforms_json_are_read_where_each_frame_has_its_own(shots, tmp_path, unit_s, is_read):
+    folder = WRITERS["nerfstudio"][0](tmp_path / "scan", shots)
+    listed = json.loads((folder / "transforms.json").read_text())
+    stamps_ns = [1_700_000_000_000_000_000 + 250_000_000 * i for i in range(len(listed["frames"]))]
+    for frame, stamp_ns in zip(reversed(listed["frames"]), stamps_ns, strict=True):
+        frame["timestamp"] = stamp_ns if unit_s == 1e-9 else stamp_ns / 1e9 * unit_s
+    (folder / "transforms.json").write_text(json.dumps(listed))
+    assert (open_source(folder).stamps_ns.tolist() == stamps_ns) == is_read
+
+
 def test_nerfs_angle_of_view_and_names_without_ending_are_read(shots, tmp_path):
     folder = WRITERS["nerfstudio"][0](tmp_path / "scan", shots)
     path = folder / "transforms.json"

@@ -24,6 +24,7 @@ from mapper.sources.image_folders.posed import PosedFrames, camera_of, pose_of_o
 from mapper.sources.image_folders.rgbd import first_size
 from mapper.sources.json_files import read_json
 from mapper.sources.listed_files import within
+from mapper.sources.text import parse_stamp
 
 FILES = ("transforms.json",)
 _LIST = "transforms.json"
@@ -35,6 +36,7 @@ class _Frame(BaseModel):
     depth_file_path: str | None = Field(None, validation_alias=AliasChoices("depth_file_path", "depth_path"))
     transform_matrix: list[list[float]]
     fl_x: float | None = None
+    timestamp: int | float | None = None
 
 
 class _Transforms(BaseModel):
@@ -71,8 +73,9 @@ def read_frames(folder: Path, config: SourceConfig) -> PosedFrames:
     if len(set(numbers)) < len(colours):
         numbers = list(range(len(colours)))
     order = sorted(range(len(numbers)), key=numbers.__getitem__)
+    stamps_us = _stamps_us(with_depth, where=f"{path}: timestamp")
     pairs, notes = stamped(
-        [NumberedPair(numbers[i], colours[i], depths[i], None) for i in order],
+        [NumberedPair(numbers[i], colours[i], depths[i], stamps_us[i]) for i in order],
         rate_hz=config.rate_hz,
         beside=[folder, colours[0].parent],
     )
@@ -86,6 +89,14 @@ def read_frames(folder: Path, config: SourceConfig) -> PosedFrames:
         stated = read_calibration(path)
     camera = camera_of(folder, config, stated)
     return PosedFrames(pairs, poses, camera, 1.0 / scale if scale else MM_PER_M, notes)
+
+
+def _stamps_us(frames: Sequence[_Frame], *, where: str) -> Sequence[int | None]:
+    """Return the frames' own stamps, microseconds, as some apps state them; None unless each has another."""
+    stated = {frame.timestamp for frame in frames}
+    if None in stated or len(stated) < len(frames):
+        return [None] * len(frames)
+    return [(parse_stamp(f"{frame.timestamp}", where=where) + 500) // 1000 for frame in frames]
 
 
 def _camera_by_angles(listed: _Transforms, images: Sequence[Path], origin: str) -> Calibration | None:
