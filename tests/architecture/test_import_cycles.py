@@ -1,13 +1,12 @@
 """No import cycles, imports inside functions included: every module can be read after those it imports."""
 
-import ast
-from collections.abc import Iterator
 from graphlib import CycleError, TopologicalSorter
 from itertools import pairwise
 from pathlib import Path
 
 import pytest
 
+from tests.support.imports import imports_of
 from tests.support.paths import ROOT
 
 PREFIXES = {"mapper": "", "evaluators": "mapper.", "cli": "mapper."}
@@ -24,24 +23,12 @@ def modules() -> dict[str, Path]:
     return found
 
 
-def imports(node: ast.AST) -> Iterator[str]:
-    """Yield what is imported, unless for type checkers alone."""
-    for child in ast.iter_child_nodes(node):
-        if isinstance(child, ast.If) and ast.unparse(child.test) == "TYPE_CHECKING":
-            continue
-        if isinstance(child, ast.ImportFrom):
-            yield from (f"{child.module}.{alias.name}" for alias in child.names)
-        elif isinstance(child, ast.Import):
-            yield from (alias.name for alias in child.names)
-        yield from imports(child)
-
-
 def importing() -> dict[str, set[str]]:
     """Return the modules that each module imports; a name that is no module is one of its parent's."""
     known = modules()
     graph: dict[str, set[str]] = {}
     for module, path in known.items():
-        names = imports(ast.parse(path.read_text()))
+        names = [name for one in imports_of(path) if not one.for_types for name in one.names]
         found = {name if name in known else name.rpartition(".")[0] for name in names}
         graph[module] = (found & known.keys()) - {module}
     return graph

@@ -3,11 +3,11 @@
 import ast
 import sys
 from collections.abc import Iterator
-from functools import cache
 from pathlib import Path
 
 import pytest
 
+from tests.support.imports import imports_of
 from tests.support.paths import ROOT
 
 OURS = {"mapper", "evaluators", "cli"}
@@ -106,25 +106,14 @@ def package_of(module: str) -> str:
     return parts[1] if parts[0] == "mapper" and parts[1:2] in (["cli"], ["evaluators"]) else parts[0]
 
 
-@cache
-def imports_of(package: str) -> tuple[tuple[str, int, str], ...]:
-    return tuple(_imports_of(package))
-
-
-def _imports_of(package: str) -> Iterator[tuple[str, int, str]]:
+def imports_in(package: str) -> Iterator[tuple[str, int, str]]:
     for path in sorted((ROOT / package).rglob("*.py")):
-        for node in ast.walk(ast.parse(path.read_text())):
-            if isinstance(node, ast.ImportFrom):
-                assert node.level == 0, f"{path}:{node.lineno}: import by full name"
-                yield str(path.relative_to(ROOT)), node.lineno, node.module or ""
-            elif isinstance(node, ast.Import):
-                for name in node.names:
-                    yield str(path.relative_to(ROOT)), node.lineno, name.name
+        yield from ((str(path.relative_to(ROOT)), one.line, one.module) for one in imports_of(path))
 
 
 @pytest.mark.parametrize("package", MAY_IMPORT)
 def test_layers_point_one_way(package):
-    for path, line, module in imports_of(package):
+    for path, line, module in imports_in(package):
         root = package_of(module)
         if (path, module) in ASKS_UPWARDS:
             continue
@@ -144,7 +133,7 @@ def test_few_modules_are_imported_by_name():
 
 def folder_imports() -> Iterator[tuple[str, str, str, str]]:
     """Yield (where, folder, imported folder, imported module) of every import between folders of mapper/."""
-    for path, line, module in imports_of("mapper"):
+    for path, line, module in imports_in("mapper"):
         inner, parts = Path(path).parts[1:-1], module.split(".")
         if (path, module) in ASKS_UPWARDS:
             continue
@@ -169,7 +158,7 @@ def test_folders_depend_one_way():
 def test_subfolders_depend_one_way(folder):
     layers, prefix = SUBFOLDERS[folder], f"mapper.{folder.replace('/', '.')}."
     assert {path.parent.name for path in (ROOT / "mapper" / folder).glob("*/__init__.py")} == set(layers)
-    for path, line, module in imports_of("mapper"):
+    for path, line, module in imports_in("mapper"):
         inner, imported = path.removeprefix(f"mapper/{folder}/"), module.removeprefix(prefix)
         if inner != path and "/" in inner and imported != module and "." in imported:
             own, other = inner.split("/")[0], imported.split(".")[0]
@@ -189,11 +178,9 @@ def settings_modules() -> list[Path]:
 
 @pytest.mark.parametrize("path", settings_modules(), ids=lambda path: str(path.relative_to(ROOT)))
 def test_settings_import_only_settings(path):
-    for node in ast.walk(ast.parse(path.read_text())):
-        if isinstance(node, ast.ImportFrom):
-            module = node.module or ""
-            known = module.split(".")[0] in {*sys.stdlib_module_names, "pydantic"}
-            assert known or module.endswith("config"), f"{path}:{node.lineno} imports {module}"
+    for one in imports_of(path):
+        known = one.module.split(".")[0] in {*sys.stdlib_module_names, "pydantic"}
+        assert known or one.module.endswith("config"), f"{path}:{one.line} imports {one.module}"
 
 
 def test_settings_build_nothing():
@@ -206,7 +193,7 @@ def test_settings_build_nothing():
 def test_each_big_library_has_one_home(library):
     homes = HOMES[library]
     for package in OURS:
-        for path, line, module in imports_of(package):
+        for path, line, module in imports_in(package):
             root = package_of(module)
             assert root != library or path.startswith(homes), f"{path}:{line} imports {library}"
 

@@ -3,9 +3,9 @@
 Only tests/fuzz, which is a program too, has modules of its own.
 """
 
-import ast
 from collections import Counter
 
+from tests.support.imports import imports_of
 from tests.support.paths import ROOT
 
 FILES = sorted((ROOT / "tests").rglob("*.py"))
@@ -14,19 +14,11 @@ TESTS = [path for path in FILES if path.name.startswith("test_")]
 
 def test_no_test_imports_another_test():
     for path in FILES:
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            match node:
-                case ast.ImportFrom(module=str(module), level=level):
-                    assert level == 0, f"{path}:{node.lineno}: import by full name"
-                    names = [module, *(f"{module}.{alias.name}" for alias in node.names)]
-                case ast.Import():
-                    names = [alias.name for alias in node.names]
-                case _:
-                    continue
-            for name in names:
+        for one in imports_of(path):
+            for name in one.names:
                 parts = name.split(".")
                 is_test = any(part == "conftest" or part.startswith("test_") for part in parts)
-                assert not is_test, f"{path}:{node.lineno} imports {name}; share it in tests/support"
+                assert not is_test, f"{path}:{one.line} imports {name}; share it in tests/support"
                 shared = ("", "support", "fuzz") if "fuzz" in path.parts else ("", "support")
                 assert parts[0] != "tests" or "".join(parts[1:2]) in shared, name
 
