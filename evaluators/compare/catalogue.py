@@ -31,7 +31,7 @@ from mapper.odometry.base import FrameOdometry
 from mapper.odometry.config import IsvdOdometryConfig, LocalMapConfig, PnpConfig
 from mapper.odometry.factory import build_frame_odometry
 from mapper.odometry.scans.config import KissOdometryConfig
-from mapper.pipeline.track import session_odometry
+from mapper.pipeline.track import begin_calibrated, session_odometry
 from mapper.registration.config import NEED_NO_GUESS, VOXEL_M, RegistrationConfig
 from mapper.registration.factory import aligner_to
 from mapper.registration.hough.config import HoughConfig
@@ -139,7 +139,9 @@ def _follower(name: str, tracker: Callable[[], Tracker]) -> Method:
 
 
 def _default_tracker(source: Log) -> Tracker:
-    odometry = session_odometry(source, load_config(None, sensor=source.sensor))
+    config = load_config(None, sensor=source.sensor)
+    odometry = session_odometry(source, config)
+    begin_calibrated(odometry, source, config.workers)
     return OdometryTracker(cast(FrameOdometry[Any], odometry))
 
 
