@@ -75,12 +75,12 @@ RUN_FILES = (
     ),
     RunFiles(
         (BASE,),
-        "those of the robot's base (`base_link`), if the recording's tf says where the sensor is on it",
+        "poses of the robot's base (`base_link`), if the recording's tf says where the sensor is on it",
         "tracking",
     ),
     RunFiles(
         (POSES,),
-        "the same poses with the outcome and covariance of each: upper triangle, in the body's tangent "
+        "the poses of `trajectory.tum` with outcome and covariance: upper triangle, in the body's tangent "
         "(rotation, translation), the first node fixed",
         "tracking",
     ),
@@ -89,8 +89,8 @@ RUN_FILES = (
     RunFiles((GRAPH,), "the pose graph at its solution", "tracking"),
     RunFiles(
         (FIXES,),
-        "the GNSS fixes that correct the path: position, antenna in its node, and information along the "
-        "map's axes, of which the weight counts",
+        "the GNSS fixes that correct the path: position, antenna in its node, information along the map's "
+        "axes, and weight",
         "tracking",
     ),
     RunFiles(
